@@ -16,6 +16,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller of each loop in the run that a recorder or launcher has opened."""
     with join_run("controller", arguments) as run:
         controllers = controllers_of(run.loops, run.phases_ns, start=run.start)
+        controllers.connect()
         run_machines(run, controllers)
     return ExitStatus.OK
 

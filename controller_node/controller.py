@@ -20,7 +20,7 @@ from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, Role, alike_loops, set_machine, take_changes
-from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
+from noack.protocol.machine_interface import BEGINNING, FAILED, External, Notice, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,
@@ -200,6 +200,11 @@ class Controller:
     def shape(self) -> RecordShape:
         """The sizes of the rows."""
         return RecordShape(len(self.H), self.inputs)
+
+    @property
+    def external(self) -> External | None:
+        """The law, if another program has it."""
+        return self.law if isinstance(self.law, External) else None
 
     def fill(self, controller: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_controller`` at its start."""

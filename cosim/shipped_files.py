@@ -45,7 +45,7 @@ def find_shipped(name: str, folder: str) -> Path:
         raise CallerError(f"no {folder.removesuffix('s')} is named: give a file or a shipped one")
     path, names = Path(name), shipped_names(folder)
     try:
-        exists = path.exists()
+        exists = path.exists() and not (path.is_dir() and name in names)
     except OSError:  # the name is too long
         exists = False
     if exists or (path.parent.name and name not in names) or not names:

@@ -725,7 +725,7 @@ enum noack_opened { NOACK_NOT_OPENED, NOACK_OPENED, NOACK_NOT_AUTHENTIC };
 
 typedef struct { /* where messages come from */
     int64_t name_bytes; /* 0: there is none */
-    uint8_t name[32];
+    uint8_t name[40];
     int64_t received; /* datagrams from this address */
 } noack_peer;
 
@@ -768,7 +768,7 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns);
 
 /* Add a datagram as if it had just been received; then noack_drive must be called. */
 void noack_driver_add_datagram(
-    noack_driver *driver, const uint8_t name[32], const uint8_t *data, int64_t size_bytes);
+    noack_driver *driver, const uint8_t name[40], const uint8_t *data, int64_t size_bytes);
 
 /* Let woken processes run before the calling thread, whose time slice becomes 100 ms, where Linux has
    time slices of threads (since 6.12). */
@@ -777,7 +777,8 @@ void noack_prefer_others(void);
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 
 enum {
-    NOACK_NAME_BYTES = 32,    /* room for a socket address; those of IPv6 have 28 bytes */
+    NOACK_NAME_BYTES = 40,    /* room for a socket address (IPv6: 28 bytes), or a 5-tuple */
+    NOACK_HEADERS_BYTES = 28, /* of IPv4 and UDP; what follows in a packet is its payload */
     NOACK_HEAD_BYTES = 32,    /* of a payload, that a record has */
     NOACK_ERRNOS = 256,
     NOACK_BLOCK_BYTES = 512,  /* payloads of delayed datagrams are kept in chained blocks */
@@ -800,7 +801,8 @@ enum noack_sends { /* the socket that sends a direction's datagrams, and their d
     NOACK_OWN_SOCKET,       /* the client's socket, which is connected to the destination */
     NOACK_DESTINATION_NAME, /* the link's sending socket, not connected, to the destination */
     NOACK_CLIENT_NAME,      /* the link's listening socket, to the client */
-    NOACK_LINK_SOCKET       /* the link's sending socket, which is connected to the destination */
+    NOACK_LINK_SOCKET,      /* the link's sending socket, which is connected to the destination */
+    NOACK_LISTENING_SOCKET  /* the link's listening socket, which is a device */
 };
 
 typedef struct {     /* 16 bytes: those of thousands of clients fill the caches */
@@ -810,15 +812,15 @@ typedef struct {     /* 16 bytes: those of thousands of clients fill the caches 
 } noack_socket;
 
 typedef struct { /* what a datagram needs is in the first 64 bytes, a cache line */
-    int64_t key[4];
+    int64_t key[5];
     int64_t last_ns; /* last datagram of the client or of the destination */
-    int64_t number;  /* number of its flows; -1: the row is free */
     int32_t in_flight;
     int32_t link;
     int32_t place; /* row of its flows in the link's two states */
     int32_t name_bytes;
-    uint8_t name[32];
-    uint8_t local[32]; /* address of its return path */
+    int64_t number; /* number of its flows; -1: the row is free */
+    uint8_t name[40];
+    uint8_t local[40]; /* address of its return path */
 } noack_client;
 
 typedef struct { /* one direction of a link in the relay */
@@ -826,8 +828,8 @@ typedef struct { /* one direction of a link in the relay */
     int64_t keeps; /* 1: datagrams can be delayed or changed */
     int64_t sends;
     int64_t name_bytes;
-    uint8_t name[32];   /* forward: the server's */
-    uint8_t listen[32]; /* the link's address */
+    uint8_t name[40];   /* forward: the server's */
+    uint8_t listen[40]; /* the link's address */
     int64_t full;       /* forward: 1: further clients are refused */
     int64_t refused;
     int64_t port_unreachable; /* forward: ICMP port-unreachable errors */
@@ -869,7 +871,7 @@ typedef struct {    /* a datagram that arrives or departs; a tap receives it */
     uint16_t source_port, destination_port;
     uint8_t source[16]; /* an IPv4 address is in the first 4 bytes */
     uint8_t destination[16];
-    uint8_t family;    /* 4 or 6: the version of IP */
+    uint8_t family;    /* 4 or 6: the version of IP; 0: the payload is a whole packet */
     uint8_t departure; /* 0: a datagram arrived here; 1: it or its copy departed here */
     uint8_t direction; /* 0: forward, from client to server; 1: reverse */
     uint8_t fate;
@@ -890,6 +892,8 @@ typedef struct { /* a row of the record's table netem_release */
 
 typedef struct { /* times are simulated and count from the relay's start, unless stated otherwise */
     int64_t links;
+    int64_t devices; /* 1: there is one link, between two TUN devices: the inner one is its listening
+                        socket, the outer one its sending socket; a client is a flow: a 5-tuple */
     int64_t epoll;
     int64_t only_socket;     /* the one that it waits for, by receiving; -1: epoll waits for sockets */
     int64_t receive_wait_ns; /* how long it waits (SO_RCVTIMEO) */
@@ -946,7 +950,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns);
 
 /* Add a datagram as if a socket had just received it; noack_relay_run decides for it. */
 void noack_relay_add_datagram(
-    noack_relay *relay, int64_t socket, const uint8_t name[32], const uint8_t *data,
+    noack_relay *relay, int64_t socket, const uint8_t name[40], const uint8_t *data,
     int64_t size_bytes);
 
 /* The sender of the current datagram, and the place of the socket that received it. */
@@ -957,7 +961,7 @@ int64_t noack_relay_receiver(const noack_relay *relay);
 void noack_relay_latest(const noack_relay *relay, int64_t direction, int64_t *latest_ns);
 
 /* The table of clients: find the row of a name (-1: none), insert a row, remove it. */
-int64_t noack_client_find(const noack_relay *relay, const uint8_t name[32], int64_t link);
+int64_t noack_client_find(const noack_relay *relay, const uint8_t name[40], int64_t link);
 void noack_client_insert(noack_relay *relay, int64_t row);
 void noack_client_remove(noack_relay *relay, int64_t row);
 

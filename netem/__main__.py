@@ -3,6 +3,7 @@
 In a run, it is one of the run's processes. On its own, it relays for any UDP program::
 
     python -m netem --listen 127.0.0.1:9000 --to 127.0.0.1:9001 loss 30% mansd 4
+    python -m netem shell loss 30% mansd 4 -- COMMAND
 """
 
 import sys
@@ -18,16 +19,22 @@ with stoppable_imports():
     from noack.runtime.run_process import RunProcess, add_options, join_run
 
 
-def main(arguments: Sequence[str] | None = None) -> ExitStatus:
-    """Run the emulator (stand-alone or in a run), or a command for a running emulator."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the emulator (stand-alone or in a run), a shell, or a command for a running emulator."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in ("show", "set", "watch"):
         from netem.control import emulator_commands  # a run's emulator starts without it
 
         return emulator_commands.main(given)
+    as_json = "--json" in given
     joining = Parser(prog="noack netem", add_help=False, allow_abbrev=False)
     add_options(joining)
     try:
+        if given[:1] == ["shell"]:
+            from netem.shell import shell  # a run's emulator starts without it
+
+            as_json = "--json" in given[: (*given, "--").index("--")]
+            return shell(given[1:])
         _, more = joining.parse_known_args(given)
         if not more:
             with join_run("netem", given) as run:
@@ -37,7 +44,6 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
         return alone(given)
     except NoackError as error:
-        as_json = "--json" in given
         return failed(str(error), error.exit_status, who="noack netem", as_json=as_json)
 
 

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from netem.relay_links import (
-    Address,
     Direction,
     Endpoint,
     LinkSpec,
@@ -23,9 +22,9 @@ from netem.relay_links import (
     return_path,
     say,
     stamp_arrivals,
-    unpacked_address,
 )
 from netem.relay_memory import RelayDirection, RelayMemory, name_array
+from netem.shell_devices import DeviceLink
 from noack.core.core_library import core
 from noack.runtime.address import text_of
 from noack.runtime.udp_sockets import drops_of
@@ -130,7 +129,7 @@ class ClientTable:
 
     def __init__(
         self,
-        links: Sequence[OpenLink],
+        links: Sequence[OpenLink | DeviceLink],
         warnings: Sequence[LinkWarnings],
         directions: Sequence[RelayDirection],
         memory: RelayMemory,
@@ -153,7 +152,7 @@ class ClientTable:
     def add(self, link: int, name: bytes) -> None:
         """Add a client by its packed name; if that is impossible, mark the link as full."""
         warnings, present, path, error = self._warnings[link], self.present[link], None, 0
-        if warnings.accepts_client(present) and self._links[link].spec.return_path:
+        if warnings.accepts_client(present) and self._links[link].has_paths:
             path, error = return_path(self._links[link].server)
         if not warnings.no_descriptor_left(error, present) and warnings.accepts_client(present):
             self._accept(link, name, path, error)
@@ -179,9 +178,8 @@ class ClientTable:
         sockets, first = self._memory.sockets, self._memory.first_path
         clients = self._memory.clients
         for row in np.flatnonzero(sockets["error"][first:]).tolist():
-            path, sockets["error"][first + row] = return_path(
-                self._links[clients["link"][row]].server
-            )
+            server = self._links[clients["link"][row]].server
+            path, sockets["error"][first + row] = return_path(server)
             if path is not None:
                 self._set_path(row, path)
 
@@ -205,9 +203,10 @@ class ClientTable:
         clients = self._memory.clients
         return np.flatnonzero((clients["number"] >= 0) & (clients["link"] == link))
 
-    def address(self, row: int) -> Address:
-        """Return a client's address."""
-        return unpacked_address(self._memory.clients["name"][row].tobytes())
+    def text(self, row: int) -> str:
+        """Return a client's address, or its flow, as text."""
+        client = self._memory.clients[row]
+        return self._links[int(client["link"])].client_text(client["name"].tobytes())
 
     def stamp_arrivals(self, link: int) -> None:
         """Enable kernel timestamps for the answers to a link's clients."""

@@ -40,10 +40,23 @@ from noack.runtime.run_process import add_options
 LINK_NAME = "relay"
 """Name of the link that the command line describes."""
 
-_COMMANDS = ("show", "set", "watch")
+_COMMANDS = ("show", "set", "watch", "shell")
 _EXAMPLE_LISTEN, _EXAMPLE_TO = ":9000", ":9001"
 """Addresses for --explain."""
 
+_NOWHERE = ("0.0.0.0", 0)
+_SHELL_EPILOG = """
+The command reaches the outside at the addresses in NOACK_OUTSIDE and NOACK_OUTSIDE6. As root, and
+in another shell, the outside is the present network namespace. Otherwise it is a new one, without
+other networks; --outside starts servers in it.
+
+exit status: the command's; 2 a mistake, or the system does not permit it; 143 ended by a signal
+
+examples:
+  noack netem shell loss 30% mansd 4 delay 20ms -- ping -c 10 198.18.16.1
+  noack netem shell --both delay 20ms rate 8mbit -- bash
+  noack netem shell loss 5% --outside "iperf3 -s" -- sh -c "sleep 1; iperf3 -c 198.18.16.1"
+"""
 _EPILOG = """
 words, in the order in which they apply; T is a time (10ms), P a percentage (5%), N a number:
   {grammar}
@@ -62,6 +75,8 @@ commands for an emulator that runs with --control NAME (each has --help):
   noack netem show [NAME]         show its statistics
   noack netem set [NAME] WORDS    change its impairments
   noack netem watch [NAME]        show its statistics live
+
+`noack netem shell --help` is about commands all of whose packets pass the emulator.
 
 When the emulator is ready, it prints a line on standard output:
   ready: listening on 127.0.0.1:9000
@@ -104,6 +119,7 @@ def command_line_parser() -> Parser:
         "                   [WORDS ...] [options]\n"
         "       %(prog)s --links FILE.toml [options]\n"
         "       %(prog)s --explain WORDS ...\n"
+        "       %(prog)s shell [WORDS ...] [options] [-- COMMAND]\n"
         "       %(prog)s show|set|watch [NAME] ...\n"
         "       %(prog)s [--session NAME]",
         description="A UDP relay that emulates a network, configured in the syntax of `tc netem`. "
@@ -115,6 +131,7 @@ def command_line_parser() -> Parser:
     )
     add_options(parser)
     alone = parser.add_argument_group("links")
+    _add_words(alone, "clients", "server")
     alone.add_argument(
         "--listen",
         metavar="HOST:PORT",
@@ -122,21 +139,57 @@ def command_line_parser() -> Parser:
         ":9000 is 127.0.0.1:9000, and 0.0.0.0:9000 or [::]:9000 is any address of this machine",
     )
     alone.add_argument("--to", metavar="HOST:PORT", help="address of the server")
-    alone.add_argument("words", nargs="*", metavar="WORDS", help="impairments, clients to server")
-    alone.add_argument(
-        "--reverse", metavar="WORDS", nargs="+", help="impairments, server to clients (none)"
-    )
-    alone.add_argument("--both", action="store_true", help="the words apply in both directions")
     alone.add_argument("--links", metavar="FILE", type=Path, help="several links, from a TOML file")
     alone.add_argument("--one-way", action="store_true", help="do not relay the server's answers")
-    alone.add_argument(
-        "--idle", metavar="TIME", help="remove a client that sends nothing for TIME (60s)"
-    )
-    alone.add_argument("--seed", type=int, help="seed of the random streams (0)")
     alone.add_argument(
         "--explain", action="store_true", help="explain the words, or the links of a file, and exit"
     )
     return parser
+
+
+def shell_parser() -> Parser:
+    """Return the parser of the command line of a shell, without its command."""
+    parser = Parser(
+        prog="noack netem shell",
+        usage="%(prog)s [WORDS ...] [options] [-- COMMAND]",
+        description="Run a command (without one: your shell) in a network namespace, and pass all "
+        "its IP packets through an emulated network. The words are those of `noack netem`. "
+        "With mansd N, at most N consecutive packets of a flow (protocol, addresses and ports) "
+        "are lost. It needs no root if the kernel permits user namespaces.",
+        epilog=_SHELL_EPILOG,
+        formatter_class=_Formatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
+    group = parser.add_argument_group("link")
+    _add_words(group, "inside", "outside")
+    help_text = "run this outside meanwhile, such as a server; may be repeated"
+    group.add_argument("--outside", metavar="COMMAND", action="append", help=help_text)
+    return parser
+
+
+def _add_words(group: argparse._ArgumentGroup, here: str, there: str) -> None:
+    group.add_argument("words", nargs="*", metavar="WORDS", help=f"impairments, {here} to {there}")
+    group.add_argument(
+        "--reverse", metavar="WORDS", nargs="+", help=f"impairments, {there} to {here} (none)"
+    )
+    group.add_argument("--both", action="store_true", help="the words apply in both directions")
+    what = "client that sends" if here == "clients" else "flow that has"
+    group.add_argument("--idle", metavar="TIME", help=f"remove a {what} nothing for TIME (60s)")
+    group.add_argument("--seed", type=int, help="seed of the random streams (0)")
+
+
+def shell_spec(options: argparse.Namespace) -> LinkSpec:
+    """Return the link that the command line of a shell describes, without its addresses.
+
+    Raises:
+        CallerError: the command line has a mistake.
+    """
+    forward, reverse, seed = _directions(options)
+    forward, reverse = (read_files(one, Path()) for one in (forward, reverse))
+    return LinkSpec(
+        LINK_NAME, _NOWHERE, _NOWHERE, forward, reverse, seed, idle_s=_idle_s(options.idle)
+    )
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
@@ -189,7 +242,7 @@ def specs_of(options: argparse.Namespace, *, read: bool = True) -> tuple[LinkSpe
             reverse=reverse,
             seed=seed,
             return_path=not options.one_way,
-            idle_s=LinkSpec.idle_s if options.idle is None else _idle_s(options.idle),
+            idle_s=_idle_s(options.idle),
         ),
     )
 
@@ -200,10 +253,12 @@ def _require_word(words: Sequence[str]) -> None:
     if first and first not in KEYWORDS and not any(word.startswith(first) for word in KEYWORDS):
         close = difflib.get_close_matches(first, [*_COMMANDS, *KEYWORDS], 1)
         hint = f"did you mean {close[0]}?" if close else "see --help"
-        raise CallerError(f"{first}: neither a command (show, set, watch) nor a word; {hint}")
+        raise CallerError(f"{first}: neither a command ({', '.join(_COMMANDS)}) nor a word; {hint}")
 
 
-def _idle_s(text: str) -> float:
+def _idle_s(text: str | None) -> float:
+    if text is None:
+        return LinkSpec.idle_s
     try:
         idle_s = OWN_TIME_S.read(text)
     except ValueError:
@@ -218,7 +273,7 @@ def _directions(options: argparse.Namespace) -> tuple[LinkSettings, LinkSettings
     forward, seed = parse(options.words or ())
     if options.both and options.reverse is not None:
         raise CallerError("--reverse and --both exclude each other")
-    if options.one_way and (options.both or options.reverse is not None):
+    if getattr(options, "one_way", False) and (options.both or options.reverse is not None):
         raise CallerError("--one-way: no reverse direction; leave out --reverse and --both")
     reverse = settings_of(options.reverse) if options.reverse is not None else LinkSettings()
     if seed is not None and options.seed is not None:

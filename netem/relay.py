@@ -16,6 +16,7 @@ from netem.relay_links import (
     FlowReport,
     LinkReport,
     LinkSpec,
+    OpenLink,
     Tap,
     let_wait,
     open_links,
@@ -23,11 +24,11 @@ from netem.relay_links import (
     stamp_arrivals,
 )
 from netem.relay_memory import RelayDirection, RelayMemory
+from netem.shell_devices import DeviceLink
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import packed_name
-from noack.runtime.udp_sockets import drops_of
 
 _PERIOD_NS = 40_000_000
 _RARE_PERIOD_NS = 250_000_000
@@ -47,6 +48,7 @@ class Relay:
         taps: receivers of all events.
         spin_ns: busy-wait instead of sleeping for this time before a delayed datagram is due, to
             avoid the delay of a wake-up.
+        devices: those of a shell, in the place of sockets; its link is the only one.
 
     Raises:
         CallerError: a socket cannot be bound, or a link is invalid.
@@ -61,10 +63,13 @@ class Relay:
         segment: bool = False,
         taps: Sequence[Tap] = (),
         spin_ns: int = 0,
+        devices: DeviceLink | None = None,
     ) -> None:
         self.specs: Sequence[LinkSpec] = tuple(specs)
         raise_file_limit()
-        self._open_links = open_links(self.specs)
+        self._open_links: Sequence[OpenLink | DeviceLink] = (
+            open_links(self.specs) if devices is None else [devices]
+        )
         self._warnings = [LinkWarnings(spec) for spec in self.specs]
         self._losses = [UnintendedLosses(spec.name, one) for spec in specs for one in DIRECTIONS]
         self._epoch_ns = self._rarely_ns = 0
@@ -167,8 +172,9 @@ class Relay:
         for number, link in enumerate(self._open_links):
             *_, port_unreachable = self._link_counts(number)
             self._warnings[number].port_unreachable(port_unreachable)
-            self._losses[2 * number].lost_in_kernel(drops_of(link.endpoint) or 0)
-            self._losses[2 * number + 1].lost_in_kernel(self._clients.drops[number])
+            self._losses[2 * number].lost_in_kernel(link.drops(False))
+            lost = self._clients.drops[number] + link.drops(True)
+            self._losses[2 * number + 1].lost_in_kernel(lost)
         for direction, error, datagrams in self._send_errors():
             self._losses[direction].not_sent(error, datagrams)
 
@@ -179,7 +185,7 @@ class Relay:
         while (reason := core.noack_relay_run(relay, until_ns)) != core.NOACK_HOUSEKEEPING:
             if reason == core.NOACK_NEW_CLIENT:
                 name = bytes(ffi.buffer(core.noack_relay_sender(relay), core.NOACK_NAME_BYTES))
-                self._clients.add(core.noack_relay_receiver(relay), name)
+                self._clients.add(core.noack_relay_receiver(relay) % len(self.specs), name)
             elif reason == core.NOACK_STORE_FULL:
                 self._memory.add_room()
             elif reason == core.NOACK_EVENTS_FULL:
@@ -234,7 +240,7 @@ class Relay:
         busiest = rows[np.argsort(-packets, kind="stable")[:_REPORTED_FLOWS]].tolist()
         return [
             FlowReport(
-                int(clients["number"][row]), self._clients.address(row), int(flow["packets"]),
+                int(clients["number"][row]), self._clients.text(row), int(flow["packets"]),
                 int(flow["longest_loss_burst"]),
             )
             for row, flow in zip(busiest, flows[clients["place"][busiest]], strict=True)
@@ -243,6 +249,13 @@ class Relay:
     def _listen(self, number: int) -> None:
         link = self._open_links[number]
         forward, reverse = self._directions[2 * number : 2 * number + 2]
+        if isinstance(link, DeviceLink):
+            self._memory.core.devices = 1
+            for place, device in enumerate(link.devices):
+                self._memory.watch(device, place)
+            forward.row.sends = core.NOACK_LINK_SOCKET
+            reverse.row.sends = core.NOACK_LISTENING_SOCKET
+            return
         if len(self.specs) == 1 and not link.spec.return_path:
             self._memory.wait_for_only(link.endpoint.fileno(), number, let_wait(link.endpoint))
         else:
@@ -261,9 +274,10 @@ class Relay:
 
     def _stamp_arrivals(self, direction: int) -> None:
         """Enable arrival timestamps where datagrams are delayed: delays count from the arrival."""
-        if self._directions[direction].tracks:
+        link = self._open_links[direction // 2]
+        if self._directions[direction].tracks and not isinstance(link, DeviceLink):
             core.noack_relay_read_stamps(self._memory.core)
             if direction % 2 == 0:
-                stamp_arrivals(self._open_links[direction // 2].endpoint)
+                stamp_arrivals(link.endpoint)
             else:
                 self._clients.stamp_arrivals(direction // 2)

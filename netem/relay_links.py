@@ -78,7 +78,8 @@ class FlowReport(NamedTuple):
     """One flow of a direction."""
 
     flow: int
-    client: Address
+    client: str
+    """The client's address; in a shell: protocol and both ends."""
     packets: int
     longest_loss_burst: int
     """Maximum number of consecutive datagrams that were not effectively delivered under the present
@@ -407,6 +408,19 @@ class OpenLink:
     def address(self) -> Address:
         """The address at which the link listens."""
         return address_of(self.name)
+
+    @property
+    def has_paths(self) -> bool:
+        """Whether each client has a return path."""
+        return self.spec.return_path
+
+    def drops(self, reverse: bool) -> int:
+        """Return how many datagrams the kernel dropped at the listening socket."""
+        return 0 if reverse else drops_of(self.endpoint) or 0
+
+    def client_text(self, name: bytes) -> str:
+        """Return a client's packed address as text."""
+        return text_of(unpacked_address(name))
 
     @property
     def discarded(self) -> int:

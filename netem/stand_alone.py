@@ -9,11 +9,11 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from rich.console import Console
 
@@ -31,6 +31,7 @@ from netem.emulator_options import command_line_parser, explain, parsed, specs_o
 from netem.fates import FateRecorder, read_fates
 from netem.relay import Relay
 from netem.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, say
+from netem.shell_devices import DeviceLink
 from noack.core.errors import CallerError, ExitStatus, NoackError, why
 from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings
@@ -44,13 +45,26 @@ _SPIN_NS = 50_000
 """Nearly all sleeping threads wake within this time; longer spinning would block the core."""
 
 
-def _add_recording_options(parser: argparse.ArgumentParser) -> None:
+class Program(Protocol):
+    """What a relay is for: it runs as long as this does."""
+
+    devices: DeviceLink
+
+    def running(self, signals: Signals) -> AbstractContextManager[Callable[[], bool]]:
+        """Run within the context; yields whether it has ended."""
+
+
+def add_recording_options(parser: argparse.ArgumentParser, *, shell: bool = False) -> None:
+    """Add the options of an emulator on its own, or of a shell, that do not describe links."""
     group = parser.add_argument_group("relay")
-    group.add_argument(
-        "--segment",
-        action="store_true",
-        help="send consecutive datagrams of equal size in one system call (UDP_SEGMENT)",
-    )
+    if shell:
+        parser.set_defaults(segment=False)
+    else:
+        group.add_argument(
+            "--segment",
+            action="store_true",
+            help="send consecutive datagrams of equal size in one system call (UDP_SEGMENT)",
+        )
     group.add_argument(
         "--realtime",
         action="store_true",
@@ -86,7 +100,7 @@ def alone(arguments: Sequence[str]) -> ExitStatus:
         CallerError: the command line has a mistake.
     """
     parser = command_line_parser()
-    _add_recording_options(parser)
+    add_recording_options(parser)
     options = parsed(parser, arguments)
     specs = specs_of(options)
     if options.explain:
@@ -98,11 +112,12 @@ def alone(arguments: Sequence[str]) -> ExitStatus:
             totals = relay(specs, options)
         except NoackError as error:  # reported in the format of the log
             return failed(str(error), error.exit_status, who="noack netem", as_json=options.json)
-        _report_totals(totals, options)
+        report_totals(totals, options)
     return ExitStatus.UNINTENDED_LOSSES if unintended(totals) else ExitStatus.OK
 
 
-def _report_totals(totals: Statistics, options: argparse.Namespace) -> None:
+def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
+    """Print the totals of a relay that has ended."""
     if options.replay_fates is not None:  # the settings do not predict the loss of replayed fates
         for direction in (link[name] for link in totals["links"] for name in DIRECTIONS):
             direction["loss"]["predicted"] = None
@@ -118,16 +133,17 @@ def _report_totals(totals: Statistics, options: argparse.Namespace) -> None:
             console.print(f"unintended losses: {text}", style="bold red", soft_wrap=True)
 
 
-def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
-    """Relay until Ctrl-C, with the options of :func:`_add_recording_options`; return the totals.
+def relay(
+    specs: Sequence[LinkSpec], options: argparse.Namespace, program: Program | None = None
+) -> Statistics:
+    """Relay until Ctrl-C, or the program's end; return the totals.
+
+    ``options`` are those of :func:`add_recording_options`.
 
     Raises:
         CallerError: an address is in use, or a file cannot be written.
     """
-    check_watching_options(options)
-    if options.capture == "-" and (options.json or options.stats is not None):
-        raise CallerError("--capture -: --json and --stats use standard output, too")
-    _check_files(options)
+    check_options(options)
     if options.replay_fates is not None:
         specs = _replaying(specs, options.replay_fates)
     with ExitStack() as last, ExitStack() as stack:
@@ -137,21 +153,27 @@ def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
                 taps.append(stack.enter_context(_capture(options.capture, specs)))
             if options.record_fates is not None:
                 taps.append(stack.enter_context(FateRecorder(options.record_fates, specs)))
-            opened = Relay(specs, options.segment, taps, _SPIN_NS if options.realtime else 0)
+            spin_ns = _SPIN_NS if options.realtime else 0
+            devices = None if program is None else program.devices
+            opened = Relay(specs, options.segment, taps, spin_ns, devices)
             stack.callback(opened.close)
             # Signals stay handled until all files are complete.
             signals = last.enter_context(Signals().handled())
             side = stack.enter_context(attached(opened, options))
+            running = nullcontext(lambda: False) if program is None else program.running(signals)
+            has_ended = stack.enter_context(running)
         for setting, answer in stack.enter_context(
             realtime(options.realtime, _FIFO_PRIORITY)
         ).items():
             if answer.startswith("refused"):
                 say(f"{setting} {answer}")
         takes_output = options.view or (options.stats is not None and options.stats_file is None)
-        is_free = options.capture != "-" and not takes_output
-        _report_ready(opened, print_it=is_free, as_json=options.json)
+        if program is None:
+            is_free = options.capture != "-" and not takes_output
+            _report_ready(opened, print_it=is_free, as_json=options.json)
         opened.run(
-            lambda: side.quit_requested or signals.received is not None, side.commands.run_pending
+            lambda: side.quit_requested or signals.received is not None or has_ended(),
+            side.commands.run_pending,
         )
         return statistics(side.commands.look())
 
@@ -177,8 +199,15 @@ def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
     ]
 
 
-def _check_files(options: argparse.Namespace) -> None:
-    """Check that no file is given for two options."""
+def check_options(options: argparse.Namespace) -> None:
+    """Check the options of :func:`add_recording_options`, and that no file is given for two.
+
+    Raises:
+        CallerError: two options contradict each other.
+    """
+    check_watching_options(options)
+    if options.capture == "-" and (options.json or options.stats is not None):
+        raise CallerError("--capture -: --json and --stats use standard output, too")
     files = {
         f"--{name.replace('_', '-')}": Path(given).resolve()
         for name in ("links", "replay_fates", "record_fates", "capture", "stats_file")

@@ -15,7 +15,7 @@ else:
 
     def __getattr__(name: str) -> object:
         """Look up a name of the library (PEP 562)."""
-        if name not in __all__ and name != "LossyChannel":  # which needs an extra: no star takes it
+        if name not in (*__all__, *_NOT_EVERYWHERE):
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from cosim import api  # upward, and it takes time: for programs only
 
@@ -23,7 +23,7 @@ else:
         return value
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__, "LossyChannel"})
+        return sorted({*globals(), *__all__, *_NOT_EVERYWHERE})
 
 
 __all__ = [
@@ -32,3 +32,5 @@ __all__ = [
     "load", "margin", "measure", "new", "open_run", "reproduce", "run",
     "save_tables", "simulate", "with_settings",
 ]  # fmt: skip
+_NOT_EVERYWHERE = ("LossyChannel", "LossyUdp")
+"""Names that need an extra, or Linux: no star import takes them."""

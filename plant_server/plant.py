@@ -34,7 +34,7 @@ from noack.disturbances.disturbance_settings import Place, SignalSource
 from noack.machines.loop_machines import NEVER_NS, LoopMachines, Role, alike_loops, set_machine
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedError
-from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
+from noack.protocol.machine_interface import BEGINNING, FAILED, External, Notice, Start
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP, RecordShape
 from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import loop_of
@@ -193,6 +193,11 @@ class Plant:
             predictions=self.predictions, internal=len(self.system.z),
             disturbed_input=d > 0, disturbed_state=w > 0,
         )  # fmt: skip
+
+    @property
+    def external(self) -> External | None:
+        """The system, if another program has it."""
+        return self.system if isinstance(self.system, External) else None
 
     def fill(self, plant: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_plant`` at time 0."""

@@ -124,6 +124,7 @@ class Sensor:
     horizon_ns: int = _ANY_TIME_NS
 
     role = SENSOR
+    external = None
 
     def __post_init__(self) -> None:
         self._trigger: EventTrigger | None = None

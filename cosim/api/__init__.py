@@ -31,12 +31,14 @@ from cosim.api.studies import save_tables as save_tables
 from cosim.studies.new_loop.linear_model import gain as gain
 from cosim.studies.new_loop.linear_model import linearise as linearise
 from cosim.studies.new_loop.new_scenario import new as new
+from noack.core.core_library import require_live_runs
 from noack.core.errors import CallerError as _CallerError
 from noack.core.errors import NoackError as NoackError
 from noack.scenario.scenario import Scenario as Scenario
 
-if TYPE_CHECKING:  # its base class is of an extra
+if TYPE_CHECKING:  # the one needs an extra, the other needs Linux
     from cosim.api.lossy_channel import LossyChannel as LossyChannel
+    from netem.lossy_udp import LossyUdp as LossyUdp
 
 __version__ = version("noack")
 
@@ -47,13 +49,18 @@ for _public in list(globals().values()):
 
 
 def __getattr__(name: str) -> object:
-    """Return the one name that needs an extra (PEP 562)."""
-    if name != "LossyChannel":
+    """Return one of the names that not every machine has (PEP 562)."""
+    if name == "LossyUdp":
+        require_live_runs()
+        module = "netem.lossy_udp"
+    elif name == "LossyChannel":
+        if find_spec("gymnasium") is None:
+            raise _CallerError(
+                "noack.LossyChannel needs a package that is not installed; "
+                "pip install 'noack[gymnasium]'"
+            )
+        module = "cosim.api.lossy_channel"
+    else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if find_spec("gymnasium") is None:
-        raise _CallerError(
-            "noack.LossyChannel needs a package that is not installed; "
-            "pip install 'noack[gymnasium]'"
-        )
-    found: object = import_module("cosim.api.lossy_channel").LossyChannel
+    found: object = getattr(import_module(module), name)
     return found

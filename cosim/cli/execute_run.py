@@ -93,6 +93,7 @@ def run_processes(
     session: str | None = None,
     server: "fork_server.ForkServer | None" = None,
     listening: "remote_access.Listening | None" = None,
+    watcher: "run_watcher.Watcher | None" = None,
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.
 
@@ -103,6 +104,7 @@ def run_processes(
         session: name that the processes of the run share.
         server: starts the processes, and ends with the run; by default a new one.
         listening: how processes on other hosts join.
+        watcher: follows the run, too.
     """
     core_library.require_live_runs()
     with fork_server.fork_server(server) as server:
@@ -121,6 +123,7 @@ def run_processes(
                     )
                 )
                 watchers = [warnings, line, run_watcher.RunLog().watcher()]
+                watchers += [] if watcher is None else [watcher]
                 if options.metrics is not None:
                     watchers.append(stack.enter_context(_served_metrics(loaded, options.metrics)))
                 ending = launcher.launch(

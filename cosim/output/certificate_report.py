@@ -60,7 +60,7 @@ def print_certificates(
         console.print(
             "[yellow]no certificate for the schedule[/], nor in another norm: raise "
             f"plant.rate_hz and controller.rate_hz, or lower {share}network.mansd, the network's "
-            "delay or certificate.late_periods; noack adversary shows what losses can do to the loop"
+            "delay or certificate.late_periods; noack adversary shows what losses can do to it"
         )
     if chosen is not None and chosen.weight is not None:
         console.print("[bold]With another norm, also in the trigger, there are certificates:[/]")

@@ -153,6 +153,7 @@ class VirtualRun:
         """The machines of all loops, by role."""
         memory = RowMemory()
         for machines in self.machines.values():
+            machines.connect()
             machines.take_rows_from(memory.rows)
         self.channel = channel_of(scenario, loops=len(loops), network=network)
         kinds = {settings_key(loop): loop for loop in loops}

@@ -25,12 +25,12 @@ const char *noack_capture_check(
     const noack_event *events, int64_t count, int64_t data_bytes, int64_t interfaces) {
     for (int64_t i = 0; i < count; i++) {
         const noack_event *event = &events[i];
-        int64_t udp_bytes = (int64_t)event->size_bytes + UDP_BYTES;
+        int64_t udp_bytes = (int64_t)event->size_bytes + (event->family == 0 ? 0 : UDP_BYTES);
         if (event->interface >= interfaces)
             return "an event has an interface that does not exist";
         if (event->t_ns < 0)
             return "an event is before 1970";
-        if (event->family != 4 && event->family != 6)
+        if (event->family != 0 && event->family != 4 && event->family != 6)
             return "an event is neither of IPv4 nor of IPv6";
         if (udp_bytes > MOST_PACKET_BYTES - (event->family == 4 ? IPV4_BYTES : 0))
             return "an event has a payload that is too large for a datagram";
@@ -193,9 +193,13 @@ static uint8_t *put_ip_header(uint8_t *at, const noack_event *event, int64_t udp
     return at + IPV4_BYTES;
 }
 
-/* The datagram with its headers. */
+/* The datagram with its headers, or the whole packet of a device. */
 static uint8_t *put_packet(uint8_t *packet, const noack_event *event, const uint8_t *data) {
     int64_t size_bytes = event->size_bytes, udp_bytes = size_bytes + UDP_BYTES;
+    if (event->family == 0) {
+        memcpy(packet, data + event->offset, (size_t)size_bytes);
+        return packet + size_bytes;
+    }
     uint8_t *udp = put_ip_header(packet, event, udp_bytes), *at = udp;
     const uint8_t *addresses = packet + (event->family == 4 ? 12 : 8);
     at = put_network_u16(at, event->source_port);

@@ -8,12 +8,15 @@ enum {
     FEW = 512 /* the data of so few clients fits into the caches */
 };
 
-/* A client's key in four words: family, port, host, scope and link. */
-static void key_of(const uint8_t name[NOACK_NAME_BYTES], int64_t link, int64_t key[4]) {
-    uint64_t words[4];
+/* A client's key in five words: family, port, host, scope and link; or the flow through devices. */
+static void key_of(
+    const noack_relay *relay, const uint8_t name[NOACK_NAME_BYTES], int64_t link, int64_t key[5]) {
+    uint64_t words[5];
     memcpy(words, name, sizeof words);
-    memset(key, 0, 4 * sizeof *key);
-    if ((words[0] & 0xFFFF) == IPV4) {
+    memset(key, 0, 5 * sizeof *key);
+    if (relay->devices)
+        memcpy(key, words, sizeof words);
+    else if ((words[0] & 0xFFFF) == IPV4) {
         key[0] = (int64_t)words[0];
         key[3] = link << 32;
     } else {
@@ -25,15 +28,16 @@ static void key_of(const uint8_t name[NOACK_NAME_BYTES], int64_t link, int64_t k
 }
 
 /* Word by word, as they were just written: memcmp would wait for them to be in the cache. */
-static int is_same(const int64_t key[4], const int64_t other[4]) {
-    return ((key[0] ^ other[0]) | (key[1] ^ other[1]) | (key[2] ^ other[2]) | (key[3] ^ other[3]))
+static int is_same(const int64_t key[5], const int64_t other[5]) {
+    return ((key[0] ^ other[0]) | (key[1] ^ other[1]) | (key[2] ^ other[2]) | (key[3] ^ other[3])
+            | (key[4] ^ other[4]))
            == 0;
 }
 
 /* The first place in the table for a key: its hash. */
-static int64_t home_of(const noack_relay *relay, const int64_t key[4]) {
+static int64_t home_of(const noack_relay *relay, const int64_t key[5]) {
     uint64_t mixed = 0;
-    for (int i = 0; i < 4; i++) {
+    for (int i = 0; i < 5; i++) {
         mixed = (mixed ^ (uint64_t)key[i]) * UINT64_C(0x9E3779B97F4A7C15); /* 2^64/phi */
         mixed ^= mixed >> 29;
     }
@@ -42,8 +46,8 @@ static int64_t home_of(const noack_relay *relay, const int64_t key[4]) {
 
 int64_t noack_client_find(
     const noack_relay *relay, const uint8_t name[NOACK_NAME_BYTES], int64_t link) {
-    int64_t key[4], mask = relay->table_places - 1;
-    key_of(name, link, key);
+    int64_t key[5], mask = relay->table_places - 1;
+    key_of(relay, name, link, key);
     for (int64_t place = home_of(relay, key);; place = (place + 1) & mask) {
         int64_t row = relay->table[place];
         if (row < 0 || is_same(relay->clients[row].key, key))
@@ -55,7 +59,7 @@ int64_t noack_client_find(
 void noack_client_insert(noack_relay *relay, int64_t row) {
     noack_client *client = &relay->clients[row];
     int64_t mask = relay->table_places - 1;
-    key_of(client->name, client->link, client->key);
+    key_of(relay, client->name, client->link, client->key);
     int64_t place = home_of(relay, client->key);
     while (relay->table[place] >= 0)
         place = (place + 1) & mask;
@@ -83,8 +87,8 @@ void noack_client_remove(noack_relay *relay, int64_t row) {
 /* The row of the current datagram's sender; -1: there is none. */
 int64_t find_sender(noack_relay *relay) {
     relay_scratch *own = scratch_of(relay);
-    int64_t key[4], k = own->batch_next, row = own->hints[k];
-    key_of(own->in_names[k], own->batch_socket, key);
+    int64_t key[5], k = own->batch_next, row = own->hints[k];
+    key_of(relay, own->in_names[k], own->batch_socket, key);
     if (row < 0 || !is_same(relay->clients[row].key, key))
         row = noack_client_find(relay, own->in_names[k], own->batch_socket);
     if (relay->client_rows <= FEW) /* the next datagram often has the same sender */
@@ -95,8 +99,8 @@ int64_t find_sender(noack_relay *relay) {
 /* The row that the table has first for the sender of datagram k; -1: none. */
 static int32_t row_of(const noack_relay *relay, int64_t k) {
     const relay_scratch *own = scratch_of(relay);
-    int64_t key[4];
-    key_of(own->in_names[k], own->batch_socket, key);
+    int64_t key[5];
+    key_of(relay, own->in_names[k], own->batch_socket, key);
     return relay->table[home_of(relay, key)];
 }
 
@@ -108,7 +112,7 @@ void touch_clients(noack_relay *relay) {
     relay_scratch *own = scratch_of(relay);
     int64_t first_path = 2 * relay->links;
     uint64_t loaded = 0;
-    if (relay->client_rows <= FEW || own->batch_socket >= first_path)
+    if (relay->client_rows <= FEW || own->batch_socket >= first_path || relay->devices)
         return;
     const noack_link *link = relay->directions[2 * own->batch_socket].link;
     for (int64_t k = own->batch_next; k < own->batch_end; k++)

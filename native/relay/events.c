@@ -61,6 +61,8 @@ static noack_event *next_event(
         .direction = direction & 1,
     };
     int reverse = direction & 1;
+    if (relay->devices)
+        return event;
     event->source_port = put_host(reverse ? far : near, event->source, &event->family);
     event->destination_port = put_host(reverse ? near : far, event->destination, &event->family);
     return event;
@@ -71,13 +73,13 @@ static int64_t after(int64_t t_ns, int64_t now_ns) {
 }
 
 void report_arrival(
-    noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data,
+    noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data, int64_t size_bytes,
     const noack_decision *decision) {
     noack_event *event = next_event(relay, direction, client, direction & 1);
     event->t_ns = relay->unix_ns + relay->now_ns;
     event->packet = decision->packet;
     event->fate = (uint8_t)decision->fate;
-    event->size_bytes = (uint32_t)decision->size_bytes;
+    event->size_bytes = (uint32_t)size_bytes;
     event->consecutive_losses = decision->consecutive_losses;
     event->delay_ns = after(decision->release_ns, relay->now_ns);
     event->copy_delay_ns = after(decision->copy_ns, relay->now_ns);
@@ -85,8 +87,8 @@ void report_arrival(
     event->bit = decision->bit;
     event->copy_bit = decision->copy_bit;
     if (relay->taps == 2) {
-        memcpy(relay->data + relay->data_length, data, (size_t)decision->size_bytes);
-        relay->data_length += decision->size_bytes;
+        memcpy(relay->data + relay->data_length, data, (size_t)size_bytes);
+        relay->data_length += size_bytes;
     }
 }
 

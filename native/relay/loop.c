@@ -80,13 +80,14 @@ static void line_up(noack_relay *relay) {
     noack_direction *direction = &relay->directions[leaving->datagram.direction];
     leaving->stale = (uint8_t)noack_link_leave(
         direction->link, relay->clients[leaving->datagram.client].place, leaving->datagram.packet,
-        leaving->datagram.size_bytes, leaving->delayed, leaving->datagram.counts);
+        max_of(leaving->datagram.size_bytes - headers_bytes(relay), 0), leaving->delayed,
+        leaving->datagram.counts);
     leaving->error = 0;
     own->leaving_bytes += leaving->datagram.size_bytes;
     int64_t link = leaving->datagram.direction >> 1;
     if (direction->sends == NOACK_OWN_SOCKET)
         leaving->socket = (int32_t)(2 * relay->links + leaving->datagram.client);
-    else if (direction->sends == NOACK_CLIENT_NAME)
+    else if (direction->sends == NOACK_CLIENT_NAME || direction->sends == NOACK_LISTENING_SOCKET)
         leaving->socket = (int32_t)link;
     else
         leaving->socket = (int32_t)(relay->links + link);
@@ -154,12 +155,13 @@ static int64_t client_of(noack_relay *relay, int64_t number, int64_t size_bytes)
         return REFUSED;
     }
     int64_t row = own->batch_socket - 2 * relay->links;
-    if (!(number & 1)) {
+    if (!(number & 1) || relay->devices) {
+        noack_direction *forward = &relay->directions[number & ~INT64_C(1)];
         row = find_sender(relay);
-        if (row < 0 && !direction->full)
+        if (row < 0 && !forward->full)
             return NO_CLIENT;
         if (row < 0) {
-            direction->refused++;
+            forward->refused++;
             return REFUSED;
         }
     }
@@ -201,7 +203,7 @@ static void release(
     datagram->packet = decision->packet;
     datagram->arrival_ns = relay->now_ns;
     datagram->bit = copy ? decision->copy_bit : decision->bit;
-    datagram->size_bytes = (int32_t)decision->size_bytes;
+    datagram->size_bytes = (int32_t)own->in_headers[own->batch_next].msg_len;
     datagram->direction = (int32_t)direction;
     datagram->client = (int32_t)client;
     datagram->copy = (uint8_t)copy;
@@ -232,9 +234,10 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
     noack_decision decision;
     client->last_ns = relay->now_ns;
     noack_link_decide(
-        relay->directions[number].link, client->place, size_bytes, relay->now_ns, &decision);
+        relay->directions[number].link, client->place,
+        max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns, &decision);
     if (relay->taps)
-        report_arrival(relay, number, row, data, &decision);
+        report_arrival(relay, number, row, data, size_bytes, &decision);
     if (relay->records)
         record_packet(relay, number, row, data, &decision);
     if (decision.release_ns != NOACK_NEVER_NS)
@@ -249,6 +252,10 @@ static int64_t decide_batch(noack_relay *relay) {
     int64_t link = own->batch_socket, reverse = link >= 2 * relay->links;
     if (reverse)
         link = relay->clients[own->batch_socket - 2 * relay->links].link;
+    if (relay->devices) {
+        link = 0;
+        reverse = own->batch_socket != 0;
+    }
     for (; own->batch_next < own->batch_end; own->batch_next++) {
         int64_t size_bytes = own->in_headers[own->batch_next].msg_len;
         read_arrival(relay);
@@ -339,7 +346,9 @@ static int receive(noack_relay *relay, int64_t socket, int flags) {
     relay_scratch *own = scratch_of(relay);
     int64_t begin = own->batch_end, before_ns = relay->read_ns;
     int fd = relay->sockets[socket].fd, most = own->is_busy ? (int)(BUFFERS - begin) : 1, taken;
-    if (own->is_busy) {
+    if (relay->devices) {
+        taken = read_packets(relay, socket, most);
+    } else if (own->is_busy) {
         taken = recvmmsg(fd, &own->in_headers[begin], (unsigned)most, flags, NULL);
     } else {
         ssize_t size_bytes = recvmsg(fd, &own->in_headers[begin].msg_hdr, flags & MSG_DONTWAIT);

@@ -78,6 +78,11 @@ int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datag
 void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into);
 void free_payload(noack_relay *relay, int64_t slot);
 
+/* device.c */
+int64_t headers_bytes(const noack_relay *relay);
+int read_packets(noack_relay *relay, int64_t socket, int most);
+int write_packets(int fd, const struct mmsghdr *headers, int count);
+
 /* clients.c */
 void touch_clients(noack_relay *relay);
 int64_t find_sender(noack_relay *relay);
@@ -85,7 +90,7 @@ int64_t find_sender(noack_relay *relay);
 /* events.c */
 int has_room(const noack_relay *relay, int64_t size_bytes);
 void report_arrival(
-    noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data,
+    noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data, int64_t size_bytes,
     const noack_decision *decision);
 void report_departure(noack_relay *relay, const departure *leaving, int64_t now_ns);
 void record_packet(

@@ -56,7 +56,7 @@ static int64_t icmp_error(struct msghdr *message) {
 int64_t take_errors(noack_relay *relay, int64_t socket) {
     relay_scratch *own = scratch_of(relay);
     int64_t found = 0;
-    int taken = ERRORS, fd = relay->sockets[socket].fd;
+    int taken = relay->devices ? 0 : ERRORS, fd = relay->sockets[socket].fd;
     while (taken == ERRORS) {
         for (int k = 0; k < ERRORS; k++) {
             struct msghdr *message = &own->error_headers[k].msg_hdr;
@@ -199,8 +199,10 @@ static int64_t wait_for_room(int fd) {
 }
 
 /* Send messages; return the number of those that were sent or failed at once, or -1. */
-static int call_send(int fd, struct mmsghdr *headers, int count) {
+static int call_send(const noack_relay *relay, int fd, struct mmsghdr *headers, int count) {
     struct msghdr *message = &headers->msg_hdr;
+    if (relay->devices)
+        return write_packets(fd, headers, count);
     if (count == 1 && message->msg_iovlen == 1 && message->msg_controllen == 0) {
         /* For a single datagram, sendto is cheaper; libc's own also handles thread cancellation. */
         long sent = syscall(
@@ -226,7 +228,7 @@ static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t fol
     int fd = relay->sockets[socket].fd, done = 0, tries = 0;
     int64_t waited_ns = 0;
     while (done < headers) {
-        int sent = call_send(fd, &own->out_headers[done], headers - done);
+        int sent = call_send(relay, fd, &own->out_headers[done], headers - done);
         if (sent > 0) {
             done += sent;
             tries = 0;

@@ -19,6 +19,8 @@ int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datag
     noack_slot *slot = &relay->slots[number];
     relay->free_slot = slot->next;
     relay->free_slots--;
+    if (bit >= 0)
+        bit += 8 * headers_bytes(relay);
     datagram->block = (int32_t)relay->free_block;
     *slot = *datagram;
     int64_t block = slot->block, last = block;

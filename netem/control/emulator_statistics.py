@@ -352,9 +352,7 @@ def _direction(
         "in_flight": report.in_flight,
         "most_in_flight": counters.most_in_flight,
         "flows": [
-            FlowStatistics(
-                flow=flow, client=address_text(client), packets=n, longest_loss_burst=burst
-            )
+            FlowStatistics(flow=flow, client=client, packets=n, longest_loss_burst=burst)
             for flow, client, n, burst in report.flows
         ],
         "delay_ns": quantiles(report.delays),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
-from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.machine_interface import External, Notice, Record
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import (
@@ -87,6 +87,11 @@ class MachinePart(Protocol):
 
     def answer(self, question: int, structure: CData) -> Sequence[Notice]:
         """Do what a step needs before it goes on; return lines for the log."""
+        ...
+
+    @property
+    def external(self) -> External | None:
+        """What another program has of it."""
         ...
 
     def inspect(self, rows: NDArray[np.void]) -> Sequence[Notice]:
@@ -253,6 +258,20 @@ class LoopMachines:
         """The earliest tick of all loops, in the run's time."""
         due_ns = int(core.noack_process_due_ns(self.core))
         return None if due_ns == NEVER_NS else due_ns
+
+    def connect(self) -> None:
+        """Connect with the programs that have a part of a machine, before a live run.
+
+        Raise CallerError if that fails.
+        """
+        for part in self.parts:
+            if part.external is not None:
+                part.external.connect()
+
+    @property
+    def asked(self) -> External | None:
+        """The part outside of noack of the machine whose step has stopped at a question."""
+        return self.parts[int(self.core.asking)].external
 
     def answer(self, question: int) -> None:
         """Do what a step needs before it goes on."""

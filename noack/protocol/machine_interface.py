@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from noack.core.linear_systems import Vector
 from noack.protocol.wire_format import Message
 
 GENERATION = 2**40
@@ -56,3 +57,16 @@ class Notice(NamedTuple):
 
 
 Output = Message | Record | Notice
+
+
+class External:
+    """A part of a machine that another program has: connected before the run.
+
+    A replay cannot ask it again: there its answers are the recorded ones.
+    """
+
+    recorded: Vector | None = None
+    """The next answer, in a replay."""
+
+    def connect(self) -> None:
+        """Connect, unless this was done; raise CallerError if that fails."""

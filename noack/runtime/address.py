@@ -9,7 +9,7 @@ from noack.core.errors import CallerError
 Address = tuple[str, int]  # numeric host and port
 SocketName = tuple[str, int] | tuple[str, int, int, int]
 """An address in the form that sockets use: host and port; IPv6: also flow label and scope."""
-NAME_BYTES = 32  # room for a packed name; those of IPv6 have 28 bytes
+NAME_BYTES = 40  # room for a packed name (IPv6: 28 bytes), or for a flow through devices
 
 LOOPBACK = "127.0.0.1"
 

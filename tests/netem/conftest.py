@@ -56,6 +56,7 @@ def decide() -> Decide:
         sizes_bytes: ArrayLike = 100,
         arrivals_ns: ArrayLike | None = None,
         recorded: Decisions = (),
+        name: Sequence[str] = ("test",),
     ) -> Decided:
         if isinstance(settings, str):
             settings = settings_of(settings).model_copy(update={"limit": MOST})
@@ -64,7 +65,7 @@ def decide() -> Decide:
             arrivals_ns = np.arange(count) * 1_000
         arrivals = np.array(np.broadcast_to(np.asarray(arrivals_ns, np.int64), count))
         sizes = np.array(np.broadcast_to(np.asarray(sizes_bytes, np.int64), count))
-        link = LinkState(settings, seed, "test", decisions=recorded)
+        link = LinkState(settings, seed, *name, decisions=recorded)
         for flow in range(int(all_flows.max(initial=0)) + 1):
             link.start_flow(flow, flow)
         return Decided(link.decide_many(all_flows, sizes, arrivals), all_flows, arrivals, link)

@@ -45,6 +45,8 @@ from sensor_node.sensor import sensors_of
 Numbers = NDArray[np.int64]
 _ROLES = {"plant": 0, "sensor": 1, "controller": 2, "netem": 3}
 _TIMERS = (PLANT_STEP, CONTROLLER_STEP, NETEM_RELEASE)
+_ANSWERS = {PLANT_STEP: "x", CONTROLLER_STEP: "u"}
+"""The column with the answer of a plant or controller outside of noack."""
 _DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
 _HEADER_WORDS = 3
@@ -108,6 +110,7 @@ class InputReplay:
                 if reason == core.NOACK_REPLAY_SETTING:
                     self._announce(place_of)
                 else:
+                    self._recall(place_of)
                     self._machine.answer(reason)
         except _DAMAGE as error:
             self._explain(place_of)
@@ -133,6 +136,13 @@ class InputReplay:
         sent = self._sent[: self._core.sent_count]
         heads = np.ascontiguousarray(sent[:, 1:]).view(f"V{PACKET_HEAD_BYTES}")
         return sent[:, 0], heads[:, 0]
+
+    def _recall(self, place_of: "_Places") -> None:
+        """Let a part that is outside of noack answer as recorded."""
+        if not isinstance(self._machine, Channel) and (asked := self._machine.asked) is not None:
+            table, row, rows = place_of(self._core.next)
+            if table in _ANSWERS:
+                asked.recorded = rows[_ANSWERS[table]][row].copy()
 
     def _announce(self, place_of: "_Places") -> None:
         """Let the machine receive a change of settings; compare its row."""

@@ -1,5 +1,6 @@
 """``noack record``, ``plant``, ``sensor``, ``controller``, ``netem``: one terminal per process."""
 
+import sys
 from enum import StrEnum
 from importlib import import_module
 from pathlib import Path
@@ -119,7 +120,8 @@ _join("controller", 40, "controller_node.__main__", "runs x_c, sends u = K x_c."
 )
 def netem(context: typer.Context) -> int:
     """Join the open run as the network; or relay any UDP program: `noack netem --help`."""
-    return emulator.main(context.args)
+    # typer removes the first `--`, which begins the command of a shell.
+    return emulator.main(sys.argv[2:] if "--" in sys.argv else context.args)
 
 
 def _require_none_of(context: typer.Context, *options: str) -> None:

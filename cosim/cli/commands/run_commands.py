@@ -22,6 +22,7 @@ from noack.core.number_format import number
 with lazy_modules():
     from cosim.analysis import summary_model
     from cosim.live import progress, remote_access, simulated_run
+    from cosim.live.bridge import ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict
     from cosim.simulation import continuous
     from noack.runtime import control_messages, run_registry
@@ -78,6 +79,34 @@ def demo(
     """
     wanted = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
     return run_processes(cli.load_scenario("lane_following", wanted), options, server=context.obj)
+
+
+@cli.command(
+    cli.RUNS, 22, takes="as long as the scenario's horizon, and a few seconds", on_linux=True
+)
+def bridge(
+    context: typer.Context,
+    given: cli.ScenarioOptions,
+    *,
+    router: Annotated[str, Option(metavar="ENDPOINT")] = "tcp/127.0.0.1:7447",
+    listen: Annotated[bool, Option("--listen")] = False,
+    domain: Annotated[int, Option(min=0, max=232)] = 0,
+    options: LiveOptions,
+) -> int:
+    """Run a scenario live, and publish it as topics of ROS 2 (rmw_zenoh).
+
+    Options:
+        router: Where the router of ROS 2 listens, as zenoh writes it.
+        listen: Be the router at this address, to which nodes connect.
+        domain: ROS_DOMAIN_ID.
+
+    Examples:
+        noack bridge lane_following --listen   without an installation of ROS
+        noack bridge lane_following --router tcp/127.0.0.1:7447 --json   with rmw_zenohd
+    """
+    loaded = given.load()
+    with ros2_bridge.bridge_process(router, domain, listen=listen) as watcher:
+        return run_processes(loaded, options, server=context.obj, watcher=watcher)
 
 
 @cli.command(cli.RUNS, 30, takes="about a second; the report, some more")

@@ -2,7 +2,7 @@
 
 Foxglove, PlotJuggler and the libraries of MCAP read it. The log time of a message is the actual
 time of its row, its publish time the nominal one, both in simulated nanoseconds since the run's
-epoch.
+epoch. Beside it, ``ros2_bag.py`` writes a file with ROS 2 messages, if rosbags is installed.
 """
 
 import json
@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic_core import to_json
 
-from cosim.output.export import ExportedRun
+from cosim.output.export import ExportedRun, ros2_bag
 from cosim.record.align import aligned_parts
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
+from noack.protocol import ros2_messages
 from noack.protocol.record_tables import COMMON, OWNER, TABLES
 
 if TYPE_CHECKING:
@@ -43,6 +44,8 @@ Message = tuple[int, int, int, bytes]
 def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Path]:
     """Write a run as MCAP; the loops of a run of several have their names before their topics.
 
+    With the package rosbags a second file has ROS 2 messages: ``NAME.ros2.mcap``.
+
     Raises:
         CallerError: the package mcap is not installed.
         MachineError: the file cannot be written.
@@ -59,6 +62,8 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
             writer.start(profile="", library="noack")
             _write(writer, run)
             writer.finish()  # type: ignore[no-untyped-call]
+        if ros2_messages.is_installed():
+            return [path, ros2_bag.write(run, path)]
     except (OSError, ValueError) as error:
         raise MachineError(f"{path}: cannot be written: {why(error)}") from None
     return [path]

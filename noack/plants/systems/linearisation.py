@@ -44,6 +44,7 @@ _LOGARITHM = 1e-6
 
 NO_STATE = "x is not its whole state, or it is not smooth"
 NOT_FINITE = "its motion is not finite there"
+NOT_REPEATED = "its motion is not the same twice from one state and input"
 NO_LOGARITHM = "a step of its motion has no real logarithm: no linear system in continuous time"
 
 
@@ -90,6 +91,8 @@ def linearise(
     point = np.concatenate([at, held])
     jacobian, drift = _differences(f, point), f(point)
     void = None if np.isfinite(jacobian).all() and np.isfinite(drift).all() else NOT_FINITE
+    if void is None and not np.array_equal(f(point), drift):
+        void = NOT_REPEATED
     return LinearMotion(jacobian[:, :n], jacobian[:, n:], drift, "derivative", void)
 
 
@@ -159,6 +162,8 @@ def _by_motion(
         before[:n, i], after[:n, i], later[:n, i] = (plus - minus) / (2 * off[i])
     if not (np.isfinite(before).all() and np.isfinite(later).all()):
         return without(NOT_FINITE)
+    if not np.array_equal(rest, _followed(system_at, at, held, settling, ahead, step_ns)):
+        return without(NOT_REPEATED)
     if np.linalg.svd(before, compute_uv=False)[-1] < _SINGULAR:
         return without(NO_STATE)
     step = after @ np.linalg.inv(before)

@@ -54,7 +54,7 @@ def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> No
         forwarded_bytes=6552, delivered_out_of_order=9, longest_loss_burst=2, most_in_flight=17,
     )  # fmt: skip
     relay.counters["up", "forward"] = counted
-    relay.flows = [FlowReport(3, ("::1", 4000), 60, 2)]
+    relay.flows = [FlowReport(3, "[::1]:4000", 60, 2)]
     relay.unintended["lost_in_kernel"] = 7
     document = statistics(look(relay, 2.5))
     assert document["time"] == "2026-09-21T14:13:20.250000+00:00"

@@ -34,6 +34,7 @@ from dnslib import RR, DNSRecord
 from dnslib.server import BaseResolver, DNSHandler, DNSLogger, DNSServer
 from psutil import NoSuchProcess, Process
 
+import noack
 from benchmarks.programs import TwoHosts, two_hosts
 from benchmarks.report import MeasurementError
 from netem.emulator_options import LINK_NAME
@@ -192,7 +193,7 @@ def test_iperf3_reports_the_losses_and_the_order_of_the_emulator(
     assert min(udp["lost_packets"], udp["out_of_order"]) > 0
 
 
-QUIC_WORDS = "delay 5ms 2ms loss 5% reorder 5% duplicate 2% corrupt 1% mansd 3 seed 1"
+QUIC_WORDS = "delay 5ms 2ms loss 5% reorder 5% duplicate 2% corrupt 1% mansd 3"
 CONTENT_BYTES = 300_000
 PATIENCE_S = 60.0
 
@@ -220,9 +221,7 @@ def certificate(tmp_path: Path) -> tuple[Path, Path]:
     return files
 
 
-def test_content_arrives_unchanged_in_both_directions(
-    emulate: Emulate, certificate: tuple[Path, Path]
-) -> None:
+def test_content_arrives_unchanged_in_both_directions(certificate: tuple[Path, Path]) -> None:
     content = np.random.default_rng(0).bytes(CONTENT_BYTES)
     received: list[bytes] = []
 
@@ -240,7 +239,7 @@ def test_content_arrives_unchanged_in_both_directions(
             writer.write_eof()
             return await reader.read()
 
-    async def go() -> tuple[bytes, dict[str, dict[str, object]]]:
+    async def go() -> tuple[bytes, noack.LossyUdp]:
         own = QuicConfiguration(is_client=False)
         own.load_cert_chain(*certificate)
         tasks: list[asyncio.Future[None]] = []
@@ -250,17 +249,17 @@ def test_content_arrives_unchanged_in_both_directions(
                 stream_handler=lambda *ends: tasks.append(asyncio.ensure_future(echo(*ends))),
             )
         )  # fmt: skip
-        emulator = emulate(f"{HOST}:{port}", "--both", QUIC_WORDS)
         try:
-            answer = await asyncio.wait_for(ask(emulator.host, emulator.port), PATIENCE_S)
+            async with noack.LossyUdp((HOST, port), QUIC_WORDS, reverse=QUIC_WORDS, seed=1) as link:
+                answer = await asyncio.wait_for(ask(*link.address), PATIENCE_S)
         finally:
             server.close()
-        return answer, emulator.finish()
+        return answer, link
 
     answer, link = asyncio.run(go())
     assert received == [content]
     assert answer == content[::-1]
-    for of in (link["forward"], link["reverse"]):
+    for of in (link.forward, link.reverse):
         assert of["received_bytes"] > CONTENT_BYTES
         assert of["fates"]["dropped"] * of["fates"]["corrupted"] * of["duplicated"] > 0
         assert of["delivered_out_of_order"] > 0

@@ -1,5 +1,6 @@
 """Linear models of plants: against closed forms, and where there is none."""
 
+import itertools
 import math
 from typing import Any
 
@@ -20,6 +21,7 @@ from noack.plants.plant_settings import (
 from noack.plants.systems.linearisation import (
     NO_LOGARITHM,
     NOT_FINITE,
+    NOT_REPEATED,
     STEP_NS,
     largest_errors,
     linearise,
@@ -107,10 +109,20 @@ def test_a_linear_system_that_is_moved_has_no_error() -> None:
     assert errors.max() < 1e-8
 
 
+DRAWN = itertools.count()  # as a plant that draws random numbers
+
+
+def test_a_derivative_that_is_not_the_same_twice_has_no_model() -> None:
+    equations = PlantEquations(lambda t, z, u: (u[0] - z[0] + next(DRAWN),))
+    found = linearise(lambda x0: OdeSystem(equations, x0), 1, 1)
+    assert found.void == NOT_REPEATED
+
+
 @pytest.mark.parametrize(("step", "why"), [
     (lambda x, u: -0.5 * x + u, NO_LOGARITHM),
     (lambda x, u: 0.0 * x + u, NO_LOGARITHM),
     (lambda x, u: x + np.where(u > 0, np.nan, u), NOT_FINITE),
+    (lambda x, u: 0.5 * x + u + next(DRAWN), NOT_REPEATED),
 ])  # fmt: skip
 def test_a_step_without_a_model_in_continuous_time_says_why(step: Any, why: str) -> None:
     found = linearise(lambda x0: Moved(step, x0), 1, 1)

@@ -1,0 +1,1 @@
+"""What shows a live run to programs outside of noack."""

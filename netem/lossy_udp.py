@@ -1,0 +1,173 @@
+"""An emulator within a program: between a UDP client and a server, for tests and experiments.
+
+:class:`LossyUdp` runs a relay with one link in a thread of this process. It is used as a context,
+with ``with`` or with ``async with``; the fixture ``lossy_udp`` of :mod:`netem.pytest_plugin` makes
+as many as a test needs.
+"""
+
+import asyncio
+from collections.abc import Sequence
+from concurrent.futures import Future
+from threading import Event, Thread
+from typing import Self
+
+from netem.control.emulator_statistics import (
+    CommandQueue,
+    DirectionStatistics,
+    LinkStatistics,
+    Snapshot,
+    statistics,
+)
+from netem.relay import Relay
+from netem.relay_links import DIRECTIONS, Address, Direction, LinkSpec
+from netem.tc_words import settings_of
+from noack.core.errors import CallerError
+from noack.runtime.address import parse_address, parse_destination, text_of
+
+
+class LossyUdp:
+    """A UDP relay to a server, which delays and loses datagrams, but never too many in a row.
+
+    Clients send to ``address`` instead of to the server. A datagram's fate depends on ``seed``,
+    ``name``, the direction, the number of the client (in the order in which clients appear) and the
+    number of the datagram within its flow; so a program that sends the same datagrams meets the
+    same losses again. How many datagrams a program sends may depend on its timers.
+
+    >>> import noack
+    >>> with noack.LossyUdp("127.0.0.1:9", "loss 30% mansd 4", seed=1) as link:
+    ...     host, port = link.address
+    ...     link.change("loss 50% mansd 4")
+    >>> link.forward["received"]
+    0
+
+    Args:
+        to: the server: host and port, or ``"host:port"``.
+        words: what happens to datagrams of clients, in the words of ``noack netem``.
+        reverse: what happens to the server's answers; nothing by default.
+        seed: of the random streams.
+        listen: where clients send to; port 0 selects a free port.
+        name: of the link; part of the names of its random streams.
+
+    Raises:
+        CallerError: an address or a word is wrong; the listening address is in use (on entering).
+    """
+
+    def __init__(
+        self,
+        to: str | Sequence[str | int],
+        words: str = "",
+        *,
+        reverse: str = "",
+        seed: int = 0,
+        listen: str | Sequence[str | int] = "127.0.0.1:0",
+        name: str = "relay",
+    ) -> None:
+        if not 0 <= seed < 2**64:
+            raise CallerError(f"seed {seed}: must be 0 or more, below 2^64")
+        listen_at = parse_address(_text(listen, "listen"), "listen")
+        server = parse_destination(_text(to, "to"), "to", listen_at)
+        self._spec = LinkSpec(
+            name, listen_at, server, settings_of(words), settings_of(reverse), seed
+        )
+        self._opened: Future[tuple[CommandQueue, Address]] = Future()
+        self._ended: Snapshot | None = None
+        self._stop = Event()
+        self._thread = Thread(target=self._run, name=f"noack {name}", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self._opened.result()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    async def __aenter__(self) -> Self:
+        return await asyncio.to_thread(self.__enter__)
+
+    async def __aexit__(self, *_: object) -> None:
+        await asyncio.to_thread(self.__exit__)
+
+    @property
+    def address(self) -> Address:
+        """Host and port to which clients send."""
+        return self._opened.result(timeout=0)[1]
+
+    @property
+    def seed(self) -> int:
+        """The seed of the random streams."""
+        return self._spec.seed
+
+    @property
+    def forward(self) -> DirectionStatistics:
+        """What ``noack netem show --json`` prints of the datagrams to the server.
+
+        Among it are ``received``, ``fates``, by name, and ``longest_loss_burst``.
+        """
+        return self._statistics()["forward"]
+
+    @property
+    def reverse(self) -> DirectionStatistics:
+        """The same of the server's answers."""
+        return self._statistics()["reverse"]
+
+    def change(self, words: str, *, directions: Sequence[Direction] = ("forward",)) -> None:
+        """Change what happens to datagrams from now on.
+
+        Flows keep their numbers, and the guarantee remembers the losses before.
+
+        Args:
+            words: as above.
+            directions: ``"forward"``, ``"reverse"``, or both.
+
+        Raises:
+            CallerError: a word is wrong.
+            PeerError: the relay has ended.
+        """
+        if unknown := [one for one in directions if one not in DIRECTIONS]:
+            raise CallerError(f"directions: {unknown[0]!r}; the directions are forward and reverse")
+        commands, _ = self._opened.result(timeout=0)
+        commands.change(self._spec.name, directions, settings_of(words))
+
+    def __str__(self) -> str:
+        """Where the link leads, its settings, and what was lost."""
+        lines = [f"{self._spec.name} to {text_of(self._spec.to)}, seed {self.seed}"]
+        for direction, counts in (("forward", self.forward), ("reverse", self.reverse)):
+            lost = counts["received"] - counts["fates"].get("delivered", 0)
+            lost -= counts["fates"].get("forced", 0)
+            lines.append(
+                f"  {direction}: {counts['words'] or 'no impairment'}; {counts['received']} "
+                f"received, {lost} lost, longest burst {counts['longest_loss_burst']}"
+            )
+        return "\n".join(lines)
+
+    def _statistics(self) -> LinkStatistics:
+        commands, _ = self._opened.result(timeout=0)
+        snapshot = commands.snapshot() if self._ended is None else self._ended
+        return statistics(snapshot)["links"][0]
+
+    def _run(self) -> None:
+        """Relay until the context ends; all of the relay is used in this thread."""
+        try:
+            relay = Relay([self._spec])
+        except BaseException as error:  # raised where the context is entered
+            self._opened.set_exception(error)
+            return
+        commands = CommandQueue(relay)
+        try:
+            self._opened.set_result((commands, relay.addresses()[self._spec.name]))
+            relay.run(self._stop.is_set, commands.run_pending)
+            self._ended = commands.look()
+        finally:
+            commands.close()
+            relay.close()
+
+
+def _text(address: str | Sequence[str | int], what: str) -> str:
+    if isinstance(address, str):
+        return address
+    match address:
+        case [str(host), int(port), *_]:
+            return text_of((host, port))
+    raise CallerError(f"{what}: {address!r}; give host and port, or 'host:port'")

@@ -1,0 +1,81 @@
+"""The pytest plug-in: the fixture ``lossy_udp``, an emulator between two sockets of a test.
+
+pytest loads this file with each start, so that it imports the emulator only for a test that uses
+the fixture.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from netem.lossy_udp import LossyUdp
+
+SEED = "NOACK_SEED"
+_OPTION = "--noack-seed"
+_LINKS = pytest.StashKey[list["LossyUdp"]]()
+_RANDOM = pytest.StashKey[int]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option, and the key of the configuration file."""
+    text = f"seed of the fixture lossy_udp; by default ${SEED}, or a random one"
+    parser.getgroup("noack").addoption(_OPTION, metavar="SEED", help=text)
+    parser.addini("noack_seed", text)
+
+
+@pytest.fixture
+def lossy_udp(request: pytest.FixtureRequest) -> Iterator[Callable[..., LossyUdp]]:
+    """A function that starts an emulator: ``lossy_udp(server, "loss 30% mansd 4")``.
+
+    It has the arguments of :class:`netem.lossy_udp.LossyUdp`. Clients send to the ``address`` of
+    what it returns. All end with the test; a test that fails says their seed and their losses.
+    """
+    from netem.lossy_udp import LossyUdp
+
+    common = _seed(request.config)
+    links: list[LossyUdp] = request.node.stash.setdefault(_LINKS, [])
+    with ExitStack() as stack:
+
+        def start(
+            to: str | Sequence[str | int],
+            words: str = "",
+            *,
+            reverse: str = "",
+            seed: int | None = None,
+            listen: str | Sequence[str | int] = "127.0.0.1:0",
+        ) -> LossyUdp:
+            own, name = common if seed is None else seed, f"link {len(links) + 1}"
+            link = LossyUdp(to, words, reverse=reverse, seed=own, listen=listen, name=name)
+            links.append(stack.enter_context(link))
+            return link
+
+        yield start
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Say which network a failed test had, and how to have it again."""
+    report = yield
+    if report.failed and (links := item.stash.get(_LINKS, [])):
+        again = f"the same losses again: pytest {_OPTION} {links[0].seed} {item.nodeid!r}"
+        report.sections.append(("lossy_udp", "\n".join([*map(str, links), again])))
+    return report
+
+
+def _seed(config: pytest.Config) -> int:
+    """Return the given seed; without one, a random seed for all tests of this process."""
+    for text in (config.getoption(_OPTION), os.environ.get(SEED), config.getini("noack_seed")):
+        if text:
+            if not str(text).isdecimal() or int(text) >= 2**64:
+                raise pytest.UsageError(f"{_OPTION} {text}: must be 0 or more, below 2^64")
+            return int(text)
+    return config.stash.setdefault(_RANDOM, random.SystemRandom().getrandbits(32))

@@ -1,0 +1,112 @@
+"""``noack netem shell``: a command whose IP packets all pass a link, as in mahimahi's shells.
+
+The command runs in a network namespace with one device. The relay of :mod:`netem.relay` reads its
+packets there and writes them to a device outside, and the other way round.
+"""
+
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from netem import shell_process
+from netem.emulator_options import parsed, shell_parser, shell_spec
+from netem.relay_links import say
+from netem.shell_devices import DeviceLink, open_devices
+from netem.stand_alone import add_recording_options, check_options, relay, report_totals
+from noack.core.errors import CallerError, ExitStatus
+from noack.runtime.command_line import Signals, log_format
+
+_ENDS_S = 10.0
+"""More than the time that a guard gives the processes of its command to end."""
+
+
+def shell(arguments: Sequence[str]) -> int:
+    """Run a command in a shell; return the command's exit status.
+
+    Raises:
+        CallerError: the command line has a mistake, or the system does not permit a shell.
+    """
+    words, command = list(arguments), []
+    if "--" in words:
+        place = words.index("--")
+        words, command = words[:place], words[place + 1 :]
+    parser = shell_parser()
+    add_recording_options(parser, shell=True)
+    options = parsed(parser, words)
+    spec = shell_spec(options)
+    if options.view or options.capture == "-":
+        raise CallerError("--view and --capture - take the terminal, which the command has")
+    check_options(options)
+    command = command or [os.environ.get("SHELL") or "/bin/sh"]
+    outside = [_split(one) for one in options.outside or ()]
+    for one in (command, *outside):
+        if shutil.which(one[0]) is None:
+            raise CallerError(f"{one[0]}: there is no such program")
+    with log_format(options.log_format):
+        program = _Program(open_devices(spec), command, outside)
+        totals = relay([program.devices.spec], options, program)
+        report_totals(totals, options)
+    return program.status
+
+
+def _split(text: str) -> list[str]:
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise CallerError(f"--outside {text}: {error}") from None
+    if not words:
+        raise CallerError("--outside: needs a command")
+    return words
+
+
+class _Program:
+    """The command of a shell, and those outside; the relay runs within :meth:`running`."""
+
+    def __init__(
+        self, devices: DeviceLink, command: Sequence[str], outside: Sequence[Sequence[str]]
+    ) -> None:
+        self.devices = devices
+        self._command, self._outside = command, outside
+        self.status: int = ExitStatus.FAILED
+        """The exit status of the command after the context."""
+
+    @contextmanager
+    def running(self, signals: Signals) -> Iterator[Callable[[], bool]]:
+        """Run the commands within the context; yields whether the command has ended.
+
+        Ctrl-C is for the command, to which the terminal sends it, too.
+        """
+        spec = self.devices.spec
+        addresses = {"NOACK_OUTSIDE": spec.to[0]}
+        if self.devices.outside6 is not None:
+            addresses["NOACK_OUTSIDE6"] = self.devices.outside6
+        kept = shell_process.children()
+        shell_process.adopt_orphans()
+        processes = [_start(command) for command in self._outside]
+        with self.devices.inside():
+            main = _start(self._command, addresses)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        say(f"inside {spec.listen[0]}, outside {' and '.join(addresses.values())}")
+        try:
+            yield lambda: main.poll() is not None
+        finally:
+            for one in (main, *processes):
+                one.terminate()
+            for one in (main, *processes):
+                one.wait(_ENDS_S)
+            shell_process.end_children(kept)  # of a guard that was killed
+            self.status = main.returncode if main.returncode >= 0 else 128 - main.returncode
+            if signals.received is not None:
+                self.status = signals.status
+
+
+def _start(
+    command: Sequence[str], variables: dict[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    guard = [sys.executable, "-IS", shell_process.__file__, "inside", str(os.getpid())]
+    return subprocess.Popen([*guard, *command], env=os.environ | (variables or {}))

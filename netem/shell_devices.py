@@ -1,0 +1,256 @@
+"""The two TUN devices of a shell: the one inside its network namespace, and the one outside.
+
+The outside is this process's network namespace. If this user may not open devices there, the
+process enters a user namespace of its own, and an outside without other networks.
+
+All shells have addresses in 198.18.0.0/16, of the range for the test of network devices (RFC 2544),
+and in a unique local prefix of IPv6 (RFC 4193). Each shell has one of 16 parts of the range of the
+shell around it. Hence longer prefixes lead to inner shells, and shells need no address translation.
+"""
+
+import errno
+import fcntl
+import os
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address
+from pathlib import Path
+from typing import NoReturn
+
+from netem import shell_process
+from netem.relay_links import Address, LinkSpec, SocketName
+from noack.core.errors import CallerError
+
+MTU_BYTES = 1500
+_RANGE = IPv4Network("198.18.0.0/16")
+_RANGE6, _RANGE6_BITS = IPv6Address("fd6e:6f61:636b::"), 48
+_STEP_BITS, _MOST_BITS = 4, 28
+_QUEUE_PACKETS = 4000
+"""Maximum number of packets that wait in a device: 0.1 s at 0.48 Gbit/s."""
+_DEVICE, _INSIDE = "/dev/net/tun", "noack0"
+_SET_INTERFACE, _GET_ADDRESS, _GET_MASK = 0x400454CA, 0x8915, 0x891B
+_TUN, _NO_HEADER, _EXCLUSIVE = 0x1, 0x1000, 0x8000
+_ENTERED = "NOACK_SHELL_OUTSIDE"
+"""Environment variable of a process that has entered, or could not enter, its own outside."""
+_DROPPED = 11
+"""Column of /proc/net/dev with the packets that a full device did not take."""
+_RESTRICTIONS = {
+    "kernel/apparmor_restrict_unprivileged_userns": ("1", 0),
+    "kernel/unprivileged_userns_clone": ("0", 1),
+    "user/max_user_namespaces": ("0", 10000),
+}
+"""Settings in /proc/sys that forbid user namespaces, and values that permit them."""
+
+
+@dataclass(frozen=True)
+class DeviceLink:
+    """The link between the two devices, in the place of a :class:`netem.relay_links.OpenLink`."""
+
+    spec: LinkSpec
+    devices: tuple[int, int]
+    """The device inside, and the one outside."""
+    statistics: tuple[int, int]
+    """/proc/net/dev of the two namespaces, whose place in the file system does not matter."""
+    names: tuple[str, str]
+    namespace: int
+    """The network namespace inside."""
+    outside6: str | None
+    """The address outside of IPv6, if the system has it."""
+
+    discarded = 0
+    has_paths = False
+
+    @property
+    def name(self) -> SocketName:
+        """The address inside, in the form that sockets use."""
+        return self.spec.listen
+
+    @property
+    def local(self) -> SocketName:
+        """The address outside."""
+        return self.spec.to
+
+    server = local
+    """The same: nothing is sent there by address."""
+
+    @property
+    def address(self) -> Address:
+        """The address inside."""
+        return self.spec.listen
+
+    def drops(self, reverse: bool) -> int:
+        """Return how many packets a direction lost because a device was full."""
+        text = os.pread(self.statistics[reverse], 65536, 0).decode()
+        line = next(line for line in text.splitlines() if f"{self.names[reverse]}:" in line)
+        return int(line.partition(":")[2].split()[_DROPPED])
+
+    def client_text(self, flow: bytes) -> str:
+        """Return a flow as text: protocol, end inside, end outside."""
+        version, protocol, is_fragment, _, near, far = struct.unpack_from("!4BHH", flow)
+        if version == 0:
+            return "not IP"
+        size, family = (4, socket.AF_INET) if version == 4 else (16, socket.AF_INET6)
+        hosts = (socket.inet_ntop(family, flow[at : at + size]) for at in (8, 24))
+        names = {1: "icmp", 6: "tcp", 17: "udp", 58: "icmpv6"}
+        words = [names.get(protocol, f"protocol {protocol}")]
+        if is_fragment:
+            words[0] += " fragments"
+        words += [
+            f"{host if version == 4 else f'[{host}]'}{f':{port}' if port else ''}"
+            for host, port in zip(hosts, (near, far), strict=True)
+        ]
+        return " ".join(words)
+
+    @contextmanager
+    def inside(self) -> Iterator[None]:
+        """Let this thread be inside within the context: what it starts then stays there."""
+        here = _open_namespace()
+        shell_process.call("setns", self.namespace, shell_process.NEW_NETWORK)
+        try:
+            yield
+        finally:
+            shell_process.call("setns", here, shell_process.NEW_NETWORK)
+            os.close(here)
+
+    def close(self) -> None:
+        """Close the devices, which end with that."""
+        for one in (*self.devices, *self.statistics, self.namespace):
+            os.close(one)
+
+
+def open_devices(spec: LinkSpec) -> DeviceLink:
+    """Open and configure the devices of a shell; this may start the program again.
+
+    Args:
+        spec: the link; its addresses are replaced.
+
+    Raises:
+        CallerError: the system does not permit it or lacks something, or there are too many shells.
+    """
+    try:
+        around = _range_here()
+        number, outer = _first_free(around)
+        here = _open_namespace()
+        shell_process.call("unshare", shell_process.NEW_NETWORK)
+    except PermissionError:
+        _enter_outside()
+    os.environ.pop(_ENTERED, None)
+    own = list(around.subnets(_STEP_BITS))[number]
+    outside, inside = own[1], own[2]
+    inner = _open_tun(_INSIDE)
+    _configure(_INSIDE, inside, own.prefixlen)
+    has_six = _ip("route add ::/0 dev noack0", "route add 0.0.0.0/0 dev noack0")
+    for setting in ("ipv4/ip_forward", "ipv6/conf/all/forwarding"):
+        with suppress(OSError):  # without it, shells in this one reach only this one
+            Path("/proc/sys/net", setting).write_text("1")
+    namespace, inner_counts = _open_namespace(), _open_counts()
+    shell_process.call("setns", here, shell_process.NEW_NETWORK)
+    os.close(here)
+    _configure(name := f"noack{number}", outside, own.prefixlen)
+    return DeviceLink(
+        replace(spec, listen=(str(inside), 0), to=(str(outside), 0)),
+        (inner, outer),
+        (inner_counts, _open_counts()),
+        (_INSIDE, name),
+        namespace,
+        str(_six(outside)) if has_six else None,
+    )
+
+
+def _range_here() -> IPv4Network:
+    """Return the addresses of which a shell in this namespace gets a part."""
+    request = struct.pack("16s16x", _INSIDE.encode())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
+        try:
+            address, mask = (
+                socket.inet_ntoa(fcntl.ioctl(endpoint, query, request)[20:24])
+                for query in (_GET_ADDRESS, _GET_MASK)
+            )
+        except OSError:  # this is not in a shell
+            return _RANGE
+    around = IPv4Interface(f"{address}/{mask}").network
+    if around.prefixlen >= _MOST_BITS:
+        raise CallerError("shells nest three deep; give the words of several to one shell")
+    return around
+
+
+def _first_free(around: IPv4Network) -> tuple[int, int]:
+    """Open the outer device with the first free number; return the number and the device."""
+    parts = 1 << _STEP_BITS
+    for number in range(1, parts):  # the first part has the addresses of the shell around
+        try:
+            return number, _open_tun(f"noack{number}")
+        except OSError as error:
+            if error.errno != errno.EBUSY:
+                raise
+    raise CallerError(f"{parts - 1} shells run in this network namespace; wait for one to end")
+
+
+def _open_tun(name: str) -> int:
+    try:
+        device = os.open(_DEVICE, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise CallerError(
+            f"a shell needs {_DEVICE} ({error.strerror}); as root: `modprobe tun` or "
+            f"`chmod 666 {_DEVICE}`; for a container: `--device {_DEVICE}`"
+        ) from None
+    flags = _TUN | _NO_HEADER | _EXCLUSIVE
+    fcntl.ioctl(device, _SET_INTERFACE, struct.pack("16sH22x", name.encode(), flags))
+    return device
+
+
+def _configure(name: str, address: IPv4Address, prefix_bits: int) -> None:
+    """Give a device its addresses, and let packets pass."""
+    six_bits = _RANGE6_BITS + prefix_bits - _RANGE.prefixlen
+    _ip(
+        "link set lo up",
+        f"link set {name} mtu {MTU_BYTES} txqueuelen {_QUEUE_PACKETS} up",
+        f"address add {_six(address)}/{six_bits} dev {name} nodad",
+        f"address add {address}/{prefix_bits} dev {name}",
+    )
+
+
+def _six(address: IPv4Address) -> IPv6Address:
+    """Return the address of IPv6 beside one of IPv4, by the latter's lower 16 bits."""
+    return _RANGE6 + ((int(address) & 0xFFFF) << 64)
+
+
+def _ip(*commands: str) -> bool:
+    """Run commands of ``ip``; return whether all succeed. The last one must, without IPv6, too."""
+    lines = "\n".join(commands).encode()
+    try:
+        done = subprocess.run(["ip", "-force", "-batch", "-"], input=lines, capture_output=True)
+    except OSError:
+        raise CallerError("a shell needs `ip` (Debian: apt install iproute2)") from None
+    errors = done.stderr.decode(errors="replace").splitlines()
+    if f"Command failed -:{len(commands)}" in errors:
+        raise CallerError(f"ip {commands[-1]}: {errors[-2]}")
+    return done.returncode == 0
+
+
+def _open_namespace() -> int:
+    return os.open("/proc/thread-self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
+
+
+def _open_counts() -> int:
+    return os.open("/proc/thread-self/net/dev", os.O_RDONLY | os.O_CLOEXEC)
+
+
+def _enter_outside() -> NoReturn:
+    """Start the program again in a user namespace and an outside of its own."""
+    if _ENTERED not in os.environ:
+        os.environ[_ENTERED] = "1"
+        process = [sys.executable, "-IS", shell_process.__file__, "outside"]
+        os.execv(sys.executable, [*process, sys.executable, *sys.orig_argv[1:]])
+    remedy = "run it as root, or in a container with `--cap-add NET_ADMIN --cap-add SYS_ADMIN`"
+    for name, (forbids, permits) in _RESTRICTIONS.items():
+        with suppress(OSError):
+            if Path("/proc/sys", name).read_text().strip() == forbids:
+                remedy = f"as root: `sysctl -w {name.replace('/', '.')}={permits}`"
+                break
+    raise CallerError(f"this system does not permit this user to create namespaces; {remedy}")

@@ -1,0 +1,144 @@
+"""The processes of a shell, as a program of their own, which starts quickly without noack.
+
+``outside ARGUMENTS``: becomes a user of its own namespaces, in which it may open devices, and
+then the program of the arguments. ``inside PARENT ARGUMENTS``: runs the program, and ends all
+processes that it started when it ends or when the parent does.
+"""
+
+import ctypes
+import os
+import signal
+import struct
+import sys
+import time
+from collections.abc import Collection
+from contextlib import suppress
+from pathlib import Path
+
+NEW_USER, NEW_NETWORK = 0x10000000, 0x40000000
+NOT_FOUND = 127
+_DEATH_SIGNAL, _SUBREAPER, _AMBIENT = 1, 36, 47
+_CAPABILITIES, _VERSION = 41, 0x20080522
+_GRACE_S = 2.0
+"""From SIGTERM to SIGKILL."""
+_POLL_S = 0.01
+
+
+def call(function: str, *arguments: object) -> None:
+    """Call a function of libc.
+
+    Raises:
+        OSError: it fails.
+    """
+    if getattr(ctypes.CDLL(None, use_errno=True), function)(*arguments) != 0:
+        error = ctypes.get_errno()
+        raise OSError(error, os.strerror(error), function)
+
+
+def adopt_orphans() -> None:
+    """Become the parent of all descendants whose parents end."""
+    call("prctl", _SUBREAPER, 1, 0, 0, 0)
+
+
+def enter_namespaces() -> None:
+    """Enter a new user namespace, with the same user, and a new network namespace.
+
+    All programs that this process becomes or starts may administer them.
+
+    Raises:
+        OSError: the system does not permit it.
+    """
+    user, group = os.getuid(), os.getgid()
+    call("unshare", NEW_USER | NEW_NETWORK)
+    for name, text in (
+        ("setgroups", "deny"),
+        ("uid_map", f"{user} {user} 1"),
+        ("gid_map", f"{group} {group} 1"),
+    ):
+        Path("/proc/self", name).write_text(text)
+    head = ctypes.create_string_buffer(struct.pack("=Ii", _VERSION, 0))
+    sets = ctypes.create_string_buffer(24)
+    call("capget", head, sets)
+    words = list(struct.unpack("=6I", sets.raw[:24]))  # effective, permitted, inheritable; twice
+    words[2], words[5] = words[1], words[4]
+    call("capset", head, struct.pack("=6I", *words))
+    for capability in range(_CAPABILITIES):
+        with suppress(OSError):  # the kernel has fewer
+            call("prctl", _AMBIENT, 2, capability, 0, 0)
+
+
+def children() -> set[int]:
+    """Return the process ids of this process's children."""
+    found = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended
+            state = (process / "stat").read_bytes().rpartition(b")")[2]
+            if int(state.split()[1]) == os.getpid():
+                found.add(int(process.name))
+    return found
+
+
+def end_children(kept: Collection[int] = ()) -> None:
+    """End all children and adopted descendants but some, by SIGTERM and, if they go on, SIGKILL."""
+    late_s = time.monotonic() + _GRACE_S
+    asked: set[int] = set()
+    while left := children().difference(kept):
+        late = time.monotonic() > late_s
+        for child in left if late else left - asked:
+            os.kill(child, signal.SIGKILL if late else signal.SIGTERM)
+            os.kill(child, signal.SIGCONT)  # a stopped process, too
+        asked |= left
+        for child in left:
+            with suppress(ChildProcessError):
+                os.waitpid(child, os.WNOHANG)
+        time.sleep(_POLL_S)
+
+
+def guard(parent: int, command: list[str]) -> int:
+    """Run a command; return its exit status when all processes that it started have ended."""
+    ending = {signal.SIGTERM, signal.SIGHUP}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGCHLD})
+    before = {one: signal.signal(one, signal.SIG_IGN) for one in (signal.SIGINT, signal.SIGQUIT)}
+    adopt_orphans()
+    group = os.getpgrp()
+    os.setpgid(0, 0)  # what kills the whole group does not kill this process
+    call("prctl", _DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
+    child = os.fork()
+    if child == 0:
+        with suppress(OSError):  # the group has ended
+            os.setpgid(0, group)
+        call("prctl", _DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+        for one, handler in before.items():
+            signal.signal(one, handler if handler is signal.SIG_IGN else signal.SIG_DFL)
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        try:
+            os.execvp(command[0], command)
+        except OSError as error:
+            os.write(2, f"noack netem: {command[0]}: {error.strerror}\n".encode())
+            os._exit(NOT_FOUND)
+    status = None
+    while status is None and os.getppid() == parent:
+        if signal.sigwait({*ending, signal.SIGCHLD}) in ending:
+            status = 128 + signal.SIGTERM
+            break
+        with suppress(ChildProcessError):
+            while (found := os.waitpid(-1, os.WNOHANG))[0]:
+                if found[0] == child:
+                    status = os.waitstatus_to_exitcode(found[1])
+    end_children()
+    return 1 if status is None else status if status >= 0 else 128 - status
+
+
+def main() -> None:
+    """Run as the program says."""
+    role, *arguments = sys.argv[1:]
+    if role == "inside":
+        sys.exit(guard(int(arguments[0]), arguments[1:]))
+    with suppress(OSError):  # the program will report that it is not permitted
+        enter_namespaces()
+    os.execv(arguments[0], arguments)
+
+
+if __name__ == "__main__":
+    main()

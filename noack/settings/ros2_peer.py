@@ -1,0 +1,96 @@
+"""A plant or controller that is a node of ROS 2: its settings, and how it is asked."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from pydantic import Field
+
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
+from noack.protocol.machine_interface import External
+from noack.protocol.ros2_messages import DEFAULT_ROUTER, Entries
+from noack.settings.section import Positive, ScenarioSection
+
+if TYPE_CHECKING:
+    from noack.protocol.ros2_node import Exchange
+
+_AGAIN_S = 0.2
+
+
+class Ros2Settings(ScenarioSection):
+    """Where the node is, and how long it may take."""
+
+    router: str = DEFAULT_ROUTER
+    """Address of the router of ROS 2, as zenoh writes it."""
+    listen: bool = False
+    """Whether this process is itself the router at this address, to which the node connects."""
+    domain: Annotated[int, Field(ge=0, le=232)] = 0
+    """The node's ROS_DOMAIN_ID."""
+    timeout_s: Positive = 0.5
+    """Longest wait for an answer, in wall time."""
+    start_timeout_s: Positive = 10.0
+    """Longest wait for the first answer, in wall time."""
+
+
+class Ros2Peer(External):
+    """The node, which is asked; connected with the first question, or before.
+
+    Args:
+        settings: of the plant or controller.
+        place: the table of the scenario.
+        topics: of the questions and of the answers.
+        first: content of the first question.
+        count: number of values of an answer.
+    """
+
+    def __init__(
+        self,
+        settings: Ros2Settings,
+        place: str,
+        topics: tuple[str, str],
+        first: Entries,
+        count: int,
+    ) -> None:
+        self._settings, self._place, self._topics = settings, place, topics
+        self._first, self._count = first, count
+        self._exchange: Exchange | None = None
+        self.first_answer = np.zeros(count)
+
+    def connect(self) -> None:
+        """Ask until the node answers.
+
+        Raises:
+            CallerError: a package is missing, there is no router, or no valid answer in time.
+        """
+        if self._exchange is not None:
+            return
+        # Scenarios without such a part do not wait for zenoh.
+        from noack.protocol.ros2_node import Exchange, Node
+
+        settings, name = self._settings, self._place.replace(".", "_")
+        node = Node(f"noack_{name}", settings.router, settings.domain, listen=settings.listen)
+        exchange = Exchange(node, *self._topics, self._place)
+        try:
+            answer = exchange.ask(
+                self._first, self._count, settings.start_timeout_s, again_s=_AGAIN_S
+            )
+        except (TimeoutError, ValueError) as error:
+            node.close()
+            raise CallerError(f'{self._place}.kind = "ros2": {error}') from None
+        self._exchange, self.first_answer = exchange, answer.values
+
+    def ask(self, question: Entries) -> Vector:
+        """Return the answer, or the recorded one in a replay.
+
+        Raises:
+            CallerError: see :meth:`connect`.
+            ValueError: there is no valid answer in time; the message is one line.
+        """
+        if self.recorded is not None:
+            return self.recorded
+        self.connect()
+        assert self._exchange is not None
+        try:
+            return self._exchange.ask(question, self._count, self._settings.timeout_s).values
+        except (TimeoutError, ValueError) as error:
+            raise ValueError(f'{self._place}.kind = "ros2": {error}') from None

@@ -1,0 +1,229 @@
+"""A shell: all packets of a command pass the rules, and nothing of it is left afterwards."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from noack.protocol.record_tables import Fate
+
+ENDS = str(Path(__file__).with_name("ends.py"))
+SHELL = [sys.executable, "-m", "netem", "shell"]
+PATIENCE_S = 120
+
+
+def run(*words: str, **how: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*SHELL, *words], capture_output=True, text=True, timeout=PATIENCE_S, **how
+    )
+
+
+@cache
+def why_not() -> str:
+    """Return why this system has no shells; empty: it has them."""
+    tried = run("--", "true") if shutil.which("ip") else None
+    return "there is no ip" if tried is None else tried.stderr if tried.returncode else ""
+
+
+@pytest.fixture(autouse=True)
+def _permitted(request: pytest.FixtureRequest) -> None:
+    if why_not():
+        pytest.skip(why_not())
+
+
+def need(*programs: str) -> None:
+    if missing := [one for one in programs if shutil.which(one) is None]:
+        pytest.skip(f"there is no {', '.join(missing)}")
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET6) as endpoint:
+        endpoint.bind(("::", 0))
+        return int(endpoint.getsockname()[1])
+
+
+def longest_burst(lost: set[int]) -> int:
+    bursts = groupby(enumerate(sorted(lost)), lambda pair: pair[1] - pair[0])
+    return max((len(list(group)) for _, group in bursts), default=0)
+
+
+def packets_of(capture: bytes) -> list[bytes]:
+    """Return the packets of a pcapng file, whose lengths are those in their headers."""
+    packets = []
+    while capture:
+        kind, size = struct.unpack_from("<II", capture)
+        if kind == 6:
+            (length,) = struct.unpack_from("<I", capture, 20)
+            packet = capture[28 : 28 + length]
+            (inner,) = struct.unpack_from("!H", packet, 2 if packet[0] >> 4 == 4 else 4)
+            assert length == (inner if packet[0] >> 4 == 4 else inner + 40)
+            packets.append(packet)
+        capture = capture[size:]
+    return packets
+
+
+class Totals:
+    """Results of a shell: what its ends received, its statistics, and the fates of its packets."""
+
+    def __init__(self, folder: Path, *words: str, change: tuple[str, ...] = ()) -> None:
+        fates, count = folder / "fates.parquet", "40" if change else "200"
+        server = ["--outside", f"{sys.executable} {ENDS} server {folder}"]
+        ends = [sys.executable, ENDS, "client", str(folder), count, *change]
+        recording = ["--stats-file", str(folder / "stats.json"), "--record-fates", str(fates)]
+        done = run(*words, *recording, *server, "--", *ends, cwd=Path(__file__).parents[3])
+        assert done.returncode == 0, done.stderr
+        assert "lost in the kernel" not in done.stderr
+        self.count = int(count)
+        self.flows = json.loads((folder / "ends.json").read_text())
+        last = (folder / "stats.json").read_text().splitlines()[-1]
+        self.link = json.loads(last)["links"][0]
+        self.rows = pq.read_table(fates).to_pylist()
+
+    def lost(self, flow: str, direction: str) -> tuple[set[int], int]:
+        """Return a flow's packets that the emulator dropped, and its count of the longest burst."""
+        text = f":{self.flows[flow]['port']} "
+        (found,) = (one for one in self.link[direction]["flows"] if text in one["client"])
+        rows = [
+            row for row in self.rows
+            if row["direction"] == direction and row["flow"] == found["flow"]
+        ]  # fmt: skip
+        assert len(rows) == found["packets"]
+        return {row["packet"] for row in rows if row["fate"] == Fate.DROPPED}, found[
+            "longest_loss_burst"
+        ]
+
+
+def test_the_ends_miss_exactly_what_the_emulator_drops(tmp_path: Path) -> None:
+    """In both directions, over both versions of IP; a replay of the fates drops the same."""
+    words = ["--both", "loss", "45%", "mansd", "4", "--seed", "7"]
+    capture = tmp_path / "all.pcapng"
+    totals = Totals(tmp_path, *words, "--capture", str(capture))
+    for flow, ends in totals.flows.items():
+        there = ends["there"]
+        missing = set(range(totals.count)) - set(there)
+        lost, longest = totals.lost(flow, "forward")
+        assert missing == lost
+        assert longest_burst(missing) == longest == 4
+        missing = {k for k, number in enumerate(there) if number not in ends["back"]}
+        lost, longest = totals.lost(flow, "reverse")
+        assert missing == lost
+        assert longest_burst(missing) == longest == 4
+    assert any("udp fragments " in one["client"] for one in totals.link["forward"]["flows"])
+    packets = packets_of(capture.read_bytes())
+    received = totals.link["forward"]["received"] + totals.link["reverse"]["received"]
+    forwarded = totals.link["forward"]["forwarded"] + totals.link["reverse"]["forwarded"]
+    assert len(packets) == received + forwarded
+
+    (tmp_path / "again").mkdir()
+    again = Totals(tmp_path / "again", "--replay-fates", str(tmp_path / "fates.parquet"))
+    for flow, ends in totals.flows.items():
+        assert again.flows[flow]["there"] == ends["there"]
+
+
+def test_changed_settings_do_not_reset_the_memory_of_a_flow(tmp_path: Path) -> None:
+    name = f"shell-{os.getpid()}"
+    words = ["loss", "100%", "mansd", "4", "--control", name]
+    totals = Totals(tmp_path, *words, change=("2", "loss 100% mansd 4 delay 1ms", name))
+    assert totals.flows["ipv4"]["there"] == list(range(4, totals.count, 5))
+
+
+def test_shells_nest_and_programs_work(tmp_path: Path) -> None:
+    need("ping", "curl", "iperf3")
+    (tmp_path / "page").write_text("a page")
+    page_port, iperf_port = free_port(), free_port()
+    outside = [
+        "--outside", f"{sys.executable} -m http.server -b :: -d {tmp_path} {page_port}",
+        "--outside", f"iperf3 -s -p {iperf_port}",
+    ]  # fmt: skip
+    script = f"""
+        set -e
+        far=$NOACK_OUTSIDE far6=$NOACK_OUTSIDE6
+        until curl -sf http://$far:{page_port}/page; do sleep 0.1; done
+        {" ".join(SHELL)} delay 30ms -- sh -c "
+            set -e
+            ping -c 3 $far
+            [ -z '$far6' ] || ping -6 -c 3 $far6
+            curl -sf --retry 9 --retry-connrefused http://$far:{page_port}/page
+            curl -sf --retry 9 --retry-connrefused http://[$far6]:{page_port}/page
+            until iperf3 -c $far -p {iperf_port} -n 200K; do sleep 0.1; done
+            until iperf3 -c $far -p {iperf_port} -u -n 200K; do sleep 0.1; done"
+    """
+    done = run("--both", "delay", "20ms", *outside, "--", "sh", "-c", script)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("a page") == 3
+    trips_ms = [
+        float(word.removeprefix("time="))
+        for word in done.stdout.split() if word.startswith("time=") and word != "time="
+    ]  # fmt: skip
+    assert len(trips_ms) >= 3
+    assert min(trips_ms) >= 70
+
+
+@pytest.mark.parametrize(
+    ("command", "status"), [("exit 7", 7), ("kill -9 $$", 128 + 9), ("true", 0)]
+)
+def test_the_status_of_the_command_is_that_of_the_shell(command: str, status: int) -> None:
+    assert run("--", "sh", "-c", command).returncode == status
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--", "no-such-program"], "no-such-program: there is no such program"),
+        (["loss", "300%", "--", "true"], "loss 300%: expected a percentage from 0% to 100%"),
+        (["--view", "--", "true"], "--view and --capture - take the terminal"),
+    ],
+)
+def test_a_mistake_is_one_line(words: list[str], line: str) -> None:
+    done = run(*words)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert line in done.stderr
+
+
+def test_a_system_that_does_not_permit_it_is_one_line_with_the_remedy() -> None:
+    need("unshare")
+    script = 'echo 0 > /proc/sys/user/max_user_namespaces && exec "$@"'
+    command = ["unshare", "-r", "sh", "-c", script, "sh", *SHELL, "--", "true"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+    if "cannot create" in done.stderr or "Permission denied" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "`sysctl -w user.max_user_namespaces=10000`" in done.stderr
+
+
+@pytest.mark.parametrize("killed", ["relay", "guard", "group", "all", "terminated"])
+def test_no_process_is_left(killed: str) -> None:
+    """All of them have the pipe: its end is the end of the last one."""
+    script = "(setsid sleep 1000 &) ; sleep 1000 & echo $PPID; wait"
+    with subprocess.Popen(
+        [*SHELL, "--outside", "sleep 1000", "--", "sh", "-c", script],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, process_group=0,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        guard = int(process.stdout.readline())
+        if killed == "relay":
+            process.kill()
+        elif killed == "guard":
+            os.kill(guard, signal.SIGKILL)
+        elif killed == "all":
+            os.killpg(process.pid, signal.SIGKILL)
+        elif killed == "group":
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            process.terminate()
+        assert process.stdout.read() == ""
+    expected = {"relay": -9, "all": -9, "guard": 128 + 9, "group": 130, "terminated": 143}
+    assert process.returncode == expected[killed]

@@ -1,0 +1,170 @@
+"""The emulator within a program, and the plug-in of pytest."""
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path
+
+import pytest
+
+import noack
+from noack.core.errors import NoackError
+from tests.netem.conftest import Decide
+from tests.pages import blocks
+
+PATIENCE_S = 120.0
+
+
+class Ends:
+    """A server that sends datagrams back, and a client; with numbers as datagrams."""
+
+    def __init__(self) -> None:
+        self.server = socket.socket(type=socket.SOCK_DGRAM)
+        self.server.bind(("127.0.0.1", 0))
+        self.client = socket.socket(type=socket.SOCK_DGRAM)
+        self.client.bind(("127.0.0.1", 0))
+        for end in (self.server, self.client):
+            end.settimeout(PATIENCE_S)
+
+    def send(self, link: noack.LossyUdp, numbers: range) -> None:
+        for number in numbers:
+            self.client.sendto(number.to_bytes(4), link.address)
+
+    def received(self, count: int) -> list[int]:
+        return [int.from_bytes(self.server.recv(4)) for _ in range(count)]
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    both = Ends()
+    yield both
+    both.server.close()
+    both.client.close()
+
+
+def intact(counts: dict[str, int]) -> int:
+    return counts.get("delivered", 0) + counts.get("forced", 0)
+
+
+def arrived(ends: Ends, words: str, seed: int, count: int = 300) -> list[bool]:
+    """Return which of the datagrams arrive, by the receiver."""
+    with noack.LossyUdp(ends.server.getsockname(), words, seed=seed) as link:
+        ends.send(link, range(count))
+        while link.forward["received"] < count:
+            pass
+        received = ends.received(intact(link.forward["fates"]))
+    assert link.forward["received"] == count  # also after the end
+    lost = [
+        len(list(run)) for kept, run in groupby(range(count), received.__contains__) if not kept
+    ]
+    assert max(lost) == link.forward["longest_loss_burst"]
+    return [number in received for number in range(count)]
+
+
+def test_the_losses_are_those_of_the_seed_and_of_the_rules(ends: Ends, decide: Decide) -> None:
+    words = "loss 60% mansd 3"
+    first = arrived(ends, words, 7)
+    assert arrived(ends, words, 7) == first
+    assert arrived(ends, words, 8) != first
+    decided = decide(words, 300, seed=7, name=("relay", "forward"))
+    assert first == [release_ns >= 0 for release_ns in decided.decisions["release_ns"]]
+
+
+def test_a_change_does_not_reset_the_guarantee(ends: Ends) -> None:
+    with noack.LossyUdp(ends.server.getsockname(), "loss 100% mansd 3") as link:
+        count = 0
+        for _ in range(20):  # each change would allow three more losses if it forgot the others
+            ends.send(link, range(count, count := count + 2))
+            while link.forward["received"] < count:
+                pass
+            link.change("loss 100% mansd 3")
+        assert ends.received(10) == list(range(3, 40, 4))
+
+
+@pytest.mark.parametrize(("arguments", "told"), [
+    (("127.0.0.1:9", "los 3%"), "los"),
+    (("127.0.0.1:9", "loss 3% seed 4"), "seed 4"),
+    (("127.0.0.1:0",), "to: expected a port from 1 to 65535"),
+    (((1, 2),), "to: (1, 2); give host and port, or 'host:port'"),
+])  # fmt: skip
+def test_a_mistake_is_one_line(arguments: tuple[str, ...], told: str) -> None:
+    with pytest.raises(NoackError) as error:
+        noack.LossyUdp(*arguments)
+    assert told in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_address_in_use_is_told_on_entering(ends: Ends) -> None:
+    used = ends.server.getsockname()
+    with (
+        pytest.raises(NoackError, match="already taken"),
+        noack.LossyUdp("127.0.0.1:9", listen=used),
+    ):
+        pass
+    with noack.LossyUdp("127.0.0.1:9") as link, pytest.raises(NoackError, match="to and fro"):
+        link.change("loss 1%", directions=["to and fro"])  # type: ignore[list-item]
+    with pytest.raises(NoackError, match="has ended"):
+        link.change("loss 1%")
+
+
+def run_pytest(
+    folder: Path, *arguments: str, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    plugin = ["-p", "no:noack", "-p", "netem.pytest_plugin"]  # if it is not installed here, too
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", *plugin, "-p", "no:cacheprovider", *arguments],
+        cwd=folder, env=os.environ | environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+FAILS = """
+import socket
+
+def test_fails(lossy_udp):
+    with socket.socket(type=socket.SOCK_DGRAM) as server, socket.socket(type=2) as client:
+        server.bind(("127.0.0.1", 0))
+        server.settimeout(100)
+        link = lossy_udp(server.getsockname(), "loss 50% mansd 6")
+        for number in range(80):
+            client.sendto(bytes([number]), link.address)
+        while link.forward["received"] < 80:
+            pass
+        fates = link.forward["fates"]
+        count = fates.get("delivered", 0) + fates.get("forced", 0)
+        assert not [server.recv(1)[0] for _ in range(count)]
+"""
+
+
+def failure(run: subprocess.CompletedProcess[str]) -> tuple[str, str]:
+    """Return the list of what arrived, and the seed that the failure names."""
+    assert run.returncode == 1, run.stdout
+    (arrived,) = (line for line in run.stdout.splitlines() if line.startswith("E ") and "[" in line)
+    seed = run.stdout.partition("pytest --noack-seed ")[2].partition(" ")[0]
+    assert f"seed {seed}\n  forward: loss 50% mansd 6; 80 received" in run.stdout
+    return arrived, seed
+
+
+def test_a_failure_names_the_seed_that_repeats_it(tmp_path: Path) -> None:
+    (tmp_path / "test_it.py").write_text(FAILS)
+    first = failure(run_pytest(tmp_path, "-vv"))
+    assert failure(run_pytest(tmp_path, "-vv", "--noack-seed", first[1])) == first
+    assert failure(run_pytest(tmp_path, "-vv", NOACK_SEED=first[1])) == first
+    assert failure(run_pytest(tmp_path, "-vv", "-o", f"noack_seed={first[1]}")) == first
+    assert failure(run_pytest(tmp_path, "-vv"))[1] != first[1]
+    assert "must be 0 or more" in run_pytest(tmp_path, "--noack-seed", "-3").stdout
+
+
+def test_the_test_of_the_documentation_passes(tmp_path: Path) -> None:
+    (program,) = blocks("docs/netem-programs.md", "python")
+    (tmp_path / "test_repeating_client.py").write_text(program)
+    done = run_pytest(tmp_path, "-q")
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_plugin_loads_nothing_for_tests_without_it() -> None:
+    code = "import sys, netem.pytest_plugin; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"numpy", "noack.core.core_library", "netem.relay"} & set(done.stdout.split())
