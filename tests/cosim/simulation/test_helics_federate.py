@@ -14,7 +14,7 @@ import pytest
 import noack
 
 pytest.importorskip("helics", reason="the extra `helics` is not installed")
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 BROKER = """
 import sys, helics
 broker = helics.helicsCreateBroker("zmq", "", sys.argv[1])
@@ -66,7 +66,9 @@ def test_two_federates_have_the_run_of_a_simulation(start: Start) -> None:
         "double_integrator",
         {
             "horizon_s": 2.0,
-            "plant": {"draw": "given", "A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.2]]},
+            "plant.draw": "given",
+            "plant.A": [[0.0, 1.0], [0.0, 0.0]],
+            "plant.B": [[0.0], [1.2]],
             "network.impairments": [{"kind": "delay", "delay_s": 0.0045}],
         },
     )
@@ -76,7 +78,7 @@ def test_two_federates_have_the_run_of_a_simulation(start: Start) -> None:
     np.testing.assert_allclose([t_s, x_1, x_2], [expected[k] for k in ("t_s", "x_1", "x_2")],
                                rtol=0, atol=1e-12)  # fmt: skip
     packets = run.table("netem_packet").to_pydict()
-    np.testing.assert_array_equal(t_s[event == 1] * 1e9, packets["t_ns"])
+    np.testing.assert_array_equal(np.rint(t_s[event == 1] * 1e9), packets["t_ns"])
     (route,) = json.loads(counts)["endpoints"]
     assert route == {
         "endpoint": "controller/update",

@@ -103,7 +103,7 @@ def _joined(options: FederateOptions) -> "Iterator[tuple[ModuleType, HelicsMessa
         info = helics.helicsCreateFederateInfo()
         helics.helicsFederateInfoSetCoreTypeFromString(info, options.core_type)
         helics.helicsFederateInfoSetCoreName(info, f"{options.name}_core")
-        helics.helicsFederateInfoSetCoreInitString(info, "--federates=1 --loglevel=error")
+        helics.helicsFederateInfoSetCoreInitString(info, "--federates=1 --loglevel=no_print")
         if options.broker:
             helics.helicsFederateInfoSetBroker(info, options.broker)
         federate = helics.helicsCreateMessageFederate(options.name, info)
