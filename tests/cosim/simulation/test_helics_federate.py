@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 import noack
+from netem.channel import UPDATE_LINK
+from netem.link_state import LinkState
 
 pytest.importorskip("helics", reason="the extra `helics` is not installed")
 ROOT = Path(__file__).parents[3]
@@ -22,6 +24,34 @@ helics.helicsBrokerWaitForDisconnect(broker, -1)
 """
 DELAY = "network.impairments=[{kind='delay', delay_s=0.0045}]"
 TIMEOUT_S = 120
+IMPAIRMENTS = [
+    {"kind": "delay", "delay_s": 0.0145, "jitter_s": 0.012},
+    {"kind": "duplicate", "probability": 0.3},
+    {"kind": "corrupt", "probability": 0.2},
+]
+MESSAGES = 300
+SENDER = f"""
+import sys, helics
+info = helics.helicsCreateFederateInfo()
+helics.helicsFederateInfoSetCoreTypeFromString(info, "zmq")
+helics.helicsFederateInfoSetBroker(info, sys.argv[1])
+helics.helicsFederateInfoSetFlagOption(info, helics.HELICS_FLAG_UNINTERRUPTIBLE, True)
+own = helics.helicsCreateMessageFederate("both", info)
+sender, *ends = (helics.helicsFederateRegisterGlobalEndpoint(own, one, "") for one in "sab")
+helics.helicsFederateEnterExecutingMode(own)
+for k in range({MESSAGES} + 10):
+    if k:
+        helics.helicsFederateRequestTime(own, k * 0.01)
+    for name, end in zip("ab", ends):
+        while helics.helicsEndpointHasMessage(end):
+            one = helics.helicsEndpointGetMessage(end)
+            data = helics.helicsMessageGetBytes(one).hex()
+            print(name, round(one.time * 1e9), data, one.original_source)
+        if k < {MESSAGES}:
+            helics.helicsEndpointSendBytesTo(sender, b"%08d" % k, "noack/" + name)
+helics.helicsFederateDisconnect(own)
+helics.helicsCloseLibrary()
+"""
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
@@ -42,23 +72,23 @@ def start() -> Iterator[Start]:
         one.communicate()
 
 
-def federation(start: Start, *options: str) -> list["subprocess.Popen[str]"]:
-    """The network, the plant and the controller of a federation, with a broker at a free port."""
+def federation(start: Start, federates: int, *options: str) -> tuple[str, "subprocess.Popen[str]"]:
+    """Start a broker at a free port, and the network; return the broker's address, too."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
+    start("-c", BROKER, f"-f {federates} --port={port} --loglevel=error", stdout=subprocess.DEVNULL)
     address = f"tcp://127.0.0.1:{port}"
-    start("-c", BROKER, f"-f 3 --port={port} --loglevel=error", stdout=subprocess.DEVNULL)
-    network = start("-m", "cosim.cli", "helics", "double_integrator", "--broker", address, *options)
-    roles = ("plant", "controller")
-    return [network, *(start("scenarios/helics_loop.py", role, address) for role in roles)]
+    command = ("-m", "cosim.cli", "helics", "double_integrator", "--broker", address)
+    return address, start(*command, *options)
 
 
 def test_two_federates_have_the_run_of_a_simulation(start: Start) -> None:
     """Same events, same losses; states to rounding errors, as scipy's exponential is another."""
-    network, plant, _ = federation(
-        start, "--endpoint", "controller/update", "--set", DELAY, "--json"
-    )
+    options = ("--endpoint", "controller/update", "--set", DELAY, "--json")
+    address, network = federation(start, 3, *options)
+    start("scenarios/helics_loop.py", "controller", address)
+    plant = start("scenarios/helics_loop.py", "plant", address)
     states, _ = plant.communicate(timeout=TIMEOUT_S)
     counts, errors = network.communicate(timeout=TIMEOUT_S)
     assert network.returncode == 0, errors
@@ -89,10 +119,32 @@ def test_two_federates_have_the_run_of_a_simulation(start: Start) -> None:
     assert route["lost"] > 0
 
 
+def test_copies_damage_and_overtaking_are_those_of_the_link(start: Start) -> None:
+    settings = json.dumps(IMPAIRMENTS).replace('": ', '" = ')
+    options = ("--endpoint", "a", "--endpoint", "b", "--set", f"network.impairments={settings}")
+    address, _ = federation(start, 2, *options)
+    seen, errors = start("-c", SENDER, address).communicate(timeout=TIMEOUT_S)
+    scenario = noack.load("double_integrator", {"network.impairments": IMPAIRMENTS})
+    link = LinkState(scenario.network.link, scenario.seeds.loss, UPDATE_LINK, rows=2)
+    for row in range(2):
+        link.start_flow(row, row)
+    expected = []
+    for k in range(MESSAGES):
+        for row, name in enumerate("ab"):
+            one = link.decide(row, 8, 10_000_000 * k)
+            for time_ns, bit in ((one.release_ns, one.bit), (one.copy_ns, one.copy_bit)):
+                data = int.from_bytes(b"%08d" % k, "little") ^ (1 << bit if bit >= 0 else 0)
+                if time_ns >= 0:
+                    expected.append(f"{name} {time_ns} {data.to_bytes(8, 'little').hex()} s")
+    assert sorted(seen.splitlines()) == sorted(expected), errors
+    assert len(expected) > MESSAGES / 4
+
+
 def test_an_endpoint_that_the_federation_does_not_have_is_one_line(start: Start) -> None:
-    network, *_ = federation(start, "--endpoint", "controller/updates")
+    address, network = federation(start, 2, "--endpoint", "c")
+    start("-c", SENDER, address)
     _, errors = network.communicate(timeout=TIMEOUT_S)
     assert network.returncode == 2
     (line,) = errors.splitlines()
-    assert "controller/updates: the federation has no such endpoint" in line
-    assert line.endswith("it has controller/update, plant/input")
+    assert "--endpoint c: the federation has no such endpoint" in line
+    assert line.endswith("it has a, b, s")
