@@ -25,6 +25,7 @@ from typing import NoReturn
 from netem.relay_links import Address, LinkSpec, SocketName
 from netem.shell import process
 from noack.core.errors import CallerError
+from noack.core.process_limits import python_command
 
 MTU_BYTES = 1500
 _RANGE = IPv4Network("198.18.0.0/16")
@@ -245,8 +246,8 @@ def _enter_outside() -> NoReturn:
     """Start the program again in a user namespace and an outside of its own."""
     if _ENTERED not in os.environ:
         os.environ[_ENTERED] = "1"
-        outside = [sys.executable, "-IS", process.__file__, "outside"]
-        os.execv(sys.executable, [*outside, sys.executable, *sys.orig_argv[1:]])
+        outside = python_command("-IS", process.__file__, "outside")
+        os.execv(outside[0], [*outside, outside[0], *sys.orig_argv[1:]])
     remedy = "run it as root, or in a container with `--cap-add NET_ADMIN --cap-add SYS_ADMIN`"
     for name, (forbids, permits) in _RESTRICTIONS.items():
         with suppress(OSError):

@@ -9,7 +9,6 @@ import shlex
 import shutil
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
@@ -19,6 +18,7 @@ from netem.shell import process
 from netem.shell.devices import DeviceLink, open_devices
 from netem.stand_alone import add_recording_options, check_options, relay, report_totals
 from noack.core.errors import CallerError, ExitStatus
+from noack.core.process_limits import python_command
 from noack.runtime.command_line import Signals, log_format
 
 _ENDS_S = 10.0
@@ -108,5 +108,5 @@ class _Program:
 def _start(
     command: Sequence[str], variables: dict[str, str] | None = None
 ) -> subprocess.Popen[bytes]:
-    guard = [sys.executable, "-IS", process.__file__, "inside", str(os.getpid())]
+    guard = python_command("-IS", process.__file__, "inside", os.getpid())
     return subprocess.Popen([*guard, *command], env=os.environ | (variables or {}))
