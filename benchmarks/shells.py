@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks.programs import compiled
 from benchmarks.report import Goal, MeasurementError, Rounds, Row, benchmark
 from netem.relay_links import LinkSpec
-from netem.shell_devices import open_devices
+from netem.shell.devices import open_devices
 from noack.impairments.link_settings import LinkSettings
 
 _ROUNDS = 5

@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_options(joining)
     try:
         if given[:1] == ["shell"]:
-            from netem.shell import shell  # a run's emulator starts without it
+            from netem.shell.shell import shell  # a run's emulator starts without it
 
             as_json = "--json" in given[: (*given, "--").index("--")]
             return shell(given[1:])

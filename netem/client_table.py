@@ -24,7 +24,7 @@ from netem.relay_links import (
     stamp_arrivals,
 )
 from netem.relay_memory import RelayDirection, RelayMemory, name_array
-from netem.shell_devices import DeviceLink
+from netem.shell.devices import DeviceLink
 from noack.core.core_library import core
 from noack.runtime.address import text_of
 from noack.runtime.udp_sockets import drops_of

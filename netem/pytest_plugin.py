@@ -67,7 +67,12 @@ def pytest_runtest_makereport(
     report = yield
     if report.failed and (links := item.stash.get(_LINKS, [])):
         again = f"the same losses again: pytest {_OPTION} {links[0].seed} {item.nodeid!r}"
-        report.sections.append(("lossy_udp", "\n".join([*map(str, links), again])))
+        text = "\n".join([*map(str, links), again])
+        add = getattr(report.longrepr, "addsection", None)  # shown whatever --show-capture is
+        if add is not None:
+            add("lossy_udp", text)
+        else:
+            report.sections.append(("lossy_udp", text))
     return report
 
 

@@ -20,11 +20,10 @@ from netem.relay_links import (
     Tap,
     let_wait,
     open_links,
-    raise_file_limit,
     stamp_arrivals,
 )
 from netem.relay_memory import RelayDirection, RelayMemory
-from netem.shell_devices import DeviceLink
+from netem.shell.devices import DeviceLink
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
@@ -66,7 +65,6 @@ class Relay:
         devices: DeviceLink | None = None,
     ) -> None:
         self.specs: Sequence[LinkSpec] = tuple(specs)
-        raise_file_limit()
         self._open_links: Sequence[OpenLink | DeviceLink] = (
             open_links(self.specs) if devices is None else [devices]
         )

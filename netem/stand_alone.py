@@ -30,8 +30,8 @@ from netem.control.statistics_view import Screen, picture_of
 from netem.emulator_options import command_line_parser, explain, parsed, specs_of
 from netem.fates import FateRecorder, read_fates
 from netem.relay import Relay
-from netem.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, say
-from netem.shell_devices import DeviceLink
+from netem.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, raise_file_limit, say
+from netem.shell.devices import DeviceLink
 from noack.core.errors import CallerError, ExitStatus, NoackError, why
 from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings
@@ -155,6 +155,7 @@ def relay(
                 taps.append(stack.enter_context(FateRecorder(options.record_fates, specs)))
             spin_ns = _SPIN_NS if options.realtime else 0
             devices = None if program is None else program.devices
+            raise_file_limit()
             opened = Relay(specs, options.segment, taps, spin_ns, devices)
             stack.callback(opened.close)
             # Signals stay handled until all files are complete.

@@ -17,7 +17,7 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 400
+MOST_MODULES = 410
 LINES = {
     "noack/scenario": 3850,
     "noack/controllers": 245,
@@ -33,7 +33,7 @@ LINES = {
     "noack/theory": 8410,
     "noack/traces": 1335,
     "noack/trigger": 1060,
-    "netem": 6460,
+    "netem": 6465,
     "cosim/analysis": 7845,
     "cosim/api": 1665,
     "cosim/cli": 3060,

@@ -361,6 +361,7 @@ WALL_CLOCK = {
     "cosim/record/run_directory.py": "the run's name and its environment",
     "cosim/live/coordinator.py": "when a change was requested",
     "cosim/live/remote_access.py": "the validity of an invitation",
+    "noack/protocol/ros2_node.py": "the time stamps of messages of ROS 2",
     "netem/relay.py": "the times of a capture",
     "netem/control/emulator_statistics.py": "lines of statistics",
     "native/relay/loop.c": "time stamps of the kernel, compared with the monotonic clock",

@@ -22,9 +22,10 @@ from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address
 from pathlib import Path
 from typing import NoReturn
 
-from netem import shell_process
 from netem.relay_links import Address, LinkSpec, SocketName
+from netem.shell import process
 from noack.core.errors import CallerError
+from noack.core.process_limits import python_command
 
 MTU_BYTES = 1500
 _RANGE = IPv4Network("198.18.0.0/16")
@@ -110,11 +111,11 @@ class DeviceLink:
     def inside(self) -> Iterator[None]:
         """Let this thread be inside within the context: what it starts then stays there."""
         here = _open_namespace()
-        shell_process.call("setns", self.namespace, shell_process.NEW_NETWORK)
+        process.call("setns", self.namespace, process.NEW_NETWORK)
         try:
             yield
         finally:
-            shell_process.call("setns", here, shell_process.NEW_NETWORK)
+            process.call("setns", here, process.NEW_NETWORK)
             os.close(here)
 
     def close(self) -> None:
@@ -136,7 +137,7 @@ def open_devices(spec: LinkSpec) -> DeviceLink:
         around = _range_here()
         number, outer = _first_free(around)
         here = _open_namespace()
-        shell_process.call("unshare", shell_process.NEW_NETWORK)
+        process.call("unshare", process.NEW_NETWORK)
     except PermissionError:
         _enter_outside()
     os.environ.pop(_ENTERED, None)
@@ -149,7 +150,7 @@ def open_devices(spec: LinkSpec) -> DeviceLink:
         with suppress(OSError):  # without it, shells in this one reach only this one
             Path("/proc/sys/net", setting).write_text("1")
     namespace, inner_counts = _open_namespace(), _open_counts()
-    shell_process.call("setns", here, shell_process.NEW_NETWORK)
+    process.call("setns", here, process.NEW_NETWORK)
     os.close(here)
     _configure(name := f"noack{number}", outside, own.prefixlen)
     return DeviceLink(
@@ -245,8 +246,8 @@ def _enter_outside() -> NoReturn:
     """Start the program again in a user namespace and an outside of its own."""
     if _ENTERED not in os.environ:
         os.environ[_ENTERED] = "1"
-        process = [sys.executable, "-IS", shell_process.__file__, "outside"]
-        os.execv(sys.executable, [*process, sys.executable, *sys.orig_argv[1:]])
+        outside = python_command("-IS", process.__file__, "outside")
+        os.execv(outside[0], [*outside, outside[0], *sys.orig_argv[1:]])
     remedy = "run it as root, or in a container with `--cap-add NET_ADMIN --cap-add SYS_ADMIN`"
     for name, (forbids, permits) in _RESTRICTIONS.items():
         with suppress(OSError):

@@ -9,16 +9,16 @@ import shlex
 import shutil
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from netem import shell_process
 from netem.emulator_options import parsed, shell_parser, shell_spec
 from netem.relay_links import say
-from netem.shell_devices import DeviceLink, open_devices
+from netem.shell import process
+from netem.shell.devices import DeviceLink, open_devices
 from netem.stand_alone import add_recording_options, check_options, relay, report_totals
 from noack.core.errors import CallerError, ExitStatus
+from noack.core.process_limits import python_command
 from noack.runtime.command_line import Signals, log_format
 
 _ENDS_S = 10.0
@@ -85,8 +85,8 @@ class _Program:
         addresses = {"NOACK_OUTSIDE": spec.to[0]}
         if self.devices.outside6 is not None:
             addresses["NOACK_OUTSIDE6"] = self.devices.outside6
-        kept = shell_process.children()
-        shell_process.adopt_orphans()
+        kept = process.children()
+        process.adopt_orphans()
         processes = [_start(command) for command in self._outside]
         with self.devices.inside():
             main = _start(self._command, addresses)
@@ -99,7 +99,7 @@ class _Program:
                 one.terminate()
             for one in (main, *processes):
                 one.wait(_ENDS_S)
-            shell_process.end_children(kept)  # of a guard that was killed
+            process.end_children(kept)  # of a guard that was killed
             self.status = main.returncode if main.returncode >= 0 else 128 - main.returncode
             if signals.received is not None:
                 self.status = signals.status
@@ -108,5 +108,5 @@ class _Program:
 def _start(
     command: Sequence[str], variables: dict[str, str] | None = None
 ) -> subprocess.Popen[bytes]:
-    guard = [sys.executable, "-IS", shell_process.__file__, "inside", str(os.getpid())]
+    guard = python_command("-IS", process.__file__, "inside", os.getpid())
     return subprocess.Popen([*guard, *command], env=os.environ | (variables or {}))
