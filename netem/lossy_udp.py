@@ -8,6 +8,7 @@ as many as a test needs.
 import asyncio
 from collections.abc import Sequence
 from concurrent.futures import Future
+from pathlib import Path
 from threading import Event, Thread
 from typing import Self
 
@@ -21,7 +22,9 @@ from netem.control.emulator_statistics import (
 from netem.relay import Relay
 from netem.relay_links import DIRECTIONS, Address, Direction, LinkSpec
 from netem.tc_words import settings_of
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, why
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import read_files
 from noack.runtime.address import parse_address, parse_destination, text_of
 
 
@@ -62,20 +65,23 @@ class LossyUdp:
         listen: str | Sequence[str | int] = "127.0.0.1:0",
         name: str = "relay",
     ) -> None:
-        if not 0 <= seed < 2**64:
-            raise CallerError(f"seed {seed}: must be 0 or more, below 2^64")
+        if not isinstance(seed, int) or not 0 <= seed < 2**64:
+            raise CallerError(f"seed {seed}: must be a whole number, 0 or more, below 2^64")
         listen_at = parse_address(_text(listen, "listen"), "listen")
         server = parse_destination(_text(to, "to"), "to", listen_at)
-        self._spec = LinkSpec(
-            name, listen_at, server, settings_of(words), settings_of(reverse), seed
-        )
+        forward, backward = _settings(words, "words"), _settings(reverse, "reverse")
+        self._spec = LinkSpec(name, listen_at, server, forward, backward, seed)
         self._opened: Future[tuple[CommandQueue, Address]] = Future()
         self._ended: Snapshot | None = None
         self._stop = Event()
         self._thread = Thread(target=self._run, name=f"noack {name}", daemon=True)
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        """Start; a link of the fixture ``lossy_udp`` runs already."""
+        if self._stop.is_set():
+            raise CallerError(f"{self._spec.name}: it has ended; make a new one")
+        if self._thread.ident is None:
+            self._thread.start()
         self._opened.result()
         return self
 
@@ -92,7 +98,7 @@ class LossyUdp:
     @property
     def address(self) -> Address:
         """Host and port to which clients send."""
-        return self._opened.result(timeout=0)[1]
+        return self._running()[1]
 
     @property
     def seed(self) -> int:
@@ -127,8 +133,8 @@ class LossyUdp:
         """
         if unknown := [one for one in directions if one not in DIRECTIONS]:
             raise CallerError(f"directions: {unknown[0]!r}; the directions are forward and reverse")
-        commands, _ = self._opened.result(timeout=0)
-        commands.change(self._spec.name, directions, settings_of(words))
+        commands, _ = self._running()
+        commands.change(self._spec.name, directions, _settings(words, "words"))
 
     def __str__(self) -> str:
         """Where the link leads, its settings, and what was lost."""
@@ -143,14 +149,22 @@ class LossyUdp:
         return "\n".join(lines)
 
     def _statistics(self) -> LinkStatistics:
-        commands, _ = self._opened.result(timeout=0)
+        commands, _ = self._running()
         snapshot = commands.snapshot() if self._ended is None else self._ended
         return statistics(snapshot)["links"][0]
+
+    def _running(self) -> tuple[CommandQueue, Address]:
+        if self._thread.ident is None:
+            raise CallerError(f"{self._spec.name}: not entered; with noack.LossyUdp(...) as link:")
+        return self._opened.result()
 
     def _run(self) -> None:
         """Relay until the context ends; all of the relay is used in this thread."""
         try:
             relay = Relay([self._spec])
+        except OSError as error:  # e.g. too many open files
+            self._opened.set_exception(CallerError(f"{self._spec.name}: {why(error)}"))
+            return
         except BaseException as error:  # raised where the context is entered
             self._opened.set_exception(error)
             return
@@ -171,3 +185,9 @@ def _text(address: str | Sequence[str | int], what: str) -> str:
         case [str(host), int(port), *_]:
             return text_of((host, port))
     raise CallerError(f"{what}: {address!r}; give host and port, or 'host:port'")
+
+
+def _settings(words: str, what: str) -> LinkSettings:
+    if not isinstance(words, str):
+        raise CallerError(f"{what}: {words!r}; give words such as 'loss 30% mansd 4'")
+    return read_files(settings_of(words), Path())

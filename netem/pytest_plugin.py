@@ -7,7 +7,8 @@ the fixture.
 from __future__ import annotations
 
 import os
-import random
+import secrets
+import shlex
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 SEED = "NOACK_SEED"
 _OPTION = "--noack-seed"
 _LINKS = pytest.StashKey[list["LossyUdp"]]()
-_RANDOM = pytest.StashKey[int]()
+_COMMON = pytest.StashKey[int]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -28,6 +29,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     text = f"seed of the fixture lossy_udp; by default ${SEED}, or a random one"
     parser.getgroup("noack").addoption(_OPTION, metavar="SEED", help=text)
     parser.addini("noack_seed", text)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Choose the seed of all tests of this process: a given one, or a random one."""
+    given = {
+        _OPTION: config.getoption(_OPTION),
+        SEED: os.environ.get(SEED),
+        "noack_seed": config.getini("noack_seed"),
+    }
+    for name, text in given.items():
+        if text and not (text.isdecimal() and int(text) < 2**64):
+            raise pytest.UsageError(f"{name} {text}: must be 0 or more, below 2^64")
+    seeds = [int(text) for text in given.values() if text]
+    config.stash[_COMMON] = seeds[0] if seeds else secrets.randbits(32)
 
 
 @pytest.fixture
@@ -39,7 +54,7 @@ def lossy_udp(request: pytest.FixtureRequest) -> Iterator[Callable[..., LossyUdp
     """
     from netem.lossy_udp import LossyUdp
 
-    common = _seed(request.config)
+    common = request.config.stash[_COMMON]
     links: list[LossyUdp] = request.node.stash.setdefault(_LINKS, [])
     with ExitStack() as stack:
 
@@ -66,7 +81,10 @@ def pytest_runtest_makereport(
     """Say which network a failed test had, and how to have it again."""
     report = yield
     if report.failed and (links := item.stash.get(_LINKS, [])):
-        again = f"the same losses again: pytest {_OPTION} {links[0].seed} {item.nodeid!r}"
+        again = (
+            "the same losses again: pytest "
+            f"{_OPTION} {item.config.stash[_COMMON]} {shlex.quote(item.nodeid)}"
+        )
         text = "\n".join([*map(str, links), again])
         add = getattr(report.longrepr, "addsection", None)  # shown whatever --show-capture is
         if add is not None:
@@ -74,13 +92,3 @@ def pytest_runtest_makereport(
         else:
             report.sections.append(("lossy_udp", text))
     return report
-
-
-def _seed(config: pytest.Config) -> int:
-    """Return the given seed; without one, a random seed for all tests of this process."""
-    for text in (config.getoption(_OPTION), os.environ.get(SEED), config.getini("noack_seed")):
-        if text:
-            if not str(text).isdecimal() or int(text) >= 2**64:
-                raise pytest.UsageError(f"{_OPTION} {text}: must be 0 or more, below 2^64")
-            return int(text)
-    return config.stash.setdefault(_RANDOM, random.SystemRandom().getrandbits(32))

@@ -5,6 +5,7 @@ the rules, random streams and guarantee of the emulator, in virtual time.
 """
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from copy import deepcopy
 from os import PathLike
 from typing import Generic, SupportsFloat, TypeVar
@@ -108,14 +109,19 @@ class LossyChannel(
         )
         super().__init__(env)
         scenario = alone(_loaded(network))
-        own_s = own_step_s(env.unwrapped) if step_s is None else step_s
-        if own_s is None or not round(own_s * NS_PER_S) > 0:
-            raise CallerError(f"LossyChannel: {env} has no time of a step; give step_s, in seconds")
-        self._network, self._step_ns = scenario.network, round(own_s * NS_PER_S)
+        self._network, self._step_ns = scenario.network, _step_ns(env, step_s)
+        if seed is not None and (not isinstance(seed, int) or seed < 0):
+            raise CallerError(f"LossyChannel: seed = {seed!r}: must be a whole number, 0 or more")
         self._seed = scenario.seeds.loss if seed is None else seed
-        self._first_action = _first(env.action_space) if first_action is None else first_action
         self._episode, self._step, self._now_ns = -1, 0, 0
-        self._sizes = [_size_bytes(space) for space in (env.observation_space, env.action_space)]
+        self._sizes = [_size_bytes(env.observation_space), 0]
+        self._first_action: UserCode = first_action
+        if len(self._network.flows) > 1:
+            self._sizes[1] = _size_bytes(env.action_space)
+            if first_action is None:
+                self._first_action = _first(env.action_space)
+            elif not env.action_space.contains(first_action):
+                raise CallerError(f"LossyChannel: first_action is not in {env.action_space}")
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, UserCode] | None = None
@@ -145,6 +151,8 @@ class LossyChannel(
         self, action: ActType
     ) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, UserCode]]:
         """Make a step with the newest action that has arrived; return the newest observation."""
+        if self._episode < 0:
+            raise gymnasium.error.ResetNeeded("LossyChannel: call reset before step")
         network, applied = dict[str, object](), action
         if len(self._receivers) > 1:
             self._send(1, self._actions, action)
@@ -189,6 +197,16 @@ def _loaded(network: Source | ReadTable) -> Scenario:
             f"network: {network!r}; give a table as {{'mansd': 3, 'loss': ...}}, or a scenario"
         )
     return load(network)
+
+
+def _step_ns(env: gymnasium.Env[ObsType, ActType], step_s: float | None) -> int:
+    own_s = own_step_s(env.unwrapped) if step_s is None else step_s
+    if own_s is None:
+        raise CallerError(f"LossyChannel: {env} has no time of a step; give step_s, in seconds")
+    with suppress(TypeError, ValueError):
+        if 1 <= float(own_s) * NS_PER_S < 2**62:
+            return round(float(own_s) * NS_PER_S)
+    raise CallerError(f"LossyChannel: step_s = {own_s!r}: must be a time in seconds, above 0")
 
 
 def _size_bytes(space: gymnasium.Space[Value]) -> int:

@@ -18,14 +18,14 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import entry_names
 from noack.protocol.ros2_messages import Entries
-from noack.settings.ros2_peer import Ros2Peer, Ros2Settings
+from noack.settings.ros2_peer import Ros2Peer, Ros2Settings, Topic
 
 
 class Ros2ControllerSettings(Ros2Settings, ControllerSettings):
     """A node of ROS 2, which is asked at each tick; a replay takes its inputs from the record."""
 
     kind: Literal["ros2"]
-    topic: str = "/noack/controller"
+    topic: Topic = "/noack/controller"
     """Namespace of the topics: the node receives TOPIC/state and sends TOPIC/input."""
 
     def law(self, model: ControlModel) -> "Ros2Law":

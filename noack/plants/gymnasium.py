@@ -4,6 +4,7 @@ The environment is used without its wrappers. Rewards and the ends of episodes h
 MuJoCo's environments are among them: their state is qpos, then qvel.
 """
 
+import math
 from importlib import import_module
 from importlib.util import find_spec
 from operator import attrgetter
@@ -169,6 +170,8 @@ class Environment:
         step_s = self._settings.step_s or own_step_s(self._own)
         if step_s is None:
             self.wrong("it has no time of a step; give plant.system.step_s")
+        if not 0 < step_s < math.inf:
+            self.wrong(f"its step is {step_s:g} s; it must be more than 0")
         return step_s
 
     def require_step(self, step_ns: int) -> None:

@@ -14,7 +14,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import PlantSettings, PlantStart, SystemFailedError
 from noack.protocol.record_tables import entry_names
 from noack.protocol.ros2_messages import Entries
-from noack.settings.ros2_peer import Ros2Peer, Ros2Settings
+from noack.settings.ros2_peer import Ros2Peer, Ros2Settings, Topic
 
 _PLACE = "plant.system"
 _START_TOLERANCE = 1e-6
@@ -26,7 +26,7 @@ class Ros2PlantSettings(Ros2Settings, PlantSettings):
     needs: ClassVar = ("rosbags", "ros")
 
     kind: Literal["ros2"]
-    topic: str = "/noack/plant"
+    topic: Topic = "/noack/plant"
     """Namespace of the topics: the node receives TOPIC/input and sends TOPIC/state."""
 
     def linearisation(self) -> tuple[Matrix, Matrix] | None:

@@ -8,6 +8,7 @@ rmw_zenoh from the distribution jazzy on; before, there were no hashes of types.
 
 import hashlib
 import json
+import re
 import struct
 import time
 from typing import Self
@@ -38,8 +39,13 @@ def _type_name() -> str:
     return f"{package}::msg::dds_::{name}_"
 
 
+_ENDPOINT = re.compile(r"[a-z]+/.+:\d+")
+
+
 def _session(endpoint: str, *, listen: bool) -> zenoh.Session:
     """Open a session with a router, or as the router to which nodes connect."""
+    if not _ENDPOINT.fullmatch(endpoint):
+        raise CallerError(f"router {endpoint}: give it as tcp/127.0.0.1:7447")
     config, side, other = (
         zenoh.Config(),
         *(("listen", "connect") if listen else ("connect", "listen")),

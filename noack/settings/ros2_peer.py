@@ -1,9 +1,10 @@
 """A plant or controller that is a node of ROS 2: its settings, and how it is asked."""
 
+import re
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
@@ -15,6 +16,15 @@ if TYPE_CHECKING:
     from noack.protocol.ros2_node import Exchange
 
 _AGAIN_S = 0.2
+
+
+def _require_topic(text: str) -> str:
+    if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", text):
+        raise ValueError("must be a name of ROS 2 such as /noack/plant")
+    return text
+
+
+Topic = Annotated[str, AfterValidator(_require_topic)]
 
 
 class Ros2Settings(ScenarioSection):

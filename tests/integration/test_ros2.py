@@ -99,7 +99,7 @@ def test_who_does_not_answer_is_named(port: int, tmp_path: Path) -> None:
         noack.simulate(noack.load(LOOP | {"controller": nowhere}), runs=tmp_path)
     done = invoke("bridge", "lane_following", "--router", "nonsense")
     assert done.exit_code == 2
-    assert "cannot reach a router of ROS 2 at nonsense" in done.output
+    assert "router nonsense: give it as tcp/127.0.0.1:7447" in done.output
 
 
 def test_an_independent_client_receives_a_live_run(port: int, tmp_path: Path) -> None:

@@ -87,6 +87,9 @@ def test_a_change_does_not_reset_the_guarantee(ends: Ends) -> None:
 @pytest.mark.parametrize(("arguments", "told"), [
     (("127.0.0.1:9", "los 3%"), "los"),
     (("127.0.0.1:9", "loss 3% seed 4"), "seed 4"),
+    (("127.0.0.1:9", 5), "words: 5; give words such as"),
+    (("127.0.0.1:9", "loss trace none.txt"), "none.txt"),
+    (("127.0.0.1:9", "loss 90% keep mansd 1"), "90"),
     (("127.0.0.1:0",), "to: expected a port from 1 to 65535"),
     (((1, 2),), "to: (1, 2); give host and port, or 'host:port'"),
 ])  # fmt: skip
@@ -108,6 +111,16 @@ def test_an_address_in_use_is_told_on_entering(ends: Ends) -> None:
         link.change("loss 1%", directions=["to and fro"])  # type: ignore[list-item]
     with pytest.raises(NoackError, match="has ended"):
         link.change("loss 1%")
+    with pytest.raises(NoackError, match="has ended"), link:
+        pass
+    with pytest.raises(NoackError, match="not entered"):
+        _ = noack.LossyUdp("127.0.0.1:9").address
+
+
+def test_words_may_name_files(ends: Ends, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "trace.txt").write_text("0 1 1\n")
+    monkeypatch.chdir(tmp_path)
+    assert arrived(ends, "loss trace trace.txt", 0, 6) == [True, False, False] * 2
 
 
 def run_pytest(
@@ -154,7 +167,11 @@ def test_a_failure_names_the_seed_that_repeats_it(tmp_path: Path) -> None:
     assert failure(run_pytest(tmp_path, "-vv", NOACK_SEED=first[1])) == first
     assert failure(run_pytest(tmp_path, "-vv", "-o", f"noack_seed={first[1]}")) == first
     assert failure(run_pytest(tmp_path, "-vv"))[1] != first[1]
-    assert "must be 0 or more" in run_pytest(tmp_path, "--noack-seed", "-3").stdout
+    assert (
+        run_pytest(tmp_path, NOACK_SEED="x")
+        .stderr.strip()
+        .endswith("NOACK_SEED x: must be 0 or more, below 2^64")
+    )
 
 
 def test_the_test_of_the_documentation_passes(tmp_path: Path) -> None:

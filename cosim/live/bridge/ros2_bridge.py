@@ -154,7 +154,8 @@ def bridge_process(router: str, domain: int, *, listen: bool) -> Iterator[Watche
             sent, errors = "", "it did not end\n"
         finally:
             process.kill()
-        print_to_stderr(f"noack: bridge: {errors.strip() or f'{sent.strip()} messages'}")
+        errors = errors.strip() or ("" if sent.strip() else "it ended before the run")
+        print_to_stderr(f"noack: bridge: {errors or f'{sent.strip()} messages'}")
 
 
 def main() -> ExitStatus:

@@ -156,7 +156,10 @@ class NoStep(Clock):
     (Clock, {**HALF, "protocol": "ack"}, {}, 'set protocol = "none"'),
     (Clock, 0.5, {}, "give a table as"),
     (NoStep, HALF, {}, "has no time of a step; give step_s, in seconds"),
-    (Clock, HALF, {"step_s": 0.0}, "has no time of a step"),
+    (Clock, HALF, {"step_s": 0.0}, "step_s = 0.0: must be a time in seconds, above 0"),
+    (Clock, HALF, {"step_s": "x"}, "step_s = 'x': must be a time in seconds"),
+    (Clock, HALF, {"step_s": float("nan")}, "step_s = nan: must be a time in seconds"),
+    (Clock, HALF, {"seed": 1.5}, "seed = 1.5: must be a whole number"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(env: Any, network: Any, given: Any, why: str) -> None:
     with pytest.raises(CallerError, match=why) as caught:
