@@ -25,11 +25,10 @@ enum {
 };
 
 /* The bytes of a packet before what a UDP payload would be; 0 for datagrams of sockets. */
-int64_t headers_bytes(const noack_relay *relay) {
-    return relay->devices ? NOACK_HEADERS_BYTES : 0;
-}
+int64_t headers_bytes(const noack_relay *relay) { return relay->devices ? NOACK_HEADERS_BYTES : 0; }
 
-/* Skip the extension headers of IPv6 from next_header on; return where the transport's header is. */
+/* Skip the extension headers of IPv6 from next_header on; return where the transport's header is.
+ */
 static int64_t skip_extensions(const uint8_t *packet, int64_t size_bytes, uint8_t *name) {
     int64_t at = IPV6_BYTES;
     uint8_t next = packet[6];
@@ -100,7 +99,8 @@ static void read_flow(const uint8_t *packet, int64_t size_bytes, int reverse, ui
         read_ports(packet + at, size_bytes - at, reverse, name);
 }
 
-/* Whether a packet is for several receivers. The kernel sends some by itself, which would be flows. */
+/* Whether a packet is for several receivers. The kernel sends some by itself, which would be flows.
+ */
 static int is_multicast(const uint8_t *packet, int64_t size_bytes) {
     if (size_bytes >= IPV4_BYTES && packet[0] >> 4 == 4)
         return packet[16] >> 4 == 0xE;
@@ -133,9 +133,8 @@ int write_packets(int fd, const struct mmsghdr *headers, int count) {
     for (int k = 0; k < count; k++) {
         const struct msghdr *message = &headers[k].msg_hdr;
         const struct iovec *first = message->msg_iov;
-        ssize_t written = message->msg_iovlen == 1
-                              ? write(fd, first->iov_base, first->iov_len)
-                              : writev(fd, first, (int)message->msg_iovlen);
+        ssize_t written = message->msg_iovlen == 1 ? write(fd, first->iov_base, first->iov_len)
+                                                   : writev(fd, first, (int)message->msg_iovlen);
         if (written < 0)
             return k > 0 ? k : -1;
     }

@@ -234,8 +234,8 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
     noack_decision decision;
     client->last_ns = relay->now_ns;
     noack_link_decide(
-        relay->directions[number].link, client->place,
-        max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns, &decision);
+        relay->directions[number].link, client->place, max_of(size_bytes - headers_bytes(relay), 0),
+        relay->now_ns, &decision);
     if (relay->taps)
         report_arrival(relay, number, row, data, size_bytes, &decision);
     if (relay->records)
