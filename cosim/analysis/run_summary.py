@@ -41,7 +41,6 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_prediction import expected_loss
-from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.plant_settings import PlantSystem
 from noack.plants.systems.linearisation import STEP_NS, linearise
 from noack.protocol.machine_interface import FAILED, RESTART
@@ -319,7 +318,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
             if (exact := plant.system.linearisation()) is not None:
                 A, B = exact
             else:
-                is_fixed = isinstance(plant.system, GymnasiumSettings)
+                is_fixed = plant.system.has_own_step
                 step_ns = resolved.timing.plant_period_ns if is_fixed else STEP_NS
                 found = linearise(
                     system_at, n, m, settling_s=plant.system.settling_s, step_ns=step_ns

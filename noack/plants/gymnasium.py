@@ -38,6 +38,7 @@ class GymnasiumSettings(FileSettings, PlantSettings):
     """
 
     needs: ClassVar = ("gymnasium", "gymnasium")
+    has_own_step: ClassVar = True
 
     kind: Literal["gymnasium"]
     id: str

@@ -94,6 +94,8 @@ class PlantSettings(ScenarioSection):
     """Names of the entries of u, with units; empty if the model names them."""
     needs: ClassVar[tuple[str, str] | None] = None
     """The module that this kind needs, and the extra of noack that installs it."""
+    has_own_step: ClassVar[bool] = False
+    """Whether the system makes steps of one length only, which the plant's rate must be."""
     scenario: ClassVar[str | None] = None
     """A shipped scenario with this kind, for tests and benchmarks."""
     variants: ClassVar[tuple[Table, ...]] = ({},)

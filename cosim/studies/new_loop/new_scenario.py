@@ -195,7 +195,7 @@ def _trials(found: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
         wanted = _STEPS_PER_TIME_CONSTANT * fastest
         base = next((rate for rate in _RATES_HZ if rate >= wanted), _RATES_HZ[-1])
         base = one.model.plant.rates.get("rate_hz", base)
-        is_fixed = isinstance(one.model.plant.system, GymnasiumSettings)
+        is_fixed = one.model.plant.system.has_own_step
         for rate in (base,) if is_fixed else (base, 2 * base):
             for mansd in range(MANSD, 0, -1):
                 for share in (ALPHA_SHARE, ALPHA_SHARE / 2):
