@@ -53,7 +53,7 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.topology import ENDS, LOOP_ROLES
-from noack.protocol.wire_format import Flow
+from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
@@ -132,6 +132,8 @@ def _quantiles(sketch: QuantileSketch) -> dict[str, float | None]:
 
 
 _ARRIVES_AFTER_END_S = 0.1
+_RECEIVERS = {"measurement": "sensor", "actuation": "plant"}
+"""The receivers of legs that are not named by theirs."""
 VIOLATION = "violation"
 """Level of a notice: a process detected that an assumption was violated."""
 
@@ -169,7 +171,7 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
 
     The processes receive for at least 150 ms of wall time beyond the horizon. A datagram that was
     to leave the emulator less than 50 ms before this, or later, is not lost: its receiver may have
-    ended.
+    ended. A datagram that its receiver rejected because an entry is not finite has arrived.
     """
     last_ns = record.scenario.timing.horizon_ns + _ARRIVES_AFTER_END_S * record.scenario.speed * 1e9
     outcomes, events = packet_outcomes(record), record.events()["event"]
@@ -198,7 +200,17 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
             _left_until(answers, last_ns), arrived
         )
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
-    return {leg: one.count(complete=complete) for leg, one in legs.items()}
+    return {
+        leg: max(one.count(complete=complete) - _not_finite(record, leg), 0)
+        for leg, one in legs.items()
+    }
+
+
+def _not_finite(record: RunRecord, leg: str) -> int:
+    """The number of datagrams that a leg's receiver rejected because an entry is not finite."""
+    receiver = _RECEIVERS.get(leg, leg.rpartition(" ")[2])
+    channel = record.reports.get(receiver, {}).get("channel") or {}
+    return int((channel.get("rejected") or {}).get(Rejection.NOT_FINITE, 0))
 
 
 def _left_until(outcomes: PacketOutcome, last_ns: float) -> NDArray[np.int64]:

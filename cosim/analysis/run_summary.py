@@ -42,7 +42,7 @@ from noack.core.errors import ExitStatus, NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_prediction import expected_loss
 from noack.plants.plant_settings import PlantSystem
-from noack.plants.systems.linearisation import STEP_NS, linearise
+from noack.plants.systems.linearisation import NO_STATE, STEP_NS, linearise
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -351,7 +351,7 @@ def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
 def linearisation_rows(found: Linearisation) -> tuple[tuple[str, str], ...]:
     """Return a linearisation as text: quantities and their values."""
     if isinstance(found, NoLinearisationPart):
-        return (("the plant, linearised", "none: x is not its whole state, or it is not smooth"),)
+        return (("the plant, linearised", f"none: {NO_STATE}, or it is another program"),)
     slowest = max(real for real, _ in found.eigenvalues)
     worst, where = max(
         (abs(entry), f"{name}[{i}, {j}]")

@@ -263,6 +263,9 @@ def test_a_failed_plant_stops_moving_and_the_run_is_recorded(
     (notice,) = [one for one in record.notices if one["level"] == "failed"]
     assert notice["t_ns"] == 502_000_000
     assert replay(record).bit_exact
+    (loop,) = outcome.summary.loops
+    assert loop.rejected_datagrams["sensor"]["not_finite"] > 0
+    assert loop.unintended_losses == 0  # what is rejected has arrived
 
 
 def test_check_describes_the_plant_and_refuses_invalid_settings(tmp_path: Path) -> None:
