@@ -174,8 +174,9 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
         grid.add_row(label, left, right)
         lines += 1 + max(cell.plain.count("\n") for cell in (left, right))
     unintended = _unintended(link)
+    ends = (link[end].removesuffix(":0") for end in ("listen", "to"))  # a shell's have no port
     title = Text.assemble(
-        (link["name"], "bold"), f"  {link['listen']} → {link['to']}  ", (_clients_text(link), "dim")
+        (link["name"], "bold"), f"  {' → '.join(ends)}  ", (_clients_text(link), "dim")
     )
     panel = Panel(
         Group(grid, *unintended),

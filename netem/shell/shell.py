@@ -91,7 +91,8 @@ class _Program:
         with self.devices.inside():
             main = _start(self._command, addresses)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        say(f"inside {spec.listen[0]}, outside {' and '.join(addresses.values())}")
+        ends = f"inside {spec.listen[0]}, outside {' and '.join(addresses.values())}"
+        say(f"{ends}; the emulator is process {os.getpid()}")
         try:
             yield lambda: main.poll() is not None
         finally:
