@@ -50,11 +50,11 @@ def run_machines(process: RunProcess, machines: LoopMachines) -> None:
     )  # fmt: skip
     with process.open_socket() as endpoint:
         addresses = process.join(endpoint.getsockname()[:2])
-        channel = LoopChannel(endpoint, driver, SENDS[process.role], **_ends(process, addresses))
+        channel = LoopChannel(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
         process.run(driver, channel, machines)
 
 
-class _Ends(TypedDict):
+class Ends(TypedDict):
     """The other ends of a process's flows; see :class:`LoopChannel`."""
 
     source: Address
@@ -63,7 +63,8 @@ class _Ends(TypedDict):
     acknowledges_to: Address | None
 
 
-def _ends(process: RunProcess, addresses: Mapping[str, Address]) -> _Ends:
+def ends_of(process: RunProcess, addresses: Mapping[str, Address]) -> Ends:
+    """Return the other ends of a process's flows, by what the coordinator has sent."""
     role, network, answer = process.role, process.scenario.network.flows, Flow.ACKNOWLEDGEMENT
     answers = answer in network
     return {
