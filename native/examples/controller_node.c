@@ -30,11 +30,10 @@ static noack_node_settings settings;
 static noack_node_counts counts;
 static noack_controller controller;
 static noack_transitions transitions;
-static noack_model *const model = &controller.model;
 static noack_machine *const machine = &controller.machine;
 static noack_wire wire;
 static noack_output output;
-static int receiver, senders[2]; /* connected to the peers; senders: by whether it acknowledges */
+static int sockets[3]; /* connected: it receives updates; sends actuations; acknowledgements */
 static struct sockaddr_storage peer;
 
 static double numbers[STATES * STATES * (PLACES + 12) + STATES * (INPUTS + 16) + 8 * INPUTS];
@@ -59,17 +58,21 @@ static void flush(int flags) {
     ssize_t sent = send(STDOUT_FILENO, pending, pending_bytes, MSG_NOSIGNAL | flags);
     if (sent < 0 && errno != EAGAIN && errno != EINTR)
         exit(0); /* nobody reads it any more */
-    pending_bytes -= (size_t)(sent > 0 ? sent : 0);
-    memmove(pending, pending + (sent > 0 ? sent : 0), pending_bytes);
+    sent = sent > 0 ? sent : 0;
+    pending_bytes -= (size_t)sent;
+    memmove(pending, pending + sent, pending_bytes);
+}
+
+static void put(const void *content, int64_t bytes) {
+    while (pending_bytes + (size_t)bytes > PENDING_BYTES)
+        flush(0);
+    memcpy(pending + pending_bytes, content, (size_t)bytes);
+    pending_bytes += (size_t)bytes;
 }
 
 static void put_frame(int64_t kind, const void *content, int64_t bytes) {
-    int64_t head[2] = {kind, bytes};
-    while (pending_bytes + sizeof head + (size_t)bytes > PENDING_BYTES)
-        flush(0);
-    memcpy(pending + pending_bytes, head, sizeof head);
-    memcpy(pending + pending_bytes + sizeof head, content, (size_t)bytes);
-    pending_bytes += sizeof head + (size_t)bytes;
+    put((int64_t[2]){kind, bytes}, 16);
+    put(content, bytes);
 }
 
 static void put_counts(void) {
@@ -90,8 +93,8 @@ static void take(void *content, int64_t bytes) {
         }
         if (taken < 0 && errno != EINTR)
             fail(strerror(errno));
-        place += taken > 0 ? taken : 0;
-        bytes -= taken > 0 ? taken : 0;
+        place += taken < 0 ? 0 : taken;
+        bytes -= taken < 0 ? 0 : taken;
     }
 }
 
@@ -109,66 +112,56 @@ static double *taken(int64_t count) {
     return place;
 }
 
-/* The first byte of the stream comes with the sockets. */
-static void take_sockets(int64_t head[2]) {
-    union {
-        struct cmsghdr head;
-        uint8_t bytes[CMSG_SPACE(3 * sizeof(int))];
-    } control;
+/* They come with the first byte of the stream. */
+static void take_sockets(void) {
+    _Alignas(struct cmsghdr) uint8_t control[CMSG_SPACE(sizeof sockets)];
+    uint8_t head[16];
     struct iovec vector = {head, 1};
-    struct msghdr message = {
-        .msg_iov = &vector,
-        .msg_iovlen = 1,
-        .msg_control = &control,
-        .msg_controllen = sizeof control};
-    int sockets[3];
+    struct msghdr message = {.msg_iov = &vector, .msg_iovlen = 1};
+    message.msg_control = control;
+    message.msg_controllen = sizeof control;
     socklen_t peer_bytes = sizeof peer;
     ssize_t received = recvmsg(STDIN_FILENO, &message, 0);
     if (received == 0)
-        exit(0); /* noack asked for the version only, or the run never began */
+        exit(0); /* the run never began */
     struct cmsghdr *first = received > 0 ? CMSG_FIRSTHDR(&message) : NULL;
     if (first == NULL || first->cmsg_len != CMSG_LEN(sizeof sockets))
         fail("it is started by noack, see docs/node.md");
     memcpy(sockets, CMSG_DATA(first), sizeof sockets);
-    receiver = sockets[0];
-    senders[0] = sockets[1];
-    senders[1] = sockets[2];
-    getpeername(receiver, (struct sockaddr *)&peer, &peer_bytes);
-    take((uint8_t *)head + 1, 2 * sizeof *head - 1);
+    getpeername(sockets[0], (struct sockaddr *)&peer, &peer_bytes);
+    take(head + 1, sizeof head - 1);
 }
 
 static void take_settings(void) {
-    int64_t head[2];
-    take_sockets(head);
+    take_sockets();
     take(&settings, sizeof settings);
     int64_t n = settings.machine.n, m = settings.machine.m;
     if (n > STATES || m > INPUTS)
         fail("the loop has more states or inputs than its STATES or INPUTS");
     wire.run_id = settings.run_id;
     noack_wire_key(&wire, settings.key);
-    controller = (noack_controller){
-        .machine = settings.machine,
-        .has_point = settings.has_point,
-        .acknowledges = settings.acknowledges,
-        .predictions = settings.predictions,
-        .carries_model = settings.carries_model,
-        .model_ns = settings.model_ns,
-        .knows_state = settings.knows_state,
-        .newest = settings.newest};
-    transitions = (noack_transitions){
-        .n = n,
-        .is_static = settings.is_static,
-        .H = taken(n * n),
-        .places = PLACES,
-        .steps_ns = steps_ns,
-        .matrices = room(PLACES * n * n),
-        .scratch = room(10 * n * n + 3 * n)};
+    controller.machine = settings.machine;
+    controller.has_point = settings.has_point;
+    controller.acknowledges = settings.acknowledges;
+    controller.predictions = settings.predictions;
+    controller.carries_model = settings.carries_model;
+    controller.model_ns = settings.model_ns;
+    controller.knows_state = settings.knows_state;
+    controller.newest = settings.newest;
+    transitions.n = n;
+    transitions.is_static = settings.is_static;
+    transitions.H = taken(n * n);
+    transitions.places = PLACES;
+    transitions.steps_ns = steps_ns;
+    transitions.matrices = room(PLACES * n * n);
+    transitions.scratch = room(10 * n * n + 3 * n);
     controller.K = taken(m * n);
     controller.x_r = taken(n);
     controller.u_r = taken(m);
     controller.safe_input = taken(m);
     controller.x_c = taken(n);
-    *model = (noack_model){&transitions, 0, &no_change, &settings.has_point, controller.x_r};
+    controller.model =
+        (noack_model){&transitions, 0, &no_change, &settings.has_point, controller.x_r};
     controller.x = room(n);
     controller.u = room(m);
     controller.scratch = room(3 * n + m);
@@ -188,17 +181,17 @@ static int64_t due_ns(void) {
 static void conclude(void) {
     static uint8_t datagram[NOACK_DATAGRAM_BYTES];
     put_frame(output.table, output.row, output.words * 8);
+    flush(MSG_DONTWAIT); /* the row is on its way before what it tells of */
     if (!output.sends)
         return;
     output.message.loop = 0;
     int64_t bytes = noack_wire_encode(&wire, &output.message, datagram);
-    int sender = senders[output.message.flow == NOACK_ACKNOWLEDGEMENT];
-    /* An ICMP error of an earlier datagram makes one call fail. */
-    if (send(sender, datagram, (size_t)bytes, MSG_DONTWAIT) == bytes
-        || send(sender, datagram, (size_t)bytes, MSG_DONTWAIT) == bytes) {
-        counts.sent++;
-        return;
-    }
+    int to = sockets[output.message.flow == NOACK_ACKNOWLEDGEMENT ? 2 : 1];
+    for (int k = 0; k < 2; k++) /* an ICMP error of an earlier datagram makes one call fail */
+        if (send(to, datagram, (size_t)bytes, MSG_DONTWAIT) == bytes) {
+            counts.sent++;
+            return;
+        }
     int64_t error = errno;
     put_frame(NOACK_NODE_UNSENT, &error, sizeof error);
 }
@@ -214,22 +207,18 @@ static void handle(const uint8_t *datagram, int64_t bytes, int64_t from_peer) {
     conclude();
 }
 
-static int is_peer(const struct sockaddr_storage *name) {
-    size_t bytes = name->ss_family == AF_INET ? 8 : 24; /* family, port and host */
-    return memcmp(name, &peer, bytes) == 0;
-}
-
 static void receive(void) {
     static uint8_t datagram[NOACK_DATAGRAM_BYTES + 1]; /* a longer one is cut, and rejected */
     for (int k = 0; k < AT_ONCE; k++) {
         struct sockaddr_storage name;
         socklen_t name_bytes = sizeof name;
         ssize_t bytes = recvfrom(
-            receiver, datagram, sizeof datagram, MSG_DONTWAIT, (struct sockaddr *)&name,
+            sockets[0], datagram, sizeof datagram, MSG_DONTWAIT, (struct sockaddr *)&name,
             &name_bytes);
         if (bytes < 0)
             return;
-        int from_peer = is_peer(&name);
+        /* Family, port and host: something may have come before the socket was connected. */
+        int from_peer = memcmp(&name, &peer, name.ss_family == AF_INET ? 8 : 24) == 0;
         *(from_peer ? &counts.received : &counts.foreign) += 1;
         handle(datagram, bytes, from_peer);
     }
@@ -267,7 +256,7 @@ int main(void) {
     printf("noack node %d %zu\n", NOACK_NODE_VERSION, sizeof settings);
     fflush(stdout);
     take_settings();
-    struct pollfd files[2] = {{receiver, POLLIN, 0}, {STDIN_FILENO, POLLIN, 0}};
+    struct pollfd files[2] = {{sockets[0], POLLIN, 0}, {STDIN_FILENO, POLLIN, 0}};
     for (int64_t report_ns = 0;;) {
         receive();
         do_ticks();

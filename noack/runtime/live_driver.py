@@ -175,6 +175,9 @@ class LiveDriver:
         core.noack_driver_add_datagram(self.core, name, data, len(data))
         self.drive(_AT_ONCE_NS, sink)
 
+    def finish(self, sink: RecordSink) -> None:
+        """End the work, after the last datagram."""
+
     @property
     def accepted(self) -> int:
         """Number of accepted datagrams."""
@@ -275,6 +278,11 @@ class LoopChannel(CountingSocket):
     def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
         """Pass a datagram to the driver, which rejects all but those of the peers."""
         self._driver.take(data, source, sink)
+
+    def finish(self, now_ns: int, sink: RecordSink) -> None:
+        """Read the datagrams that still wait, so that the counters are complete."""
+        super().finish(now_ns, sink)
+        self._driver.finish(sink)
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""

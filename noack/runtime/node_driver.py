@@ -24,7 +24,7 @@ from typing import Self
 from noack.controllers.program_controller import ProgramControllerSettings
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.core_library import core, ffi
-from noack.core.errors import CallerError, PeerError, printable, shortened
+from noack.core.errors import CallerError, PeerError, shortened
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.topology import SENDS
 from noack.runtime.address import Address, SocketName
@@ -36,7 +36,7 @@ from noack.settings.user_files import unchanged
 _PR_SET_PDEATHSIG = 1
 _PATIENCE_S = 10.0
 """Longest wait for the program's first line, and for its end."""
-_READ_BYTES = 2**18
+_READ_BYTES = 2**20
 _HEAD = struct.Struct("<qq")
 _GREETING = f"noack node {core.NOACK_NODE_VERSION} {ffi.sizeof('noack_node_settings')}"
 
@@ -52,19 +52,8 @@ def run_program(
     """
     with process.open_socket() as endpoint, NodeDriver(process, machines, settings) as driver:
         addresses = process.join(endpoint.getsockname()[:2])
-        channel = _NodeChannel(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
+        channel = LoopChannel(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
         process.run(driver, channel, machines)
-
-
-class _NodeChannel(LoopChannel):
-    """The sockets, which the program uses."""
-
-    _driver: "NodeDriver"
-
-    def finish(self, now_ns: int, sink: RecordSink) -> None:
-        """Pass on the datagrams that still wait, and end the program."""
-        super().finish(now_ns, sink)
-        self._driver.finish(sink)
 
 
 class NodeDriver(LiveDriver):
@@ -86,6 +75,7 @@ class NodeDriver(LiveDriver):
                for kind in (core.NOACK_TICKS, core.NOACK_MESSAGES)},
         }  # fmt: skip
         self._own, its = socket.socketpair()
+        its.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
         with its:
             self._program = self._started(unchanged(settings, "controller"), settings.runner, its)
 
@@ -100,22 +90,19 @@ class NodeDriver(LiveDriver):
                 preexec_fn=partial(prctl, _PR_SET_PDEATHSIG, signal.SIGKILL),
             )  # fmt: skip
         except OSError as error:
-            remedy = {
-                PermissionError: "make it executable by chmod +x",
-                FileNotFoundError: "is what runner names installed?",
-            }.get(type(error), "for another processor, name what runs it: controller.runner")
-            raise CallerError(f"{self._named}: {error.strerror}: {remedy}") from None
+            raise CallerError(
+                f"{self._named}: cannot be started: {error.strerror}; it must be executable (chmod "
+                "+x), and of this processor, or controller.runner names what runs it"
+            ) from None
 
     def __enter__(self) -> Self:
         """Wait for the program's first line; raise CallerError if it is not that of a node."""
-        try:
-            self._own.settimeout(_PATIENCE_S)
-            line = bytearray()
+        line = b""
+        self._own.settimeout(_PATIENCE_S)
+        with suppress(TimeoutError):
             while not line.endswith(b"\n") and len(line) < 200 and (one := self._own.recv(1)):
                 line += one
-        except TimeoutError:
-            line = bytearray()
-        text = printable(line.decode(errors="replace").strip())
+        text = line.decode(errors="replace").strip()
         if text != _GREETING:
             how = f"says {shortened(text)!r}" if text else self._how_it_ended()
             self.__exit__()
@@ -168,22 +155,22 @@ class NodeDriver(LiveDriver):
             (model.transitions.H, n * n), (controller.K, m * n), (controller.x_r, n),
             (controller.u_r, m), (controller.safe_input, m), (controller.x_c, n),
         )  # fmt: skip
-        return bytes(ffi.buffer(ffi.new("noack_node_settings *", numbers))) + b"".join(
-            bytes(8 * size) if array == ffi.NULL else bytes(ffi.buffer(array, 8 * size))
+        settings = ffi.new("noack_node_settings *", numbers)
+        return bytes(ffi.buffer(settings)) + b"".join(
+            bytes(ffi.buffer(array, 8 * size)) if array else bytes(8 * size)
             for array, size in arrays
         )
 
     def drive(self, until_ns: int, sink: RecordSink) -> None:
         """Take what the program has done until about a time of the run."""
-        while True:
+        goes_on, wait_s = True, 1.0
+        while goes_on and wait_s > 0:
             wait_s = (until_ns - self._clock.now_ns()) / NS_PER_S / self._clock.speed
-            if not self._exchange(max(wait_s, 0.0)):
-                self._pass_rows(sink)
-                raise PeerError(f"{self._named}: {self._how_it_ended()}")
+            goes_on = self._exchange(max(wait_s, 0.0))
             self._take_frames(sink)
-            if wait_s <= 0:
-                break
         self._pass_rows(sink)
+        if not goes_on:
+            raise PeerError(f"{self._named}: {self._how_it_ended()}")
 
     def take(self, data: bytes, source: SocketName, sink: RecordSink) -> None:
         """Pass the program a datagram that Python has received."""
@@ -197,37 +184,39 @@ class NodeDriver(LiveDriver):
 
         Raise PeerError if it does not end, or fails.
         """
-        until_s = time.monotonic() + _PATIENCE_S
-        while self._exchange(max(until_s - time.monotonic(), 0.0)):
-            self._take_frames(sink)
+        until_s, goes_on = time.monotonic() + _PATIENCE_S, True
+        while goes_on and (wait_s := until_s - time.monotonic()) > 0:
             if not self._to_send:
-                with suppress(OSError):
+                with suppress(OSError):  # it has ended
                     self._own.shutdown(socket.SHUT_WR)
-            if time.monotonic() > until_s:
-                raise PeerError(f"{self._named}: has not ended {_PATIENCE_S:g} s after its input")
+            goes_on = self._exchange(wait_s, select.POLLIN)
+            self._take_frames(sink)
         self._pass_rows(sink)
-        if self._program.wait(_PATIENCE_S):
+        if goes_on or self._program.wait(_PATIENCE_S):
             raise PeerError(f"{self._named}: {self._how_it_ended()}")
 
     def _put(self, kind: int, content: bytes) -> None:
         self._to_send += _HEAD.pack(kind, len(content)) + content
 
-    def _exchange(self, wait_s: float) -> bool:
-        """Send and receive for a time, or less; return whether the program still has its output."""
-        writers = [self._own] if self._to_send else []
-        readable, writable, _ = select.select([self._own], writers, [], wait_s)
-        if writable:
-            try:
+    def _exchange(self, wait_s: float, wake: int = 0) -> bool:
+        """Wait, then send and receive; return whether the program may send more.
+
+        Its rows do not end the wait, unless ``wake`` is POLLIN: they would take time of its core.
+        """
+        poll = select.poll()
+        poll.register(self._own, wake | (select.POLLOUT if self._to_send else 0))
+        poll.poll(1000 * wait_s)
+        with suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
+            while self._to_send:
                 del self._to_send[: self._own.send(self._to_send)]
-            except (BrokenPipeError, ConnectionResetError):  # what it has sent is still there
-                self._to_send.clear()
-        data = b"-"
-        if readable:
-            data = b""
-            with suppress(ConnectionResetError):
-                data = self._own.recv(_READ_BYTES)
-            self._received += data
-        return bool(data)
+        try:
+            while data := self._own.recv(_READ_BYTES):
+                self._received += data
+        except BlockingIOError:
+            return True
+        except ConnectionResetError:
+            pass
+        return False
 
     def _take_frames(self, sink: RecordSink) -> None:
         """Put the complete frames where the core's driver puts what they have."""
@@ -275,6 +264,6 @@ class NodeDriver(LiveDriver):
         try:
             code = self._program.wait(_PATIENCE_S)
         except subprocess.TimeoutExpired:
-            return f"says nothing for {_PATIENCE_S:g} s"
+            return f"the program has not answered for {_PATIENCE_S:g} s"
         how = f"exit status {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
         return f"the program has ended: {how}"
