@@ -109,7 +109,7 @@ def build_node(into: Path, example: Path | None = None) -> None:
         subprocess.CalledProcessError: the compiler reports a mistake.
     """
     own = [flag for flag in FLAGS if flag not in ("-fPIC", "-O3")]
-    own += ["-O2", "-ffunction-sections", "-fdata-sections"]
+    own += ["-Os", "-ffunction-sections", "-fdata-sections"]
     files = sorted(file for pattern in MACHINES for file in HERE.glob(pattern))
     if example is None:
         own += ["-ffreestanding", "-nostdlib", "-r"]
