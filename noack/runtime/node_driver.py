@@ -37,6 +37,8 @@ _PR_SET_PDEATHSIG = 1
 _PATIENCE_S = 10.0
 """Longest wait for the program's first line, and for its end."""
 _READ_BYTES = 2**20
+_ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
+_COPIED = "has_point acknowledges predictions carries_model model_ns knows_state newest".split()
 _HEAD = struct.Struct("<qq")
 _GREETING = f"noack node {core.NOACK_NODE_VERSION} {ffi.sizeof('noack_node_settings')}"
 
@@ -69,11 +71,9 @@ class NodeDriver(LiveDriver):
         self._to_send, self._received = bytearray(), bytearray()
         self._foreign = 0
         tables = machines.core.tables
-        self._sizes = {
-            core.NOACK_NODE_COUNTS: ffi.sizeof("noack_node_counts"), core.NOACK_NODE_UNSENT: 8,
-            **{kind: tables[kind].row_bytes - core.NOACK_LOOP_BYTES
-               for kind in (core.NOACK_TICKS, core.NOACK_MESSAGES)},
-        }  # fmt: skip
+        rows = {kind: tables[kind].row_bytes - core.NOACK_LOOP_BYTES for kind in _ROWS}
+        counts = ffi.sizeof("noack_node_counts")
+        self._sizes = rows | {core.NOACK_NODE_COUNTS: counts, core.NOACK_NODE_UNSENT: 8}
         self._own, its = socket.socketpair()
         its.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
         with its:
@@ -85,10 +85,12 @@ class NodeDriver(LiveDriver):
         prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
         try:
             return subprocess.Popen(
-                [*runner, str(path)], stdin=its.fileno(), stdout=its.fileno(),
+                [*runner, str(path)],
+                stdin=its.fileno(),
+                stdout=its.fileno(),
                 # Not only the end of its input: the program may hang, or be stopped.
                 preexec_fn=partial(prctl, _PR_SET_PDEATHSIG, signal.SIGKILL),
-            )  # fmt: skip
+            )
         except OSError as error:
             raise CallerError(
                 f"{self._named}: cannot be started: {error.strerror}; it must be executable (chmod "
@@ -145,16 +147,21 @@ class NodeDriver(LiveDriver):
     def _settings(self) -> bytes:
         controller = self.machines.machines[0]
         n, m, model = controller.machine.n, controller.machine.m, controller.model
-        names = ("has_point", "acknowledges", "predictions", "carries_model", "model_ns",
-                 "knows_state", "newest")  # fmt: skip
-        numbers = {name: getattr(controller, name) for name in names} | {
-            "run_id": self.core.wire.run_id, "key": self._key, "clock": self.core.clock,
-            "machine": controller.machine, "is_static": model.transitions.is_static,
-        }  # fmt: skip
+        numbers = {name: getattr(controller, name) for name in _COPIED} | {
+            "run_id": self.core.wire.run_id,
+            "key": self._key,
+            "clock": self.core.clock,
+            "machine": controller.machine,
+            "is_static": model.transitions.is_static,
+        }
         arrays = (
-            (model.transitions.H, n * n), (controller.K, m * n), (controller.x_r, n),
-            (controller.u_r, m), (controller.safe_input, m), (controller.x_c, n),
-        )  # fmt: skip
+            (model.transitions.H, n * n),
+            (controller.K, m * n),
+            (controller.x_r, n),
+            (controller.u_r, m),
+            (controller.safe_input, m),
+            (controller.x_c, n),
+        )
         settings = ffi.new("noack_node_settings *", numbers)
         return bytes(ffi.buffer(settings)) + b"".join(
             bytes(ffi.buffer(array, 8 * size)) if array else bytes(8 * size)
