@@ -38,7 +38,15 @@ _PATIENCE_S = 10.0
 """Longest wait for the program's first line, and for its end."""
 _READ_BYTES = 2**20
 _ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
-_COPIED = "has_point acknowledges predictions carries_model model_ns knows_state newest".split()
+_COPIED = [
+    "has_point",
+    "acknowledges",
+    "predictions",
+    "carries_model",
+    "model_ns",
+    "knows_state",
+    "newest",
+]
 _HEAD = struct.Struct("<qq")
 _GREETING = f"noack node {core.NOACK_NODE_VERSION} {ffi.sizeof('noack_node_settings')}"
 
