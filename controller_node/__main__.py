@@ -7,8 +7,10 @@ from noack.runtime.command_line import stoppable_imports
 
 with stoppable_imports():
     from controller_node.controller import controllers_of
+    from noack.controllers.program_controller import ProgramControllerSettings
     from noack.core.errors import ExitStatus
     from noack.runtime.live_driver import run_machines
+    from noack.runtime.node_driver import run_program
     from noack.runtime.run_process import join_run
 
 
@@ -16,8 +18,12 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller of each loop in the run that a recorder or launcher has opened."""
     with join_run("controller", arguments) as run:
         controllers = controllers_of(run.loops, run.phases_ns, start=run.start)
-        controllers.connect()
-        run_machines(run, controllers)
+        settings = run.loops[0].controller
+        if isinstance(settings, ProgramControllerSettings):
+            run_program(run, controllers, settings)
+        else:
+            controllers.connect()
+            run_machines(run, controllers)
     return ExitStatus.OK
 
 

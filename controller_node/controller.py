@@ -341,6 +341,7 @@ def _part(start: Start, resolved: Scenario) -> Controller:
     loop = loop_of(resolved)
     known = resolved.network.initial_sync == "known_state" and not start.is_restart
     safe_input, acknowledges = resolved.controller.safe_input, resolved.protocol.acknowledges
+    changes = not (acknowledges or resolved.controller.is_program)
     return Controller(
         loop.H,
         law_of(resolved),
@@ -356,7 +357,7 @@ def _part(start: Start, resolved: Scenario) -> Controller:
         predictive=resolved.message_sizes.is_predictive,
         predictions=resolved.controller.predictions,
         setpoint=setpoint_of(resolved),
-        schedule=None if acknowledges else ChangeSchedule(resolved, setpoint_of),
+        schedule=ChangeSchedule(resolved, setpoint_of) if changes else None,
     )
 
 

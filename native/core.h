@@ -12,7 +12,12 @@
 #include "noack.h"
 #pragma GCC visibility pop
 
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "datagrams and rows are little endian, and so must be the processor"
+#endif
+
 /* Functions of libm whose last bits depend on the library. */
+#undef log2 /* a macro of newlib */
 #pragma GCC poison exp exp2 expm1 log log2 log10 log1p pow cbrt hypot erf erfc
 #pragma GCC poison sin cos tan asin acos atan atan2 sinh cosh tanh
 

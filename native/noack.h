@@ -984,6 +984,36 @@ int64_t noack_capture_blocks(
     const noack_event *events, int64_t count, const uint8_t *data, int64_t *missing,
     int64_t *written, uint8_t *out);
 
+/* ---- A node that is a program of its own (docs/node.md) ------------------------------------------
+
+   noack and the node exchange frames over the node's standard input and output: the kind, the number
+   of bytes that follow, and these. All is little endian, in words of 64 bits. */
+
+enum { NOACK_NODE_VERSION = 1 }; /* of the frames; the node begins with it, in a line of text */
+
+enum noack_node_frame {  /* first, rows of enum noack_table_number, from the node */
+    NOACK_NODE_COUNTS = 8, /* from the node: noack_node_counts, from time to time and at its end */
+    NOACK_NODE_UNSENT,     /* from the node: a datagram could not be sent; errno */
+    NOACK_NODE_SETTINGS,   /* to the node, once and first: noack_node_settings, then arrays */
+    NOACK_NODE_CLOCK,      /* to the node: another noack_clock, from now on */
+    NOACK_NODE_DATAGRAM    /* to the node: 1 if it is from the peer's address, and a datagram */
+};
+
+typedef struct { /* of a controller; then H (n, n), K (m, n), x_r (n,), u_r (m,), safe_input (m,) and
+                    x_c (n,), as in noack_controller */
+    int64_t run_id;
+    uint8_t key[32];
+    noack_clock clock;
+    noack_machine machine;
+    int64_t is_static, has_point, acknowledges, predictions, carries_model;
+    int64_t model_ns, knows_state, newest;
+} noack_node_settings;
+
+typedef struct { /* datagrams so far */
+    int64_t sent, received, foreign; /* foreign: not from the peer's address */
+    int64_t accepted, rejected[10];
+} noack_node_counts;
+
 /* ---- The network of a run, without sockets ----------------------------------------------------- */
 
 typedef struct { /* a datagram in the network */

@@ -122,9 +122,14 @@ def open_append(path: Path) -> int:
 
 
 def copy_whole(source: Path, target: Path) -> None:
-    """Copy a regular file as :func:`new_file` writes; raise OSError or ValueError."""
+    """Copy a regular file as :func:`new_file` writes; raise OSError or ValueError.
+
+    The copy of a program that its owner may run can be run, too.
+    """
     with open_regular(source) as content, new_file(target, make_folder=False) as file:
         shutil.copyfileobj(content, file)
+        mode = os.fstat(file.fileno()).st_mode
+        os.fchmod(file.fileno(), mode | os.fstat(content.fileno()).st_mode & 0o100)
 
 
 def remove_folder(path: Path) -> None:

@@ -50,11 +50,11 @@ def run_machines(process: RunProcess, machines: LoopMachines) -> None:
     )  # fmt: skip
     with process.open_socket() as endpoint:
         addresses = process.join(endpoint.getsockname()[:2])
-        channel = LoopChannel(endpoint, driver, SENDS[process.role], **_ends(process, addresses))
+        channel = LoopChannel(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
         process.run(driver, channel, machines)
 
 
-class _Ends(TypedDict):
+class Ends(TypedDict):
     """The other ends of a process's flows; see :class:`LoopChannel`."""
 
     source: Address
@@ -63,7 +63,8 @@ class _Ends(TypedDict):
     acknowledges_to: Address | None
 
 
-def _ends(process: RunProcess, addresses: Mapping[str, Address]) -> _Ends:
+def ends_of(process: RunProcess, addresses: Mapping[str, Address]) -> Ends:
+    """Return the other ends of a process's flows, by what the coordinator has sent."""
     role, network, answer = process.role, process.scenario.network.flows, Flow.ACKNOWLEDGEMENT
     answers = answer in network
     return {
@@ -174,6 +175,9 @@ class LiveDriver:
         core.noack_driver_add_datagram(self.core, name, data, len(data))
         self.drive(_AT_ONCE_NS, sink)
 
+    def finish(self, sink: RecordSink) -> None:
+        """End the work, after the last datagram."""
+
     @property
     def accepted(self) -> int:
         """Number of accepted datagrams."""
@@ -274,6 +278,11 @@ class LoopChannel(CountingSocket):
     def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
         """Pass a datagram to the driver, which rejects all but those of the peers."""
         self._driver.take(data, source, sink)
+
+    def finish(self, now_ns: int, sink: RecordSink) -> None:
+        """Read the datagrams that still wait, so that the counters are complete."""
+        super().finish(now_ns, sink)
+        self._driver.finish(sink)
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""

@@ -165,9 +165,10 @@ def _with_parts(
 def check_loops(scenario: Scenario) -> None:
     """Raise ValueError unless the loops can run together; the message begins with the key."""
     names: dict[str, int] = {}
+    has_program = False
     for place, section in enumerate(scenario.loops or ()):
         try:
-            loop_scenario(scenario, section)
+            has_program |= loop_scenario(scenario, section).controller.is_program
         except ValueError as error:
             raise ValueError(f"loops.{place}.{error}") from None
         for name in section.names:
@@ -178,6 +179,11 @@ def check_loops(scenario: Scenario) -> None:
             names[name] = place
         if len(names) > MOST_LOOPS:
             raise ValueError(f"loops.{place}.count: a run has at most {MOST_LOOPS} loops")
+        if has_program and len(names) > 1:
+            raise ValueError(
+                f'loops.{place}: a run of several loops has no controller.kind = "program", whose '
+                'program has one loop; use "linear"'
+            )
 
 
 def _period_ns(loop: Scenario) -> int:

@@ -1,0 +1,279 @@
+"""The driver of a machine that is a program of its own, which does what the core's driver does.
+
+The program is started before the start barrier, and gets the sockets of the process with its
+settings: then noack is no longer in the path of the loop. It returns rows of the record and counts,
+by frames (``enum noack_node_frame`` in native/noack.h, docs/node.md). Their place is the core's
+process of the same loop, so that everything else is as with the core's own driver.
+
+The program ends when its standard input does, and is killed if this process dies.
+"""
+
+import ctypes
+import select
+import signal
+import socket
+import struct
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Self
+
+from noack.controllers.program_controller import ProgramControllerSettings
+from noack.core.clock import NS_PER_S, RunClock
+from noack.core.core_library import core, ffi
+from noack.core.errors import CallerError, PeerError, shortened
+from noack.machines.loop_machines import LoopMachines
+from noack.protocol.topology import SENDS
+from noack.runtime.address import Address, SocketName
+from noack.runtime.live_driver import LiveDriver, LoopChannel, ends_of
+from noack.runtime.real_time_loop import RecordSink
+from noack.runtime.run_process import RunProcess
+from noack.settings.user_files import unchanged
+
+_PR_SET_PDEATHSIG = 1
+_PATIENCE_S = 10.0
+"""Longest wait for the program's first line, and for its end."""
+_READ_BYTES = 2**20
+_ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
+_COPIED = (
+    *("has_point", "acknowledges", "predictions", "carries_model"),
+    *("model_ns", "knows_state", "newest"),
+)
+_HEAD = struct.Struct("<qq")
+_GREETING = f"noack node {core.NOACK_NODE_VERSION} {ffi.sizeof('noack_node_settings')}"
+
+
+def run_program(
+    process: RunProcess, machines: LoopMachines, settings: ProgramControllerSettings
+) -> None:
+    """Join the run, let a program drive its controller to the horizon, and report.
+
+    Raises:
+        CallerError: it is no program of this version, or the process's port is taken.
+        PeerError: the run never started, or the program ended before the run.
+    """
+    with process.open_socket() as endpoint, NodeDriver(process, machines, settings) as driver:
+        addresses = process.join(endpoint.getsockname()[:2])
+        channel = LoopChannel(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
+        process.run(driver, channel, machines)
+
+
+class NodeDriver(LiveDriver):
+    """Starts the program, and is its peer; a context, with which the program ends."""
+
+    def __init__(
+        self, process: RunProcess, machines: LoopMachines, settings: ProgramControllerSettings
+    ) -> None:
+        super().__init__(machines, process.wire, admitted_ns=process.admitted_ns)
+        self._named = f'controller.file = "{settings.file}"'
+        self._key, self._sockets = process.ticket.key, list[socket.socket]()
+        self._clock, self._sent_clock = RunClock(0), b""
+        self._to_send, self._received = bytearray(), bytearray()
+        self._foreign = 0
+        tables = machines.core.tables
+        rows = {kind: tables[kind].row_bytes - core.NOACK_LOOP_BYTES for kind in _ROWS}
+        counts = ffi.sizeof("noack_node_counts")
+        self._sizes = rows | {core.NOACK_NODE_COUNTS: counts, core.NOACK_NODE_UNSENT: 8}
+        self._own, its = socket.socketpair()
+        its.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
+        with its:
+            self._program = self._started(unchanged(settings, "controller"), settings.runner, its)
+
+    def _started(
+        self, path: Path, runner: Sequence[str], its: socket.socket
+    ) -> "subprocess.Popen[bytes]":
+        prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
+        try:
+            return subprocess.Popen(
+                [*runner, str(path)],
+                stdin=its.fileno(),
+                stdout=its.fileno(),
+                # Not only the end of its input: the program may hang, or be stopped.
+                preexec_fn=partial(prctl, _PR_SET_PDEATHSIG, signal.SIGKILL),
+            )
+        except OSError as error:
+            raise CallerError(
+                f"{self._named}: cannot be started: {error.strerror}; it must be executable (chmod "
+                "+x), and of this processor, or controller.runner names what runs it"
+            ) from None
+
+    def __enter__(self) -> Self:
+        """Wait for the program's first line; raise CallerError if it is not that of a node."""
+        line = b""
+        self._own.settimeout(_PATIENCE_S)
+        with suppress(TimeoutError):
+            while not line.endswith(b"\n") and len(line) < 200 and (one := self._own.recv(1)):
+                line += one
+        text = line.decode(errors="replace").strip()
+        if text != _GREETING:
+            how = f"says {shortened(text)!r}" if text else self._how_it_ended()
+            self.__exit__()
+            raise CallerError(
+                f"{self._named}: {how}; a node of this version says {_GREETING!r}: build it by "
+                "native/build.py --node"
+            )
+        self._own.setblocking(False)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._program.kill()
+        self._program.wait()
+        self._own.close()
+
+    def open(
+        self,
+        senders: Sequence[socket.socket],
+        receivers: Sequence[socket.socket],
+        sources: Sequence[Address],
+    ) -> None:
+        """Let the program use these sockets from now on."""
+        super().open(senders, receivers, sources)
+        self._sockets, self._source = [receivers[0], senders[0], senders[-1]], sources[0]
+
+    def set_clock(self, clock: RunClock) -> None:
+        """Let the program read the time as this clock does; the first time, it begins."""
+        super().set_clock(clock)
+        self._clock, now = clock, bytes(ffi.buffer(ffi.addressof(self.core, "clock")))
+        if not self._sent_clock:
+            data = self._settings()
+            first = _HEAD.pack(core.NOACK_NODE_SETTINGS, len(data))
+            with suppress(BrokenPipeError):  # drive() finds that it has ended
+                socket.send_fds(self._own, [first[:1]], [one.fileno() for one in self._sockets])
+            self._to_send += first[1:] + data
+        elif now != self._sent_clock:
+            self._put(core.NOACK_NODE_CLOCK, now)
+        self._sent_clock = now
+
+    def _settings(self) -> bytes:
+        controller = self.machines.machines[0]
+        n, m, model = controller.machine.n, controller.machine.m, controller.model
+        numbers = {name: getattr(controller, name) for name in _COPIED} | {
+            "run_id": self.core.wire.run_id,
+            "key": self._key,
+            "clock": self.core.clock,
+            "machine": controller.machine,
+            "is_static": model.transitions.is_static,
+        }
+        arrays = (
+            (model.transitions.H, n * n),
+            (controller.K, m * n),
+            (controller.x_r, n),
+            (controller.u_r, m),
+            (controller.safe_input, m),
+            (controller.x_c, n),
+        )
+        settings = ffi.new("noack_node_settings *", numbers)
+        return bytes(ffi.buffer(settings)) + b"".join(
+            bytes(ffi.buffer(array, 8 * size)) if array else bytes(8 * size)
+            for array, size in arrays
+        )
+
+    def drive(self, until_ns: int, sink: RecordSink) -> None:
+        """Take what the program has done until about a time of the run."""
+        goes_on, wait_s = True, 1.0
+        while goes_on and wait_s > 0:
+            wait_s = (until_ns - self._clock.now_ns()) / NS_PER_S / self._clock.speed
+            goes_on = self._exchange(max(wait_s, 0.0))
+            self._take_frames(sink)
+        self._pass_rows(sink)
+        if not goes_on:
+            raise PeerError(f"{self._named}: {self._how_it_ended()}")
+
+    def take(self, data: bytes, source: SocketName, sink: RecordSink) -> None:
+        """Pass the program a datagram that Python has received."""
+        from_peer = source[:2] == self._source
+        if not from_peer:
+            self.core.foreign += 1
+        self._put(core.NOACK_NODE_DATAGRAM, struct.pack("<q", from_peer) + data)
+
+    def finish(self, sink: RecordSink) -> None:
+        """Let the program end; take all that it has done.
+
+        Raise PeerError if it does not end, or fails.
+        """
+        until_s, goes_on = time.monotonic() + _PATIENCE_S, True
+        while goes_on and (wait_s := until_s - time.monotonic()) > 0:
+            if not self._to_send:
+                with suppress(OSError):  # it has ended
+                    self._own.shutdown(socket.SHUT_WR)
+            goes_on = self._exchange(wait_s, select.POLLIN)
+            self._take_frames(sink)
+        self._pass_rows(sink)
+        if goes_on or self._program.wait(_PATIENCE_S):
+            raise PeerError(f"{self._named}: {self._how_it_ended()}")
+
+    def _put(self, kind: int, content: bytes) -> None:
+        self._to_send += _HEAD.pack(kind, len(content)) + content
+
+    def _exchange(self, wait_s: float, wake: int = 0) -> bool:
+        """Wait, then send and receive; return whether the program may send more.
+
+        Its rows do not end the wait, unless ``wake`` is POLLIN: they would take time of its core.
+        """
+        poll = select.poll()
+        poll.register(self._own, wake | (select.POLLOUT if self._to_send else 0))
+        poll.poll(1000 * wait_s)
+        with suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
+            while self._to_send:
+                del self._to_send[: self._own.send(self._to_send)]
+        try:
+            while data := self._own.recv(_READ_BYTES):
+                self._received += data
+        except BlockingIOError:
+            return True
+        except ConnectionResetError:
+            pass
+        return False
+
+    def _take_frames(self, sink: RecordSink) -> None:
+        """Put the complete frames where the core's driver puts what they have."""
+        at, received = 0, bytes(self._received)
+        while at + _HEAD.size <= len(received):
+            kind, size = _HEAD.unpack_from(received, at)
+            if size != self._sizes.get(kind):
+                raise PeerError(
+                    f"{self._named}: has sent a frame of kind {kind} and {size} bytes, which no "
+                    "node of this version sends"
+                )
+            if len(received) < at + _HEAD.size + size:
+                break
+            content = received[at + _HEAD.size : at + _HEAD.size + size]
+            self._take_frame(kind, content, sink)
+            at += _HEAD.size + size
+        del self._received[:at]
+        core.noack_process_begin(self.machines.core)  # its next tick
+
+    def _take_frame(self, kind: int, content: bytes, sink: RecordSink) -> None:
+        own, machine = self.core, self.machines.machines[0].machine
+        if kind == core.NOACK_NODE_UNSENT:
+            (number,) = struct.unpack("<q", content)
+            own.errors[number % len(own.errors)] += 1
+        elif kind == core.NOACK_NODE_COUNTS:
+            counts = ffi.from_buffer("noack_node_counts *", content)
+            own.sent, own.sources[0].received = counts.sent, counts.received
+            own.foreign += counts.foreign - self._foreign
+            self._foreign = counts.foreign
+            machine.received.accepted = counts.accepted
+            machine.received.rejected = counts.rejected
+        else:
+            table = own.process.tables[kind]
+            row = table.rows + table.count * table.row_bytes + core.NOACK_LOOP_BYTES
+            ffi.memmove(row - core.NOACK_LOOP_BYTES, bytes(core.NOACK_LOOP_BYTES), 2)
+            ffi.memmove(row, content, len(content))
+            table.count += 1
+            if kind == core.NOACK_TICKS:
+                sequence = struct.unpack_from("<q", content, 8)[0]
+                machine.step = sequence - machine.first_number + 1
+            if table.count == table.places:
+                self._pass_rows(sink)
+
+    def _how_it_ended(self) -> str:
+        try:
+            code = self._program.wait(_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            return f"the program has not answered for {_PATIENCE_S:g} s"
+        how = f"exit status {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
+        return f"the program has ended: {how}"
