@@ -517,7 +517,7 @@ class _Page:
             mover.join()
 
     def strokes_ms(self) -> tuple[list[float], list[float]]:
-        """Drag; return the times from each move to its curve on the screen: the page's, and alone."""
+        """Drag; return the times from each move to its painted curve: the page's, and alone."""
         place = self.js(_BOX)
         return self._dragged_ms(_NOTE_STROKES, *place), self._dragged_ms(_DRAW_ALONE, *place)
 
