@@ -104,7 +104,7 @@ def paper(
         noack paper selivanov_fridman   one of them
     """
     if list_names:
-        known = paper_results.overview()
+        known = {one: paper_results.named(one).about for one in paper_results.NAMES}
         cli.print_lines(json, known, *(f"{one:<18} {about}" for one, about in known.items()))
         return ExitStatus.OK
     if name is not None:

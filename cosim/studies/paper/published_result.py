@@ -1,7 +1,9 @@
 """A published result, beside what noack computes for it: its rows, its tables, its document."""
 
 import math
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,7 +13,7 @@ from cosim.shipped_files import find_shipped
 from cosim.simulation.continuous import ContinuousLoop, continuous_loop_of
 from cosim.simulation.exact_simulation import EventLog
 from noack.core.errors import MachineError
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 
@@ -110,6 +112,15 @@ def number(
     return Row(quantity, where, *texts, how, agrees)
 
 
+def stored(name: str) -> dict[str, dict[str, Matrix]]:
+    """Return the tables of numbers, published or found, beside the result in NAME.toml."""
+    path = Path(__file__).parent / "results" / f"{name}.toml"
+    tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    return {
+        key: {one: np.array(two) for one, two in table.items()} for key, table in tables.items()
+    }
+
+
 def shipped_loop(name: str, settings: Iterable[str] = ()) -> ContinuousLoop:
     """Return the exact loop of a shipped scenario, with settings as for ``--set``."""
     return continuous_loop_of(resolve(load(find_shipped(name, "scenarios"), list(settings))))
@@ -125,10 +136,9 @@ def directions(draws: int, n: int) -> Matrix:
 
 
 def run_all(loop: ContinuousLoop, x0: Matrix, horizon_s: float, places: int = 2000) -> EventLog:
-    """Return the events of one run from each initial state; every update arrives.
+    """Return the events of a run from each initial state; every update arrives.
 
-    Raises:
-        MachineError: a run has more events than there are places.
+    Raise MachineError if a run has more events than there are places.
     """
     k = len(x0)
     A, B = (np.broadcast_to(part, (k, *part.shape)) for part in (loop.loop.A, loop.loop.B))
@@ -140,9 +150,3 @@ def run_all(loop: ContinuousLoop, x0: Matrix, horizon_s: float, places: int = 20
         raise MachineError(f"a run did not reach its end within {places} events")
     log.event_s[np.arange(places) >= rows["transmissions"][:, None]] = np.nan
     return log
-
-
-def inter_event_times(log: EventLog) -> Vector:
-    """Return the times between successive events of all runs, the start included."""
-    times = np.diff(log.event_s, axis=1, prepend=0.0)
-    return np.asarray(times[~np.isnan(times)])

@@ -34,8 +34,3 @@ def reproduce(name: str, draws: int | None = None) -> "Reproduction":
     if draws is not None and not result.draws:
         raise CallerError(f"--draws: {name} has no draws")
     return published_result.Reproduction(name, result, result.rows(draws or result.draws))
-
-
-def overview() -> dict[str, str]:
-    """Return what each result is about, by name."""
-    return {name: named(name).about for name in NAMES}

@@ -6,9 +6,7 @@ solutions were computed by an SDP solver; whoever checks them needs none. Names 
 """
 
 import math
-import tomllib
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +17,7 @@ from cosim.studies.paper.published_result import (
     directions,
     run_all,
     shipped_loop,
+    stored,
 )
 from noack.core.linear_systems import Matrix
 
@@ -39,7 +38,6 @@ _RUN = (
 )
 DELTA, GAMMA, DELAY_S = 0.24, 100.0, 0.1
 """Decay rate of Example 1; gain and largest delay of Example 2."""
-_HORIZON_S = 20.0
 _SWITCHING, _PERIODIC = (0.899, 0.554), (1.115, 0.0046)
 """h in seconds and ε of Example 1: Theorem 1, and the periodic event trigger of Remark 1."""
 
@@ -122,17 +120,8 @@ INEQUALITIES = {
 """By statement: the inequalities, h in seconds, ε, whether the sensor waits."""
 
 
-def solutions() -> dict[str, Solution]:
-    """Return a solution of the inequalities of each statement."""
-    text = Path(__file__).with_name("selivanov_fridman.toml").read_text(encoding="utf-8")
-    return {
-        statement: {name: np.array(rows) for name, rows in table.items()}
-        for statement, table in tomllib.loads(text).items()
-    }
-
-
 def _rows(draws: int) -> list[Row]:
-    found, solved = [], solutions()
+    found, solved = [], stored("selivanov_fridman")
     for statement, (inequalities, h, epsilon, waits) in INEQUALITIES.items():
         parts = inequalities(solved[statement], h, epsilon, waits=waits)
         margin = min(map(smallest_eigenvalue, parts))
@@ -168,7 +157,7 @@ def _run(loop: ContinuousLoop, P: Matrix, x0: Matrix) -> tuple[float, float]:
 
     At a transmission the paper's functional V is xᵀPx. The one at t = 0 counts.
     """
-    log = run_all(loop, x0, _HORIZON_S, places=100)
+    log = run_all(loop, x0, 20.0, places=100)
     assert log.states is not None
     happened = ~np.isnan(log.event_s)
     x, t_s = log.states[:, :, 0][happened], log.event_s[happened]

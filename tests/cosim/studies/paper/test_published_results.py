@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+from cosim.studies.paper.published_result import stored
 from cosim.studies.paper.results import NAMES, demirel, named, reproduce, selivanov_fridman
 from noack.core.errors import ExitStatus
 from tests.command_line import invoke
@@ -86,7 +87,7 @@ def margin(statement: str, solution: selivanov_fridman.Solution, h: float, epsil
 def test_a_broken_solution_is_no_solution() -> None:
     """Beyond the published h and ε the stored solutions fail, and so do changed ones."""
     for statement, (_, h, epsilon, _) in selivanov_fridman.INEQUALITIES.items():
-        solution = selivanov_fridman.solutions()[statement]
+        solution = stored("selivanov_fridman")[statement]
         assert margin(statement, solution, h, epsilon) > 1e-9
         assert margin(statement, solution, 1.02 * h, epsilon) < 0
         assert margin(statement, solution, h, 1.05 * epsilon) < 0
