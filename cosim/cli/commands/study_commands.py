@@ -93,8 +93,7 @@ def paper(
     Options:
         name: Name of another published result; --list shows them.
         list_names: List the other published results.
-        draws: Number of random plants, losses and initial states, 1,000 by default; of a published
-            result, of its initial states.
+        draws: Number of random plants, losses and initial states; 1,000 by default.
         out: Folder for paper.md and its figures; runs/paper by default.
 
     Examples:
@@ -108,10 +107,10 @@ def paper(
         cli.print_lines(json, known, *(f"{one:<18} {about}" for one, about in known.items()))
         return ExitStatus.OK
     if name is not None:
-        if out is not None:
-            raise CallerError("--out: is for the page of Section V; --tables writes this table")
+        if out is not None or draws is not None:
+            raise CallerError("--out, --draws: are for the page of Section V; this has --tables")
         with cli.status("computing"):
-            found = paper_results.reproduce(name, draws)
+            found = paper_results.reproduce(name)
         cli.show(json, found.document, published_result.print_rows, found)
         cli.write_tables([found.table], tables, json=json)
         return ExitStatus.OK if found.as_expected else ExitStatus.FAILED

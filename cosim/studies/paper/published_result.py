@@ -54,10 +54,8 @@ class PublishedResult(NamedTuple):
     about: str
     """What is reproduced, in one line."""
     reference: str
-    rows: Callable[[int], Sequence[Row]]
-    """Compute the rows, with so many draws."""
-    draws: int
-    """Number of draws by default; 0: none are needed."""
+    rows: Callable[[], Sequence[Row]]
+    """Computes the rows."""
     notes: tuple[str, ...] = ()
     """What the publication, as far as it was available, does not give."""
 

@@ -28,9 +28,7 @@ def named(name: str) -> "PublishedResult":
     return found
 
 
-def reproduce(name: str, draws: int | None = None) -> "Reproduction":
-    """Compute a result; raise CallerError if there is none of this name, or it has no draws."""
+def reproduce(name: str) -> "Reproduction":
+    """Compute a result; raise CallerError if there is none of this name."""
     result = named(name)
-    if draws is not None and not result.draws:
-        raise CallerError(f"--draws: {name} has no draws")
-    return published_result.Reproduction(name, result, result.rows(draws or result.draws))
+    return published_result.Reproduction(name, result, result.rows())

@@ -84,7 +84,7 @@ def loops(seed: int = 20, n: int = 2, count: int = 3) -> list[Loop]:
     return found
 
 
-def _rows(_: int) -> list[Row]:
+def _rows() -> list[Row]:
     drawn, found = list(zip("123", loops(), strict=True)), []
     for schedule, published in stored("demirel")["losses"].items():
         turns = schedule.split(",")
@@ -99,7 +99,6 @@ RESULT = PublishedResult(
     reference="Demirel, Aytekin, European Control Conference 2021, arXiv 2006.08015; authors' "
     "program: github.com/demirelbu/periodic-schedules",
     rows=_rows,
-    draws=0,
     notes=(
         "not available: the paper's text; the plants are those that the authors' program draws",
         "not run: links of noack have no schedule; this is the loss on an ideal channel",

@@ -27,7 +27,7 @@ def edges() -> list[Edge]:
     return found
 
 
-def _rows(_: int) -> list[Row]:
+def _rows() -> list[Row]:
     found = joint_spectral_radius(edges(), accuracy=1e-11)
     modes = [_EDGES[number] % 10 for number in found.cycle]
     rotated = [tuple(modes[i:] + modes[:i]) for i in range(len(modes))]
@@ -46,6 +46,5 @@ RESULT = PublishedResult(
     "with constrained switching sequences, Automatica 72, 2016; value: github.com/blegat/"
     "SwitchOnSafety.jl",
     rows=_rows,
-    draws=0,
     notes=("not available: the paper's text; the value stands in that library's test",),
 )

@@ -120,7 +120,7 @@ INEQUALITIES = {
 """By statement: the inequalities, h in seconds, ε, whether the sensor waits."""
 
 
-def _rows(draws: int) -> list[Row]:
+def _rows() -> list[Row]:
     found, solved = [], stored("selivanov_fridman")
     for statement, (inequalities, h, epsilon, waits) in INEQUALITIES.items():
         parts = inequalities(solved[statement], h, epsilon, waits=waits)
@@ -130,7 +130,7 @@ def _rows(draws: int) -> list[Row]:
     loops = (("switching", "Theorem 1", _switching()), ("periodic", "Remark 1", _periodic()))
     means = []
     for name, statement, loop in loops:
-        grown, mean = _run(loop, solved[statement]["P"], directions(draws, 2))
+        grown, mean = _run(loop, solved[statement]["P"], directions(100, 2))
         means.append(mean)
         what, where = f"growth of V, {name}", f"follows from {statement}"
         found.append(Row(what, where, "≤ 1", f"{grown:.3f}", _RUN, grown <= 1))
@@ -172,7 +172,6 @@ RESULT = PublishedResult(
     reference="Selivanov, Fridman, Event-Triggered H-infinity Control: a Switching Approach, IEEE "
     "TAC 61(10), 2016, arXiv 1506.01587; authors' program: github.com/AntonSelivanov/TAC16",
     rows=_rows,
-    draws=100,
     notes=(
         "not available: the paper's text, so its own numbers of sent measurements and its runs "
         "are not compared",
