@@ -12,7 +12,7 @@ _WORKS = {1: [1, 1], 2: [0, 1], 3: [1, 0], 4: [0, 0]}
 """Which of the two gains work, by mode."""
 _EDGES = (123, 212, 131, 312, 231, 323, 331, 344, 431)
 """From node, to node, mode."""
-_WHERE, _RADIUS = "test of Section 4", 0.9748171979372
+_WHERE, _RADIUS = "test/PEDJ16s4.jl", 0.9748171979372
 _CYCLE = (2, 1, 2, 3, 1, 1, 1, 1)
 _HOW = "by noack margin's enclosures: a cycle from below, invariant polytopes from above"
 
