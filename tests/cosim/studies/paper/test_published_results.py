@@ -77,7 +77,7 @@ def test_losses_agree_with_the_authors_formula(seed: int) -> None:
 
 
 def test_the_row_that_differs_is_not_what_the_authors_formula_gives_either() -> None:
-    turns = "2,1,3,1,2,1,1".split(",")
+    turns = list("2131211")
     loops = zip("123", demirel.loops(), strict=True)
     total = sum(formula(loop, [turn == own for turn in turns]) for own, loop in loops)
     assert total == pytest.approx(380.4944, abs=5e-5)
