@@ -12,6 +12,7 @@ PAGES = (
     "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md", "docs/plants.md",
     "docs/library.md", "docs/command-line.md", "docs/howto.md", "docs/guarantees.md",
     "docs/benchmarks.md", "docs/measure.md", "docs/capacity.md", "docs/papers.md",
+    "docs/published.md",
 )  # fmt: skip
 
 

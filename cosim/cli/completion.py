@@ -5,6 +5,7 @@ from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE
 from cosim.shipped_files import shipped_names
 
 with lazy_modules():
+    from cosim.studies.paper import results
     from noack.scenario import runtime_parameters as parameters
     from noack.scenario import scenario, toml_file
 
@@ -22,6 +23,11 @@ def campaigns(incomplete: str) -> list[str]:
 def shipped(incomplete: str) -> list[str]:
     """Return matching names of shipped scenarios and campaigns."""
     return scenarios(incomplete) + campaigns(incomplete)
+
+
+def papers(incomplete: str) -> list[str]:
+    """Return matching names of published results."""
+    return _matching(incomplete, list(results.NAMES))
 
 
 def run_directories(incomplete: str) -> list[str]:

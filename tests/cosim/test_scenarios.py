@@ -1,6 +1,6 @@
 """Every shipped scenario in virtual time, and the classic plants against their literature.
 
-The reactor and Tabuada's example are in ``simulation/continuous/test_published.py``, the cart-pole
+The published cases are in ``studies/paper/test_published_results.py``, the cart-pole
 in ``tests/noack/plants/test_physical_laws.py``.
 """
 

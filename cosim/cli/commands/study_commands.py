@@ -25,7 +25,8 @@ with lazy_modules():
     from cosim.studies.campaign import campaign_file, campaign_grid, campaign_report
     from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result
     from cosim.studies.design import design_page, design_search, design_space
-    from cosim.studies.paper import paper_page
+    from cosim.studies.paper import paper_page, published_result
+    from cosim.studies.paper import results as paper_results
     from noack.core import linear_systems
     from noack.scenario import run_sections, scenario, scenario_file
 
@@ -74,39 +75,64 @@ def campaign(
 
 @cli.command(cli.THEORY, 30, takes="up to a minute")
 def paper(
+    name: Annotated[str | None, typer.Argument(autocompletion=completion.papers)] = None,
     *,
+    list_names: Annotated[bool, Option("--list")] = False,
     draws: Annotated[int | None, Option(min=1)] = None,
-    out: Path = cli.DEFAULT_RUNS / "paper",
+    out: cli.OutOption = None,
+    tables: cli.TablesOption = None,
     json: cli.JsonOption = False,
-) -> None:
-    """Reproduce the paper's Section V: a page with figures, tables and verdicts.
+) -> int:
+    """Reproduce the paper's Section V, or another published result: published against computed.
 
-    The runs are those of the campaign paper, in runs/campaigns/paper.
+    Without a name: a page with figures, tables and verdicts; the runs are those of the campaign
+    paper, in runs/campaigns/paper. With a name: a table.
+
+    Exit status 1: a value differs from the published one, and it is not known why.
 
     Options:
+        name: Name of another published result; --list shows them.
+        list_names: List the other published results.
         draws: Number of random plants, losses and initial states; 1,000 by default.
-        out: Folder for paper.md and its figures.
+        out: Folder for paper.md and its figures; runs/paper by default.
 
     Examples:
         noack paper   1,000 draws into runs/paper
         noack paper --draws 50 --out paper --json   fewer draws, as JSON
+        noack paper --list   the other published results
+        noack paper selivanov_fridman   one of them
     """
+    if list_names:
+        known = {one: paper_results.named(one).about for one in paper_results.NAMES}
+        cli.print_lines(json, known, *(f"{one:<18} {about}" for one, about in known.items()))
+        return ExitStatus.OK
+    if name is not None:
+        if out is not None or draws is not None:
+            raise CallerError("--out, --draws: are for the page of Section V; this has --tables")
+        with cli.status("computing"):
+            found = paper_results.reproduce(name)
+        cli.show(json, found.document, published_result.print_rows, found)
+        cli.write_tables([found.table], tables, json=json)
+        return ExitStatus.OK if found.as_expected else ExitStatus.FAILED
+    out = out or cli.DEFAULT_RUNS / "paper"
     paper_page.make_folder(out)
     path, folder = find_shipped("paper", "campaigns"), cli.DEFAULT_RUNS / "campaigns" / "paper"
     plan = campaign_file.load(path)
     done = execute_campaign(plan, path, worker_pool(None), folder=folder, draws=draws)
     with cli.status("computing the examples"):
-        found, files = paper_page.write_page(done, out)
+        numbers, files = paper_page.write_page(done, out)
+    table = campaign_report.claims_table(done.summary)
     if not json:
-        table = campaign_report.claims_table(done.summary)
         cli.console().print(result_tables.terminal_table(table, left=range(3)))
     document = {
         "draws": done.summary.draws,
-        "representative": found["representative"],
-        "claims": found["summary"]["claims"],
+        "representative": numbers["representative"],
+        "claims": numbers["summary"]["claims"],
         "files": [str(file) for file in files],
     }
     cli.print_lines(json, document, *files)
+    cli.write_tables([table], tables, json=json)
+    return ExitStatus.OK
 
 
 @cli.option_group

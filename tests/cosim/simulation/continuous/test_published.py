@@ -1,6 +1,7 @@
 """Published results on the policies, against the exact simulator.
 
 Each docstring states whether its figures are printed in the source or follow from a theorem there.
+What ETCetera and Tabuada (2007) print is in ``noack paper``.
 """
 
 import math
@@ -22,7 +23,7 @@ from cosim.simulation.continuous import (
 from noack.scenario.resolution import LoopMatrices, resolve
 from noack.scenario.scenario_file import load
 from noack.trigger.trigger_rule import TriggerRule
-from tests.trigger_rules import absolute_rule, lyapunov_rule, mixed_rule
+from tests.trigger_rules import absolute_rule, lyapunov_rule
 
 Matrix = NDArray[np.float64]
 System = tuple[Matrix, Matrix, Matrix]
@@ -73,61 +74,6 @@ def step(system: System, t_s: float) -> Matrix:
     both = expm(np.block([[A, B @ K], [np.zeros((n, 2 * n))]]) * t_s)
     found: Matrix = both[:n, :n] + both[:n, n:]
     return found
-
-
-def directions(count: int) -> Matrix:
-    angles = np.linspace(0.0, math.pi, count, endpoint=False)
-    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
-def test_the_reactor_transmits_after_two_periods_in_etceteras_region() -> None:
-    """Printed: xᵀN(1)x ≤ 0 < xᵀN(2)x with these N, up to a positive factor each (ibid.)."""
-    first = symmetric(
-        0.0325014371942073, -0.758236561497541, 2.28413716988318, -1.57991935089754,
-        2.38486724990143, 0.198562111037632, 2.68392804714407,
-        3.0913841666531, -2.03625414224163, 2.14744812716726,
-    )  # fmt: skip
-    second = symmetric(
-        34.1084257021831, -22.2685952023407, 68.7949413314049, -47.7543148417454,
-        102.519813292189, 8.36602721281553, 82.3989681651887,
-        121.315797670082, -56.7655786995279, 97.0796601856019,
-    )  # fmt: skip
-    loop = shipped("reactor_petc")
-    states = np.random.default_rng(1).normal(size=(120, 4))
-    expected = [bool(x @ first @ x <= 0 < x @ second @ x) for x in states]
-    found = [between(run_from(x, loop, 0.05))[:1].tolist() == [0.02] for x in states]
-    assert found == expected
-    assert 15 < sum(found) < 105
-    # Printed: after an inter-event time of one period, one to three further ones follow; this is
-    # from a relaxation, so there may be fewer.
-    early = step(REACTOR, 0.01)
-    follow = {
-        round(float(between(run_from(early @ x, loop, 0.1))[0]) / 0.01)
-        for x in states[np.array(expected)]
-    }
-    assert follow <= {1, 2, 3}
-
-
-def symmetric(*upper: float) -> Matrix:
-    matrix = np.zeros((4, 4))
-    matrix[np.triu_indices(4)] = upper
-    return matrix + np.triu(matrix, 1).T
-
-
-@pytest.mark.parametrize("sigma", [0.02, 0.2])
-def test_tabuadas_example_keeps_the_published_bound_and_comes_close_to_it(sigma: float) -> None:
-    """IEEE TAC 52(9), 2007, Corollary IV.1 and Section V: |e| ≤ σ|x|, every update arrives.
-
-    The inter-event time is at least τ with φ(τ) = σ, φ̇ = a + (a + b)φ + bφ², φ(0) = 0, a = |A+BK|,
-    b = |BK|, for all initial states.
-    """
-    A, B, K = TABUADA
-    a, b = float(np.linalg.norm(A + B @ K, 2)), float(np.linalg.norm(B @ K, 2))
-    tau_s, _ = quad(lambda phi: 1 / (a + (a + b) * phi + b * phi**2), 0.0, sigma)
-    loop = held(TABUADA, mixed_rule(sigma))
-    runs = [run_from(10 * x0, loop, 2.0) for x0 in directions(40)]
-    shortest_s = min(float(np.diff(run.event_s).min()) for run in runs)
-    assert tau_s <= shortest_s < 1.2 * tau_s
 
 
 def test_the_lyapunov_rule_meets_its_minimum_time_and_no_earlier_one() -> None:

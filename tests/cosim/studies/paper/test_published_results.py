@@ -1,0 +1,108 @@
+"""The published results: every one is reproduced, but for rows whose deviation is known."""
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+from cosim.studies.paper.published_result import stored
+from cosim.studies.paper.results import NAMES, demirel, named, reproduce, selivanov_fridman
+from noack.core.errors import ExitStatus
+from tests.command_line import invoke
+from tests.pages import ROOT
+
+PAGE = (ROOT / "docs/published.md").read_text()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rows_are_as_published_and_as_documented(name: str) -> None:
+    found = reproduce(name)
+    for row in found.rows:
+        assert row.as_expected, row
+        assert f"| {' | '.join(found.table.rows[found.rows.index(row)])} |" in PAGE
+    assert found.result.about in PAGE
+
+
+def test_a_value_that_differs_fails_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    plants = demirel.loops()
+    monkeypatch.setattr(demirel, "loops", lambda: [*plants[:2], plants[0]])
+    result = invoke("paper", "demirel", "--json")
+    assert result.exit_code == ExitStatus.FAILED
+    assert {row["verdict"] for row in json.loads(result.stdout)["rows"]} == {"differs"}
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["selivanow"], "no published result of this name; did you mean selivanov_fridman?"),
+        (["umsonst"], f"no published result of this name; there are {', '.join(NAMES)}"),
+        (["tabuada", "--draws", "3"], "--out, --draws: are for the page of Section V"),
+    ],
+)
+def test_a_mistake_is_one_line(words: list[str], says: str) -> None:
+    result = invoke("paper", *words)
+    assert (result.exit_code, result.stdout) == (ExitStatus.CALLER, "")
+    assert says in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_the_list_has_every_result() -> None:
+    result = invoke("paper", "--list", "--json")
+    assert result.exit_code == ExitStatus.OK
+    assert json.loads(result.stdout) == {name: named(name).about for name in NAMES}
+
+
+def formula(loop: demirel.Loop, sent: Sequence[bool]) -> float:
+    """The authors' formula of the loss, by the steps since the last transmission."""
+    A, L, C = loop.A, loop.gain, loop.C
+    S = solve_discrete_are(A, loop.B, loop.Q, loop.R)
+    P = solve_discrete_are(A.T, C.T, loop.W, loop.V)
+    M, corrected = L.T @ (loop.B.T @ S @ loop.B + loop.R) @ L, loop.filter_gain @ C @ P
+    errors, error = [], np.zeros_like(A)
+    for arrives in [*sent, *sent]:
+        error = np.zeros_like(A) if arrives else A @ error @ A.T + corrected
+        errors.append(error)
+    mean = np.mean(errors[len(sent) :], axis=0)
+    return float(np.trace(S @ loop.W) + np.trace(M @ (P - corrected + mean)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_losses_agree_with_the_authors_formula(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for loop in demirel.loops(seed + 20):
+        sent = [True, *(rng.random(6) < 0.4)]
+        assert loop.loss(sent) == pytest.approx(formula(loop, sent), rel=1e-8)
+
+
+def test_the_row_that_differs_is_not_what_the_authors_formula_gives_either() -> None:
+    turns = list("2131211")
+    loops = zip("123", demirel.loops(), strict=True)
+    total = sum(formula(loop, [turn == own for turn in turns]) for own, loop in loops)
+    assert total == pytest.approx(380.4944, abs=5e-5)
+
+
+def margin(statement: str, solution: selivanov_fridman.Solution, h: float, epsilon: float) -> float:
+    inequalities, _, _, waits = selivanov_fridman.INEQUALITIES[statement]
+    parts = inequalities(solution, h, epsilon, waits=waits)
+    return min(map(selivanov_fridman.smallest_eigenvalue, parts))
+
+
+def test_a_broken_solution_is_no_solution() -> None:
+    """Beyond the published h and ε the stored solutions fail, and so do changed ones."""
+    for statement, (_, h, epsilon, _) in selivanov_fridman.INEQUALITIES.items():
+        solution = stored("selivanov_fridman")[statement]
+        assert margin(statement, solution, h, epsilon) > 1e-9
+        assert margin(statement, solution, 1.02 * h, epsilon) < 0
+        assert margin(statement, solution, h, 1.05 * epsilon) < 0
+        for name in solution:
+            assert margin(statement, {**solution, name: -solution[name]}, h, epsilon) < 0, name
+
+
+def test_the_scaled_eigenvalue_is_that_of_the_matrix() -> None:
+    one, two = np.array([[4.0]]), np.array([[1.0, 0.0], [0.0, 9.0]])
+    blocks = {(1, 1): one, (1, 2): np.array([[0.0, 3.0]]), (2, 2): two}
+    matrix = selivanov_fridman.symmetric(blocks)
+    assert selivanov_fridman.smallest_eigenvalue(matrix) == pytest.approx(0.5)  # 1 − 3/√(4·9)
+    assert selivanov_fridman.smallest_eigenvalue(-one) < 0
