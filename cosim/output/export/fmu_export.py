@@ -5,28 +5,21 @@ the structures of the core that a run would have, with their arrays, as if they 
 """
 
 import io
+import math
 import re
 import sys
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from platform import machine
 from typing import TYPE_CHECKING, NamedTuple
-from xml.etree import ElementTree as ET
 
 from controller_node.controller import controllers_of
 from netem.channel import UPDATE_LINK, Channel, alone
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
-from noack.core.core_library import (
-    LIBRARY,
-    SCRATCH_MATRICES,
-    SOURCES,
-    CData,
-    core,
-    ffi,
-)
+from noack.core.core_library import LIBRARY, SCRATCH_MATRICES, SOURCES, CData, core, ffi
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
 from noack.protocol.wire_format import KEY_BYTES, Flow
@@ -46,46 +39,56 @@ _SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": 
 _PROCESSORS = {"amd64": "x86_64", "arm64": "aarch64"}
 _DATE = (1980, 1, 1, 0, 0, 0)
 """Of all files, so that the same scenario gives the same bytes."""
+_INDEPENDENT, _INPUT, _OUTPUT = "independent", "input", "output"
 
 
 class _Variable(NamedTuple):
-    """A variable; its place in the table is its value reference."""
+    """A variable; its place in the table is its value reference (``noack_fmu_variable``)."""
 
     name: str
-    of_channel: str
+    channel: str
     """Its causality there; empty if the channel does not have it."""
-    of_controller: str
+    controller: str
     is_real: bool
-    shape: Sequence[str]
-    """Of n, m and packets."""
+    shape: str
+    """Of n, m and p = :data:`_PACKETS`."""
     description: str
-
-    def causality(self, role: str) -> str:
-        return self.of_channel if role == "channel" else self.of_controller
 
 
 _VARIABLES = (
-    _Variable("time", "independent", "independent", True, (), "time"),
-    _Variable("send", "input", "", False, (), "packets sent so far; a step may send one"),
-    _Variable("x", "input", "", True, ("n",), "what a packet carries: the state"),
-    _Variable("arrivals", "output", "input", False, (), "packets that have arrived so far"),
-    _Variable(
-        "packet_number", "output", "input", False, ("packets",), "number of a packet: from 0"
-    ),
-    _Variable("packet_sent", "output", "input", True, ("packets",), "when it was sent"),
-    _Variable("packet_arrival", "output", "input", True, ("packets",), "when it arrived"),
-    _Variable("packet_x", "output", "input", True, ("packets", "n"), "the state in it"),
-    _Variable("received", "output", "", False, (), "number of the newest arrival; -1: none"),
-    _Variable("received_sent", "output", "", True, (), "when it was sent"),
-    _Variable("received_x", "output", "", True, ("n",), "the state in it"),
-    _Variable("lost", "output", "", False, (), "packets lost so far"),
-    _Variable("longest_burst", "output", "", False, (), "most consecutive losses so far"),
-    _Variable("in_flight", "output", "", False, (), "packets delayed at present"),
-    _Variable("u", "", "output", True, ("m",), "input of the plant"),
-    _Variable("x_c", "", "output", True, ("n",), "state of the controller's model"),
-    _Variable("updates", "", "output", False, (), "packets used so far: neither stale nor invalid"),
+    _Variable("time", _INDEPENDENT, _INDEPENDENT, True, "", "time"),
+    _Variable("send", _INPUT, "", False, "", "packets sent so far; each step may send one more"),
+    _Variable("x", _INPUT, "", True, "n", "the state in the packet that is sent"),
+    _Variable("arrivals", _OUTPUT, _INPUT, False, "", "packets that have arrived so far"),
+    _Variable("packet_number", _OUTPUT, _INPUT, False, "p", "of the last arrivals, newest first"),
+    _Variable("packet_sent_s", _OUTPUT, _INPUT, True, "p", "when each was sent"),
+    _Variable("packet_arrival_s", _OUTPUT, _INPUT, True, "p", "when each arrived"),
+    _Variable("packet_x", _OUTPUT, _INPUT, True, "pn", "the state in each"),
+    _Variable("received", _OUTPUT, "", False, "", "highest number that has arrived; -1: none"),
+    _Variable("received_sent_s", _OUTPUT, "", True, "", "when that packet was sent"),
+    _Variable("received_x", _OUTPUT, "", True, "n", "the state in it"),
+    _Variable("lost", _OUTPUT, "", False, "", "packets lost so far"),
+    _Variable("longest_burst", _OUTPUT, "", False, "", "most consecutive losses so far"),
+    _Variable("in_flight", _OUTPUT, "", False, "", "packets and copies that are delayed"),
+    _Variable("u", "", _OUTPUT, True, "m", "input of the plant"),
+    _Variable("x_c", "", _OUTPUT, True, "n", "state of the controller's model"),
+    _Variable("updates", "", _OUTPUT, False, "", "packets used so far: neither stale nor invalid"),
 )
-_UNITS = {"time": "s", "packet_sent": "s", "packet_arrival": "s", "received_sent": "s"}
+_DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="3.0" modelName="{scenario} {role}" instantiationToken="{token}"
+    generationTool="noack {version}" license="Apache-2.0">
+  <CoSimulation modelIdentifier="{identifier}" canHandleVariableCommunicationStepSize="true"
+      canGetAndSetFMUState="true" canSerializeFMUState="true"/>
+  <LogCategories><Category name="logStatusError"/></LogCategories>
+  <DefaultExperiment startTime="0" stopTime="{stop_s}" stepSize="{step_s}"/>
+  <ModelVariables>
+{variables}
+  </ModelVariables>
+  <ModelStructure>
+{structure}
+  </ModelStructure>
+</fmiModelDescription>
+"""
 
 
 def write(run: "ExportedRun", path: Path, *, certificates: bool = True) -> list[Path]:
@@ -101,32 +104,115 @@ def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
         MachineError: a file cannot be written.
     """
     alone(scenario)
-    network, kind = scenario.network, scenario.controller.kind
-    if network.flows != (Flow.UPDATE,):
-        raise CallerError("network.actuation: the FMUs have the way to the controller only")
+    kind = scenario.controller.kind
+    if scenario.network.flows != (Flow.UPDATE,):
+        raise CallerError(
+            "network.actuation: an FMU's channel leads to the controller only; remove this table"
+        )
     if not scenario.controller.is_linear:
-        raise CallerError(f'controller.kind = "{kind}": an FMU has no Python; set kind = "linear"')
+        raise CallerError(f'controller.kind = "{kind}": needs Python; an FMU needs kind = "linear"')
     (resolved,) = resolved_loops(scenario)
-    written = []
-    for role in ("channel", "controller"):
-        model = _Model(resolved, role)
-        written.append(write_whole(path.with_name(f"{path.stem}_{role}{SUFFIX}"), model.archive()))
-    return written
+    return [
+        write_whole(path.with_name(f"{path.stem}_{role}{SUFFIX}"), _archive(resolved, role))
+        for role in ("channel", "controller")
+    ]
+
+
+def _archive(resolved: Scenario, role: str) -> bytes:
+    """Return the file of an FMU."""
+    loop, image, variables = loop_of(resolved), _Image(), dict[int, tuple[_Variable, list[int]]]()
+    sizes = {"n": len(loop.H), "m": loop.m, "p": _PACKETS}
+    for reference, variable in enumerate(_VARIABLES):
+        if getattr(variable, role):
+            variables[reference] = variable, [sizes[name] for name in variable.shape]
+    if role == "channel":
+        image.head.channel_at = _add_channel(image, resolved)
+    else:
+        image.head.controller_at = _add_controller(image, resolved)
+    image.head.n = len(loop.H)
+    for reference, (variable, shape) in variables.items():
+        numbers = [_start(variable)] * math.prod(shape)
+        is_input = getattr(variable, role) == _INPUT
+        image.add_variable(reference, numbers, is_real=variable.is_real, is_input=is_input)
+    content = image.content()
+    identifier = re.sub(r"\W|^(?=\d)", "_", f"{resolved.name}_{role}", flags=re.ASCII)
+    description = _DESCRIPTION.format(
+        scenario=resolved.name,
+        role=role,
+        token=content[: core.NOACK_TAG_BYTES].hex(),
+        version=version("noack"),
+        identifier=identifier,
+        stop_s=resolved.timing.horizon_ns / NS_PER_S,
+        step_s=resolved.timing.plant_period_ns / NS_PER_S,
+        variables="\n".join(_element(role, ref, *one) for ref, one in variables.items()),
+        structure="\n".join(
+            f'    <{tag} valueReference="{reference}"/>'
+            for tag in ("Output", "InitialUnknown")
+            for reference, (variable, _) in variables.items()
+            if getattr(variable, role) == _OUTPUT
+        ),
+    )
+    system, ending = _SYSTEMS[sys.platform]
+    processor = _PROCESSORS.get(machine().lower(), machine().lower())
+    files = {
+        "modelDescription.xml": description.encode(),
+        "resources/noack.bin": content,
+        f"binaries/{processor}-{system}/{identifier}{ending}": LIBRARY.read_bytes(),
+    }
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), data, zipfile.ZIP_DEFLATED)
+    return buffer.getvalue()
+
+
+def _start(variable: _Variable) -> int:
+    return -1 if variable.name == "received" else 0
+
+
+def _element(role: str, reference: int, variable: _Variable, shape: list[int]) -> str:
+    """Return the element of a variable."""
+    causality, tag = getattr(variable, role), "Float64" if variable.is_real else "Int64"
+    variability = "continuous" if causality == _INDEPENDENT else "discrete"
+    start = " ".join(["0"] * math.prod(shape))
+    dimensions = "".join(f'<Dimension start="{size}"/>' for size in shape)
+    return (
+        f'    <{tag} name="{variable.name}" valueReference="{reference}" causality="{causality}" '
+        f'variability="{variability}" description="{variable.description}"'
+        + (f' start="{start}"' if causality == _INPUT else "")
+        + (f">{dimensions}</{tag}>" if shape else "/>")
+    )
 
 
 class _Image:
     """The bytes of an image, and its pointers."""
 
     def __init__(self) -> None:
-        self.data, self.pointers = bytearray(), list[tuple[int, int]]()
+        self.head = ffi.new("noack_fmu_image *", {"sources": SOURCES.encode(), "packets": _PACKETS})
+        self._data, self._pointers = bytearray(ffi.buffer(self.head)), list[tuple[int, int]]()
 
-    def add(self, rows: CData) -> int:
-        """Append what ``ffi.buffer`` takes; return its place."""
-        place, content = len(self.data), bytes(rows)
-        self.data += content + bytes(-len(content) % 8)
-        return place
+    def content(self) -> bytes:
+        """Return the content of the file."""
+        pointers = ffi.new("noack_fmu_pointer[]", self._pointers)
+        self.head.pointer_count, self.head.pointers_at = len(pointers), self._add(pointers)
+        self.head.bytes = len(self._data)
+        for values in self.head.values:
+            values.at = values.at or self.head.pointers_at  # of a variable that is not there
+        self._data[: ffi.sizeof("noack_fmu_image")] = ffi.buffer(self.head)
+        wire, tag = ffi.new("noack_wire *"), ffi.new(f"uint8_t[{core.NOACK_TAG_BYTES}]")
+        content = bytes(self._data[len(tag) :])
+        core.noack_wire_key(wire, bytes(KEY_BYTES))
+        core.noack_wire_tag(wire, len(content), content, tag)
+        return bytes(tag) + content
 
-    def structure(
+    def add_variable(
+        self, reference: int, numbers: list[int], *, is_real: bool, is_input: bool
+    ) -> None:
+        """Append the numbers of a variable."""
+        at = self._add(ffi.new("double[]" if is_real else "int64_t[]", numbers))
+        self.head.values[reference] = (len(numbers), is_real, is_input, at)
+
+    def add_structure(
         self, found: CData, rows: Mapping[str, int], places: Mapping[str, int] | None = None
     ) -> int:
         """Append a copy of a structure and of its arrays; return its place.
@@ -137,218 +223,55 @@ class _Image:
                 names of inner structures.
             places: where the targets of other pointers are.
         """
-        kind = ffi.typeof(found).item
-        place = self.add(ffi.buffer(found))
+        kind, place, targets = ffi.typeof(found).item, self._add(found), dict(places or {})
         for name, count in rows.items():
             array = found
             for part in name.split("."):
                 array = getattr(array, part)
             if array != ffi.NULL:
-                size = count * ffi.sizeof(ffi.typeof(array).item)
-                self._point(place + _offset(kind, name), self.add(ffi.buffer(array, size)))
-        for name, target in (places or {}).items():
-            self._point(place + _offset(kind, name), target)
+                targets[name] = self._add(array, count * ffi.sizeof(ffi.typeof(array).item))
+        for name, target in targets.items():
+            fields = (int(part) if part.isdigit() else part for part in name.split("."))
+            pointer_at = place + ffi.offsetof(kind, *fields)
+            self._pointers.append((pointer_at, target))
+            self._data[pointer_at : pointer_at + 8] = target.to_bytes(8, sys.byteorder)
         return place
 
-    def _point(self, place: int, target: int) -> None:
-        self.pointers.append((place, target))
-        self.data[place : place + 8] = target.to_bytes(8, sys.byteorder)
-
-
-def _offset(kind: CData, name: str) -> int:
-    return int(ffi.offsetof(kind, *(int(p) if p.isdigit() else p for p in name.split("."))))
-
-
-class _Model:
-    """An FMU.
-
-    Args:
-        resolved: the resolved scenario.
-        role: channel or controller.
-    """
-
-    def __init__(self, resolved: Scenario, role: str) -> None:
-        self._scenario, self._role = resolved, role
-        self._identifier = re.sub(r"\W|^(?=\d)", "_", f"{resolved.name}_{role}", flags=re.ASCII)
-        loop = loop_of(resolved)
-        self._sizes = {"n": len(loop.H), "m": loop.m, "packets": _PACKETS}
-        self._variables = [
-            (reference, variable)
-            for reference, variable in enumerate(_VARIABLES)
-            if variable.causality(role)
-        ]
-
-    def archive(self) -> bytes:
-        """Return the file."""
-        image = self._image()
-        system, ending = _SYSTEMS[sys.platform]
-        processor = _PROCESSORS.get(machine().lower(), machine().lower())
-        files = {
-            "modelDescription.xml": self._description(image[: core.NOACK_TAG_BYTES].hex()),
-            "resources/noack.bin": image,
-            f"binaries/{processor}-{system}/{self._identifier}{ending}": LIBRARY.read_bytes(),
-        }
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in files.items():
-                archive.writestr(zipfile.ZipInfo(name, _DATE), content, zipfile.ZIP_DEFLATED)
-        return buffer.getvalue()
-
-    def _image(self) -> bytes:
-        image, head = _Image(), ffi.new("noack_fmu_image *")
-        image.add(ffi.buffer(head))
-        head.sources, head.n, head.packets = SOURCES.encode(), self._sizes["n"], _PACKETS
-        if self._role == "channel":
-            head.channel_at = _add_channel(image, self._scenario)
-        else:
-            head.controller_at = _add_controller(image, self._scenario)
-        for values in head.values:
-            values.at = len(image.data)
-        for reference, variable in self._variables:
-            values = head.values[reference]
-            numbers = self._start(variable)
-            kind = "double[]" if variable.is_real else "int64_t[]"
-            values.count, values.is_real = len(numbers), variable.is_real
-            values.is_input = variable.causality(self._role) == "input"
-            values.at = image.add(ffi.buffer(ffi.new(kind, numbers)))
-        pointers = ffi.new("noack_fmu_pointer[]", image.pointers)
-        head.pointer_count, head.pointers_at = len(pointers), image.add(ffi.buffer(pointers))
-        head.bytes = len(image.data)
-        image.data[: ffi.sizeof("noack_fmu_image")] = ffi.buffer(head)
-        wire, tag = ffi.new("noack_wire *"), ffi.new(f"uint8_t[{core.NOACK_TAG_BYTES}]")
-        core.noack_wire_key(wire, bytes(KEY_BYTES))
-        content = bytes(image.data[len(tag) :])
-        core.noack_wire_tag(wire, len(content), content, tag)
-        return bytes(tag) + content
-
-    def _start(self, variable: _Variable) -> list[float]:
-        count = 1
-        for dimension in variable.shape:
-            count *= self._sizes[dimension]
-        return [-1 if variable.name == "received" else 0] * count
-
-    def _description(self, token: str) -> bytes:
-        """Return the content of modelDescription.xml."""
-        timing, name = self._scenario.timing, self._scenario.name
-        root = ET.Element(
-            "fmiModelDescription",
-            fmiVersion="3.0",
-            modelName=f"{name} {self._role}",
-            instantiationToken=token,
-            generationTool=f"noack {version('noack')}",
-            description=f"The {self._role} of noack's scenario {name}",
-            license="Apache-2.0",
-        )
-        ET.SubElement(
-            root,
-            "CoSimulation",
-            modelIdentifier=self._identifier,
-            canHandleVariableCommunicationStepSize="true",
-            canGetAndSetFMUState="true",
-            canSerializeFMUState="true",
-        )
-        unit = ET.SubElement(ET.SubElement(root, "UnitDefinitions"), "Unit", name="s")
-        ET.SubElement(unit, "BaseUnit", s="1")
-        ET.SubElement(ET.SubElement(root, "LogCategories"), "Category", name="logStatusError")
-        ET.SubElement(
-            root,
-            "DefaultExperiment",
-            startTime="0",
-            stopTime=str(timing.horizon_ns / NS_PER_S),
-            stepSize=str(timing.plant_period_ns / NS_PER_S),
-        )
-        variables = ET.SubElement(root, "ModelVariables")
-        structure = ET.SubElement(root, "ModelStructure")
-        for reference, variable in self._variables:
-            self._describe(variables, reference, variable)
-        for tag in ("Output", "InitialUnknown"):
-            for reference, variable in self._variables:
-                if variable.causality(self._role) == "output":
-                    ET.SubElement(structure, tag, valueReference=str(reference))
-        ET.indent(root)
-        text: bytes = ET.tostring(root, "utf-8", xml_declaration=True)
-        return text
-
-    def _describe(self, variables: ET.Element, reference: int, variable: _Variable) -> None:
-        causality = variable.causality(self._role)
-        attributes = {
-            "name": variable.name,
-            "valueReference": str(reference),
-            "causality": causality,
-            "variability": "continuous" if causality == "independent" else "discrete",
-            "description": variable.description,
-        }  #
-        if causality == "input":
-            attributes["start"] = " ".join(map(str, self._start(variable)))
-        if unit := _UNITS.get(variable.name):
-            attributes["unit"] = unit
-        tag = "Float64" if variable.is_real else "Int64"
-        element = ET.SubElement(variables, tag, attributes)
-        for dimension in variable.shape:
-            ET.SubElement(element, "Dimension", start=str(self._sizes[dimension]))
+    def _add(self, rows: CData, size: int = -1) -> int:
+        place, content = len(self._data), bytes(ffi.buffer(rows, size))
+        self._data += content + bytes(-len(content) % 8)
+        return place
 
 
 def _add_channel(image: _Image, resolved: Scenario) -> int:
+    """Append the network of the updates, with nothing in flight."""
     state = LinkState(resolved.network.link, resolved.seeds.loss, UPDATE_LINK)
     channel, link = Channel([state]), state.core
     for _ in range(_DOUBLED):
         channel.answer(core.NOACK_ASK_PLACES)
     channel.core.row_places = 1  # there is no record
-    link_at = image.structure(
-        link,
-        {
-            "stages": link.stage_count,
-            "integers": link.integer_count,
-            "reals": link.real_count,
-            "windows": link.window_count,
-            "decisions": 0,
-            "decisions_begin": 1,
-            "flows": 1,
-            "memory": link.stage_count,
-            "recent_ns": link.recent_width,
-            "losses": link.loss_width,
-            "queues": link.stage_count,
-            "departures_ns": link.departure_places,
-        },
-    )
-    places = channel.core.places
-    return image.structure(
-        channel.core,
-        {"heap": places, "delayed": places, "packets": 1, "releases": 1},
-        {"links.0": link_at},
-    )
+    stages, places = link.stage_count, channel.core.places
+    of_link = {"stages": stages, "memory": stages, "queues": stages, "flows": 1}
+    of_link |= {"integers": link.integer_count, "reals": link.real_count}
+    of_link |= {"windows": link.window_count, "decisions": 0, "decisions_begin": 1}
+    of_link |= {"recent_ns": link.recent_width, "losses": link.loss_width}
+    of_link |= {"departures_ns": link.departure_places}
+    link_at = image.add_structure(link, of_link)
+    of_channel = {"heap": places, "delayed": places, "packets": 1, "releases": 1}
+    return image.add_structure(channel.core, of_channel, {"links.0": link_at})
 
 
 def _add_controller(image: _Image, resolved: Scenario) -> int:
+    """Append the controller, which goes on beyond the horizon."""
     machines = controllers_of([resolved])
     controller = machines.machines + 0  # a pointer to the first one
-    model, n, m = controller.model, controller.machine.n, controller.machine.m
-    controller.machine.horizon_ns = controller.machine.received.not_after_ns = _NO_HORIZON_NS
-    transitions = model.transitions
-    places = transitions.places
-    transitions_at = image.structure(
-        transitions,
-        {
-            "H": n * n,
-            "steps_ns": places,
-            "matrices": places * n * n,
-            "scratch": SCRATCH_MATRICES * n * n + 3 * n,
-        },
-    )
-    return image.structure(
-        controller,
-        {
-            "model.since_ns": 1,
-            "model.has_point": 1,
-            "model.points": n,
-            "K": m * n,
-            "x_r": n,
-            "u_r": m,
-            "safe_input": m,
-            "x_c": n,
-            "x": n,
-            "u": m,
-            "scratch": 3 * n + m,
-        },
-        {"model.transitions": transitions_at},
-    )
+    own, model = controller.machine, controller.model
+    own.horizon_ns = own.received.not_after_ns = _NO_HORIZON_NS
+    n, m, places = own.n, own.m, model.transitions.places
+    of_transitions = {"H": n * n, "steps_ns": places, "matrices": places * n * n}
+    of_transitions |= {"scratch": SCRATCH_MATRICES * n * n + 3 * n}
+    transitions_at = image.add_structure(model.transitions, of_transitions)
+    rows = {"model.since_ns": 1, "model.has_point": 1, "model.points": n, "K": m * n}
+    rows |= {"x_r": n, "u_r": m, "safe_input": m, "x_c": n}
+    rows |= {"x": n, "u": m, "scratch": 3 * n + m}
+    return image.add_structure(controller, rows, {"model.transitions": transitions_at})
