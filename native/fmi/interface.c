@@ -115,8 +115,9 @@ static status exchange(
     if (!is_in(instance, INSTANTIATED, sets ? STEPPING : TERMINATED, sets ? "fmi3Set" : "fmi3Get"))
         return FMI_ERROR;
     for (size_t k = 0; k < count; k++) {
-        const noack_fmu_values *values = &instance->image->values[references[k]];
-        if (references[k] >= NOACK_FMU_VARIABLES || values->count == 0 || values->is_real != is_real
+        int is_known = references[k] < NOACK_FMU_VARIABLES;
+        const noack_fmu_values *values = &instance->image->values[is_known ? references[k] : 0];
+        if (!is_known || values->count == 0 || values->is_real != is_real
             || (sets && !values->is_input))
             return fail(instance, "a value reference is not one of the variables of this type");
         if ((size_t)values->count > number_count)
