@@ -61,29 +61,25 @@ fmu *fmi3InstantiateCoSimulation(
     return NULL;
 }
 
+static status go(fmu *instance, int from, int to, const char *function) {
+    if (!is_in(instance, from, from, function))
+        return FMI_ERROR;
+    instance->image->mode = to;
+    return FMI_OK;
+}
+
 status fmi3EnterInitializationMode(
     fmu *instance, _Bool tolerates, double tolerance, double start_s, _Bool stops, double stop_s) {
-    if (!is_in(instance, INSTANTIATED, INSTANTIATED, __func__))
-        return FMI_ERROR;
-    if (start_s != 0.0)
+    if (instance != NULL && start_s != 0.0)
         return fail(instance, "the start time must be 0");
-    instance->image->mode = INITIALIZING;
-    return FMI_OK;
+    return go(instance, INSTANTIATED, INITIALIZING, __func__);
 }
 
 status fmi3ExitInitializationMode(fmu *instance) {
-    if (!is_in(instance, INITIALIZING, INITIALIZING, __func__))
-        return FMI_ERROR;
-    instance->image->mode = STEPPING;
-    return FMI_OK;
+    return go(instance, INITIALIZING, STEPPING, __func__);
 }
 
-status fmi3Terminate(fmu *instance) {
-    if (!is_in(instance, STEPPING, STEPPING, __func__))
-        return FMI_ERROR;
-    instance->image->mode = TERMINATED;
-    return FMI_OK;
-}
+status fmi3Terminate(fmu *instance) { return go(instance, STEPPING, TERMINATED, __func__); }
 
 status fmi3DoStep(
     fmu *instance, double from_s, double step_s, _Bool is_final, _Bool *needs_event, _Bool *ends,

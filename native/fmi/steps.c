@@ -117,14 +117,17 @@ static const char *step_controller(fmu *instance, int64_t to_ns) {
     const double *arrival_s = values_of(image, NOACK_FMU_ARRIVAL_S);
     if (!is_between(image->taken, arrivals, image->taken + image->packets))
         return "more packets have arrived than `packets` has room for: make shorter steps";
-    for (int64_t due_ns; (due_ns = tick_ns(machine)) < to_ns || image->taken < arrivals;) {
-        int64_t place = arrivals - image->taken - 1;
-        if (place >= 0 && (due_ns >= to_ns || ns_of(arrival_s[place]) <= due_ns)) {
+    for (;;) {
+        int64_t place = arrivals - image->taken - 1, due_ns = tick_ns(machine);
+        int64_t arrival_ns = place >= 0 ? ns_of(arrival_s[place]) : INT64_MAX;
+        if (arrival_ns <= due_ns && arrival_ns < to_ns) {
             receive(instance, place);
             image->taken++;
-        } else {
+        } else if (due_ns < to_ns) {
             noack_controller_tick(controller, due_ns, &instance->output);
             copy(machine->m, instance->output.message.vector, values_of(image, NOACK_FMU_U));
+        } else {
+            break;
         }
     }
     copy(machine->n, controller->x_c, values_of(image, NOACK_FMU_X_C));

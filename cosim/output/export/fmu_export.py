@@ -173,7 +173,7 @@ def _start(variable: _Variable) -> int:
 def _element(role: str, reference: int, variable: _Variable, shape: list[int]) -> str:
     """Return the element of a variable."""
     causality, tag = getattr(variable, role), "Float64" if variable.is_real else "Int64"
-    variability = "continuous" if causality == _INDEPENDENT else "discrete"
+    variability = "continuous" if variable.name in ("time", "x") else "discrete"
     start = " ".join(["0"] * math.prod(shape))
     dimensions = "".join(f'<Dimension start="{size}"/>' for size in shape)
     return (

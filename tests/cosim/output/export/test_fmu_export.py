@@ -5,7 +5,7 @@ import math
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from fmpy.fmi1 import FMICallException  # noqa: E402
 from fmpy.fmi3 import FMU3Slave  # noqa: E402
 from fmpy.validation import validate_fmu  # noqa: E402
 
-BURSTS = {
+BURSTS: dict[str, Any] = {
     "horizon_s": 4.0,
     "network.mansd": 3,
     "network.loss": {"model": "gilbert_elliott", "good_to_bad": 0.4, "bad_to_good": 0.3},
@@ -37,12 +37,12 @@ BURSTS = {
         {"kind": "corrupt", "probability": 0.1},
     ],
 }
+SLOW_TICKS = {"network.initial_sync": "known_state", "controller.rate_hz": 200.0, "horizon_s": 6.0}
 LOST = (Fate.DROPPED, Fate.CORRUPTED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
 PASSED = ("arrivals", "packet_number", "packet_sent_s", "packet_arrival_s", "packet_x")
-
-
 H_S = 0.01
 LOGS = list[list[str]]()
+"""Of all instances."""
 Folders = Callable[[Scenario], list[Path]]
 
 
@@ -54,40 +54,36 @@ class Fmu:
         self.variables = {one.name: one for one in found.modelVariables}
         self.log = list[str]()
         LOGS.append(self.log)
-        self.slave = FMU3Slave(
-            instanceName="one", guid=found.guid, unzipDirectory=str(folder),
-            modelIdentifier=found.coSimulation.modelIdentifier,
-        )  # fmt: skip
-        self.slave.instantiate(
-            logMessage=lambda _env, _status, _kind, text: self.log.append(text.decode())
-        )
+        name = found.coSimulation.modelIdentifier
+        self.slave = FMU3Slave("", guid=found.guid, unzipDirectory=folder, modelIdentifier=name)
+        self.slave.instantiate(logMessage=lambda *given: self.log.append(given[-1].decode()))
 
     def start(self) -> "Fmu":
         self.slave.enterInitializationMode()
         self.slave.exitInitializationMode()
         return self
 
-    def _method(self, verb: str, name: str) -> tuple[Any, int, int]:
-        one = self.variables[name]
-        count = int(np.prod([int(dimension.start) for dimension in one.dimensions]))
-        return getattr(self.slave, f"{verb}{one.type}"), one.valueReference, count
-
     def get(self, name: str) -> Any:
-        method, reference, count = self._method("get", name)
-        found = method([reference], nValues=count)
-        return found if self.variables[name].dimensions else found[0]
+        one = self.variables[name]
+        count = math.prod(int(dimension.start) for dimension in one.dimensions)
+        found = getattr(self.slave, f"get{one.type}")([one.valueReference], nValues=count)
+        return found if one.dimensions else found[0]
 
     def set(self, name: str, value: Any) -> None:
-        method, reference, _ = self._method("set", name)
-        method([reference], np.ravel(value).tolist())
+        one = self.variables[name]
+        getattr(self.slave, f"set{one.type}")([one.valueReference], np.ravel(value).tolist())
 
     def step(self, t_s: float, h_s: float, **inputs: Any) -> None:
         for name, value in inputs.items():
             self.set(name, value)
         self.slave.doStep(t_s, h_s)
 
+    def follow(self, channel: "Fmu", t_s: float, h_s: float) -> Any:
+        """A step of the controller after the channel; its u."""
+        self.step(t_s, h_s, **{name: channel.get(name) for name in PASSED})
+        return self.get("u")
+
     def state(self) -> bytes:
-        """A copy of its state, serialised."""
         state = self.slave.getFMUState()
         content: bytes = self.slave.serializeFMUState(state)
         self.slave.freeFMUState(state)
@@ -119,74 +115,63 @@ def folders(tmp_path: Path) -> Folders:
     return make
 
 
-def only_message(outputs: Sequence[Any]) -> Message | None:
-    return next((one for one in outputs if isinstance(one, Message)), None)
-
-
-def co_simulated(scenario: Scenario, channel: Fmu, controller: Fmu) -> dict[str, Any]:
-    """Run the loop of plant and sensor, which are the core's machines, with the two FMUs."""
-    (resolved,) = resolved_loops(scenario)
-    plant, sensor, h_ns = plant_of(resolved), sensor_of(resolved), resolved.timing.plant_period_ns
-    x, u, events_ns = list[Any](), list[Any](), list[int]()
-    last = resolved.timing.horizon_ns // h_ns
-    for k in range(last + 100):  # at the end, what is in flight arrives
-        t_ns, t_s, h_s = k * h_ns, k * h_ns / 1e9, h_ns / 1e9
-        if k <= last:
-            measured = only_message(plant.on_timer(t_ns))
-            assert measured is not None
-            x.append(measured.vector)
-            update = only_message(sensor.handle(measured, t_ns))
-            if update is not None:
-                events_ns.append(t_ns)
-                channel.set("x", update.vector)
-        channel.step(t_s, h_s, send=len(events_ns))
-        controller.step(t_s, h_s, **{name: channel.get(name) for name in PASSED})
-        u.append(controller.get("u"))
-        plant.handle(Message(Flow.ACTUATION, k, t_ns, np.array(u[-1])), t_ns)
-    counts = {name: channel.get(name) for name in ("lost", "longest_burst", "arrivals")}
-    counts["updates"] = controller.get("updates")
-    return {"x": np.array(x), "u": np.array(u), "events_ns": events_ns} | counts
-
-
-SLOW_TICKS = {
-    "horizon_s": 6.0,
-    "network.initial_sync": "known_state",
-    "controller.rate_hz": 200.0,
-}
-
-
-@pytest.mark.parametrize(
-    ("name", "settings"),
-    [
-        ("lane_following", {"horizon_s": 6.0}),
-        ("double_integrator", BURSTS),
-        ("lane_constrained", SLOW_TICKS),
-    ],
-    ids=["plain", "bursts, delays, copies and damage", "constraints, a known start, slow ticks"],
-)
-def test_a_run_is_that_of_a_simulation(name: str, settings: Any, folders: Folders) -> None:
-    """Bit for bit."""
-    scenario = noack.load(name, settings)
-    run = noack.simulate(scenario)
-    channel, controller = (Fmu(folder).start() for folder in folders(scenario))
-    found = co_simulated(scenario, channel, controller)
-    packets = run.table("netem_packet").to_pydict()
-    assert found["events_ns"] == packets["t_ns"]
-    np.testing.assert_array_equal(found["x"], vectors(run, "plant_step", "x"))
-    assert found["lost"] == sum(fate in LOST for fate in packets["fate"])
-    assert found["longest_burst"] == max(packets["consecutive_losses"]) > 0
-    assert found["updates"] == len(run.table("controller_delivery"))
-    ticks = run.table("controller_step").to_pydict()["t_ns"]
-    last = {t_ns // scenario.timing.plant_period_ns: row for row, t_ns in enumerate(ticks)}
-    expected = vectors(run, "controller_step", "u")[[*last.values()]]
-    np.testing.assert_array_equal(found["u"][[*last]], expected)
-
-
 def vectors(run: Any, table: str, name: str) -> Any:
     """A vector of a table's rows, (rows, entries)."""
     found = run.table(table)
     names = [one for one in found.column_names if re.fullmatch(rf"{name}_\d+", one)]
     return np.transpose([found[one].to_numpy() for one in names])
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("lane_following", {"horizon_s": 6.0}), ("double_integrator", BURSTS),
+     ("lane_constrained", SLOW_TICKS)],
+    ids=["plain", "bursts, delays, copies and damage", "constraints, a known start, slow ticks"],
+)  # fmt: skip
+def test_a_run_is_that_of_a_simulation(name: str, settings: Any, folders: Folders) -> None:
+    """Bit for bit; plant and sensor are the core's machines."""
+    scenario = noack.load(name, settings)
+    run, (resolved,) = noack.simulate(scenario), resolved_loops(scenario)
+    channel, controller = (Fmu(folder).start() for folder in folders(scenario))
+    plant, sensor, h_ns = plant_of(resolved), sensor_of(resolved), resolved.timing.plant_period_ns
+    x, u, events_ns, last = [], [], [], resolved.timing.horizon_ns // h_ns
+    for k in range(last + 100):  # at the end, what is in flight arrives
+        t_ns, t_s, h_s = k * h_ns, k * h_ns / 1e9, h_ns / 1e9
+        if k <= last:
+            measured = next(one for one in plant.on_timer(t_ns) if isinstance(one, Message))
+            x.append(measured.vector)
+            for update in sensor.handle(measured, t_ns):
+                if isinstance(update, Message):
+                    events_ns.append(t_ns)
+                    channel.set("x", update.vector)
+        channel.step(t_s, h_s, send=len(events_ns))
+        u.append(controller.follow(channel, t_s, h_s))
+        plant.handle(Message(Flow.ACTUATION, k, t_ns, np.array(u[-1])), t_ns)
+    packets = run.table("netem_packet").to_pydict()
+    assert events_ns == packets["t_ns"]
+    np.testing.assert_array_equal(x, vectors(run, "plant_step", "x"))
+    assert channel.get("lost") == sum(fate in LOST for fate in packets["fate"])
+    assert channel.get("longest_burst") == max(packets["consecutive_losses"]) > 0
+    assert controller.get("updates") == len(run.table("controller_delivery"))
+    ticks = run.table("controller_step").to_pydict()["t_ns"]
+    rows = {t_ns // h_ns: row for row, t_ns in enumerate(ticks)}  # the last tick of each step
+    expected = vectors(run, "controller_step", "u")[[*rows.values()]]
+    np.testing.assert_array_equal(np.array(u)[[*rows]], expected)
+
+
+def test_steps_may_have_any_length(folders: Folders) -> None:
+    """A channel with steps ten times as long gives the controller packets ahead of their time."""
+    first, second = folders(noack.load("double_integrator", BURSTS))
+    short, long, one, other = (Fmu(folder).start() for folder in (first, first, second, second))
+    u = list[tuple[Any, Any]]()
+    for k in range(400):
+        number, t_s, h_s = k // 10 + 1, k * H_S / 10, H_S / 10
+        if k % 10 == 0:
+            long.step(t_s, H_S, send=number, x=[number, 1.0])
+        short.step(t_s, h_s, send=number, x=[number, 1.0])
+        u.append((one.follow(short, t_s, h_s), other.follow(long, t_s, h_s)))
+    assert all(left == right for left, right in u)
+    assert long.get("arrivals") == short.get("arrivals") == other.get("arrivals") > 10
 
 
 def sent(channel: Fmu, steps: range) -> list[list[float]]:
@@ -203,14 +188,13 @@ def test_instances_are_separate_and_can_begin_or_go_on_again(folders: Folders) -
     one, two = Fmu(folder).start(), Fmu(folder).start()
     whole = sent(one, range(60))
     assert len({tuple(row) for row in whole}) > 20
-    first = sent(two, range(30))  # while the other one exists
+    assert sent(two, range(30)) == whole[:30]  # while the other one exists
     kept = two.state()
-    assert first + sent(two, range(30, 60)) == whole
-    two.set_state(kept)
     assert sent(two, range(30, 60)) == whole[30:]
-    one.set_state(kept)  # another instance's
-    assert one.state() == kept
-    assert sent(one, range(30, 60)) == whole[30:]
+    for instance in (one, two):
+        instance.set_state(kept)
+        assert instance.state() == kept
+        assert sent(instance, range(30, 60)) == whole[30:]
     one.slave.reset()
     assert sent(one.start(), range(60)) == whole
     controller = Fmu(other).start()
@@ -222,29 +206,24 @@ def test_instances_are_separate_and_can_begin_or_go_on_again(folders: Folders) -
 
 def test_what_is_called_at_the_wrong_time_is_an_error(folders: Folders) -> None:
     channel, controller = map(Fmu, folders(noack.load("double_integrator", BURSTS)))
-    slave = channel.slave
-    assert "DoStep must not be called now" in channel.refuses(slave.doStep, 0.0, H_S)
-    assert "must not be called now" in channel.refuses(slave.exitInitializationMode)
+    slave, now = channel.slave, "must not be called now"
+    assert now in channel.refuses(slave.doStep, 0.0, H_S)
+    assert now in channel.refuses(slave.exitInitializationMode)
     start_later = (slave.fmi3EnterInitializationMode, slave.component, False, 0.0, 1.0, False, 0.0)
     assert "the start time must be 0" in channel.refuses(*start_later)
     channel.start()
-    assert "must not be called now" in channel.refuses(slave.enterInitializationMode)
-    for method, *given in (
-        (slave.setFloat64, [99], [1.0]), (slave.setFloat64, [1], [1.0]),
-        (slave.setInt64, [3], [1]), (slave.getFloat64, [14]), (slave.getFloat64, [2]),
-        (slave.getFloat64, [2], 3),
-    ):  # fmt: skip
-        assert "value" in channel.refuses(method, *given)
+    assert now in channel.refuses(slave.enterInitializationMode)
+    get, put = slave.getFloat64, slave.setFloat64
+    for wrong in ((put, [99], [1.0]), (put, [1], [1.0]), (put, [5], [1.0]), (get, [14]), (get, [2]),
+                  (get, [2], 3)):  # fmt: skip
+        assert "value" in channel.refuses(*wrong)
     with pytest.raises(FMICallException, match="status 3"):
         slave.getFloat32([0])
     channel.step(0.0, H_S)
-    for from_s, step_s, words in (
-        (0.0, H_S, "forward"), (H_S, -H_S, "forward"), (math.nan, H_S, "forward"),
-        (H_S, math.inf, "forward"), (2 * H_S, H_S, "begins where"),
-    ):  # fmt: skip
-        kept = channel.state()
-        assert words in channel.refuses(slave.doStep, from_s, step_s)
-        assert "must not be called now" in channel.refuses(slave.doStep, H_S, H_S)
+    kept = channel.state()
+    for from_s, step_s in ((0.0, H_S), (H_S, -H_S), (math.nan, H_S), (H_S, math.inf), (0.5, H_S)):
+        assert "a step" in channel.refuses(slave.doStep, from_s, step_s)
+        assert now in channel.refuses(slave.doStep, H_S, H_S)
         channel.set_state(kept)
     channel.set("send", 2)
     assert "`send` must be" in channel.refuses(slave.doStep, H_S, H_S)
@@ -258,22 +237,23 @@ def test_what_is_called_at_the_wrong_time_is_an_error(folders: Folders) -> None:
     slave.reset()
     channel.start().slave.terminate()
     assert channel.get("arrivals") == 0
-    assert "must not be called now" in channel.refuses(slave.doStep, 0.0, H_S)
+    assert now in channel.refuses(slave.doStep, 0.0, H_S)
 
 
 def test_packets_that_no_run_has_are_not_used(folders: Folders) -> None:
     controller = Fmu(folders(noack.load("double_integrator"))[1]).start()
-    for k, (number, sent_s, x) in enumerate(
-        [(-1, 0.0, 1.0), (0, math.nan, 1.0), (0, -1.0, 1.0), (0, 1e300, 1.0), (0, 0.0, math.inf),
-         (5, 0.0, 1.0), (5, 0.0, 2.0), (4, 0.0, 2.0)]
-    ):  # fmt: skip
-        packets = np.zeros((8, 3))
-        packets[0] = number, sent_s, x
-        controller.step(
-            k * 1e-3, 1e-3, arrivals=k + 1, packet_number=packets[:, 0].astype(int),
-            packet_sent_s=packets[:, 1], packet_x=np.repeat(packets[:, 2], 2),
-        )  # fmt: skip
-        assert controller.get("updates") == (k >= 5)
+    wrong = (
+        (-1, 0.0, 1.0),
+        (0, math.nan, 1.0),
+        (0, -1.0, 1.0),
+        (0, 1e300, 1.0),
+        (0, 0.0, math.inf),
+    )
+    for k, packet in enumerate([*wrong, (5, 0.0, 1.0), (5, 0.0, 2.0), (4, 0.0, 2.0)]):
+        number, sent_s, x = ([value, *[0] * 7] for value in packet)
+        given = {"packet_number": number, "packet_sent_s": sent_s}
+        controller.step(k * H_S, H_S, arrivals=k + 1, packet_x=np.repeat(x, 2), **given)
+        assert controller.get("updates") == (k >= len(wrong))
     assert np.isfinite(controller.get("x_c")).all()
 
 
@@ -298,15 +278,12 @@ def test_resources_that_are_damaged_give_one_line(folders: Folders) -> None:
         assert line in found
 
 
-@pytest.mark.parametrize(
-    ("name", "settings", "line"),
-    [
-        ("model_predictive", {}, 'controller.kind = "python": needs Python'),
-        ("shared_bottleneck", {}, "the scenario has loops"),
-        ("double_integrator", {"network.protocol": "ack"}, 'set protocol = "none"'),
-        ("lane_actuation_loss", {}, "network.actuation: an FMU's channel"),
-    ],
-)
+@pytest.mark.parametrize(("name", "settings", "line"), [
+    ("model_predictive", {}, 'controller.kind = "python": needs Python'),
+    ("shared_bottleneck", {}, "the scenario has loops"),
+    ("double_integrator", {"network.protocol": "ack"}, 'set protocol = "none"'),
+    ("lane_actuation_loss", {}, "network.actuation: an FMU's channel"),
+])  # fmt: skip
 def test_a_scenario_that_an_fmu_cannot_have_is_one_line(
     name: str, settings: Any, line: str, tmp_path: Path
 ) -> None:
@@ -324,16 +301,14 @@ def test_the_command_takes_scenarios_and_runs(
     monkeypatch.chdir(tmp_path)
     scenario = noack.load("double_integrator", {"network.mansd": 2})
     expected = [path.read_bytes() for path in export_scenario(scenario, Path("a.fmu"), "fmu")]
-    command = [sys.executable, "-m", "cosim.cli", "export", "double_integrator", "--format", "fmu"]
-    subprocess.run([*command, "--set", "network.mansd=2"], check=True, capture_output=True)
+    command = ("export", "double_integrator", "--format", "fmu", "--set", "network.mansd=2")
+    subprocess.run([sys.executable, "-m", "cosim.cli", *command], check=True, capture_output=True)
     names = [f"double_integrator_{role}.fmu" for role in ("channel", "controller")]
-    assert [len(Path(name).read_bytes()) for name in names] == [*map(len, expected)]
-    run = noack.simulate(scenario, runs="runs")
-    assert run.export("a.fmu") == [Path("a_channel.fmu"), Path("a_controller.fmu")]
-    assert [path.read_bytes() for path in run.export("a.fmu")] == expected
-    found = invoke("export", str(run.directory), "--format", "fmu", "--json")
-    assert [Path(name).read_bytes() for name in json.loads(found.stdout)["files"]] == expected
     assert [Path(name).read_bytes() for name in names] == expected
+    run = noack.simulate(scenario, runs="runs")
+    found = invoke("export", str(run.directory), "--format", "fmu", "--out", "b.fmu", "--json")
+    for files in (run.export("c.fmu"), map(Path, json.loads(found.stdout)["files"])):
+        assert [path.read_bytes() for path in files] == expected
     refused = invoke("export", str(run.directory), "--format", "csv", "--set", "network.mansd=2")
     assert refused.exit_code == 2
     assert "--set: a run has its settings" in refused.stderr
