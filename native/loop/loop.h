@@ -78,9 +78,6 @@ int64_t handle_message(
     noack_process *process, int64_t loop, const noack_message *message, int64_t now_ns);
 int64_t do_tick(noack_process *process, int64_t loop, int64_t now_ns);
 
-/* machine_check.c: NULL, or what is wrong with a controller that is not in a process. */
-const char *controller_check(const noack_controller *controller);
-
 /* plant.c: set the input of the system for a step: u + d, and w behind it. */
 void disturb(noack_plant *plant, int64_t step);
 

@@ -245,11 +245,6 @@ static const char *check_loop(const noack_process *process, int64_t loop) {
     return wrong != NULL ? wrong : check_tables(process, loop);
 }
 
-const char *controller_check(const noack_controller *controller) {
-    const char *wrong = check_machine(&controller->machine);
-    return wrong != NULL ? wrong : check_controller(controller);
-}
-
 const char *noack_process_check(const noack_process *process) {
     if (!is_between(NOACK_PLANT, process->role, NOACK_CONTROLLER)
         || !is_between(1, process->loops, MOST_LOOPS))
