@@ -16,6 +16,7 @@ from platform import machine
 from typing import TYPE_CHECKING, NamedTuple
 
 from controller_node.controller import controllers_of
+from cosim.record.run_directory import SCENARIO_FILE
 from netem.channel import UPDATE_LINK, Channel, alone
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
@@ -23,6 +24,7 @@ from noack.core.core_library import LIBRARY, SCRATCH_MATRICES, SOURCES, CData, c
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
 from noack.protocol.wire_format import KEY_BYTES, Flow
+from noack.scenario import scenario_file
 from noack.scenario.resolution import loop_of, resolved_loops
 from noack.scenario.scenario import Scenario
 
@@ -93,7 +95,7 @@ _DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 
 def write(run: "ExportedRun", path: Path, *, certificates: bool = True) -> list[Path]:
     """Write the FMUs of a run's scenario; see :func:`write_scenario`."""
-    return write_scenario(run.record.scenario, path)
+    return write_scenario(scenario_file.load(run.directory / SCENARIO_FILE), path)
 
 
 def write_scenario(scenario: Scenario, path: Path) -> list[Path]:

@@ -309,6 +309,9 @@ def test_the_command_takes_scenarios_and_runs(
     found = invoke("export", str(run.directory), "--format", "fmu", "--out", "b.fmu", "--json")
     for files in (run.export("c.fmu"), map(Path, json.loads(found.stdout)["files"])):
         assert [path.read_bytes() for path in files] == expected
+    loops = noack.simulate(noack.load("different_loops", {"horizon_s": 0.1}))
+    with pytest.raises(CallerError, match="the scenario has loops"):
+        next(iter(loops.loops.values())).export("d.fmu")
     refused = invoke("export", str(run.directory), "--format", "csv", "--set", "network.mansd=2")
     assert refused.exit_code == 2
     assert "--set: a run has its settings" in refused.stderr
