@@ -112,7 +112,9 @@ def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
             "network.actuation: an FMU's channel leads to the controller only; remove this table"
         )
     if not scenario.controller.is_linear:
-        raise CallerError(f'controller.kind = "{kind}": needs Python; an FMU needs kind = "linear"')
+        raise CallerError(
+            f'controller.kind = "{kind}": an FMU has the linear law only, kind = "linear"'
+        )
     (resolved,) = resolved_loops(scenario)
     return [
         write_whole(path.with_name(f"{path.stem}_{role}{SUFFIX}"), _archive(resolved, role))

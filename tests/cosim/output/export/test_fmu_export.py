@@ -279,7 +279,7 @@ def test_resources_that_are_damaged_give_one_line(folders: Folders) -> None:
 
 
 @pytest.mark.parametrize(("name", "settings", "line"), [
-    ("model_predictive", {}, 'controller.kind = "python": needs Python'),
+    ("model_predictive", {}, 'controller.kind = "python": an FMU has the linear law'),
     ("shared_bottleneck", {}, "the scenario has loops"),
     ("double_integrator", {"network.protocol": "ack"}, 'set protocol = "none"'),
     ("lane_actuation_loss", {}, "network.actuation: an FMU's channel"),
