@@ -1207,6 +1207,56 @@ const char *noack_replay_check(const noack_input_replay *replay);
 /* Replay the next inputs: compare each row bit for bit, and the times of ticks with the deadlines.
    Return NOACK_DONE, or why Python is needed. */
 int64_t noack_replay_inputs(noack_input_replay *replay);
+
+/* ---- Functional Mock-up Units: native/fmi/ -------------------------------------------------------
+
+   An instance of an FMU is an image: a block of memory without pointers to elsewhere. The file in
+   the FMU is its start, as if the block were at address 0. */
+
+enum noack_fmu_variable { /* value references */
+    NOACK_FMU_TIME_S,
+    NOACK_FMU_SEND, /* of the channel: number of packets that have been sent */
+    NOACK_FMU_X,
+    NOACK_FMU_ARRIVALS, /* from the channel to the controller; the newest one is first: */
+    NOACK_FMU_NUMBERS,
+    NOACK_FMU_SENT_S,
+    NOACK_FMU_ARRIVAL_S,
+    NOACK_FMU_PACKETS,
+    NOACK_FMU_RECEIVED, /* of the channel: the newest packet that has arrived */
+    NOACK_FMU_RECEIVED_S,
+    NOACK_FMU_RECEIVED_X,
+    NOACK_FMU_LOST,
+    NOACK_FMU_LONGEST_BURST,
+    NOACK_FMU_IN_FLIGHT,
+    NOACK_FMU_U, /* of the controller */
+    NOACK_FMU_X_C,
+    NOACK_FMU_UPDATES,
+    NOACK_FMU_VARIABLES
+};
+
+typedef struct {
+    int64_t count; /* 0: this FMU has no such variable */
+    int64_t is_real, is_input;
+    int64_t at; /* place of its numbers in the image, in bytes */
+} noack_fmu_values;
+
+typedef struct {
+    int64_t place, target; /* of a pointer, and of what it points to, in bytes */
+} noack_fmu_pointer;
+
+typedef struct { /* begins an image */
+    uint8_t tag[16];   /* check sum of all that follows: noack_wire_tag with the key 0 */
+    char sources[32];  /* noack_sources() of the library that it is for */
+    int64_t bytes;     /* of the image */
+    int64_t pointer_count, pointers_at; /* (pointer_count,) of noack_fmu_pointer */
+    int64_t channel_at, controller_at;  /* one of them is 0 */
+    int64_t n, packets;                 /* packets: most of them that can arrive in a step */
+    noack_fmu_values values[17];
+    int64_t mode, now_ns;
+    int64_t taken;  /* packets that have been sent, or of those that have arrived */
+    int64_t before; /* arrivals before this step */
+} noack_fmu_image;
+
 /* ---- Exact simulation in continuous time: native/exact/ ----------------------------------------
 
    The loop of plant, sensor's model and controller's model, without sampling and without delay.

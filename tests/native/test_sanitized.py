@@ -43,8 +43,10 @@ def test_the_end_of_each_array_is_known() -> None:
      "(numbers or exact or bit_for_bit or runs_end)) or (test_worst_patterns and (machines or "
      "early))"),
     ("tests/noack/runtime/test_live_driver.py", "tests/noack/runtime/test_peer_sockets.py"),
+    ("tests/cosim/output/export/test_fmu_export.py", "-k",
+     "not plain and not slow and not command"),
 ], ids=["random machines and exact simulations", "parsers", "simulations and replays",
-        "the live driver"])  # fmt: skip
+        "the live driver", "FMUs"])  # fmt: skip
 def test_these_tests_run_clean(arguments: Sequence[str]) -> None:
     done = run(*PYTEST, *arguments)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[:4000]

@@ -10,9 +10,15 @@ from typer import Argument, Option
 from cosim.cli import command as cli
 from cosim.cli import completion
 from cosim.lazy_modules import lazy_modules
-from cosim.output.export import FORMATS, export_run, export_suffix
+from cosim.output.export import (
+    FORMATS,
+    export_run,
+    export_scenario,
+    export_suffix,
+    needs_run,
+)
 from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
-from noack.core.errors import ExitStatus
+from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
@@ -177,10 +183,13 @@ def export(
         ),
     ],
     out: cli.OutOption = None,
+    settings: cli.SetOption = None,
     certificates: bool = True,
     json: cli.JsonOption = False,
 ) -> None:
     """Export a run for other programs: its tables, its summary and its certificates.
+
+    fmu: the channel and the controller of a scenario, whose name or file may be given as RUN.
 
     Options:
         file_format: Format of the file, or of the folder's files.
@@ -191,13 +200,31 @@ def export(
         noack export --format mat   the last run for MATLAB and Octave
         noack export --format mcap --out run.mcap   for Foxglove and PlotJuggler
         noack export runs/latest --format csv --json   a folder of CSV files
+        noack export lane_following --format fmu   FMUs of its channel and its controller
     """
-    finalize.reopen(chosen := run.path)
-    name = run.loop or chosen.resolve().name
-    path = out or Path(f"{name}{export_suffix(file_format)}")
-    with cli.status("exporting"):
-        written = export_run(chosen, path, file_format, loop=run.loop, certificates=certificates)
+    if needs_run(file_format):
+        if settings:
+            raise CallerError(f"--set: a run has its settings; {file_format} is a format of runs")
+        finalize.reopen(chosen := run.path)
+        name = run.loop or chosen.resolve().name
+        path = out or Path(f"{name}{export_suffix(file_format)}")
+        with cli.status("exporting"):
+            written = export_run(
+                chosen, path, file_format, loop=run.loop, certificates=certificates
+            )
+    else:
+        scenario = cli.load_scenario(_scenario_name(run), settings)
+        path = out or Path(f"{scenario.name}{export_suffix(file_format)}")
+        written = export_scenario(scenario, path, file_format)
     cli.print_lines(json, {"files": [str(path) for path in written]}, *written)
+
+
+def _scenario_name(run: cli.LoopOptions) -> str:
+    """Return the file of a run's scenario, or the scenario that is given instead of a run."""
+    given = run.run_dir
+    if given is not None and not (given / SCENARIO_FILE).is_file():
+        return str(given)
+    return str(run.path / SCENARIO_FILE)
 
 
 @cli.command(cli.RUNS, 92, takes="about a second")

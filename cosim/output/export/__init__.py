@@ -1,7 +1,8 @@
 """Exports of a run to the files of other programs.
 
 A format is a file ``NAME_export.py`` in this folder. It has ``SUFFIX``, the ending of its files
-(empty: a folder), and ``write(run, path, *, certificates)``, which returns the written files.
+(empty: a folder), and ``write(run, path, *, certificates)``, which returns the written files. A
+format that needs no run has ``write_scenario(scenario, path)``, too.
 """
 
 import pkgutil
@@ -22,6 +23,7 @@ with lazy_modules():
 
 if TYPE_CHECKING:
     from cosim.record.run_record import RunRecord
+    from noack.scenario.scenario import Scenario
 
 _ENDING = "_export"
 FORMATS = tuple(
@@ -86,6 +88,22 @@ def export_run(
         raise CallerError(f"{path}: an export is written to {expected}")
     run = _exported_run(run_dir, loop)
     written: list[Path] = _module(chosen).write(run, path, certificates=certificates)
+    return written
+
+
+def needs_run(kind: str) -> bool:
+    """Return whether a format is that of a run; else a scenario is enough."""
+    return not hasattr(_module(kind), "write_scenario")
+
+
+def export_scenario(scenario: "Scenario", path: Path, kind: str) -> list[Path]:
+    """Export a scenario in a format that needs no run; return the written files.
+
+    Raises:
+        CallerError: the format cannot have something of the scenario.
+        MachineError: a file cannot be written.
+    """
+    written: list[Path] = _module(kind).write_scenario(scenario, path)
     return written
 
 
