@@ -28,15 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.programs import FREE_PORTS, NOACK, TwoHosts, two_hosts
-from benchmarks.report import (
-    Figures,
-    Goal,
-    MeasurementError,
-    Rounds,
-    Row,
-    benchmark,
-    say,
-)
+from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, say
 from noack.core.clock import ClockOffset, Restart
 from noack.runtime.address import Address
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient, TimeReference, answering

@@ -23,14 +23,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from benchmarks.programs import (
-    FREE_PORTS,
-    NOACK,
-    Processes,
-    execute,
-    imported_s,
-    noack,
-)
+from benchmarks.programs import FREE_PORTS, NOACK, Processes, execute, imported_s, noack
 from benchmarks.report import (
     Figures,
     Goal,
