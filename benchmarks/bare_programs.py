@@ -1,12 +1,7 @@
-"""Bare programs that run as processes of their own: a ping, ticking loops, a flood.
+"""Bare programs that run as processes of their own: ticking loops, a flood.
 
 ``python -m benchmarks.bare_programs NAME ...`` runs one of them:
 
-* ``ping COUNT PERIOD_NS PRIORITY``: a UDP ping through a relay, the one-way latency of Python
-  alone. Three minimal processes: a sender that sleeps until each datagram is due, a relay, and a
-  receiver. Relay and receiver block in ``recv``; the receiver reads the clock right after it. An
-  empty datagram ends the next process. ``ping.c`` is the same in C, with the same arguments,
-  output and real-time settings, which are those of a run.
 * ``ticks LOOP COUNT PERIOD_NS PRIORITY``: a loop that ticks at a fixed rate, and prints p50, p99
   and maximum of the lateness, µs, and the real-time settings. Priority 0: none are requested.
 * ``flood SECONDS RATE PORT...``: sends unwanted datagrams at a total rate, or as fast as possible
@@ -34,66 +29,11 @@ from noack.runtime.real_time_loop import realtime
 
 LOOPBACK = "127.0.0.1"
 PRIORITY = 50
-_PING_BYTES = 72
-_STAMP = struct.Struct("<q")
-_SETTLE_S = 0.3
 
 
 def command_of(program: str, *arguments: object) -> list[str]:
     """Return the command that runs a program."""
     return [sys.executable, "-m", "benchmarks.bare_programs", program, *map(str, arguments)]
-
-
-def ping(count: str, period_ns: str, priority: str) -> None:
-    """Run the three processes of the ping."""
-    receiver, relay, relay_out, out = (socket.socket(type=socket.SOCK_DGRAM) for _ in range(4))
-    for endpoint, sender in ((receiver, relay_out), (relay, out)):
-        endpoint.bind((LOOPBACK, 0))
-        sender.connect(endpoint.getsockname())
-    # The receiver first; a place is that of controller, emulator and sensor along the loop.
-    for place in (3, 2, 1):
-        if os.fork() > 0:
-            continue
-        with realtime(priority != "0", max(int(priority), 1), place) as granted:
-            for setting, answer in granted.items():
-                if answer.startswith("not permitted"):
-                    print(f"{setting}: {answer}", file=sys.stderr, flush=True)
-            if place == 3:
-                _receive(receiver)
-            elif place == 2:
-                _relay(relay, relay_out)
-            else:
-                _send(out, int(count), int(period_ns) * 1e-9)
-        os._exit(0)
-    for _ in range(3):
-        _, status = os.wait()
-        if status != 0:
-            sys.exit(1)
-
-
-def _receive(endpoint: socket.socket) -> None:
-    latencies_ns = []
-    while data := endpoint.recv(2048):
-        now_ns = time.monotonic_ns()
-        latencies_ns.append(now_ns - _STAMP.unpack_from(data)[0])
-    os.write(sys.stdout.fileno(), np.array(latencies_ns, "<i8").tobytes())
-
-
-def _relay(endpoint: socket.socket, out: socket.socket) -> None:
-    data = b"first"
-    while data:
-        data = endpoint.recv(2048)
-        out.send(data)
-
-
-def _send(out: socket.socket, count: int, period_s: float) -> None:
-    padding = bytes(_PING_BYTES - _STAMP.size)
-    begin_s = time.monotonic() + _SETTLE_S
-    for number in range(count):
-        time.sleep(max(begin_s + number * period_s - time.monotonic(), 0.0))
-        out.send(_STAMP.pack(time.monotonic_ns()) + padding)
-    time.sleep(_SETTLE_S)
-    out.send(b"")
 
 
 def _run_loop(count: int, period_ns: int) -> Sequence[int]:
@@ -188,4 +128,4 @@ def print_flood(seconds: str, rate_hz: str, *ports: str) -> None:
 
 if __name__ == "__main__":
     _, name, *arguments = sys.argv
-    {"ping": ping, "ticks": ticks, "flood": print_flood}[name](*arguments)
+    {"ticks": ticks, "flood": print_flood}[name](*arguments)

@@ -24,15 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.programs import execute
-from benchmarks.report import (
-    Goal,
-    MeasurementError,
-    Peer,
-    Row,
-    benchmark,
-    own_cpu_s,
-    say,
-)
+from benchmarks.report import Goal, MeasurementError, Peer, Row, benchmark, own_cpu_s, say
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.cli import find_scenario
 from cosim.live import finalize

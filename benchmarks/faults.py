@@ -17,16 +17,7 @@ import psutil
 
 from benchmarks.bare_programs import Flood, command_of
 from benchmarks.programs import imported_s, processes_of, udp_port
-from benchmarks.report import (
-    Figures,
-    MeasurementError,
-    Peer,
-    Rounds,
-    Row,
-    benchmark,
-    median,
-    say,
-)
+from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from cosim.analysis.loop_statistics import lateness_us
 from cosim.analysis.run_summary import summarise
 from cosim.cli import find_scenario

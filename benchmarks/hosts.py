@@ -12,7 +12,6 @@ the offset, without a bound (RFC 5905).
 
 import argparse
 import json
-import os
 import select
 import socket
 import struct
@@ -21,26 +20,19 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.programs import FREE_PORTS, NOACK, TwoHosts, two_hosts
-from benchmarks.report import (
-    Figures,
-    Goal,
-    MeasurementError,
-    Rounds,
-    Row,
-    benchmark,
-    say,
-)
+from benchmarks.programs import FREE_PORTS, TwoHosts, two_hosts
+from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, say
 from noack.core.clock import ClockOffset, Restart
 from noack.runtime.address import Address
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient, TimeReference, answering
 from noack.runtime.real_time_loop import realtime
+from tests.integration.conftest import starting
 
 
 class DrivenClocks(HostClocks):
@@ -343,20 +335,11 @@ def run_by_hand(hosts: TwoHosts | None) -> dict[str, Any]:
     Raises:
         MeasurementError: a process failed.
     """
-    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as name, starting() as begin:
 
         def start(host: int, *arguments: str) -> subprocess.Popen[str]:
-            command = [*NOACK, *arguments]
-            if hosts is not None:
-                command = hosts.inside(host, *command)
-            process = subprocess.Popen(
-                command, cwd=folder, env=os.environ | {"XDG_RUNTIME_DIR": name}, text=True,
-                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            )  # fmt: skip
-            stack.enter_context(process)
-            stack.callback(process.kill)
-            return process
+            before = () if hosts is None else hosts.inside(host)
+            return begin(*arguments, before=before, runtime=Path(name), cwd=Path(name))
 
         listen = () if hosts is None else ("--listen", hosts.addresses[0][0])
         invited = () if hosts is None else ("--invitation", "invitation.json")

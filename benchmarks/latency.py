@@ -5,7 +5,8 @@ import json
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,19 +14,10 @@ import numpy as np
 
 from benchmarks.bare_programs import LOOPS, PRIORITY, command_of
 from benchmarks.programs import compiled, noack
-from benchmarks.report import (
-    Figures,
-    Goal,
-    MeasurementError,
-    Peer,
-    Rounds,
-    Row,
-    benchmark,
-    say,
-)
+from benchmarks.report import Figures, Goal, MeasurementError, Peer, Rounds, Row, benchmark, say
 
 ROUNDS = 3
-OURS, C_PING, PYTHON_PING = "noack", "ping and relay in C", "ping and relay in Python"
+OURS, PING = "noack", "ping and relay in C"
 P99_GOAL = Goal("<=", 2)
 _OFTEN = ("--set", "trigger.beta=1e-9")
 _RARELY = ("--set", 'trigger={policy="periodic", period_s=0.5}')
@@ -53,13 +45,11 @@ CASES = {
 }
 
 
-def ping(
-    command: Sequence[str], count: int, period_s: float, *, asked: bool
-) -> tuple[Figures, set[str]]:
+def ping(program: Path, count: int, period_s: float, *, asked: bool) -> tuple[Figures, set[str]]:
     """Send ``count`` datagrams, one every ``period_s`` of wall time, through a bare relay.
 
     Args:
-        command: the program, in C or in Python (:mod:`benchmarks.bare_programs`).
+        program: ``ping.c``, compiled.
         count: number of datagrams.
         period_s: time between two datagrams.
         asked: whether the processes request real-time settings.
@@ -72,13 +62,9 @@ def ping(
         MeasurementError: the program failed.
     """
     numbers = (count, round(period_s * 1e9), PRIORITY if asked else 0)
+    command, patience_s = [str(program), *map(str, numbers)], count * period_s + 30
     try:
-        done = subprocess.run(
-            [*command, *map(str, numbers)],
-            capture_output=True,
-            timeout=count * period_s + 30,
-            check=True,
-        )
+        done = subprocess.run(command, capture_output=True, timeout=patience_s, check=True)
         latencies_us = np.frombuffer(done.stdout, "<i8") / 1e3
         p50_us, p99_us = np.quantile(latencies_us, [0.5, 0.99]).tolist()
     except (subprocess.SubprocessError, IndexError):
@@ -89,27 +75,23 @@ def ping(
 
 def rows_of(name: str, rounds: Rounds, refused: set[str]) -> list[Row]:
     """Return the rows of a case; ``refused`` are the real-time settings that were not applied."""
-    counts = [f"{sum(rounds.of(side, 'count')):.0f}" for side in (OURS, C_PING, PYTHON_PING)]
-    note = f"{counts[0]} updates; {counts[1]} and {counts[2]} pings"
+    updates, pings = (sum(rounds.of(side, "count")) for side in (OURS, PING))
+    note = f"{updates:.0f} updates, {pings:.0f} pings"
     note += f"; not applied: {', '.join(sorted(refused))}" if refused else ""
+    row = partial(rounds.row, unit="µs", ours=OURS, peer=PING)
     return [
-        rounds.row(
-            f"event → update, {name}, {quantile}", "µs", quantile, OURS, peer, goal,
-            note=note if goal is CASES[name].goal else None,
-        )
-        for peer, goals in ((C_PING, (CASES[name].goal, P99_GOAL)), (PYTHON_PING, (None, None)))
-        for quantile, goal in zip(("p50", "p99"), goals, strict=True)
-    ]  # fmt: skip
+        row(f"event → update, {name}, p50", quantity="p50", goal=CASES[name].goal, note=note),
+        row(f"event → update, {name}, p99", quantity="p99", goal=P99_GOAL),
+    ]
 
 
-def in_turn(case: Case, rounds: Rounds, pings: Mapping[str, Sequence[str]]) -> set[str]:
-    """Measure all sides of a case; return the settings that were not applied."""
+def in_turn(case: Case, rounds: Rounds, program: Path | None) -> set[str]:
+    """Measure both sides of a case; return the settings that were not applied."""
     refused = set[str]()
-    for side, command in pings.items():
+    if program is not None:
         count = round(case.round_s / case.period_s)
-        figures, not_permitted = ping(command, count, case.period_s, asked=case.asked)
-        rounds.add(side, figures)
-        refused |= not_permitted
+        figures, refused = ping(program, count, case.period_s, asked=case.asked)
+        rounds.add(PING, figures)
     horizon = ("--set", f"horizon_s={case.round_s}")
     (loop,) = noack("run", "lane_following", *horizon, *_LOSSLESS, *case.arguments).summary["loops"]
     found = loop["latency_us"]
@@ -123,26 +105,25 @@ def in_turn(case: Case, rounds: Rounds, pings: Mapping[str, Sequence[str]]) -> s
 def latency(options: argparse.Namespace) -> Iterator[Row]:
     """Measure the time from the sensor's event to the controller's update, through netem.
 
-    Compared with a bare ping through a bare relay in C, and in Python, at the same period and with
-    the same real-time settings. noack's figure is that of the record of a live run; it also
-    includes the sensor's trigger test, tagging and checking the datagram, the loss model, the MANSD
-    cap and the record, on a machine that also runs the plant, the control plane and the recorder.
-    Events come with every measurement, so that all code is in the processor's caches, or every half
-    second.
+    Compared with a bare ping through a bare relay in C, at the same period and with the same
+    real-time settings. noack's figure is that of the record of a live run; it also includes the
+    sensor's trigger test, tagging and checking the datagram, the loss model, the MANSD cap and the
+    record, on a machine that also runs the plant, the control plane and the recorder. Events come
+    with every measurement, so that all code is in the processor's caches, or every half second.
     """
     rounds = {name: Rounds() for name in CASES}
     refused = {name: set[str]() for name in CASES}
-    pings: dict[str, Sequence[str]] = {PYTHON_PING: command_of("ping")}
+    program = None
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         try:
-            pings = {C_PING: [str(compiled("ping.c", Path(folder)))]} | pings
+            program = compiled("ping.c", Path(folder))
         except MeasurementError as error:
             for one in rounds.values():
-                one.add(C_PING, str(error))
+                one.add(PING, str(error))
         for number in range(ROUNDS):
             for name, case in CASES.items():
                 say(f"round {number + 1} of {ROUNDS}, {name}")
-                refused[name] |= in_turn(case, rounds[name], pings)
+                refused[name] |= in_turn(case, rounds[name], program)
     for name, found in rounds.items():
         yield from rows_of(name, found, refused[name])
 

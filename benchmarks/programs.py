@@ -36,13 +36,13 @@ NOACK = (sys.executable, "-m", "cosim.cli")
 LAUNCHER = "launcher"
 
 
-def provide(packages: Mapping[str, str] = PACKAGES) -> list[str]:
-    """Install missing programs, where root has apt-get; return those that are still missing.
+def provide() -> None:
+    """Install missing programs, where root has apt-get.
 
     The rows of a missing program have no value: standard error names the packages first.
     """
-    missing = [program for program in packages if shutil.which(program) is None]
-    wanted = [word for program in missing for word in packages[program].split()]
+    missing = [program for program in PACKAGES if shutil.which(program) is None]
+    wanted = [word for program in missing for word in PACKAGES[program].split()]
     if wanted and shutil.which("apt-get") and os.geteuid() == 0:
         print(f"installing {', '.join(wanted)} ...", file=sys.stderr)
         install = ["apt-get", "install", "-y", "-qq", "--no-install-recommends", *wanted]
@@ -50,13 +50,12 @@ def provide(packages: Mapping[str, str] = PACKAGES) -> list[str]:
             subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
         missing = [program for program in missing if shutil.which(program) is None]
     if missing:
-        names = " ".join(packages[program] for program in missing)
+        names = " ".join(PACKAGES[program] for program in missing)
         print(
             f"not installed: {', '.join(missing)}; without them some goals are not measured "
             f"(Debian: sudo apt-get install {names})",
             file=sys.stderr,
         )
-    return missing
 
 
 def compiled(source: str, into: Path, *options: str) -> Path:
@@ -90,7 +89,7 @@ class Finished(NamedTuple):
     stdout: str
 
 
-def execute(command: Sequence[str], cwd: Path | None = None) -> Finished:
+def execute(command: Sequence[str]) -> Finished:
     """Run a program to its end, recording the time of each line of its standard error.
 
     Raises:
@@ -99,7 +98,7 @@ def execute(command: Sequence[str], cwd: Path | None = None) -> Finished:
     with tempfile.TemporaryFile("w+") as stdout:
         begun_s = time.monotonic()
         with subprocess.Popen(
-            command, cwd=cwd, stdin=subprocess.DEVNULL, stdout=stdout, stderr=subprocess.PIPE,
+            command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=subprocess.PIPE,
             text=True, env=os.environ | PLAIN_TERMINAL,
         ) as process:  # fmt: skip
             assert process.stderr is not None

@@ -33,17 +33,11 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import psutil
 from cffi import FFI
 
 from benchmarks.latency import KERNEL, cyclictest
-from benchmarks.programs import (
-    BEFORE_OTHERS,
-    LOAD_CORE,
-    RELAY_CORE,
-    compiled,
-    on_core,
-    scheduled,
-)
+from benchmarks.programs import BEFORE_OTHERS, LOAD_CORE, RELAY_CORE, compiled, on_core, scheduled
 from benchmarks.report import (
     Figures,
     Goal,
@@ -657,22 +651,6 @@ _LAST_S = 0.1
 _STARVED = 0.01
 
 
-class Soaked(NamedTuple):
-    """Results of a steady load."""
-
-    maximum_per_s: float
-    """Maximum rate of the relay."""
-    seconds: float
-    counts: Any
-    """Of sender and sink (:func:`new_soak`)."""
-    totals: Totals
-    resident_kib: Sequence[float]
-    """Memory of the relay, each second."""
-    cpu_s: float
-    waited_s: float
-    """Time in which the relay was ready to run, but other threads had its core."""
-
-
 def _seconds(text: str) -> int:
     if (seconds := int(text)) < 4:
         raise argparse.ArgumentTypeError("must be 4 or more")
@@ -696,31 +674,7 @@ def steady_load(options: argparse.Namespace) -> Iterator[Row]:
         with running(kind, tools) as relay:
             maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
         with running(kind, tools) as relay:
-            yield from soak_rows(_soaked(relay, options.soak_s, maximum_per_s))
-
-
-def groups(per_s: float) -> tuple[int, int]:
-    """Return the size of a group and the time between two groups, ns, for a rate."""
-    size = max(round(per_s * _GROUP_S), 1)
-    return size, round(size / per_s * 1e9)
-
-
-def _soaked(relay: Relay, seconds: int, maximum_per_s: float) -> Soaked:
-    group, period_ns = groups(maximum_per_s / 2)
-    groups_per_s = round(1e9 / period_ns)
-    state, resident_kib = new_soak(), list[float]()
-    begun_s, before_s = time.monotonic(), relay.scheduled_s()
-    for number in range(seconds):
-        if number % 60 == 0:
-            say(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
-        relay.ends.soak(state, groups_per_s, group, period_ns)
-        pages = int(Path(f"/proc/{relay.pid}/statm").read_text().split()[1])
-        resident_kib.append(pages * os.sysconf("SC_PAGE_SIZE") / 1024)
-    elapsed_s = time.monotonic() - begun_s
-    used_s = np.subtract(relay.scheduled_s(), before_s).tolist()
-    # Empty groups: receive the datagrams still in flight.
-    relay.ends.soak(state, round(_LAST_S / _GROUP_S), 0, period_ns)
-    return Soaked(maximum_per_s, elapsed_s, state, relay.totals(), resident_kib, *used_s)
+            yield from _soak_rows(relay, options.soak_s, maximum_per_s)
 
 
 def growth_kib(resident_kib: Sequence[float]) -> float:
@@ -729,14 +683,26 @@ def growth_kib(resident_kib: Sequence[float]) -> float:
     return median(resident_kib[-quarter:]) - median(resident_kib[quarter : 2 * quarter])
 
 
-def soak_rows(found: Soaked) -> list[Row]:
-    """Return the rows of a steady load."""
-    counts, totals = found.counts, found.totals
-    waited = found.waited_s / found.seconds
-    none = Goal("==", 0)
+def _soak_rows(relay: Relay, seconds: int, maximum_per_s: float) -> list[Row]:
+    """Load a relay with half of its maximum rate, in groups of datagrams; return the rows."""
+    group = max(round(maximum_per_s / 2 * _GROUP_S), 1)
+    period_ns = round(group / (maximum_per_s / 2) * 1e9)
+    groups_per_s = round(1e9 / period_ns)
+    counts, resident_kib = new_soak(), list[float]()
+    begun_s, before_s = time.monotonic(), relay.scheduled_s()
+    for number in range(seconds):
+        if number % 60 == 0:
+            say(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
+        relay.ends.soak(counts, groups_per_s, group, period_ns)
+        resident_kib.append(psutil.Process(relay.pid).memory_info().rss / 1024)
+    elapsed_s = time.monotonic() - begun_s
+    cpu_s, waited_s = np.subtract(relay.scheduled_s(), before_s).tolist()
+    # Empty groups: receive the datagrams still in flight.
+    relay.ends.soak(counts, round(_LAST_S / _GROUP_S), 0, period_ns)
+    totals, none, waited = relay.totals(), Goal("==", 0), waited_s / elapsed_s
     return [
-        Row("load", counts.sent / found.seconds, "datagrams/s",
-            Peer("drained maximum", found.maximum_per_s), note=f"for {found.seconds:.0f} s"),
+        Row("load", counts.sent / elapsed_s, "datagrams/s",
+            Peer("drained maximum", maximum_per_s), note=f"for {elapsed_s:.0f} s"),
         Row("sent but not counted as arrived", counts.sent - totals.arrived, "datagrams",
             goal=none),
         Row("forwarded but not received", totals.forwarded - counts.received, "datagrams",
@@ -744,9 +710,9 @@ def soak_rows(found: Soaked) -> list[Row]:
         Row("lost in the relay's receive buffer", totals.lost_in_kernel, "datagrams", goal=none),
         Row("longest loss burst", counts.longest_gap, "datagrams", goal=Goal("<=", MANSD)),
         Row("received out of order", counts.disordered, "datagrams", goal=none),
-        Row("memory, last quarter beyond second", growth_kib(found.resident_kib), "KiB",
-            goal=MEMORY_GOAL, note=f"of {found.resident_kib[-1] / 1024:.0f} MiB"),
-        Row("CPU of the relay", 100 * found.cpu_s / found.seconds, "% of a core"),
+        Row("memory, last quarter beyond second", growth_kib(resident_kib), "KiB",
+            goal=MEMORY_GOAL, note=f"of {resident_kib[-1] / 1024:.0f} MiB"),
+        Row("CPU of the relay", 100 * cpu_s / elapsed_s, "% of a core"),
         Row("the relay waited for its core", 100 * waited, "% of the time",
             note="others had its core: a loss may be theirs" if waited > _STARVED else None),
     ]  # fmt: skip

@@ -6,8 +6,6 @@ import json
 import os
 import re
 import shutil
-import signal
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -15,7 +13,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -23,14 +21,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from benchmarks.programs import (
-    FREE_PORTS,
-    NOACK,
-    Processes,
-    execute,
-    imported_s,
-    noack,
-)
+from benchmarks.programs import FREE_PORTS, NOACK, Processes, execute, imported_s, noack
 from benchmarks.report import (
     Figures,
     Goal,
@@ -46,6 +37,7 @@ from benchmarks.report import (
 )
 from cosim.record.run_directory import LATEST
 from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
+from tests.cosim.lab.conftest import TEXT, Page, Served
 from tools.screenshot_recording import BROWSERS, Browser
 
 ROOT = Path(__file__).parents[1]
@@ -412,7 +404,6 @@ LAB_ROUNDS = 3
 HORIZON_S = 10.0
 ALONE, OPEN = "run without the page", "page open"
 DRAGGED, VIEWED = "a slider moves", "viewer open"
-_PATIENCE_S = 120.0
 _MOVE_S = 0.05
 _KEYS = [("ArrowLeft", 37)] * 20 + [("ArrowRight", 39)] * 20
 _SLIDER = "document.getElementById('lab-set-network.loss.probability')"
@@ -474,99 +465,54 @@ addEventListener("pointermove", event => {
 """Leaves only the canvases on the page, each with a curve that moves with the mouse."""
 
 
-class _Page:
-    """The lab page in a headless browser."""
-
-    def __init__(self, browser: Browser, address: str) -> None:
-        self._browser = browser
-        browser.open(address, 1280, 900)
-        self.wait(f"!!{_SLIDER} && document.body.innerText.includes('certified')")
-
-    def js(self, expression: str) -> Any:
-        """Return the value of an expression."""
-        found = self._browser.call("Runtime.evaluate", expression=expression, returnByValue=True)
-        return found["result"].get("value")
-
-    def wait(self, condition: str) -> None:
-        """Wait until a condition holds."""
-        deadline_s = time.monotonic() + _PATIENCE_S
-        while not self.js(condition):
-            if time.monotonic() > deadline_s:
-                text = self.js("document.body.innerText")
-                raise MeasurementError(f"the page does not reach {condition}: {text}")
-            time.sleep(0.2)
-
-    @contextmanager
-    def moving(self) -> Iterator[None]:
-        """Move a slider to and fro meanwhile."""
-        ended = threading.Event()
-
-        def move() -> None:
-            self.js(f"{_SLIDER}.focus()")
-            for key, code in itertools.cycle(_KEYS):
-                if ended.wait(_MOVE_S):
-                    return
-                self._press(key, code)
-
-        mover = threading.Thread(target=move)
-        mover.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            mover.join()
-
-    def strokes_ms(self) -> tuple[list[float], list[float]]:
-        """Drag; return the times from each move to its painted curve: the page's, and alone."""
-        place = self.js(_BOX)
-        return self._dragged_ms(_NOTE_STROKES, *place), self._dragged_ms(_DRAW_ALONE, *place)
-
-    def _dragged_ms(self, prepared: str, x: float, y: float, width: float) -> list[float]:
-        self.js(prepared)
-        self._mouse("mousePressed", x + width / 2, y)
-        time.sleep(1)  # the curve of this place is drawn
-        for i in range(1, _STROKES + 1):
-            self._mouse("mouseMoved", x + (0.5 + 0.005 * i) * width, y)
-            time.sleep(_STROKE_S)
-        return [float(stroke_ms) for stroke_ms in self.js("STROKES")]
-
-    def _mouse(self, kind: str, x: float, y: float) -> None:
-        self._browser.call(
-            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1
-        )
-
-    def _press(self, key: str, code: int) -> None:
-        for kind in ("rawKeyDown", "keyUp"):
-            self._browser.call("Input.dispatchKeyEvent", type=kind, key=key, code=key,
-                               windowsVirtualKeyCode=code)  # fmt: skip
-
-    def run_live(self) -> None:
-        """Run live by the page, until it says that the run ended."""
-        for text in ("live", "run live"):
-            self.js(
-                "[...document.querySelectorAll('button')].find("
-                f"e => e.innerText.trim().endsWith('{text}') && e.offsetParent).click()"
-            )
-            time.sleep(0.5)
-        self.wait(f"document.body.innerText.includes('completed {HORIZON_S:g} s')")
-
-
 @contextmanager
-def _opened(folder: Path, settings: Sequence[str]) -> Iterator[_Page]:
+def _opened(folder: Path, *settings: str) -> Iterator[Page]:
+    """Show the lab page in a headless browser."""
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
         raise MeasurementError("no Chromium or Chrome")
-    command = [*NOACK, "lab", "lane_following", "--no-browser", "--json", *settings, *FREE_PORTS]
-    server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
-    assert server.stdout is not None
     browser = Browser(program, str(folder / "profile"))
+    with closing(browser), Served(folder, "lane_following", *settings, *FREE_PORTS) as server:
+        page = Page(browser, server.address)
+        page.wait(f"{TEXT}.includes('certified')")
+        yield page
+
+
+@contextmanager
+def _moving(page: Page) -> Iterator[None]:
+    """Move a slider to and fro meanwhile."""
+    ended = threading.Event()
+
+    def move() -> None:
+        page.js(f"{_SLIDER}.focus()")
+        for key, code in itertools.cycle(_KEYS):
+            if ended.wait(_MOVE_S):
+                return
+            page.press(key, code)
+
+    mover = threading.Thread(target=move)
+    mover.start()
     try:
-        address = json.loads("".join(iter(server.stdout.readline, "}\n")) + "}")["address"]
-        yield _Page(browser, address)
+        yield
     finally:
-        browser.close()
-        server.send_signal(signal.SIGINT)
-        server.wait()
+        ended.set()
+        mover.join()
+
+
+def _strokes_ms(page: Page, prepared: str, x: float, y: float, width: float) -> list[float]:
+    """Drag a slider; return the times from each move to its curve on the screen."""
+    page.js(prepared)
+
+    def mouse(kind: str, share: float) -> None:
+        page.call("Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y, button="left",
+                  buttons=1, clickCount=1)  # fmt: skip
+
+    mouse("mousePressed", 0.5)
+    time.sleep(1)  # the curve of this place is drawn
+    for i in range(1, _STROKES + 1):
+        mouse("mouseMoved", 0.5 + 0.005 * i)
+        time.sleep(_STROKE_S)
+    return [float(stroke_ms) for stroke_ms in page.js("STROKES")]
 
 
 def summary_of(side: str, folder: Path) -> dict[str, Any]:
@@ -575,13 +521,15 @@ def summary_of(side: str, folder: Path) -> dict[str, Any]:
     arguments = ("run", "lane_following", *settings)
     if side == ALONE:
         return noack(*arguments).summary
-    with _opened(folder, settings) as page:
+    with _opened(folder, *settings) as page:
         if side == OPEN:
             return noack(*arguments).summary
         if side == DRAGGED:
-            with page.moving():
+            with _moving(page):
                 return noack(*arguments).summary
-        page.run_live()
+        for button in ("live", "run live"):
+            page.press_button(button)
+        page.wait(f"{TEXT}.includes('completed {HORIZON_S:g} s')")
     found: dict[str, Any] = json.loads((folder / "runs/latest/summary.json").read_bytes())
     return found
 
@@ -609,10 +557,12 @@ def stroke(options: argparse.Namespace) -> Iterator[Row]:
         say(name)
         with (
             tempfile.TemporaryDirectory(prefix="noack-bench-") as folder,
-            _opened(Path(folder), ()) as page,
+            _opened(Path(folder), "--set", "horizon_s=20") as page,
             _busy(processes),
         ):
-            median_ms, alone_ms = map(statistics.median, page.strokes_ms())
+            place = page.js(_BOX)
+            median_ms = median(_strokes_ms(page, _NOTE_STROKES, *place))
+            alone_ms = median(_strokes_ms(page, _DRAW_ALONE, *place))
         yield Row(f"moved slider to painted curve, {name}", median_ms, "ms",
                   goal=Goal("<=", goal_ms))  # fmt: skip
         yield Row(f"moved mouse to a curve of the browser alone, {name}", alone_ms, "ms")

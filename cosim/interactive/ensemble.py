@@ -70,14 +70,14 @@ class Ensemble:
         )
 
 
-def explore_ensemble(scenario: Scenario, draws: int = DRAWS, seed: int = 0) -> Ensemble:
+def explore_ensemble(scenario: Scenario, draws: int = DRAWS) -> Ensemble:
     """Run many draws of a scenario's plant, initial state and losses.
 
     Raises:
         CallerError: exact simulation does not cover the scenario.
     """
     setting = _setting(scenario)
-    population = box_of(scenario).population(seed, range(draws))
+    population = box_of(scenario).population(0, range(draws))
     rows, events = run_with_events(setting, population)
     used = np.flatnonzero((rows["status"] == OK) | (rows["status"] == DIVERGED))
     chosen = Population(

@@ -19,13 +19,7 @@ from typing import Self, TypeVar, TypeVarTuple
 from cosim.interactive.draft import Draft, DraftError, Mistake, known_scenarios
 from cosim.interactive.ensemble import explore_ensemble
 from cosim.interactive.exploration import Exploration, run_of, why_not_exact
-from cosim.interactive.exploration_figure import (
-    CERTIFICATE,
-    ENSEMBLE,
-    MARGIN,
-    RUN,
-    DraftResults,
-)
+from cosim.interactive.exploration_figure import CERTIFICATE, ENSEMBLE, MARGIN, RUN, DraftResults
 from cosim.interactive.scenario_guarantee import certify, margin_of
 from cosim.lab.live_run import LiveRun
 from cosim.lab.run_views import live_view, recorded_view

@@ -14,12 +14,7 @@ from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, clai
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
-from cosim.analysis.network_summary import (
-    LoopOverTime,
-    loop_over_time,
-    summarise_run,
-    worst_loop,
-)
+from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run, worst_loop
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
 from cosim.analysis.run_summary import Outcome, linearisation, summarise

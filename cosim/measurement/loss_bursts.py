@@ -8,6 +8,7 @@ intervals are those of likelihoods, and the exact ones of a Poisson rate.
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -275,14 +276,11 @@ def quantile_m(bursts: LossBursts, share: float) -> QuantileM:
 def _packet_quantile(bursts: LossBursts, share: float) -> int:
     """Return the smallest M with Σ max(length − (M − 1), 0) ≤ (1 − share) packets."""
     allowed = math.floor((1 - share) * bursts.packets + 1e-9)
-    low, high = 0, bursts.longest
-    while low < high:
-        middle = (low + high) // 2
-        if int(np.maximum(bursts.length - middle, 0).sum()) <= allowed:
-            high = middle
-        else:
-            low = middle + 1
-    return low + 1
+
+    def is_enough(most: int) -> bool:
+        return int(np.maximum(bursts.length - most, 0).sum()) <= allowed
+
+    return bisect_left(range(bursts.longest), True, key=is_enough) + 1
 
 
 def most_losses(

@@ -317,11 +317,10 @@ def _model_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
         yield "  fit", model.test.verdict, model.test.figures
 
 
-def _estimate(estimate: Estimate | None, digits: int = 3) -> tuple[str, str]:
+def _estimate(estimate: Estimate | None) -> tuple[str, str]:
     if estimate is None:
         return "not determined", ""
-    low, high = number(estimate.low, digits), number(estimate.high, digits)
-    return number(estimate.value, digits), f"{low} to {high}"
+    return number(estimate.value), f"{number(estimate.low)} to {number(estimate.high)}"
 
 
 def _outage_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:

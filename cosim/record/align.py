@@ -22,13 +22,7 @@ from numpy.typing import NDArray
 from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.linear_systems import (
-    ModelFlow,
-    Propagator,
-    all_entries,
-    largest_sizes,
-    row_norms,
-)
+from noack.core.linear_systems import ModelFlow, Propagator, all_entries, largest_sizes, row_norms
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,

@@ -68,13 +68,7 @@ from noack.scenario.resolution import (
     run_tables,
     tables_of,
 )
-from noack.scenario.scenario import (
-    Scenario,
-    loop_names,
-    loop_scenario,
-    loop_sections,
-    phases_ns,
-)
+from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections, phases_ns
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it

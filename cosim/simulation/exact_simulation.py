@@ -301,14 +301,6 @@ def run_batch(setting: Setting, population: Population) -> NDArray[np.void]:
     return rows
 
 
-def run_events(setting: Setting, population: Population) -> Events:
-    """Run one draw and return its events; raises the errors of :func:`run_batch`."""
-    if len(population.A) != 1:
-        raise ValueError(f"one run is wanted, not {len(population.A)}")
-    _, (events,) = run_with_events(setting, population)
-    return events
-
-
 def run_with_events(
     setting: Setting, population: Population
 ) -> tuple[NDArray[np.void], list[Events]]:

@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.record.record_source import (
-    NetworkRows,
-    RecordSource,
-    RowsInMemory,
-    joined,
-    packed,
-)
+from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, joined, packed
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
 from noack.core.core_library import CData, core, ffi

@@ -59,7 +59,6 @@ _COMPILED = ("std", "mb")
 _WHEELS = 4
 _OPTIONS: Any = {**CALLED_BY_CODE, "error_model": "python"}
 _TYRE_FIELDS = [
-    ("evaluations", np.int64, 0),
     ("wheel", np.int64, 0),
     ("signs", (np.float64, _WHEELS), np.zeros(_WHEELS)),
     ("cambers", (np.float64, _WHEELS), np.zeros(_WHEELS)),
@@ -263,11 +262,6 @@ class CompiledVehicle:
         self._work = buffers(0, _WHEELS)
 
     @property
-    def evaluations(self) -> int:
-        """Number of evaluations of the equations so far."""
-        return int(self._parameters["tire"]["evaluations"][0])
-
-    @property
     def cambers(self) -> Vector:
         """The wheels' camber angles at the last evaluation, (4,), rad."""
         return self._work.values.copy()
@@ -382,7 +376,6 @@ def rates(
 ) -> None:
     """Write ż with the sign of each wheel's camber held, and the cambers; for compiled code."""
     tyre = parameters[0].tire
-    tyre.evaluations += 1
     tyre.wheel = 0
     for k in range(_WHEELS):
         tyre.signs[k] = signs[k]

@@ -23,11 +23,7 @@ from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.loss_prediction import with_kept_loss
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.scenario.runtime_parameters import (
-    LOSS,
-    put_settings,
-    require_runtime_parameters,
-)
+from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtime_parameters
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyController, AnyTrigger
 from noack.scenario.toml_file import explain

@@ -13,16 +13,7 @@ from contextlib import suppress
 from datetime import date, time
 from pathlib import Path
 from types import UnionType
-from typing import (
-    Annotated,
-    Literal,
-    NamedTuple,
-    TypeAlias,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-)
+from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails

@@ -131,11 +131,6 @@ class MissedEvents:
             first = last
 
 
-def missed_sum(missed: Iterator[MissedJumps], measurements: int, n: int) -> Vector:
-    """Return the right-hand side of (I1) at each measurement, (measurements, n)."""
-    return sum((one.sums(measurements) for one in missed), np.zeros((measurements, n)))
-
-
 class ErrorBounds(NamedTuple):
     """Bounds of ‖e_c‖_W at k measurements, and the right-hand side of (I1) there."""
 

@@ -13,14 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.protocol.wire_format import (
-    HEADER_BYTES,
-    KEY_BYTES,
-    TAG_BYTES,
-    Encoder,
-    Flow,
-    Message,
-)
+from noack.protocol.wire_format import HEADER_BYTES, KEY_BYTES, TAG_BYTES, Encoder, Flow, Message
 from noack.runtime.address import LOOPBACK
 
 FUTURE = 2**40

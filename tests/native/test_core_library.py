@@ -11,15 +11,7 @@ import numpy as np
 import pytest
 
 from native.build import HEADER, NO_COMPILER, is_current
-from noack.core.core_library import (
-    LIBRARY,
-    address_of,
-    core,
-    dtype_of,
-    ffi,
-    load_core,
-    pointer_to,
-)
+from noack.core.core_library import LIBRARY, address_of, core, dtype_of, ffi, load_core, pointer_to
 from noack.core.errors import CallerError
 from noack.impairments.feature import StageTables
 from noack.impairments.link_settings import Counters, RecordedDecision

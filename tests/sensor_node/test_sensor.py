@@ -9,10 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 from noack.core.core_library import core, ffi
-from noack.observers.observer_settings import (
-    observer_gain,
-    unobservable_mode,
-)
+from noack.observers.observer_settings import observer_gain, unobservable_mode
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, tables
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire

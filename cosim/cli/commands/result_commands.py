@@ -10,13 +10,7 @@ from typer import Argument, Option
 from cosim.cli import command as cli
 from cosim.cli import completion
 from cosim.lazy_modules import lazy_modules
-from cosim.output.export import (
-    FORMATS,
-    export_run,
-    export_scenario,
-    export_suffix,
-    needs_run,
-)
+from cosim.output.export import FORMATS, export_run, export_scenario, export_suffix, needs_run
 from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.command_line import print_to_stderr

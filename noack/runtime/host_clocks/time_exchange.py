@@ -275,12 +275,11 @@ class TimeReference:
     if the address cannot be used.
     """
 
-    def __init__(self, listen: Address, key: bytes, clocks: HostClocks = _HOST_CLOCKS) -> None:
+    def __init__(self, listen: Address, key: bytes) -> None:
         self._format = TimeFormat(key)
         self._endpoint = _open_socket(listen, socket.socket.bind, "listen on")
         self.address: Address = self._endpoint.getsockname()[:2]
-        self._arrivals = ArrivalSocket(self._endpoint, TIME_BYTES, clocks)
-        self._clocks = clocks
+        self._arrivals = ArrivalSocket(self._endpoint, TIME_BYTES, _HOST_CLOCKS)
         self._clock = secrets.randbits(64)
         self.answered = 0
         self.rejected: Counter[Rejection] = Counter()
@@ -298,7 +297,7 @@ class TimeReference:
             if isinstance(request, Rejection):
                 self.rejected[request] += 1
                 continue
-            sent_ns = self._clocks.monotonic_ns()
+            sent_ns = _HOST_CLOCKS.monotonic_ns()
             reply = TimeDatagram(TimeKind.REPLY, request.nonce, self._clock, received_ns, sent_ns)
             try:
                 self._endpoint.sendto(self._format.encode(reply), source)

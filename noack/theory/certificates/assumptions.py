@@ -12,13 +12,7 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.scenario.resolution import (
-    LoopMatrices,
-    SteadyState,
-    loop_of,
-    policy_of,
-    steady_state,
-)
+from noack.scenario.resolution import LoopMatrices, SteadyState, loop_of, policy_of, steady_state
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.theory.bounds.disturbances import normal_bounds

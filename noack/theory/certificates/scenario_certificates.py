@@ -59,11 +59,9 @@ def certify(
     return own_plant(resolved, start_error).certificate(conditions)
 
 
-def certify_box(
-    resolved: Scenario, conditions: NetworkConditions, start_error: float = 0.0
-) -> ScenarioCertificate | None:
+def certify_box(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCertificate | None:
     """The certificate of all plants in the scenario's uncertainty box; None if it has none."""
-    scope = box(resolved, start_error)
+    scope = box(resolved)
     return None if scope is None else scope.certificate(conditions)
 
 

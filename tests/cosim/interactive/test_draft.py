@@ -19,13 +19,7 @@ from cosim.interactive.controls import (
     filled,
     form_of,
 )
-from cosim.interactive.draft import (
-    Draft,
-    DraftError,
-    draft_of_query,
-    known_scenarios,
-    open_draft,
-)
+from cosim.interactive.draft import Draft, DraftError, draft_of_query, known_scenarios, open_draft
 from cosim.shipped_files import shipped_names
 from noack.core.errors import CallerError
 from noack.scenario import toml_file

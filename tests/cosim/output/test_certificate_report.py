@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from cosim.analysis.certificates import (
-    Certificates,
-    certificates_of,
-    with_weight,
-)
+from cosim.analysis.certificates import Certificates, certificates_of, with_weight
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError

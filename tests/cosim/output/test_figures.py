@@ -27,12 +27,7 @@ from cosim.output.figure_description import (
 )
 from cosim.output.figure_drawing import draw
 from cosim.output.figure_files import inline, save_figure
-from cosim.output.run_figures import (
-    Trajectory,
-    Transmissions,
-    run_figures,
-    states_figure,
-)
+from cosim.output.run_figures import Trajectory, Transmissions, run_figures, states_figure
 from cosim.output.run_tables import key_numbers
 from cosim.output.timing_figures import later_than
 from cosim.record.run_record import RunRecord

@@ -19,11 +19,7 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.private_folder import open_private
-from noack.scenario.parameter_changes import (
-    ChangeSchedule,
-    settings_bytes,
-    settings_of,
-)
+from noack.scenario.parameter_changes import ChangeSchedule, settings_bytes, settings_of
 from noack.scenario.resolution import resolve
 from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario import Scenario

@@ -9,10 +9,7 @@ from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import Array
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.random_losses.mean_square_growth import (
-    mean_square_growth,
-    sure_growth,
-)
+from noack.theory.random_losses.mean_square_growth import mean_square_growth, sure_growth
 from noack.theory.random_losses.moments import moment_at_events, moments
 
 

@@ -11,14 +11,7 @@ from cosim.output.viewer.network_diagram import LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.lane_picture import LanePicture
 from cosim.output.viewer.pictures.pendulum_picture import PendulumPicture
 from cosim.output.viewer.pictures.phase_picture import PhasePicture
-from cosim.output.viewer.pictures.picture import (
-    WHO,
-    Columns,
-    Frames,
-    Picture,
-    panel,
-    picture_of,
-)
+from cosim.output.viewer.pictures.picture import WHO, Columns, Frames, Picture, panel, picture_of
 from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
 from noack.core.linear_systems import Propagator

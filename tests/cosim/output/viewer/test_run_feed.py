@@ -15,14 +15,7 @@ from cosim.analysis.network_summary import (
 )
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.run_feed import RunFeed
-from cosim.output.viewer.run_recording import (
-    ERROR,
-    MAP,
-    QUEUE,
-    SHARE,
-    SIZE,
-    open_recording,
-)
+from cosim.output.viewer.run_recording import ERROR, MAP, QUEUE, SHARE, SIZE, open_recording
 from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun

@@ -9,7 +9,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from cosim.simulation.continuous import ContinuousLoop, ContinuousRun, simulate_continuous
-from cosim.simulation.exact_simulation import OK, Events, Population, Setting, run_batch
+from cosim.simulation.exact_simulation import (
+    OK,
+    Events,
+    Population,
+    Setting,
+    run_batch,
+    run_with_events,
+)
 from noack.core.linear_systems import Vector
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.corrupt import Corrupt
@@ -84,6 +91,12 @@ def random_population(rng: np.random.Generator, setting: Setting, k: int) -> Pop
 
 def one(population: Population, i: int) -> Population:
     return Population(*(part[i : i + 1] for part in population))
+
+
+def events_of(setting: Setting, draw: Population) -> Events:
+    """The events of a population of one."""
+    _, (events,) = run_with_events(setting, draw)
+    return events
 
 
 def reference(setting: Setting, draw: Population, most_events: int = 2000) -> ContinuousRun:

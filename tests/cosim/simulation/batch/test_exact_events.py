@@ -14,7 +14,6 @@ from cosim.simulation.exact_simulation import (
     Population,
     Setting,
     run_batch,
-    run_events,
     setting_of,
 )
 from noack.core.errors import CallerError
@@ -28,6 +27,7 @@ from tests.cosim.simulation.batch.exact import (
     check_events,
     check_independence,
     compare,
+    events_of,
     one,
     random_population,
     random_setting,
@@ -69,7 +69,7 @@ def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -
             except TooManyEventsError:
                 assert row["status"] == TOO_MANY_EVENTS
                 continue
-            compare(setting, row, run_events(setting, draw), run)
+            compare(setting, row, events_of(setting, draw), run)
             if i == 0 and events < 30:
                 check_events(run, setting)
             events += len(run.event_s)
@@ -116,12 +116,12 @@ def test_very_short_crossings_are_found(depth: float, omega: float, alpha_omega:
 
     Each of the hundred polynomials up to there adds a relative error of about 1e-14.
     """
-    found = run_events(*turning(2 * (1 - depth), omega, alpha_omega * omega))
+    found = events_of(*turning(2 * (1 - depth), omega, alpha_omega * omega))
     first_s = 2 / omega * math.asin(1 - depth)
     tolerance_s = 5e-13 / math.sqrt(depth) / omega + 1e-12 * first_s
     assert found.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
     beyond = turning(2 * (1 + depth), omega, alpha_omega * omega)
-    assert run_events(*beyond).event_s.size == 0
+    assert events_of(*beyond).event_s.size == 0
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
@@ -131,7 +131,7 @@ def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(mode: str) -> Non
     resolved = resolve(load(find_shipped("lane_following", "scenarios"), settings))
     loop = loop_of(resolved)
     draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.array([seed], np.uint64))
-    found = run_events(setting_of(resolved), draw)
+    found = events_of(setting_of(resolved), draw)
     run = run_continuous(resolved)
     assert len(run.event_s) >= (1 if mode == "model" else 5)
     np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
@@ -146,8 +146,6 @@ def test_invalid_settings_are_refused() -> None:
         run_batch(setting, population._replace(x0=population.x0[:, :1]))
     with pytest.raises(ValueError, match="loss_seeds: expected uint64"):
         run_batch(setting, population._replace(loss_seeds=np.zeros(3, np.int64)))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="one run"):
-        run_events(setting, population)
     late = setting.link.model_copy(update={"impairments": (Delay(delay_s=1.0),)})
     with pytest.raises(CallerError, match="losses and corruption only"):
         run_batch(Setting(**{**vars(setting), "link": late}), population)

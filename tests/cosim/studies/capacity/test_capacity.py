@@ -17,11 +17,7 @@ from cosim.studies.campaign.sampled_draws import used_up
 from cosim.studies.capacity import capacity_plan as plans
 from cosim.studies.capacity.capacity_page import CapacityResult
 from cosim.studies.capacity.capacity_plan import kinds_of, policies_of
-from cosim.studies.capacity.capacity_result import (
-    PolicyCapacity,
-    capacities,
-    capacity_of,
-)
+from cosim.studies.capacity.capacity_result import PolicyCapacity, capacities, capacity_of
 from noack.protocol.record_tables import Fate
 from noack.scenario.scenario_file import load
 from tests.command_line import invoke
