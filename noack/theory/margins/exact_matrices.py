@@ -12,8 +12,9 @@ hundreds of steps are computed with them, so that what remains is the rounding o
 double precision. The entries are Python integers, in units of 2⁻³⁸⁴.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,15 +140,32 @@ def stacked(*parts: FixedPointMatrix) -> FixedPointMatrix:
     return FixedPointMatrix(entries, max(part.error for part in parts))
 
 
-def power(matrix: FixedPointMatrix, exponent: int) -> FixedPointMatrix:
-    """Return a power by repeated squaring; the exponent is not negative."""
-    result = fixed(np.eye(len(matrix.entries)))
+class ProductMatrix(Protocol):
+    """What the maps of a loop are computed with: products and rows."""
+
+    def __matmul__(self, other: Self) -> Self:
+        """Return the product."""
+
+    def rows(self, which: slice | list[int]) -> Self:
+        """Return some of the rows."""
+
+    def interval(self) -> IntervalMatrix:
+        """Return the matrix in double precision."""
+
+
+LoopMatrix = TypeVar("LoopMatrix", bound=ProductMatrix)
+
+
+def power(matrix: LoopMatrix, exponent: int) -> LoopMatrix:
+    """Return a power by repeated squaring; the exponent is positive."""
+    result = None
     while exponent:
         if exponent & 1:
-            result = matrix @ result
+            result = matrix if result is None else matrix @ result
         exponent >>= 1
         if exponent:
             matrix = matrix @ matrix
+    assert result is not None
     return result
 
 
@@ -167,3 +185,14 @@ def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
         total = total + term
     total = FixedPointMatrix(total.entries, total.error + 1)
     return power(total, 1 << halvings)
+
+
+class Arithmetic(NamedTuple, Generic[LoopMatrix]):
+    """How matrices are made: from numbers, as e^{G dt}, and on top of each other."""
+
+    fixed: Callable[[Matrix], LoopMatrix]
+    exponential: Callable[[Matrix, int], LoopMatrix]
+    stacked: Callable[..., LoopMatrix]
+
+
+EXACT = Arithmetic(fixed, exponential, stacked)
