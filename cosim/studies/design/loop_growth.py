@@ -21,7 +21,7 @@ from noack.theory.margins.loss_margin import Burst
 from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 
 Indices = NDArray[np.int64]
-_ROUNDS, _BEAM, _BALANCING = 6, 24, 12
+_ROUNDS, _MOST_ROUNDS, _BEAM, _BALANCING = 5, 40, 24, 12
 _TINY = 1e-300
 
 
@@ -131,10 +131,11 @@ class PatternGraph:
         self._durations = np.array([one.steps for one in bursts])
         nodes = range(int(self._sources.max()) + 1)
         self._leaving = [np.flatnonzero(self._sources == node) for node in nodes]
+        self._rounds = min(_ROUNDS + len(self._leaving), _MOST_ROUNDS)
         self._known: dict[tuple[int, ...], None] = {}
 
     def growth(self, maps: Matrix) -> QuickGrowth:
-        """Return the fastest growth found, of cycles of up to 6 edges and those known before."""
+        """Return the fastest growth found, of short cycles and those known before."""
         if not np.isfinite(maps).all() or np.abs(maps).max() > 1e150:
             return QuickGrowth(np.inf, ())
         turned, best = self._balanced(maps), QuickGrowth(-np.inf, ())
@@ -180,7 +181,7 @@ class PatternGraph:
         best = QuickGrowth(at_least, ())
         paths, products = np.arange(len(maps))[:, None], maps
         durations = self._durations.astype(float)
-        for _ in range(_ROUNDS):
+        for _ in range(self._rounds):
             norms = np.log(np.linalg.norm(products, axis=(1, 2)) + _TINY) / durations
             closed = np.flatnonzero(
                 (self._sources[paths[:, 0]] == self._targets[paths[:, -1]])

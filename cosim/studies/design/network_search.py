@@ -44,8 +44,8 @@ _LONGER = 1.02
 _RUNGS = 400
 _SLACK = 0.002
 """The search wants log growth below −_SLACK: a loop at the limit takes long to judge."""
-_JUDGE = 3e-3
-"""First accuracy of the judge."""
+_JUDGE = 3e-3, 0.1
+"""Limits of the judge's first accuracy: half of what the lower bound leaves."""
 _STARTS = 4
 _UNSTABLE = 1e3
 
@@ -167,6 +167,11 @@ class NetworkSearch:
     """All that is known about the loops of a scenario with other gains."""
 
     def __init__(self, scenario: Scenario, wish: Wish) -> None:
+        if not scenario.coverage.is_linear:
+            raise CallerError(
+                f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear; '
+                "--set 'plant.system={kind=\"linear\"}' designs for its model"
+            )
         scenario.coverage.require_exact()
         if not wish.cost >= 1:
             raise CallerError(f"--cost: 1 or more times that of the given loop, not {wish.cost:g}")
@@ -182,16 +187,13 @@ class NetworkSearch:
         self.ladder = ladder_of(self.scenario, wish, margin)
         n, m = self.plant.n, self.plant.m
         self.weights = wish.weights or (np.eye(n), np.eye(m))
-        self._require_reachable()
+        lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
         self.given = Candidate(resolved.mode, rows_of(self.plant.K))
         base = self.quick_loop(self.given, margin.longest_ns).cost(self.plant.x0)
         self.limit = wish.cost * base
         """Largest cost; infinite if the given loop is unstable without losses."""
         self.tried = self.judged = 0
         self._graphs: dict[tuple[LossGuarantee, int], PatternGraph] = {}
-
-    def _require_reachable(self) -> None:
-        lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)
 
     def quick_loop(self, candidate: Candidate, period_ns: int) -> QuickLoop:
         """Return the loop of a candidate in double precision."""
@@ -261,7 +263,8 @@ class NetworkSearch:
         """Return the certified bounds of a loop on a rung."""
         self.judged += 1
         margin = LossMargin(resolve(self.scenario_of(candidate, rung)))
-        found = margin.stability(accuracy=_JUDGE, refine=refine)
+        left = abs(math.expm1(-self.growth(candidate, rung))) / 2
+        found = margin.stability(accuracy=min(max(left, _JUDGE[0]), _JUDGE[1]), refine=refine)
         if found.verdict != "stable":
             self.graph(self.ladder[rung]).remember(found.pattern)
         return found
