@@ -145,10 +145,11 @@ class LimitOptions:
         if self.under not in ("paper", "schedule"):
             raise CallerError(f'--under: paper or schedule, not "{self.under}"')
         return design_search.DesignLimits(
-            self.settling, self.quantile, self.settle, self._bounds(), self.under == "schedule"
+            self.settling, self.quantile, self.settle, self.bounds(), self.under == "schedule"
         )
 
-    def _bounds(self) -> "dict[design_search.Bounded, float]":
+    def bounds(self) -> "dict[design_search.Bounded, float]":
+        """Return the limits of certified bounds; raise CallerError if one is wrong."""
         found: dict[design_search.Bounded, float] = {}
         for text in self.bound or ():
             name, _, value = text.partition("=")
@@ -181,10 +182,13 @@ class NetworkOptions:
         aim: `settling`: the trigger with the fewest transmissions that settles in time. `network`:
             the gain and hold strategy that are proven stable for the largest M. `transmissions`:
             those with the longest period for the scenario's guarantee.
-        period: Time between two updates; by default that of a periodic scenario.
+        period: Time between two updates of a time-triggered sensor; by default that of a periodic
+            scenario. Without it, the paper's trigger is kept, with other α and β.
         window: Maximise m in "at most m losses in WINDOW updates" instead of M.
-        most: Largest M to examine.
-        cost: Largest cost ∫ xᵀQx + uᵀRu dt without losses, as a multiple of the given loop's.
+        most: Largest M to examine; 16 with a period, else 1,000.
+        cost: Largest cost ∫ xᵀQx + uᵀRu dt, as a multiple of the given loop's. With a period, that
+            without losses; else the mean over draws.
+        share: Most transmissions of events, as a multiple of the given loop's.
         holds: Hold strategies to try: `model`, or `zoh` to hold the last input.
         effort: Number of loops that the search may try.
     """
@@ -192,13 +196,16 @@ class NetworkOptions:
     aim: Annotated[DesignAim, Option("--for")] = DesignAim.SETTLING
     period: Annotated[float | None, Option(metavar="SECONDS")] = None
     window: Annotated[int | None, Option(metavar="UPDATES")] = None
-    most: Annotated[int, Option(min=2, max=200)] = 16
+    most: Annotated[int | None, Option(min=1, max=10_000)] = None
     cost: float = 1.2
+    share: float = 1.0
     holds: str = "model,zoh"
     effort: Annotated[int, Option(min=0)] = 1500
 
     def wish(
-        self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]"
+        self,
+        weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]",
+        bounds: "design_search.Bounds",
     ) -> "network_search.Wish":
         """Return what is asked for; raise CallerError if an option is wrong."""
         modes = [mode.strip() for mode in self.holds.split(",")]
@@ -206,9 +213,12 @@ class NetworkOptions:
             raise CallerError(f'--holds: {", ".join(network_search.MODES)}, not "{self.holds}"')
         if self.period is not None and not 1e-6 <= self.period < math.inf:
             raise CallerError(f"--period: must be positive, not {self.period:g}")
+        if not 0 < self.share < math.inf:
+            raise CallerError(f"--share: must be positive, not {self.share:g}")
         return network_search.Wish(
             goal="transmissions" if self.aim is DesignAim.TRANSMISSIONS else "network",
-            window=self.window, most=self.most, period_s=self.period, cost=self.cost,
+            window=self.window, most=self.most, transmissions=self.share,
+            period_s=self.period, cost=self.cost, bounds=bounds,
             weights=weights, modes=[mode for mode in network_search.MODES if mode in modes],
             effort=self.effort,
         )  # fmt: skip
@@ -269,8 +279,9 @@ def design(
     """Choose a trigger that transmits least, or a gain that tolerates the most losses.
 
     Without --for: α, β and the norm with the fewest transmissions that meet your limits. With --for
-    network or --for transmissions: K and the hold strategy of a time-triggered loop, by LQR and a
-    search without gradients; the result is proven as by noack margin (up to two minutes).
+    network or --for transmissions: K, by LQR and a search without gradients, with α and β, or with
+    the hold strategy of a time-triggered loop; the result is certified, as by noack certify or
+    noack margin. This takes up to two minutes.
 
     Exit status 1: no choice meets the limits or is proven stable, or fresh draws do not confirm it.
 
@@ -295,7 +306,13 @@ def design(
         if wanted.settling is not None or feedback.gain != "given":
             raise CallerError(f"--settling, --gain: are not for --for {network.aim.value}")
         return _design_for_network(
-            loaded, network.wish(feedback.costs(loaded)), out, page, figure_files, json
+            loaded,
+            network.wish(feedback.costs(loaded), wanted.bounds()),
+            seed,
+            out,
+            page,
+            figure_files,
+            json,
         )
     loaded.decaying  # noqa: B018 - raises for another policy
     limits = wanted.limits()
@@ -317,19 +334,21 @@ def design(
 def _design_for_network(
     loaded: "scenario.Scenario",
     wish: "network_search.Wish",
+    seed: int,
     out: Path | None,
     page: Path | None,
     figure_files: "figure_format.FigureFiles | None",
     json: bool,
 ) -> int:
     with progress.work_bar("trying gains") as bar:
-        found = network_page.design_for_network(loaded, wish, bar)
+        found = network_page.design_for_network(loaded, wish, seed, bar)
     path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}-network.html"
     written = network_page.write_page(found, path, figure_files)
-    if out is not None and found.certified:
-        written.append(write_whole(out, scenario_file.dumps(found.scenario)))
+    if out is not None and found.is_certified:
+        text = scenario_file.dumps(network_page.written_scenario(found))
+        written.append(write_whole(out, text))
     cli.show_with_files(json, found.document(), written, network_page.print_design, found)
-    return ExitStatus.OK if found.certified else ExitStatus.FAILED
+    return ExitStatus.OK if found.is_certified else ExitStatus.FAILED
 
 
 def _matrix(option: str, text: str | None, size: int) -> "linear_systems.Matrix":

@@ -21,11 +21,13 @@ from cosim.output.figure_files import save_figures
 from cosim.output.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.studies.design.event_design import EventDesign, EventSearch
 from cosim.studies.design.network_search import NetworkSearch, Progress, Reached, Wish
 from noack.core.file_access import write_whole
 from noack.core.number_format import NONE
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, toml_text
+from noack.trigger.decaying import DecayingSettings
 
 _DESIGNED = "_designed"
 _HEIGHT_IN = 3.8
@@ -51,7 +53,22 @@ class NetworkDesign:
         return self.search.scenario.name
 
     @property
-    def certified(self) -> bool:
+    def is_better(self) -> bool:
+        """Whether it is another loop than the given one."""
+        return self.best.candidate != self.given.candidate
+
+    @property
+    def notes(self) -> list[str]:
+        """What the reader should know of the search."""
+        limit = self.search.limit
+        cost = f"{limit:.4g}" if math.isfinite(limit) else "any size: the given loop is unstable"
+        return [
+            f"the best of {self.search.tried:,} loops tried, with a cost of at most {cost}; what "
+            "it tolerates is proven, that it is the best is not"
+        ]
+
+    @property
+    def is_certified(self) -> bool:
         """Whether the best loop is proven to tolerate anything."""
         return self.best.rung >= 0
 
@@ -67,7 +84,7 @@ class NetworkDesign:
         """The verdict in one line."""
         what = {"network": "every loss pattern", "transmissions": "every loss pattern with updates"}
         before, after = self.rung(self.given), self.rung(self.best)
-        if not self.certified:
+        if not self.is_certified:
             return "no loop was found that is proven stable"
         if self.best.rung == self.given.rung:
             return f"{after} for the given loop; no better one was found"
@@ -75,11 +92,8 @@ class NetworkDesign:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of the best loop, under a new name, with the guarantee that it needs."""
-        chosen = self.search.scenario_of(self.best.candidate, self.best.rung)
-        name = f"{self.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}"
-        about = f"{self.name} with a gain that is proven stable: {self.rung(self.best)}."
-        return chosen.model_copy(update={"name": name, "description": about})
+        """The scenario of the best loop, with the guarantee that it is proven for."""
+        return self.search.scenario_of(self.best.candidate, self.best.rung)
 
     @property
     def lines(self) -> str:
@@ -149,6 +163,35 @@ class NetworkDesign:
             "lines": self.lines,
         }  # fmt: skip
 
+    def figure(self) -> FigureDescription:
+        """Describe the growth of both loops over the ladder."""
+        search, ladder = self.search, self.search.ladder
+        top = min(max(self.best.rung, self.given.rung) + 4, len(ladder))
+        rungs = np.unique(np.linspace(0, top - 1, min(top, _MOST_POINTS)).astype(int))
+        numbers = np.array([one.number for one in ladder])
+        items: list[Line | Rule | Marks] = [
+            Rule(at=1.0, colour=palette.CERTIFIED, label="stable below")
+        ]
+        for reached, label, colour in (
+            (self.given, "given", palette.NETWORK), (self.best, "designed", palette.LOST),
+        ):  # fmt: skip
+            logs = [search.growth(reached.candidate, int(rung)) for rung in rungs]
+            growth = np.array([math.exp(min(one, 300.0)) for one in logs])
+            shown = growth < 3.0
+            items.append(Line(x=numbers[rungs][shown], y=growth[shown], colour=colour, label=label,
+                              marker="o", size=3.0))  # fmt: skip
+            if reached.found is not None:
+                items.append(Marks(
+                    x=numbers[[reached.rung]], y=np.array([reached.found.upper]), colour=colour,
+                    marker="*", size=12, label=f"{label}: proven",
+                ))  # fmt: skip
+        along = {"network": "M", "transmissions": "time between updates [s]"}[search.wish.goal]
+        if search.wish.window is not None:
+            along = f"losses in {search.wish.window} updates"
+        panel = Panel(items=items, x=Axis(label=along, whole=search.wish.goal == "network"),
+                      y=Axis(label="growth per period"))  # fmt: skip
+        return one_panel("growth", panel, _HEIGHT_IN).captioned(_CAPTION)
+
 
 _HOLDS = {"model": "the model's input", "zoh": "hold"}
 
@@ -157,84 +200,60 @@ def _matrix(reached: Reached) -> str:
     return "\n".join(" ".join(f"{entry:.6g}" for entry in row) for row in reached.candidate.K)
 
 
+AnyDesign = NetworkDesign | EventDesign
+
+
 def design_for_network(
-    scenario: Scenario, wish: Wish, progress: Progress = lambda share: None
-) -> NetworkDesign:
-    """Search for a loop; the result is deterministic.
+    scenario: Scenario, wish: Wish, seed: int = 0, progress: Progress = lambda share: None
+) -> AnyDesign:
+    """Search for a loop; with a period it is time-triggered. The result is deterministic.
 
     Raises:
         CallerError: the scenario does not permit it, or a wish is out of range.
     """
+    if wish.period_s is None and isinstance(scenario.trigger, DecayingSettings):
+        events = EventSearch(scenario, wish, seed)
+        return EventDesign(events, *events.run(progress))
     search = NetworkSearch(scenario, wish)
-    given, best = search.run(progress)
-    progress(1.0)
-    return NetworkDesign(search, given, best)
+    return NetworkDesign(search, *search.run(progress))
+
+
+def written_scenario(design: AnyDesign) -> Scenario:
+    """Return the scenario of the best loop under a new name."""
+    name = f"{design.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}"
+    about = f"{design.name} with another gain: {design.verdict}."
+    return design.scenario.model_copy(update={"name": name, "description": about})
 
 
 def write_page(
-    design: NetworkDesign, path: Path, figure_files: FigureFiles | None = None
+    design: AnyDesign, path: Path, figure_files: FigureFiles | None = None
 ) -> list[Path]:
     """Write page and figure; return the files.
 
     Raises:
         MachineError: they cannot be written.
     """
-    figure = growth_figure(design)
+    figure = design.figure()
     html = templates(Path(__file__).parent).get_template("network.html.jinja").render(
         title=design.name,
         subtitle=f"{design.search.tried:,} loops tried, {design.search.judged} judged",
         verdict=design.verdict,
-        tone="good" if design.best.rung > design.given.rung else "doubt",
+        tone="good" if design.is_better else "doubt",
         figure=figure,
         headings=HEADINGS,
         rows=design.rows(),
-        scenario_toml=dumps(design.scenario),
+        scenario_toml=dumps(written_scenario(design)),
     )  # fmt: skip
     return [write_whole(path, html), *save_figures([figure], path, figure_files)]
 
 
-def growth_figure(design: NetworkDesign) -> FigureDescription:
-    """Describe the growth of both loops over the ladder."""
-    search, ladder = design.search, design.search.ladder
-    top = min(max(design.best.rung, design.given.rung) + 4, len(ladder))
-    rungs = np.unique(np.linspace(0, top - 1, min(top, _MOST_POINTS)).astype(int))
-    numbers = np.array([one.number for one in ladder])
-    items: list[Line | Rule | Marks] = [
-        Rule(at=1.0, colour=palette.CERTIFIED, label="stable below")
-    ]
-    for reached, label, colour in (
-        (design.given, "given", palette.NETWORK), (design.best, "designed", palette.LOST),
-    ):  # fmt: skip
-        logs = [search.growth(reached.candidate, int(rung)) for rung in rungs]
-        growth = np.array([math.exp(min(one, 300.0)) for one in logs])
-        shown = growth < 3.0
-        items.append(Line(x=numbers[rungs][shown], y=growth[shown], colour=colour, label=label,
-                          marker="o", size=3.0))  # fmt: skip
-        if reached.found is not None:
-            items.append(Marks(
-                x=numbers[[reached.rung]], y=np.array([reached.found.upper]), colour=colour,
-                marker="*", size=12, label=f"{label}: proven",
-            ))  # fmt: skip
-    along = {"network": "M", "transmissions": "time between updates [s]"}[search.wish.goal]
-    if search.wish.window is not None:
-        along = f"losses in {search.wish.window} updates"
-    panel = Panel(items=items, x=Axis(label=along, whole=search.wish.goal == "network"),
-                  y=Axis(label="growth per period"))  # fmt: skip
-    return one_panel("growth", panel, _HEIGHT_IN).captioned(_CAPTION)
-
-
-def print_design(console: Console, design: NetworkDesign) -> None:
+def print_design(console: Console, design: AnyDesign) -> None:
     """Print the comparison, the verdict, and the lines for the scenario."""
-    search = design.search
     table = ResultTable("design", f"{design.name}: loops under the worst losses", HEADINGS,
                         design.rows())  # fmt: skip
     console.print(terminal_table(table, left=range(3)))
-    limit = f"{search.limit:.4g}" if math.isfinite(search.limit) else "none: given loop unstable"
-    lines = [
-        design.verdict,
-        f"the best of {search.tried:,} loops tried, with a cost of at most {limit}; what it "
-        "tolerates is proven, that it is the best is not",
-        *((f"for the scenario:\n{design.lines.rstrip()}",) if design.certified else ()),
-    ]
+    lines = [design.verdict, *design.notes]
+    if design.is_certified:
+        lines.append(f"for the scenario:\n{design.lines.rstrip()}")
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

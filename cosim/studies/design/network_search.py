@@ -15,11 +15,12 @@ A pattern with which the judge rejects a loop is tried first with all later ones
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.loop_growth import PatternGraph, QuickLoop
 from noack.core.clock import NS_PER_S
@@ -42,6 +43,7 @@ COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
 _LONGER = 1.02
 """Ratio of successive periods of the ladder, where measurements are close enough."""
 _RUNGS = 400
+_MOST_M = 16
 _SLACK = 0.002
 """The search wants log growth below −_SLACK: a loop at the limit takes long to judge."""
 _JUDGE = 3e-3, 0.1
@@ -76,14 +78,18 @@ class Wish:
     goal: Goal = "network"
     window: int | None = None
     """K of (m, K): maximise m; None: maximise M."""
-    most: int = 16
-    """Largest M to examine."""
+    most: int | None = None
+    """Largest M to examine; None: 16 with periodic updates, else 1,000."""
     period_s: float | None = None
     """Time between updates; None: the scenario's."""
     cost: float = 1.2
-    """Largest cost without losses, as a multiple of that of the given loop."""
+    """Largest cost, as a multiple of that of the given loop."""
+    transmissions: float = 1.0
+    """Most transmissions of a loop with events, as a multiple of those of the given loop."""
     weights: tuple[Matrix, Matrix] | None = None
     """Q and R of the cost; None: identities."""
+    bounds: Bounds = field(default_factory=dict)
+    """Upper limits of the certified bounds of a loop with events."""
     modes: Sequence[Mode] = MODES
     effort: int = 1500
     """Number of loops that the search without gradients may try."""
@@ -144,7 +150,8 @@ def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
     others = LossGuarantee(
         tuple(rule for rule in network.guarantee.rules if not isinstance(rule, LongestBurst))
     )
-    most = min(wish.most, (others.longest_burst or wish.most) + 1)
+    most = wish.most or _MOST_M
+    most = min(most, (others.longest_burst or most) + 1)
     return [
         Rung(f"M = {m}", m, _capped(others, m - 1), period_ns, {"mansd": m - 1})
         for m in range(1, most + 1)
@@ -173,6 +180,8 @@ class NetworkSearch:
                 "--set 'plant.system={kind=\"linear\"}' designs for its model"
             )
         scenario.coverage.require_exact()
+        if wish.bounds:
+            raise CallerError("--bound: is for a loop with events, not for periodic updates")
         if not wish.cost >= 1:
             raise CallerError(f"--cost: 1 or more times that of the given loop, not {wish.cost:g}")
         self.wish, self.scenario = wish, time_triggered(scenario, wish.period_s)
@@ -351,7 +360,7 @@ class NetworkSearch:
         from scipy.optimize import minimize  # slow to import
 
         K = np.array(start.K)
-        scale = np.maximum(np.abs(K), 0.1 * np.abs(K).max(axis=1, keepdims=True)).ravel()
+        scale = scaled_steps(K)
 
         def objective(steps: Vector) -> float:
             candidate = _rounded(start.mode, (K.ravel() + scale * steps).reshape(K.shape))
@@ -372,6 +381,11 @@ class NetworkSearch:
         except _FoundError as found:
             return found.candidate
         return None
+
+
+def scaled_steps(K: Matrix) -> Vector:
+    """Return the unit of a search's steps of each entry of a gain."""
+    return np.ravel(np.maximum(np.abs(K), 0.1 * np.abs(K).max(axis=1, keepdims=True)))
 
 
 def _rounded(mode: Mode, K: Matrix) -> Candidate:

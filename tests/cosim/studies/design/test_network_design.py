@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
+from cosim.studies.design.event_design import EventDesign
 from cosim.studies.design.loop_growth import PatternGraph
 from cosim.studies.design.network_page import NetworkDesign, design_for_network
 from cosim.studies.design.network_search import Candidate, NetworkSearch, Wish
@@ -22,6 +23,8 @@ from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.settings.section import rows_of
+from noack.theory.certificates.conditions import nominal_conditions
+from noack.theory.certificates.scenario_certificates import certify_box
 from noack.theory.margins.loss_margin import LossMargin, list_bursts
 from tests.approved import compare_lines
 from tests.command_line import invoke
@@ -39,7 +42,10 @@ def shipped(name: str, *settings: str) -> Scenario:
 @pytest.fixture(scope="module")
 def pole() -> NetworkDesign:
     """The pole on a cart, by regulators alone."""
-    return design_for_network(shipped("cart_pole", LINEAR), Wish(period_s=PERIOD_S, effort=0))
+    wish = Wish(period_s=PERIOD_S, effort=0)
+    found = design_for_network(shipped("cart_pole", LINEAR), wish)
+    assert isinstance(found, NetworkDesign)
+    return found
 
 
 def patterns(guarantee: LossGuarantee, length: int) -> Iterator[tuple[bool, ...]]:
@@ -121,6 +127,7 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
     name: str, settings: tuple[str, ...], wish: Wish
 ) -> None:
     found = design_for_network(shipped(name, *settings), wish)
+    assert isinstance(found, NetworkDesign)
     given, best = found.given, found.best
     assert best.rung >= given.rung
     assert best.cost <= found.search.limit or best == given
@@ -192,6 +199,66 @@ def test_the_written_scenario_is_checked_and_decided_as_claimed(tmp_path: Path) 
     pasted = tmp_path / "pasted.toml"
     pasted.write_text(found["lines"])
     assert f"gain = [\n  {list(found['best']['K'][0])},\n]".replace("[[", "[") in found["lines"]
+
+
+@pytest.fixture(scope="module")
+def events() -> EventDesign:
+    """The pendulum's own trigger and gain, and better ones, with a certified bound of ‖x‖."""
+    wish = Wish(most=40, bounds={"state": 1.6}, effort=300)
+    found = design_for_network(shipped("unstable_pendulum"), wish, seed=5)
+    assert isinstance(found, EventDesign)
+    return found
+
+
+def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
+    events: EventDesign,
+) -> None:
+    search, best = events.search, events.best
+    assert best.m > events.given.m > 1
+    assert search.of_box
+    resolved = resolve(events.scenario)
+    conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
+    certificate = certify_box(resolved, conditions)
+    assert certificate is not None
+    assert certificate.constants is not None
+    assert certificate.constants.state <= 1.6
+    assert search.state_bound(best.loop, best.m + 1) > 1.6
+    measured = search.measured(best.loop, search._draws)
+    assert measured.cost <= search.limits.cost
+    assert measured.transmissions <= search.limits.transmissions
+    # Means of fresh draws differ by their own spread.
+    assert best.measured.transmissions == pytest.approx(measured.transmissions, rel=0.1)
+
+
+def test_runs_with_the_claimed_m_keep_the_certified_bound(events: EventDesign) -> None:
+    m = events.best.m
+    rng = np.random.default_rng(7)
+    largest = 0.0
+    for seed in range(12):
+        one = events.scenario.model_copy(update={"horizon_s": 5.0})
+        plant = one.plant.model_copy(update={"initial_state_halfwidth": None, "draw": "vertex"})
+        seeds = one.seeds.model_copy(update={"plant": seed})
+        resolved = resolve(one.model_copy(update={"plant": plant, "seeds": seeds}))
+        lost = 0
+
+        def fate(data: bytes, now_ns: int, often: float = rng.random()) -> int | None:
+            nonlocal lost
+            lost = lost + 1 if lost < m - 1 and rng.random() < often else 0
+            return None if lost else 0
+
+        x = simulate(resolved, fate)["plant_step"]["x"]
+        largest = max(largest, float(np.linalg.norm(x, axis=1).max()))
+    assert 0.2 <= largest <= events.search.state_bound(events.best.loop, m)
+
+
+def test_fewer_transmissions_of_events_for_the_same_network() -> None:
+    given = shipped("double_integrator")
+    found = design_for_network(given, Wish("transmissions", effort=300), seed=1)
+    assert isinstance(found, EventDesign)
+    assert found.scenario.network == given.network
+    assert found.best.measured.transmissions < 0.9 * found.given.measured.transmissions
+    assert found.search.certificate(found.best.loop, given.network.mansd + 1) is not None
+    assert found.best.m >= given.network.mansd + 1
 
 
 def test_the_lines_about_mistakes_are_those_that_were_approved(tmp_path: Path) -> None:
