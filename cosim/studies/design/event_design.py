@@ -88,7 +88,7 @@ class EventSearch:
         self.weights = wish.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
         self.given = EventLoop(rows_of(self.plant.K), trigger.alpha_per_s, trigger.beta)
-        self.tried = self.judged = 0
+        self.tried = self.judged = self._likely = 0
         self.most = wish.most or _MOST_M
         box = box_of(scenario)
         self._draws = box.population(seed, range(draws))
@@ -142,13 +142,13 @@ class EventSearch:
         return Measured(float(rows["cost"].mean()), float(rows["transmissions"].mean()))
 
     def largest_m(self, loop: EventLoop) -> int:
-        """Return the largest M with a certificate, by doubling and bisection; 0: there is none.
+        """Return the largest M with a certificate, by bisection; 0: there is none.
 
         The bounds grow with M, so that it ceases to exist at one M. Only this M is claimed.
         """
-        low, high = 0, 1
+        low, high = 0, max(self._likely * 2 // 3, 1)
         while high <= self.most and math.isfinite(self.state_bound(loop, high)):
-            low, high = high, 2 * high
+            low, high = high, max(high * 4 // 3, high + 1)
         high = min(high, self.most + 1)
         while high - low > 1:
             middle = (low + high) // 2
@@ -156,6 +156,7 @@ class EventSearch:
                 low = middle
             else:
                 high = middle
+        self._likely = low
         return low
 
     def excess(self, loop: EventLoop) -> float:
