@@ -51,12 +51,7 @@ def network_design(options: argparse.Namespace) -> Iterator[Row]:
         found = design_for_network(given, wish)
         loops: list[Any] = [found.document()[loop] for loop in ("given", "best")]
         about = f"{' '.join((name, *settings[:1]))}, {kind}"
-        for key, words in (
-            ("certified", "M"),
-            ("cost", "cost"),
-            ("transmissions", "transmissions"),
-        ):
-            if key == "transmissions" and not isinstance(found, EventDesign):
-                continue
+        keys = {"certified": "M", "cost": "cost", "transmissions": "transmissions"}
+        for key in list(keys)[: None if isinstance(found, EventDesign) else 2]:
             before, after = (float(loop[key] or 0) for loop in loops)
-            yield Row(f"{about}: {'M' if key == 'certified' else key}", after, "", Peer("given loop", before))
+            yield Row(f"{about}: {keys[key]}", after, "", Peer("given loop", before))

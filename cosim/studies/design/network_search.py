@@ -9,8 +9,6 @@ pattern of its guarantee is proven stable there.
    left is judged: the margin's certified upper bound must be below 1.
 3. From the best starts, the lower bound at the next rung is minimised over K without gradients
    (Nelder and Mead). As soon as it is below 1, the loop is judged, and the search aims higher.
-
-A pattern with which the judge rejects a loop is tried first with all later ones.
 """
 
 import math
@@ -46,8 +44,6 @@ _RUNGS = 400
 _MOST_M = 16
 _SLACK = 0.002
 """The search wants log growth below −_SLACK: a loop at the limit takes long to judge."""
-_JUDGE = 3e-3, 0.1
-"""Limits of the judge's first accuracy: half of what the lower bound leaves."""
 _STARTS = 4
 _UNSTABLE = 1e3
 
@@ -268,15 +264,12 @@ class NetworkSearch:
             }
         )
 
-    def judge(self, candidate: Candidate, rung: int, *, refine: bool = False) -> Stability:
+    def judge(self, candidate: Candidate, rung: int) -> Stability:
         """Return the certified bounds of a loop on a rung."""
         self.judged += 1
         margin = LossMargin(resolve(self.scenario_of(candidate, rung)))
-        left = abs(math.expm1(-self.growth(candidate, rung))) / 2
-        found = margin.stability(accuracy=min(max(left, _JUDGE[0]), _JUDGE[1]), refine=refine)
-        if found.verdict != "stable":
-            self.graph(self.ladder[rung]).remember(found.pattern)
-        return found
+        found = margin.first_bounds()
+        return margin.is_stable() if found.verdict == "undecided" else found
 
     def reach(
         self, candidate: Candidate, most: int, least: int = -1
@@ -302,11 +295,11 @@ class NetworkSearch:
         """Return a loop with refined bounds on its rung and on the next one."""
         rung = most
         found = None
-        while rung >= 0 and (found := self.judge(candidate, rung, refine=True)).verdict != "stable":
+        while rung >= 0 and (found := self.judge(candidate, rung)).verdict != "stable":
             rung, found = rung - 1, None
         beyond = None
         while rung + 1 < len(self.ladder):
-            beyond = self.judge(candidate, rung + 1, refine=True)
+            beyond = self.judge(candidate, rung + 1)
             if beyond.verdict != "stable":
                 break
             rung, found, beyond = rung + 1, beyond, None

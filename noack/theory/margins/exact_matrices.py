@@ -12,9 +12,8 @@ hundreds of steps are computed with them, so that what remains is the rounding o
 double precision. The entries are Python integers, in units of 2⁻³⁸⁴.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, Protocol, Self, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,32 +139,15 @@ def stacked(*parts: FixedPointMatrix) -> FixedPointMatrix:
     return FixedPointMatrix(entries, max(part.error for part in parts))
 
 
-class ProductMatrix(Protocol):
-    """What the maps of a loop are computed with: products and rows."""
-
-    def __matmul__(self, other: Self) -> Self:
-        """Return the product."""
-
-    def rows(self, which: slice | list[int]) -> Self:
-        """Return some of the rows."""
-
-    def interval(self) -> IntervalMatrix:
-        """Return the matrix in double precision."""
-
-
-LoopMatrix = TypeVar("LoopMatrix", bound=ProductMatrix)
-
-
-def power(matrix: LoopMatrix, exponent: int) -> LoopMatrix:
-    """Return a power by repeated squaring; the exponent is positive."""
-    result = None
+def power(matrix: FixedPointMatrix, exponent: int) -> FixedPointMatrix:
+    """Return a power by repeated squaring; the exponent is not negative."""
+    result = fixed(np.eye(len(matrix.entries)))
     while exponent:
         if exponent & 1:
-            result = matrix if result is None else matrix @ result
+            result = matrix @ result
         exponent >>= 1
         if exponent:
             matrix = matrix @ matrix
-    assert result is not None
     return result
 
 
@@ -185,14 +167,3 @@ def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
         total = total + term
     total = FixedPointMatrix(total.entries, total.error + 1)
     return power(total, 1 << halvings)
-
-
-class Arithmetic(NamedTuple, Generic[LoopMatrix]):
-    """How matrices are made: from numbers, as e^{G dt}, and on top of each other."""
-
-    fixed: Callable[[Matrix], LoopMatrix]
-    exponential: Callable[[Matrix, int], LoopMatrix]
-    stacked: Callable[..., LoopMatrix]
-
-
-EXACT = Arithmetic(fixed, exponential, stacked)

@@ -32,7 +32,7 @@ from noack.theory.margins.joint_spectral_radius import (
     joint_spectral_radius,
 )
 from noack.theory.margins.switched_system import Edge
-from noack.theory.margins.time_triggered_loop import LoopTimes, exact_loop
+from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 from noack.trigger.trigger_rule import NEVER_NS
 
 MOST_EDGES = 5000
@@ -222,7 +222,7 @@ class LossMargin:
                 f"network.impairments: a delay of {times.delay_ns / NS_PER_S:g} s; expected less "
                 f"than the period between {what}, {unit_ns / NS_PER_S:g} s"
             )
-        self.loop = exact_loop((loop.A, loop.B, loop.K, loop.H), times)
+        self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
         self.maps = cache(self.loop.map)
         """The loop's maps by slot and number of lost updates."""
 

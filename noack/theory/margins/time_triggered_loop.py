@@ -16,18 +16,18 @@ may be no tick since the last arrival; then z = (x, x_c, u).
 
 import math
 from functools import cache
-from typing import Generic, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from noack.core.linear_systems import Matrix
 from noack.theory.margins.exact_matrices import (
-    EXACT,
-    Arithmetic,
     FixedPointMatrix,
     IntervalMatrix,
-    LoopMatrix,
+    exponential,
+    fixed,
     power,
+    stacked,
 )
 
 
@@ -56,24 +56,11 @@ class LoopTimes(NamedTuple):
         return (t_ns - self.phase_ns - 1) % self.tick_ns + 1
 
 
-class TimeTriggeredLoop(Generic[LoopMatrix]):
-    """The maps of a loop, in an arithmetic; :func:`exact_loop` has no rounding.
+class TimeTriggeredLoop:
+    """The maps of a loop with the matrices A, (n, n), B, (n, m), K, (m, n), and H, (n, n)."""
 
-    Args:
-        matrices: A, (n, n), B, (n, m), K, (m, n), and H, (n, n).
-        times: the times of the loop.
-        arithmetic: makes and stacks the matrices.
-    """
-
-    def __init__(
-        self,
-        matrices: tuple[Matrix, Matrix, Matrix, Matrix],
-        times: LoopTimes,
-        arithmetic: Arithmetic[LoopMatrix],
-    ) -> None:
-        A, B, K, H = matrices
+    def __init__(self, A: Matrix, B: Matrix, K: Matrix, H: Matrix, times: LoopTimes) -> None:
         n, m = B.shape
-        fixed, exponential, self._stacked = arithmetic
         self.times, self._H = times, H
         self._cycle_ns = math.lcm(times.step_ns, times.tick_ns)
         # The state of the loop is (x, x_c, u, w).
@@ -83,14 +70,12 @@ class TimeTriggeredLoop(Generic[LoopMatrix]):
         generator[:n, 2 * n : 2 * n + m] = B
         x, x_c, u, w = np.split(np.eye(size), [n, 2 * n, 2 * n + m])
         self._x, self._x_c, self._K = slice(n), slice(n, 2 * n), fixed(K)
-        self._start = fixed(np.eye(size))
         self._inputs = slice(2 * n, size)
         self._latch = fixed(np.vstack([x, x_c, w, w]))
         self._tick = fixed(np.vstack([x, x_c, u, K @ x_c]))
         self._flow = cache(lambda dt_ns: exponential(generator, dt_ns))
-        self._fixed, self._exponential = fixed, exponential
         self._advance = cache(self._advance_from_cycle)
-        self._states: dict[int, list[LoopMatrix]] = {}
+        self._states: dict[int, list[FixedPointMatrix]] = {}
         """By slot: (x, x_c, u, w) after 1, 2, … periods, as functions of z."""
         since_ns = [times.since_tick_ns(k * times.period_ns) for k in range(times.slots)]
         follows = max(since_ns) <= times.period_ns - times.delay_ns
@@ -118,7 +103,7 @@ class TimeTriggeredLoop(Generic[LoopMatrix]):
         """
         return self._after(slot, losses).interval().middle
 
-    def _after(self, slot: int, losses: int) -> LoopMatrix:
+    def _after(self, slot: int, losses: int) -> FixedPointMatrix:
         period_ns = self.times.period_ns
         states = self._states.setdefault(slot, [])
         while len(states) <= losses:
@@ -136,70 +121,58 @@ class TimeTriggeredLoop(Generic[LoopMatrix]):
             slot: number of the transmission, modulo the number of slots.
             delivered: whether its update arrives.
         """
-        return self.period_map(slot, delivered).interval().middle
-
-    def period_map(self, slot: int, delivered: bool) -> LoopMatrix:
-        """Return the map of :meth:`period` in the arithmetic."""
-        from_ns = slot * self.times.period_ns
+        from_ns, size = slot * self.times.period_ns, len(self._latch.entries)
         until_ns, arrival_ns = from_ns + self.times.period_ns, from_ns + self.times.delay_ns
+        start = fixed(np.eye(size))
         if not delivered:
-            return self._between(from_ns, until_ns)
-        before = self._between(from_ns, arrival_ns)
-        start = self._start
-        updated = self._exponential(self._H, self.times.delay_ns) @ start.rows(self._x)
-        state = self._stacked(before.rows(self._x), updated, before.rows(self._inputs))
-        return self._between(arrival_ns, until_ns) @ state
+            return self._between(from_ns, until_ns).interval().middle
+        state = self._between(from_ns, arrival_ns) @ start
+        updated = exponential(self._H, self.times.delay_ns) @ start.rows(self._x)
+        state = stacked(state.rows(self._x), updated, state.rows(self._inputs))
+        return (self._between(arrival_ns, until_ns) @ state).interval().middle
 
-    def _first_period(self, from_ns: int) -> LoopMatrix:
+    def _first_period(self, from_ns: int) -> FixedPointMatrix:
         state, until_ns = self._state(from_ns), from_ns + self.times.period_ns
         if not self.times.delay_ns:
             return self._between(from_ns, until_ns) @ state
         # Until the update arrives, x_c is that of older ones.
         sent, arrival_ns = state.rows(self._x), from_ns + self.times.delay_ns
         state = self._between(from_ns, arrival_ns) @ state
-        updated = self._exponential(self._H, self.times.delay_ns) @ sent
-        state = self._stacked(state.rows(self._x), updated, state.rows(self._inputs))
+        updated = exponential(self._H, self.times.delay_ns) @ sent
+        state = stacked(state.rows(self._x), updated, state.rows(self._inputs))
         return self._between(arrival_ns, until_ns) @ state
 
-    def _state(self, t_ns: int) -> LoopMatrix:
+    def _state(self, t_ns: int) -> FixedPointMatrix:
         """Return (x, x_c, u, w) as a function of z at a transmission."""
-        z, n = self._fixed(np.eye(self.dimension)), self._x.stop
+        z, n = fixed(np.eye(self.dimension)), self._x.stop
         if self.times.delay_ns == 0:
             x, u = z.rows(slice(n)), z.rows(slice(n, None))
-            return self._stacked(x, x, u, u)
+            return stacked(x, x, u, u)
         if self.dimension > 2 * n:
-            return self._stacked(z, z.rows(slice(2 * n, None)))
-        back = self._exponential(-self._H, self.times.since_tick_ns(t_ns))
-        u = self._K @ back @ z.rows(self._x_c)
-        return self._stacked(z, u, u)
+            return stacked(z, z.rows(slice(2 * n, None)))
+        u = self._K @ exponential(-self._H, self.times.since_tick_ns(t_ns)) @ z.rows(self._x_c)
+        return stacked(z, u, u)
 
-    def _between(self, from_ns: int, until_ns: int) -> LoopMatrix:
+    def _between(self, from_ns: int, until_ns: int) -> FixedPointMatrix:
         """Return the map of (x, x_c, u, w); a tick at its end is excluded, a step at its start."""
         return self._advance(from_ns % self._cycle_ns, until_ns - from_ns)
 
-    def _advance_from_cycle(self, from_ns: int, duration_ns: int) -> LoopMatrix:
+    def _advance_from_cycle(self, from_ns: int, duration_ns: int) -> FixedPointMatrix:
         cycles, rest_ns = divmod(duration_ns, self._cycle_ns)
         rest = self._occurrences(from_ns, from_ns + rest_ns)
         if not cycles:
             return rest
         return rest @ power(self._occurrences(from_ns, from_ns + self._cycle_ns), cycles)
 
-    def _occurrences(self, from_ns: int, until_ns: int) -> LoopMatrix:
+    def _occurrences(self, from_ns: int, until_ns: int) -> FixedPointMatrix:
         times = self.times
         first = -(-(from_ns - times.phase_ns) // times.tick_ns)
         ticks = range(first * times.tick_ns + times.phase_ns, until_ns, times.tick_ns)
         steps = range((from_ns // times.step_ns + 1) * times.step_ns, until_ns + 1, times.step_ns)
         both = [(t_ns, 0, self._latch) for t_ns in steps]
         both += [(t_ns, 1, self._tick) for t_ns in ticks]
-        result, now_ns = self._start, from_ns
+        result, now_ns = fixed(np.eye(len(self._latch.entries))), from_ns
         for t_ns, _, occurrence in sorted(both, key=lambda occurrence: occurrence[:2]):
             result = occurrence @ self._flow(t_ns - now_ns) @ result
             now_ns = t_ns
         return self._flow(until_ns - now_ns) @ result
-
-
-def exact_loop(
-    matrices: tuple[Matrix, Matrix, Matrix, Matrix], times: LoopTimes
-) -> TimeTriggeredLoop[FixedPointMatrix]:
-    """Return the loop in fixed-point arithmetic with bounds of its errors."""
-    return TimeTriggeredLoop(matrices, times, EXACT)
