@@ -4,6 +4,7 @@ import json as json_module
 import math
 import re
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,10 +22,16 @@ from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
     from cosim.live import progress
-    from cosim.output import result_tables
+    from cosim.output import figure_format, result_tables
     from cosim.studies.campaign import campaign_file, campaign_grid, campaign_report
     from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result
-    from cosim.studies.design import design_page, design_search, design_space
+    from cosim.studies.design import (
+        design_page,
+        design_search,
+        design_space,
+        network_page,
+        network_search,
+    )
     from cosim.studies.paper import paper_page, published_result
     from cosim.studies.paper import results as paper_results
     from noack.core import linear_systems
@@ -140,14 +147,14 @@ class LimitOptions:
     """What a design must meet.
 
     Options:
-        settling: Largest settling time allowed.
+        settling: Largest settling time allowed; required for --for settling.
         quantile: Share of the draws that must settle in time.
         settle: A run has settled when ‖x‖ stays below this share of ‖x(0)‖.
         bound: Largest certified sup‖x‖ (state) or sup‖e_c‖ (error) allowed over the box.
         under: Conditions of the certificates: the `paper`'s, or the scenario's `schedule`.
     """
 
-    settling: Annotated[float, Option(metavar="SECONDS")]
+    settling: Annotated[float | None, Option(metavar="SECONDS")] = None
     quantile: float = 0.95
     settle: float = 0.02
     bound: Annotated[list[str] | None, Option(metavar="state=X|error=X")] = None
@@ -155,6 +162,8 @@ class LimitOptions:
 
     def limits(self) -> "design_search.DesignLimits":
         """Return the limits; raise CallerError if one is wrong."""
+        if self.settling is None:
+            raise CallerError("--settling: give the largest settling time, e.g. --settling 14")
         for option, most in (("settling", math.inf), ("quantile", 1), ("settle", 1)):
             if not 0 < (value := getattr(self, option)) < most:
                 allowed = "positive" if most == math.inf else "between 0 and 1"
@@ -162,10 +171,11 @@ class LimitOptions:
         if self.under not in ("paper", "schedule"):
             raise CallerError(f'--under: paper or schedule, not "{self.under}"')
         return design_search.DesignLimits(
-            self.settling, self.quantile, self.settle, self._bounds(), self.under == "schedule"
+            self.settling, self.quantile, self.settle, self.bounds(), self.under == "schedule"
         )
 
-    def _bounds(self) -> "dict[design_search.Bounded, float]":
+    def bounds(self) -> "dict[design_search.Bounded, float]":
+        """Return the limits of certified bounds; raise CallerError if one is wrong."""
         found: dict[design_search.Bounded, float] = {}
         for text in self.bound or ():
             name, _, value = text.partition("=")
@@ -180,6 +190,64 @@ class LimitOptions:
                 raise CallerError(f"--bound {text}: {name} is given twice")
             found[bounded[name]] = limit
         return found
+
+
+class DesignAim(StrEnum):
+    """What ``noack design`` may choose, and for what."""
+
+    SETTLING = "settling"
+    NETWORK = "network"
+    TRANSMISSIONS = "transmissions"
+
+
+@cli.option_group
+class NetworkOptions:
+    """What a design for a network must meet.
+
+    Options:
+        aim: `settling`: the trigger with the fewest transmissions that settles in time. `network`:
+            the gain and hold strategy that are proven stable for the largest M. `transmissions`:
+            those with the longest period for the scenario's guarantee.
+        period: Time between two updates of a time-triggered sensor; by default that of a periodic
+            scenario. Without it, the paper's trigger is kept, with other α and β.
+        window: Maximise m in "at most m losses in WINDOW updates" instead of M.
+        most: Largest M to examine; 16 with a period, else 1,000.
+        cost: Largest cost ∫ xᵀQx + uᵀRu dt, as a multiple of the given loop's. With a period, that
+            without losses; else the mean over draws.
+        share: Most transmissions of events, as a multiple of the given loop's.
+        holds: Hold strategies to try: `model`, or `zoh` to hold the last input.
+        effort: Number of loops that the search may try.
+    """
+
+    aim: Annotated[DesignAim, Option("--for")] = DesignAim.SETTLING
+    period: Annotated[float | None, Option(metavar="SECONDS")] = None
+    window: Annotated[int | None, Option(metavar="UPDATES")] = None
+    most: Annotated[int | None, Option(min=1, max=10_000)] = None
+    cost: float = 1.2
+    share: float = 1.0
+    holds: str = "model,zoh"
+    effort: Annotated[int, Option(min=0)] = 1500
+
+    def wish(
+        self,
+        weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]",
+        bounds: "design_search.Bounds",
+    ) -> "network_search.Wish":
+        """Return what is asked for; raise CallerError if an option is wrong."""
+        modes = [mode.strip() for mode in self.holds.split(",")]
+        if not set(modes) <= set(network_search.MODES):
+            raise CallerError(f'--holds: {", ".join(network_search.MODES)}, not "{self.holds}"')
+        if self.period is not None and not 1e-6 <= self.period < math.inf:
+            raise CallerError(f"--period: must be positive, not {self.period:g}")
+        if not 0 < self.share < math.inf:
+            raise CallerError(f"--share: must be positive, not {self.share:g}")
+        return network_search.Wish(
+            goal="transmissions" if self.aim is DesignAim.TRANSMISSIONS else "network",
+            window=self.window, most=self.most, transmissions=self.share,
+            period_s=self.period, cost=self.cost, bounds=bounds,
+            weights=weights, modes=[mode for mode in network_search.MODES if mode in modes],
+            effort=self.effort,
+        )  # fmt: skip
 
 
 @cli.option_group
@@ -206,17 +274,24 @@ class GainOptions:
         if self.gain not in ("given", "lqr"):
             raise CallerError(f'--gain: given or lqr, not "{self.gain}"')
         if self.gain == "lqr":
-            n, m = given.model.dimensions
-            return _matrix("--Q", self.Q, n), _matrix("--R", self.R, m)
+            return self.costs(given)
         if self.Q or self.R:
             raise CallerError("--Q, --R: are for --gain lqr only")
         return None
+
+    def costs(
+        self, given: "scenario.Scenario"
+    ) -> "tuple[linear_systems.Matrix, linear_systems.Matrix]":
+        """Return Q (n, n) and R (m, m); raise CallerError if one is wrong."""
+        n, m = given.model.dimensions
+        return _matrix("--Q", self.Q, n), _matrix("--R", self.R, m)
 
 
 @cli.command(cli.CAMPAIGNS, 20, takes="up to a minute")
 def design(
     given: cli.ScenarioOptions,
     *,
+    network: NetworkOptions,
     wanted: LimitOptions,
     weights: str = "identity,chosen",
     feedback: GainOptions,
@@ -227,9 +302,14 @@ def design(
     figures: cli.FigureOptions,
     json: cli.JsonOption = False,
 ) -> int:
-    """Choose α, β and the norm: the fewest transmissions that meet your limits.
+    """Choose a trigger that transmits least, or a gain that tolerates the most losses.
 
-    Exit status 1: no choice meets the limits, or fresh draws do not confirm it.
+    Without --for: α, β and the norm with the fewest transmissions that meet your limits. With --for
+    network or --for transmissions: K, by LQR and a search without gradients, with α and β, or with
+    the hold strategy of a time-triggered loop; the result is certified, as by noack certify or
+    noack margin. This takes up to two minutes.
+
+    Exit status 1: no choice meets the limits or is proven stable, or fresh draws do not confirm it.
 
     Options:
         weights: Norms to try: `identity`, `given` in the scenario, `chosen` by noack.
@@ -241,12 +321,27 @@ def design(
         noack design lane_following --settling 14   the fewest transmissions
         noack design lane_following --settling 14 --bound error=3 --out mine.toml
         noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json
+        noack design lane_periodic --for network   a gain for the largest M
+        noack design unstable_pendulum --for network --period 0.25 --out mine.toml
+        noack design lane_periodic --for transmissions --cost 1   the longest period
     """
     figure_files, loaded = figures.files, given.load()
-    loaded.decaying  # noqa: B018 - raises for another policy
-    limits = wanted.limits()
     if out is not None and not out.parent.is_dir():
         raise CallerError(f"--out {out}: there is no folder {out.parent}")
+    if network.aim is not DesignAim.SETTLING:
+        if wanted.settling is not None or feedback.gain != "given":
+            raise CallerError(f"--settling, --gain: are not for --for {network.aim.value}")
+        return _design_for_network(
+            loaded,
+            network.wish(feedback.costs(loaded), wanted.bounds()),
+            seed,
+            out,
+            page,
+            figure_files,
+            json,
+        )
+    loaded.decaying  # noqa: B018 - raises for another policy
+    limits = wanted.limits()
     norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
     with progress.work_bar("choosing norms") as bar:
         families = design_space.families_of(loaded, norms, feedback.regulator(loaded), bar)
@@ -260,6 +355,26 @@ def design(
     if not found.confirmed:
         print_to_stderr(f"noack: {found.verdict()}")
     return ExitStatus.OK if found.confirmed else ExitStatus.FAILED
+
+
+def _design_for_network(
+    loaded: "scenario.Scenario",
+    wish: "network_search.Wish",
+    seed: int,
+    out: Path | None,
+    page: Path | None,
+    figure_files: "figure_format.FigureFiles | None",
+    json: bool,
+) -> int:
+    with progress.work_bar("trying gains") as bar:
+        found = network_page.design_for_network(loaded, wish, seed, bar)
+    path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}-network.html"
+    written = network_page.write_page(found, path, figure_files)
+    if out is not None and found.is_certified:
+        text = scenario_file.dumps(network_page.written_scenario(found))
+        written.append(write_whole(out, text))
+    cli.show_with_files(json, found.document(), written, network_page.print_design, found)
+    return ExitStatus.OK if found.is_certified else ExitStatus.FAILED
 
 
 def _matrix(option: str, text: str | None, size: int) -> "linear_systems.Matrix":

@@ -160,8 +160,12 @@ def certificate_of(scenario: Scenario, limits: DesignLimits) -> ScenarioCertific
 
 
 def _bounds_of(scenario: Scenario, limits: DesignLimits) -> Bounds:
+    """Return the certified bounds of a scenario."""
+    return bounds_of(certificate_of(scenario, limits), scenario)
+
+
+def bounds_of(found: ScenarioCertificate, scenario: Scenario) -> Bounds:
     """Return certified sup‖x‖ and sup‖e_c‖ over all times; ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W."""
-    found = certificate_of(scenario, limits)
     if found.constants is None:
         return {"state": math.inf, "error": math.inf}
     t_s = np.array([0.0, found.floor_from_s if math.isfinite(found.floor_from_s) else 0.0])

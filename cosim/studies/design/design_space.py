@@ -199,7 +199,7 @@ def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
         P = solve_continuous_are(A, B, Q, R)
     except np.linalg.LinAlgError:
         raise CallerError(
-            "--gain lqr: the Riccati equation of this model has no stabilising solution; "
+            "model: its Riccati equation has no stabilising solution; "
             "every unstable mode must be within the inputs' reach and weighed by Q"
         ) from None
     return np.asarray(-np.linalg.solve(R, B.T @ P), dtype=np.float64)

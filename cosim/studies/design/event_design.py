@@ -1,0 +1,373 @@
+"""The search for a gain and a threshold whose certificate exists for the largest M.
+
+The sensor has the paper's trigger. *Certified for M* means: under the scenario's schedule, for all
+plants of its uncertainty box, there is a certificate with at most M − 1 consecutive losses. If the
+given loop has none for the box even with M = 1, the scenario's own plant is certified instead.
+
+Q, R and the number of transmissions are measured over common draws of the scenario's own network,
+in continuous time. Regulators (LQR) over a grid of weights are the starts; then K, α and β are
+searched together without gradients (Nelder and Mead). The result is measured on fresh draws.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.output import palette
+from cosim.output.figure_description import Axis, FigureDescription, Line, Panel, one_panel
+from cosim.simulation.exact_simulation import Population, run_batch, setting_of
+from cosim.studies.campaign.random_draws import box_of
+from cosim.studies.design.design_search import WORDS, bounds_of
+from cosim.studies.design.design_space import lqr_gain
+from cosim.studies.design.network_search import COSTS_OF_INPUT, Progress, Wish, scaled_steps
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector, spectral_abscissa
+from noack.core.number_format import NONE
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import toml_text
+from noack.settings.section import Rows, rows_of
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import nominal_conditions
+from noack.theory.certificates.scenario_certificates import certify, certify_box
+
+DRAWS = 200
+_ALPHAS = (1.0, 0.5)
+"""Factors of α of the starts."""
+_STARTS = 3
+_HEIGHT_IN = 3.8
+_FORBIDDEN = 1e3
+_MOST_M = 1000
+
+
+class EventLoop(NamedTuple):
+    """A gain and a threshold."""
+
+    K: Rows
+    alpha_per_s: float
+    beta: float
+
+
+class Measured(NamedTuple):
+    """Means over draws; infinite if a run diverges."""
+
+    cost: float
+    transmissions: float
+
+
+class Certified(NamedTuple):
+    """A loop with the largest M for which it has a certificate."""
+
+    loop: EventLoop
+    m: int
+    """0: there is none."""
+    measured: Measured
+    """On fresh draws."""
+
+
+class EventSearch:
+    """All that is known about the loops of a scenario with other gains and thresholds."""
+
+    def __init__(self, scenario: Scenario, wish: Wish, seed: int, draws: int = DRAWS) -> None:
+        trigger = scenario.decaying
+        scenario.coverage.require_exact()
+        if wish.window is not None:
+            raise CallerError("--window: is for periodic updates; give their --period, too")
+        resolved = resolve(scenario)
+        self.scenario, self.wish, self.plant = scenario, wish, loop_of(resolved)
+        n, m = self.plant.n, self.plant.m
+        self.weights = wish.weights or (np.eye(n), np.eye(m))
+        lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
+        self.given = EventLoop(rows_of(self.plant.K), trigger.alpha_per_s, trigger.beta)
+        self.tried = self.judged = self._likely = 0
+        self.most = wish.most or _MOST_M
+        box = box_of(scenario)
+        self._draws = box.population(seed, range(draws))
+        self._fresh = box.population(seed, range(draws, 2 * draws))
+        self.of_box = False
+        found = self.certificate(self.given, 1, of_box=True)
+        self.of_box = found is not None and found.constants is not None
+        base = self.measured(self.given, self._draws)
+        self.limits = Measured(wish.cost * base.cost, wish.transmissions * base.transmissions)
+
+    def scenario_of(self, loop: EventLoop, m: int | None = None) -> Scenario:
+        """Return the scenario of a loop; with M, or with its own."""
+        one = self.scenario
+        trigger = one.decaying.model_copy(
+            update={"alpha_per_s": loop.alpha_per_s, "beta": loop.beta}
+        )
+        update: dict[str, object] = {
+            "model": one.model.model_copy(update={"gain": loop.K}), "trigger": trigger,
+        }  # fmt: skip
+        if m is not None:
+            update["network"] = one.network.model_copy(update={"mansd": m - 1})
+        return one.model_copy(update=update)
+
+    def certificate(
+        self, loop: EventLoop, m: int, *, of_box: bool | None = None
+    ) -> ScenarioCertificate | None:
+        """Return the certificate for M under the scenario's schedule."""
+        self.judged += 1
+        resolved = resolve(self.scenario_of(loop, m))
+        conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
+        if self.of_box if of_box is None else of_box:
+            return certify_box(resolved, conditions)
+        return certify(resolved, conditions)
+
+    def state_bound(self, loop: EventLoop, m: int) -> float:
+        """Return certified sup‖x‖; infinite without a certificate, or beyond the given limits."""
+        found = self.certificate(loop, m)
+        if found is None:
+            return math.inf
+        bounds = bounds_of(found, self.scenario)
+        within = all(bounds[name] <= limit for name, limit in self.wish.bounds.items())
+        return bounds["state"] if within else math.inf
+
+    def measured(self, loop: EventLoop, population: Population) -> Measured:
+        """Run a loop over draws."""
+        Q, R = self.weights
+        setting = replace(setting_of(resolve(self.scenario_of(loop))), Q=Q, R=R)
+        rows = run_batch(setting, population)
+        if np.isnan(rows["cost"]).any():
+            return Measured(math.inf, math.inf)
+        return Measured(float(rows["cost"].mean()), float(rows["transmissions"].mean()))
+
+    def largest_m(self, loop: EventLoop) -> int:
+        """Return the largest M with a certificate, by bisection; 0: there is none.
+
+        The bounds grow with M, so that it ceases to exist at one M. Only this M is claimed.
+        """
+        low, high = 0, max(self._likely * 2 // 3, 1)
+        while high <= self.most and math.isfinite(self.state_bound(loop, high)):
+            low, high = high, max(high * 4 // 3, high + 1)
+        high = min(high, self.most + 1)
+        while high - low > 1:
+            middle = (low + high) // 2
+            if math.isfinite(self.state_bound(loop, middle)):
+                low = middle
+            else:
+                high = middle
+        self._likely = low
+        return low
+
+    def excess(self, loop: EventLoop) -> float:
+        """Return what is minimised: below 0 if all limits are met, the lower the better."""
+        plant = self.plant
+        rate_per_s = spectral_abscissa(plant.A_model + plant.B_model @ np.array(loop.K))
+        if not rate_per_s < 0 or not 0 < loop.alpha_per_s < -rate_per_s:
+            return _FORBIDDEN + min(abs(rate_per_s), _FORBIDDEN)
+        self.tried += 1
+        found, least = self.measured(loop, self._draws), self.scenario.network.mansd + 1
+        over = max(0.0, math.log(found.cost / self.limits.cost))
+        if self.wish.goal == "transmissions":
+            bound = 0.0 if math.isfinite(self.state_bound(loop, least)) else 1.0
+            if over or bound:
+                return min(1.0 + over + bound, _FORBIDDEN)
+            return -math.log(1e6 / found.transmissions)
+        over += max(0.0, math.log(found.transmissions / self.limits.transmissions))
+        if over:
+            return min(1.0 + over, _FORBIDDEN)
+        m = self.largest_m(loop)
+        # Between loops of the same M, a smaller bound is closer to the next M.
+        bound = min(math.log1p(self.state_bound(loop, m)), 50.0) if m else 50.0
+        return -math.log1p(m) - 0.01 * (1 - bound / 50.0)
+
+    def run(self, progress: Progress = lambda share: None) -> tuple[Certified, Certified]:
+        """Return the given loop and the best one found."""
+        plant, (Q, R) = self.plant, self.weights
+        starts = [self.given]
+        for factor in COSTS_OF_INPUT:
+            K = lqr_gain(plant.A_model, plant.B_model, Q, factor * R).ravel()
+            for scale in _ALPHAS:
+                alpha_per_s = scale * self.given.alpha_per_s
+                starts.append(_rounded(K, self.given, alpha_per_s, self.given.beta))
+        values = []
+        for number, start in enumerate(starts):
+            values.append(self.excess(start))
+            progress(0.3 * (number + 1) / len(starts))
+        order = sorted(range(len(starts)), key=lambda number: values[number])[:_STARTS]
+        best, value = starts[order[0]], values[order[0]]
+        for number, place in enumerate(order):
+            found, reached = self._improve(starts[place], self.wish.effort // (10 * _STARTS))
+            if reached < value:
+                best, value = found, reached
+            progress(0.3 + 0.6 * (number + 1) / len(order))
+        if value >= min(values[0], 0.0):  # no better than the given loop, or beyond a limit
+            best = self.given
+        given, chosen = (
+            Certified(loop, self.largest_m(loop), self.measured(loop, self._fresh))
+            for loop in (self.given, best)
+        )
+        return given, chosen
+
+    def _improve(self, start: EventLoop, most: int) -> tuple[EventLoop, float]:
+        from scipy.optimize import minimize  # slow to import
+
+        centre = np.array([*np.ravel(start.K), start.alpha_per_s, start.beta])
+        scale = np.append(scaled_steps(np.array(start.K)), centre[-2:])
+        best, value = start, math.inf
+
+        def objective(steps: Vector) -> float:
+            nonlocal best, value
+            moved = centre + scale * steps
+            moved[-2:] = centre[-2:] * np.exp(steps[-2:])
+            loop = _rounded(moved[:-2], start, *moved[-2:].tolist())
+            excess = self.excess(loop)
+            if excess < value:
+                best, value = loop, excess
+            return excess
+
+        if most > 0:
+            simplex = np.vstack([np.zeros(centre.size), 0.2 * np.eye(centre.size)])
+            minimize(
+                objective,
+                np.zeros(centre.size),
+                method="Nelder-Mead",
+                options={"maxfev": most, "adaptive": True, "initial_simplex": simplex},
+            )
+        return best, value
+
+
+def _rounded(entries: Vector, like: EventLoop, alpha_per_s: float, beta: float) -> EventLoop:
+    """Return a loop with six digits: what is judged is what is printed."""
+    width = len(like.K[0])
+    *numbers, alpha_per_s, beta = (float(f"{one:.6g}") for one in (*entries, alpha_per_s, beta))
+    K = tuple(tuple(numbers[i : i + width]) for i in range(0, len(numbers), width))
+    return EventLoop(K, alpha_per_s, beta)
+
+
+@dataclass(frozen=True)
+class EventDesign:
+    """The given loop and the best one found, with the M that they are certified for."""
+
+    search: EventSearch
+    given: Certified
+    best: Certified
+
+    @property
+    def name(self) -> str:
+        """Name of the given scenario."""
+        return self.search.scenario.name
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the best loop has a certificate for some M."""
+        return self.best.m > 0
+
+    @property
+    def is_better(self) -> bool:
+        """Whether it is another loop than the given one."""
+        return self.best.loop != self.given.loop
+
+    @property
+    def _plants(self) -> str:
+        return "for the whole box" if self.search.of_box else "for the scenario's own plant"
+
+    @cached_property
+    def verdict(self) -> str:
+        """The verdict in one line."""
+        before, after = (self._m(one) for one in (self.given, self.best))
+        if not self.is_certified:
+            return "no loop was found that has a certificate"
+        if not self.is_better:
+            return f"{after} for the given loop; no better one was found"
+        sent = f"{self.given.measured.transmissions:.4g} to {self.best.measured.transmissions:.4g}"
+        return f"certified {self._plants}: {before} before, {after} after; transmissions {sent}"
+
+    def _m(self, one: Certified) -> str:
+        if not one.m:
+            return "nothing certified"
+        return f"M = {one.m}" + (", the most examined" if one.m == self.search.most else "")
+
+    @property
+    def notes(self) -> list[str]:
+        """What the reader should know of the search."""
+        limits = self.search.limits
+        limit = f"a mean cost of at most {limits.cost:.4g}"
+        if self.search.wish.goal == "network":
+            limit += f", at most {limits.transmissions:.4g} transmissions"
+        for name, most in self.search.wish.bounds.items():
+            limit += f", {WORDS[name]} ≤ {most:g} certified"
+        return [
+            f"the best of {self.search.tried:,} loops tried with {limit}; its certificate is "
+            "proven, that it is the best is not",
+            "costs and transmissions are means over fresh draws with the scenario's own network",
+        ]
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the best loop, with the M that it is certified for."""
+        m = self.best.m if self.search.wish.goal == "network" and self.best.m else None
+        return self.search.scenario_of(self.best.loop, m)
+
+    @property
+    def lines(self) -> str:
+        """What to change in the scenario, as TOML."""
+        loop = self.best.loop
+        content: dict[str, object] = {
+            "model": {"gain": [list(row) for row in loop.K]},
+            "trigger": {"alpha_per_s": loop.alpha_per_s, "beta": loop.beta},
+            "network": {"mansd": self.scenario.network.mansd},
+        }
+        return toml_text(content)
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Return the comparison of both loops."""
+        both = (self.given, self.best)
+
+        def row(heading: str, *cells: str) -> tuple[str, str, str]:
+            return heading, cells[0], cells[1]
+
+        def bound(one: Certified, m: int) -> str:
+            value = self.search.state_bound(one.loop, m) if m else math.inf
+            return f"{value:.4g}" if value < math.inf else NONE
+
+        own = self.search.scenario.network.mansd + 1
+        return [
+            row("certified for", *(self._m(one) for one in both)),
+            row("sup‖x‖ there at most", *(bound(one, one.m) for one in both)),
+            row(f"sup‖x‖ with M = {own} at most", *(bound(one, own) for one in both)),
+            row("cost, mean", *(f"{one.measured.cost:.4g}" for one in both)),
+            row("transmissions, mean", *(f"{one.measured.transmissions:.4g}" for one in both)),
+            row("α [1/s]", *(f"{one.loop.alpha_per_s:.4g}" for one in both)),
+            row("β", *(f"{one.loop.beta:.4g}" for one in both)),
+            row("K", *("\n".join(" ".join(f"{entry:.6g}" for entry in line) for line in one.loop.K)
+                       for one in both)),
+        ]  # fmt: skip
+
+    def document(self) -> dict[str, object]:
+        """Return the result as JSON."""
+
+        def loop(one: Certified) -> dict[str, object]:
+            return {"certified": one.m or None, **one.loop._asdict(), **one.measured._asdict()}
+
+        search = self.search
+        return {
+            "scenario": self.name, "goal": search.wish.goal, "of_box": search.of_box,
+            "limits": search.limits._asdict(), "tried": search.tried, "judged": search.judged,
+            "given": loop(self.given), "best": loop(self.best), "verdict": self.verdict,
+            "lines": self.lines,
+        }  # fmt: skip
+
+    def figure(self) -> FigureDescription:
+        """Describe the certified bounds of ‖x‖ over M, which end where the certificate does."""
+        most = max(self.given.m, self.best.m, 2)
+        numbers = np.unique(np.geomspace(1, most, 30).round().astype(int))
+        items = [
+            Line(x=numbers.astype(float), colour=colour, label=label, marker="o", size=3.0,
+                 y=np.array([self.search.state_bound(one.loop, int(m)) for m in numbers]))
+            for one, label, colour in (
+                (self.given, "given", palette.NETWORK), (self.best, "designed", palette.LOST),
+            )
+        ]  # fmt: skip
+        panel = Panel(
+            items=items,
+            x=Axis(label="M", logarithmic=True),
+            y=Axis(label="certified sup‖x‖", logarithmic=True),
+        )
+        return one_panel("certified", panel, _HEIGHT_IN).captioned(
+            "Certified bound of the state over M. A curve ends where its certificate does."
+        )

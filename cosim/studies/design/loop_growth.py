@@ -1,0 +1,209 @@
+"""Growth under the worst losses, and cost, of a time-triggered loop: quickly, with rounding.
+
+A search tries thousands of gains. For each, the loop's maps are computed in double precision, and
+short cycles give a lower bound of the growth. It excludes gains; it proves nothing.
+:mod:`noack.theory.margins` has the exact maps, and decides about what is left.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm, solve_discrete_lyapunov
+
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.margins.loss_margin import Burst
+from noack.theory.margins.time_triggered_loop import LoopTimes
+
+_ROUNDS, _MOST_ROUNDS, _BEAM, _BALANCING = 5, 40, 24, 12
+_TINY = 1e-300
+
+
+class _Map(NamedTuple):
+    """The map of a state over some time, z to M z, and the cost of this time, zᵀ C z."""
+
+    M: Matrix
+    C: Matrix
+
+    def after(self, first: "_Map") -> "_Map":
+        return _Map(self.M @ first.M, first.C + first.M.T @ self.C @ first.M)
+
+
+class QuickLoop:
+    """A loop of the times of :class:`TimeTriggeredLoop`, with (x, x_c, u, w) as its state.
+
+    Args:
+        matrices: A, (n, n), B, (n, m), K, (m, n), and H, (n, n).
+        times: the times of the loop.
+        weights: Q and R, the weights of x and u in the cost.
+    """
+
+    def __init__(
+        self,
+        matrices: tuple[Matrix, Matrix, Matrix, Matrix],
+        times: LoopTimes,
+        weights: tuple[Matrix, Matrix],
+    ) -> None:
+        A, B, K, H = matrices
+        n, m = B.shape
+        self._times, self._m, size = times, m, 2 * (n + m)
+        x, x_c, u, w = np.split(np.eye(size), [n, 2 * n, 2 * n + m])
+        self._generator = x.T @ A @ x + x_c.T @ H @ x_c + x.T @ B @ u
+        self._weight = x.T @ weights[0] @ x + u.T @ weights[1] @ u
+        self._latch, self._tick = np.vstack([x, x_c, w, w]), np.vstack([x, x_c, u, K @ x_c])
+        self._x_c, self._arrived = slice(n, 2 * n), expm(H * (times.delay_ns / NS_PER_S)) @ x
+        self._flow = cache(self._exponential)
+        self._z = np.eye(size), np.eye(size)
+        if not times.delay_ns:  # just after a delivery x_c = x and w = u
+            self._z = np.vstack([x, u]), np.vstack([x, x, u, u]) @ np.vstack([x, u]).T
+        self._periods = [self._period(slot) for slot in range(times.slots)]
+
+    def _exponential(self, dt_ns: int) -> _Map:
+        """Return the flow over dt (Van Loan, IEEE Trans. Autom. Control 23(3), 1978)."""
+        G, n = self._generator, len(self._generator)
+        block = np.block([[-G.T, self._weight], [np.zeros((n, n)), G]])
+        exponential = expm(block * (dt_ns / NS_PER_S))
+        M = exponential[n:, n:]
+        return _Map(M, M.T @ exponential[:n, n:])
+
+    def _between(self, from_ns: int, until_ns: int) -> _Map:
+        """Return the map from a time to another; a tick at its end is excluded, a step at 0."""
+        times = self._times
+        cycle_ns = int(np.lcm(times.step_ns, times.tick_ns))
+        cycles, rest_ns = divmod(until_ns - from_ns, cycle_ns)
+        whole = self._occurrences(from_ns, from_ns + rest_ns)
+        square = self._occurrences(from_ns + rest_ns, from_ns + rest_ns + cycle_ns)
+        while cycles:
+            if cycles & 1:
+                whole = square.after(whole)
+            cycles, square = cycles >> 1, square.after(square)
+        return whole
+
+    def _occurrences(self, from_ns: int, until_ns: int) -> _Map:
+        times = self._times
+        first = -(-(from_ns - times.phase_ns) // times.tick_ns) * times.tick_ns + times.phase_ns
+        both = [(t_ns, 1, self._tick) for t_ns in range(first, until_ns, times.tick_ns)]
+        steps = range((from_ns // times.step_ns + 1) * times.step_ns, until_ns + 1, times.step_ns)
+        both += [(t_ns, 0, self._latch) for t_ns in steps]
+        none = np.zeros_like(self._generator)
+        found, now_ns = _Map(np.eye(len(none)), none), from_ns
+        for t_ns, _, matrix in sorted(both, key=lambda one: one[:2]):
+            found = _Map(matrix, none).after(self._flow(t_ns - now_ns).after(found))
+            now_ns = t_ns
+        return self._flow(until_ns - now_ns).after(found)
+
+    def _period(self, slot: int) -> tuple[_Map, _Map]:
+        """Return the maps of a period whose update is lost, and of one whose update is not."""
+        from_ns = slot * self._times.period_ns
+        until_ns, arrival_ns = from_ns + self._times.period_ns, from_ns + self._times.delay_ns
+        first, rest = self._between(from_ns, arrival_ns), self._between(arrival_ns, until_ns)
+        arrived = first.M.copy()
+        arrived[self._x_c] = self._arrived
+        return rest.after(first), rest.after(_Map(arrived, first.C))
+
+    def cost(self, x0: Vector) -> float:
+        """Return ∫ xᵀQx + uᵀRu dt from x(0) with every update delivered; infinite if unstable.
+
+        The controller knows x(0), and the input is 0 until its first tick.
+        """
+        whole = self._periods[0][1]
+        for _, delivered in self._periods[1:]:
+            whole = delivered.after(whole)
+        if not np.isfinite(whole.M).all() or not _radius(whole.M) < 1 - 1e-9:
+            return np.inf
+        z0 = np.concatenate([x0, x0, np.zeros(2 * self._m)])
+        return float(z0 @ solve_discrete_lyapunov(whole.M.T, whole.C) @ z0)
+
+    def maps(self, bursts: Sequence[Burst]) -> Matrix:
+        """Return the maps of bursts between two deliveries, (k, d, d)."""
+        (rows, start), slots, found = self._z, len(self._periods), []
+        for burst in bursts:
+            M = self._periods[burst.slot][1].M @ start
+            for number in range(1, burst.losses + 1):
+                M = self._periods[(burst.slot + number) % slots][0].M @ M
+            found.append(rows @ M)
+        return np.array(found)
+
+
+def _radius(matrix: Matrix) -> float:
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+
+class QuickGrowth(NamedTuple):
+    """A lower bound of the growth, up to rounding."""
+
+    logarithm: float
+    """log of the growth per period."""
+    cycle: tuple[int, ...]
+    """The numbers of the edges that grow so fast, in their order of time."""
+
+
+class PatternGraph:
+    """The graph of a guarantee, with the cycles that were the worst ones of loops seen so far."""
+
+    def __init__(self, bursts: Sequence[Burst]) -> None:
+        self.bursts = bursts
+        self._sources = np.array([one.source for one in bursts])
+        self._targets = np.array([one.target for one in bursts])
+        self._durations = np.array([float(one.steps) for one in bursts])
+        nodes = range(int(self._sources.max()) + 1)
+        self._leaving = [np.flatnonzero(self._sources == node) for node in nodes]
+        self._rounds = min(_ROUNDS + len(nodes), _MOST_ROUNDS)
+        self._known: dict[tuple[int, ...], None] = {}
+
+    def growth(self, maps: Matrix) -> QuickGrowth:
+        """Return the fastest growth found, of short cycles and those known before."""
+        if not np.isfinite(maps).all() or np.abs(maps).max() > 1e150:
+            return QuickGrowth(np.inf, ())
+        turned, best = _balanced(maps), QuickGrowth(-np.inf, ())
+        for cycle in self._known:
+            product = np.eye(maps.shape[1])
+            for number in cycle:
+                product = turned[number] @ product
+            logarithm = np.log(_radius(product) + _TINY) / self._durations[list(cycle)].sum()
+            best = max(best, QuickGrowth(float(logarithm), cycle))
+        best = max(best, self._searched(turned, best.logarithm))
+        if best.cycle:
+            self._known[best.cycle] = None
+        return best
+
+    def _searched(self, maps: Matrix, at_least: float) -> QuickGrowth:
+        """Keep, at each length, the paths with the largest products."""
+        best = QuickGrowth(at_least, ())
+        paths, products, durations = np.arange(len(maps))[:, None], maps, self._durations
+        for _ in range(self._rounds):
+            norms = np.log(np.linalg.norm(products, axis=(1, 2)) + _TINY) / durations
+            closed = np.flatnonzero(
+                (self._sources[paths[:, 0]] == self._targets[paths[:, -1]])
+                & (norms > best.logarithm)
+            )
+            if len(closed):
+                radii = np.abs(np.linalg.eigvals(products[closed])).max(axis=1)
+                growths = np.log(radii + _TINY) / durations[closed]
+                fastest = int(growths.argmax())
+                if growths[fastest] > best.logarithm + 1e-12:
+                    cycle = tuple(paths[closed[fastest]].tolist())
+                    best = QuickGrowth(float(growths[fastest]), cycle)
+            rank = durations * (norms - max(best.logarithm, -50.0))
+            kept = np.argsort(-rank, kind="stable")[:_BEAM]
+            steps = [self._leaving[self._targets[paths[index, -1]]] for index in kept]
+            before, step = np.repeat(kept, [len(one) for one in steps]), np.concatenate(steps)
+            paths = np.concatenate([paths[before], step[:, None]], axis=1)
+            products = maps[step] @ products[before]
+            durations = durations[before] + self._durations[step]
+        return best
+
+
+def _balanced(maps: Matrix) -> Matrix:
+    """Return the maps in coordinates in which no direction grows much more than others."""
+    P = np.eye(maps.shape[1])
+    for _ in range(_BALANCING):
+        P = (maps.swapaxes(1, 2) @ (P @ maps)).sum(axis=0)
+        size = float(np.trace(P))
+        if not 0 < size < np.inf:
+            return maps
+        P = P / size + 1e-6 * np.eye(len(P))
+    T = np.linalg.cholesky(P).T
+    return np.asarray(T @ maps @ np.linalg.inv(T))

@@ -1,0 +1,394 @@
+"""The search for a gain and a hold strategy that tolerate the most losses, or the fewest updates.
+
+The sensor is time-triggered. A *ladder* has what is asked for, from easy to hard: M = 1, 2, …; m =
+0, 1, … losses in a window; or longer and longer periods. A loop *reaches* a rung if every loss
+pattern of its guarantee is proven stable there.
+
+1. The given loop is examined; regulators (LQR) over a grid of weights are the further starts.
+2. A quick lower bound of the growth (``loop_growth.py``) excludes what cannot reach a rung. What is
+   left is judged: the margin's certified upper bound must be below 1.
+3. From the best starts, the lower bound at the next rung is minimised over K without gradients
+   (Nelder and Mead). As soon as it is below 1, the loop is judged, and the search aims higher.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from cosim.studies.design.design_search import Bounds
+from cosim.studies.design.design_space import lqr_gain
+from cosim.studies.design.loop_growth import PatternGraph, QuickLoop
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.impairments.constraints.at_most import AtMost
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.settings.section import Rows, rows_of
+from noack.theory.margins.loss_margin import LossMargin, Stability, list_bursts
+from noack.trigger.periodic_trigger import PeriodicSettings
+
+Mode = Literal["model", "zoh"]
+Goal = Literal["network", "transmissions"]
+Progress = Callable[[float], None]
+MODES: tuple[Mode, ...] = ("model", "zoh")
+COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
+"""Factors of R of the regulators that the search begins with."""
+_LONGER = 1.02
+"""Ratio of successive periods of the ladder, where measurements are close enough."""
+_RUNGS = 400
+_MOST_M = 16
+_SLACK = 0.002
+"""The search wants log growth below −_SLACK: a loop at the limit takes long to judge."""
+_STARTS = 4
+_UNSTABLE = 1e3
+
+
+class Candidate(NamedTuple):
+    """A gain and what the controller does between updates."""
+
+    mode: Mode
+    K: Rows
+
+
+class Rung(NamedTuple):
+    """What a loop must tolerate."""
+
+    name: str
+    number: float
+    """M, m or the period in seconds."""
+    guarantee: LossGuarantee
+    period_ns: int
+    network: dict[str, object]
+    """Settings of the network with this guarantee; empty: the scenario's."""
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a design is asked for."""
+
+    goal: Goal = "network"
+    window: int | None = None
+    """K of (m, K): maximise m; None: maximise M."""
+    most: int | None = None
+    """Largest M to examine; None: 16 with periodic updates, else 1,000."""
+    period_s: float | None = None
+    """Time between updates; None: the scenario's."""
+    cost: float = 1.2
+    """Largest cost, as a multiple of that of the given loop."""
+    transmissions: float = 1.0
+    """Most transmissions of a loop with events, as a multiple of those of the given loop."""
+    weights: tuple[Matrix, Matrix] | None = None
+    """Q and R of the cost; None: identities."""
+    bounds: Bounds = field(default_factory=dict)
+    """Upper limits of the certified bounds of a loop with events."""
+    modes: Sequence[Mode] = MODES
+    effort: int = 1500
+    """Number of loops that the search without gradients may try."""
+
+
+class Reached(NamedTuple):
+    """A loop with the highest rung that it is proven to reach."""
+
+    candidate: Candidate
+    rung: int
+    """Its number in the ladder; −1: none."""
+    found: Stability | None
+    """The certificate there; None: there is none."""
+    beyond: Stability | None
+    """What is known about the next rung; None: there is none, or it was not examined."""
+    cost: float
+    """Without losses; infinite: the loop is unstable then."""
+
+
+def time_triggered(scenario: Scenario, period_s: float | None) -> Scenario:
+    """Return a scenario with an update every period.
+
+    Raises:
+        CallerError: no period is given, neither here nor in the scenario.
+    """
+    given = scenario.trigger
+    if period_s is None:
+        if isinstance(given, PeriodicSettings):
+            return scenario
+        raise CallerError(
+            f'--period: trigger.policy = "{given.policy}" has no period; give the time between '
+            "two updates in seconds, e.g. --period 0.5"
+        )
+    trigger = PeriodicSettings(policy="periodic", period_s=period_s, weight=given.weight)
+    return scenario.model_copy(update={"trigger": trigger})
+
+
+def _capped(others: LossGuarantee, limit: int) -> LossGuarantee:
+    return LossGuarantee((LongestBurst(limit), *others.rules))
+
+
+def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
+    """Return what a loop must tolerate, from easy to hard."""
+    network, period_ns = scenario.network, margin.longest_ns
+    if wish.goal == "transmissions":
+        return list(_periods(scenario, margin))
+    if wish.window is not None:
+        if not 2 <= wish.window <= 64:
+            raise CallerError(f"--window: from 2 to 64 updates, not {wish.window}")
+        found = []
+        for m in range(wish.window):
+            rules = (AtMost(losses=m, window=wish.window),) if m else ()
+            guarantee = LossGuarantee((LongestBurst(m), *(one.rule for one in rules)))
+            settings: dict[str, object] = {"mansd": m, "constraints": rules}
+            name = f"m = {m} of {wish.window}"
+            found.append(Rung(name, m, guarantee, period_ns, settings))
+        return found
+    others = LossGuarantee(
+        tuple(rule for rule in network.guarantee.rules if not isinstance(rule, LongestBurst))
+    )
+    most = wish.most or _MOST_M
+    most = min(most, (others.longest_burst or most) + 1)
+    return [
+        Rung(f"M = {m}", m, _capped(others, m - 1), period_ns, {"mansd": m - 1})
+        for m in range(1, most + 1)
+    ]
+
+
+def _periods(scenario: Scenario, margin: LossMargin) -> Iterator[Rung]:
+    step_ns = scenario.timing.measurement_period_ns
+    longest = scenario.timing.horizon_ns // step_ns
+    steps = max(margin.loop.times.delay_ns // step_ns + 1, margin.longest_ns // step_ns // 16, 1)
+    for _ in range(_RUNGS):
+        period_s = steps * step_ns / NS_PER_S
+        yield Rung(f"{period_s:g} s", period_s, margin.guarantee, steps * step_ns, {})
+        steps = max(steps + 1, round(steps * _LONGER))
+        if steps > longest:
+            return
+
+
+class NetworkSearch:
+    """All that is known about the loops of a scenario with other gains."""
+
+    def __init__(self, scenario: Scenario, wish: Wish) -> None:
+        if not scenario.coverage.is_linear:
+            raise CallerError(
+                f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear; '
+                "--set 'plant.system={kind=\"linear\"}' designs for its model"
+            )
+        scenario.coverage.require_exact()
+        if wish.bounds:
+            raise CallerError("--bound: is for a loop with events, not for periodic updates")
+        if not wish.cost >= 1:
+            raise CallerError(f"--cost: 1 or more times that of the given loop, not {wish.cost:g}")
+        self.wish, self.scenario = wish, time_triggered(scenario, wish.period_s)
+        resolved = resolve(self.scenario)
+        self.plant, margin = loop_of(resolved), LossMargin(resolved)
+        self._times, self._resolved = margin.loop.times, resolved
+        if margin.shortest_ns < margin.longest_ns:
+            raise CallerError(
+                f'trigger.policy = "{scenario.trigger.policy}": the search is for periodic '
+                "updates; give their --period"
+            )
+        self.ladder = ladder_of(self.scenario, wish, margin)
+        n, m = self.plant.n, self.plant.m
+        self.weights = wish.weights or (np.eye(n), np.eye(m))
+        lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
+        self.given = Candidate(resolved.mode, rows_of(self.plant.K))
+        base = self.quick_loop(self.given, margin.longest_ns).cost(self.plant.x0)
+        self.limit = wish.cost * base
+        """Largest cost; infinite if the given loop is unstable without losses."""
+        self.tried = self.judged = 0
+        self._graphs: dict[tuple[LossGuarantee, int], PatternGraph] = {}
+
+    def quick_loop(self, candidate: Candidate, period_ns: int) -> QuickLoop:
+        """Return the loop of a candidate in double precision."""
+        plant, K = self.plant, np.array(candidate.K)
+        H = plant.A_model + plant.B_model @ K
+        if candidate.mode == "zoh":
+            H = np.zeros_like(H)
+        times = self._times._replace(period_ns=period_ns)
+        return QuickLoop((plant.A, plant.B, K, H), times, self.weights)
+
+    def graph(self, rung: Rung) -> PatternGraph:
+        """Return the loss patterns of a rung."""
+        slots = self._times._replace(period_ns=rung.period_ns).slots
+        key = rung.guarantee, slots
+        if key not in self._graphs:
+            self._graphs[key] = PatternGraph(list_bursts(rung.guarantee, slots))
+        return self._graphs[key]
+
+    def growth(self, candidate: Candidate, rung: int) -> float:
+        """Return a lower bound of the logarithm of the growth per period."""
+        self.tried += 1
+        at = self.ladder[rung]
+        loop, graph = self.quick_loop(candidate, at.period_ns), self.graph(at)
+        return graph.growth(loop.maps(graph.bursts)).logarithm
+
+    def cost(self, candidate: Candidate, rung: int) -> float:
+        """Return the cost without losses."""
+        return self.quick_loop(candidate, self.ladder[max(rung, 0)].period_ns).cost(self.plant.x0)
+
+    def excess(self, candidate: Candidate, rung: int) -> float:
+        """Return what is minimised: the growth, and by how much the cost exceeds its limit."""
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            plant = self.plant
+            rate_per_s = spectral_abscissa(plant.A_model + plant.B_model @ np.array(candidate.K))
+            if not rate_per_s < 0:
+                return _UNSTABLE + min(rate_per_s, _UNSTABLE)
+            cost = self.cost(candidate, rung)
+            growth = self.growth(candidate, rung)
+            if not math.isfinite(cost) or not math.isfinite(growth):
+                return _UNSTABLE / 2 + min(max(growth, 0.0), _UNSTABLE / 4)
+        if cost <= self.limit:
+            return growth
+        return max(growth, -_SLACK) + _SLACK + math.log(cost / self.limit)
+
+    def climb(self, candidate: Candidate, rung: int) -> tuple[int, float]:
+        """Return the highest rung that is not excluded, from one on, and the excess at the next."""
+        while rung < len(self.ladder):
+            if (excess := self.excess(candidate, rung)) >= -_SLACK:
+                return rung - 1, excess
+            rung += 1
+        return rung - 1, -math.inf
+
+    def scenario_of(self, candidate: Candidate, rung: int) -> Scenario:
+        """Return the scenario of a loop on a rung, not resolved."""
+        at, one = self.ladder[max(rung, 0)], self.scenario
+        trigger = one.trigger.model_copy(update={"period_s": at.period_ns / NS_PER_S})
+        return one.model_copy(
+            update={
+                "model": one.model.model_copy(update={"gain": candidate.K}),
+                "mode": candidate.mode,
+                "trigger": trigger,
+                "network": one.network.model_copy(update=at.network),
+            }
+        )
+
+    def judge(self, candidate: Candidate, rung: int) -> Stability:
+        """Return the certified bounds of a loop on a rung."""
+        self.judged += 1
+        margin = LossMargin(resolve(self.scenario_of(candidate, rung)))
+        found = margin.first_bounds()
+        return margin.is_stable() if found.verdict == "undecided" else found
+
+    def reach(
+        self, candidate: Candidate, most: int, least: int = -1
+    ) -> tuple[int, Stability | None]:
+        """Return the highest certified rung from ``most`` down to above ``least``."""
+        for rung in range(most, least, -1):
+            if (found := self.judge(candidate, rung)).verdict == "stable":
+                return rung, found
+        return least, None
+
+    def first(self) -> Reached:
+        """Return what the given loop reaches; its bounds are refined until they decide."""
+        start = 0
+        if self.wish.goal == "transmissions":
+            period_ns = self._times.period_ns
+            start = max(i for i, one in enumerate(self.ladder) if one.period_ns <= period_ns)
+        top, _ = self.climb(self.given, start)
+        if top < start:
+            top = next((i for i in range(start, -1, -1) if self.climb(self.given, i)[0] >= i), -1)
+        return self.completed(self.given, top)
+
+    def completed(self, candidate: Candidate, most: int) -> Reached:
+        """Return a loop with refined bounds on its rung and on the next one."""
+        rung = most
+        found = None
+        while rung >= 0 and (found := self.judge(candidate, rung)).verdict != "stable":
+            rung, found = rung - 1, None
+        beyond = None
+        while rung + 1 < len(self.ladder):
+            beyond = self.judge(candidate, rung + 1)
+            if beyond.verdict != "stable":
+                break
+            rung, found, beyond = rung + 1, beyond, None
+        return Reached(candidate, rung, found, beyond, self.cost(candidate, rung))
+
+    def regulators(self) -> list[Candidate]:
+        """Return LQR gains of the model with all hold strategies."""
+        plant, (Q, R) = self.plant, self.weights
+        gains = [lqr_gain(plant.A_model, plant.B_model, Q, c * R) for c in COSTS_OF_INPUT]
+        return [_rounded(mode, K) for mode in self.wish.modes for K in gains]
+
+    def run(self, progress: Progress = lambda share: None) -> tuple[Reached, Reached]:
+        """Return what the given loop reaches, and the best loop found."""
+        given = self.first()
+        self.tried, best, rung = 0, given.candidate, given.rung
+        progress(0.1)
+        starts = [Candidate(mode, given.candidate.K) for mode in self.wish.modes]
+        starts += self.regulators()
+        ranked = sorted(
+            ((*self.climb(one, max(rung, 0)), one) for one in starts),
+            key=lambda entry: (-entry[0], entry[1]),
+        )
+        for top, _, candidate in ranked[:_STARTS]:
+            if top > rung:
+                reached, found = self.reach(candidate, top, rung)
+                if found is not None:
+                    best, rung = candidate, reached
+        progress(0.3)
+        pool = [best, *dict.fromkeys(one for _, _, one in ranked[:_STARTS])]
+        share = max(self.wish.effort // len(pool), 1)
+        for number, start in enumerate(pool):
+            candidate = start
+            left = share
+            while left > 0 and rung + 1 < len(self.ladder):
+                before = self.tried
+                improved = self._improve(candidate, rung + 1, left)
+                left -= max(self.tried - before, 1)
+                if improved is None:
+                    break
+                candidate = improved
+                top, _ = self.climb(candidate, rung + 1)
+                reached, found = self.reach(candidate, max(top, rung + 1), rung)
+                if found is None:
+                    break
+                best, rung = candidate, reached
+            progress(0.3 + 0.6 * (number + 1) / len(pool))
+        return given, given if best == given.candidate else self.completed(best, rung)
+
+    def _improve(self, start: Candidate, rung: int, most: int) -> Candidate | None:
+        """Return a loop near ``start`` whose lower bound is below 1 on a rung; None: none found."""
+        from scipy.optimize import minimize  # slow to import
+
+        K = np.array(start.K)
+        scale = scaled_steps(K)
+
+        def objective(steps: Vector) -> float:
+            candidate = _rounded(start.mode, (K.ravel() + scale * steps).reshape(K.shape))
+            excess = self.excess(candidate, rung)
+            if excess < -_SLACK:
+                raise _FoundError(candidate)
+            return excess
+
+        simplex = np.vstack([np.zeros(K.size), 0.3 * np.eye(K.size)])
+        try:
+            minimize(
+                objective,
+                np.zeros(K.size),
+                method="Nelder-Mead",
+                options={"maxfev": most, "adaptive": True, "initial_simplex": simplex,
+                         "xatol": 1e-4, "fatol": 1e-5},
+            )  # fmt: skip
+        except _FoundError as found:
+            return found.candidate
+        return None
+
+
+def scaled_steps(K: Matrix) -> Vector:
+    """Return the unit of a search's steps of each entry of a gain."""
+    return np.ravel(np.maximum(np.abs(K), 0.1 * np.abs(K).max(axis=1, keepdims=True)))
+
+
+def _rounded(mode: Mode, K: Matrix) -> Candidate:
+    """Return a candidate with six digits: what is judged is what is printed."""
+    return Candidate(mode, tuple(tuple(float(f"{entry:.6g}") for entry in row) for row in K))
+
+
+class _FoundError(Exception):
+    """Ends a minimisation."""
+
+    def __init__(self, candidate: Candidate) -> None:
+        super().__init__()
+        self.candidate = candidate

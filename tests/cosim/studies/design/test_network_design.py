@@ -1,0 +1,275 @@
+"""``noack design --for network``: what is found is proven, and no worse than what was given.
+
+The certificates are compared with products of maps that are computed step by step, without
+:mod:`noack.theory`.
+"""
+
+import json
+import shlex
+from collections.abc import Iterator, Sequence
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.simulation.virtual_time import simulate
+from cosim.studies.design.event_design import EventDesign
+from cosim.studies.design.loop_growth import PatternGraph
+from cosim.studies.design.network_page import NetworkDesign, design_for_network
+from cosim.studies.design.network_search import Candidate, NetworkSearch, Wish
+from noack.impairments.loss_guarantee import LossesInWindow, LossGuarantee, LossHistory
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
+from noack.settings.section import rows_of
+from noack.theory.certificates.conditions import nominal_conditions
+from noack.theory.certificates.scenario_certificates import certify_box
+from noack.theory.margins.loss_margin import LossMargin, list_bursts
+from tests.approved import compare_lines
+from tests.command_line import invoke
+from tests.noack.theory.test_loss_margin import held_loop
+
+ROOT = Path(__file__).parents[4]
+LINEAR = 'plant.system={kind="linear"}'
+PERIOD_S = 0.25
+
+
+def shipped(name: str, *settings: str) -> Scenario:
+    return load(ROOT / "scenarios" / f"{name}.toml", settings)
+
+
+@pytest.fixture(scope="module")
+def pole() -> NetworkDesign:
+    """The pole on a cart, by regulators alone."""
+    wish = Wish(period_s=PERIOD_S, effort=0)
+    found = design_for_network(shipped("cart_pole", LINEAR), wish)
+    assert isinstance(found, NetworkDesign)
+    return found
+
+
+def patterns(guarantee: LossGuarantee, length: int) -> Iterator[tuple[bool, ...]]:
+    """All patterns that begin with a delivery and keep a guarantee when they are repeated."""
+    for losses in product((False, True), repeat=length - 1):
+        pattern = (True, *(not lost for lost in losses))
+        history = LossHistory(guarantee.rules)
+        kept = all(
+            value <= rule.limit for lost in pattern * 3 for rule, value in history.add(not lost)
+        )
+        if kept:
+            yield pattern
+
+
+def growths(scenario: Scenario, guarantee: LossGuarantee, length: int) -> dict[str, float]:
+    """The growth per period of each pattern, repeated; of the model's or the holding loop."""
+    resolved, found = resolve(scenario), dict[str, float]()
+    period_s = scenario.trigger.model_dump()["period_s"]
+    maps = {delivered: held_loop(resolved, [delivered], [period_s]) for delivered in (True, False)}
+    for n in range(1, length + 1):
+        for pattern in patterns(guarantee, n):
+            whole = np.eye(len(maps[True]))
+            for delivered in pattern:
+                whole = maps[delivered] @ whole
+            radius = float(np.abs(np.linalg.eigvals(whole)).max())
+            found["".join("DL"[not one] for one in pattern)] = radius ** (1 / n)
+    return found
+
+
+def test_no_pattern_grows_faster_than_certified(pole: NetworkDesign) -> None:
+    best, search = pole.best, pole.search
+    assert best.found is not None
+    assert best.rung > pole.given.rung
+    guarantee = pole.scenario.network.guarantee
+    found = growths(pole.scenario, guarantee, 10)
+    assert len(found) > 500
+    assert max(found.values()) <= best.found.upper < 1
+    assert max(found.values()) >= best.found.lower * (1 - 1e-3)  # its pattern is longer
+    # The given gain, with the same claim, is found out.
+    broken = search.scenario_of(pole.given.candidate, best.rung)
+    assert max(growths(broken, guarantee, 10).values()) > 1
+
+
+def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
+    pole: NetworkDesign,
+) -> None:
+    beyond = pole.best.beyond
+    assert beyond is not None
+    assert beyond.verdict == "destabilised"
+    more = pole.search.scenario_of(pole.best.candidate, pole.best.rung + 1)
+
+    def final(pattern: Sequence[bool]) -> float:
+        """‖x‖ at the end of a simulated run of the processes under a pattern, repeated."""
+        resolved = resolve(more.model_copy(update={"horizon_s": 120.0}))
+        numbers = iter(range(100_000))
+        run = simulate(
+            resolved, lambda data, now_ns: 0 if pattern[next(numbers) % len(pattern)] else None
+        )
+        return float(np.linalg.norm(run["plant_step"]["x"][-1]))
+
+    kept = pole.best.found
+    assert kept is not None
+    assert final(kept.pattern) < 1e-3
+    assert final((True, False, False, True, False)) < 1e-3
+    assert final(beyond.pattern) > 1e3
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "wish"),
+    [
+        ("lane_periodic", (), Wish(effort=0, most=8)),
+        ("lane_periodic", (), Wish(effort=0, window=8)),
+        ("unstable_pendulum", (), Wish(effort=200, period_s=PERIOD_S, modes=("model",))),
+        ("unstable_pendulum", ("mode=zoh",), Wish(effort=60, period_s=PERIOD_S, modes=("zoh",))),
+        ("double_integrator", ("network.mansd=2",), Wish("transmissions", period_s=1, effort=60)),
+    ],
+)
+def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
+    name: str, settings: tuple[str, ...], wish: Wish
+) -> None:
+    found = design_for_network(shipped(name, *settings), wish)
+    assert isinstance(found, NetworkDesign)
+    given, best = found.given, found.best
+    assert best.rung >= given.rung
+    assert best.cost <= found.search.limit or best == given
+    if best.rung >= 0:
+        assert best.found is not None
+        assert LossMargin(resolve(found.scenario)).is_stable().upper < 1
+        slower = growths(found.scenario, found.scenario.network.guarantee, 6)
+        assert max(slower.values()) < 1
+    if name != "double_integrator":
+        assert best.rung > given.rung
+    if wish.window:
+        assert isinstance(found.scenario.network.guarantee.rules[-1], LossesInWindow)
+
+
+def test_the_search_is_deterministic() -> None:
+    wish = Wish(period_s=PERIOD_S, effort=60)
+    first, second = (
+        design_for_network(shipped("cart_pole", LINEAR), wish).document() for _ in range(2)
+    )
+    assert first == second
+
+
+def test_quick_bounds_are_those_of_the_exact_maps() -> None:
+    settings = ("network.impairments=[{kind='delay', delay_s=0.0333}]", "controller.rate_hz=40")
+    for more in ((), settings, (*settings, "mode=zoh")):
+        given = shipped("double_integrator", *more)
+        search = NetworkSearch(given, Wish(period_s=0.31, most=5))
+        exact = LossMargin(resolve(search.scenario))
+        bursts = list_bursts(search.ladder[4].guarantee, exact.loop.times.slots)
+        quick = search.quick_loop(search.given, exact.longest_ns).maps(bursts)
+        maps = np.array([exact.maps(one.slot, one.losses).middle for one in bursts])
+        if not more:
+            np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
+        stability = exact.is_stable(search.ladder[4].guarantee)
+        lower = np.exp(PatternGraph(bursts).growth(quick).logarithm)
+        assert lower <= stability.upper
+        assert lower == pytest.approx(stability.lower, rel=2e-2)
+
+
+def test_the_cost_is_that_of_a_run_without_losses() -> None:
+    given = shipped("double_integrator", "horizon_s=60", "plant.rate_hz=1000")
+    weights = np.diag([2.0, 0.5]), np.array([[3.0]])
+    search = NetworkSearch(given, Wish(period_s=0.3, weights=weights))
+    resolved = resolve(search.scenario)
+    run = simulate(resolved, lambda data, now_ns: 0)["plant_step"]
+    x, u = np.asarray(run["x"]), np.asarray(run["u"])
+    rates = np.einsum("ki,ij,kj->k", x, weights[0], x) + np.einsum("ki,ij,kj->k", u, weights[1], u)
+    expected = float(rates.sum()) * 1e-3
+    assert search.cost(search.given, 0) == pytest.approx(expected, rel=2e-3)
+    unstable = Candidate("zoh", rows_of(-loop_of(resolved).K))
+    assert search.cost(unstable, 0) == np.inf
+
+
+def test_the_written_scenario_is_checked_and_decided_as_claimed(tmp_path: Path) -> None:
+    out, page = tmp_path / "out.toml", tmp_path / "p.html"
+    result = invoke(
+        "design", ROOT / "scenarios" / "cart_pole.toml", "--set", LINEAR, "--for", "network",
+        "--period", PERIOD_S, "--effort", 0, "--out", out, "--page", page, "--json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert found["files"] == [str(page), str(out)]
+    assert "<svg" in page.read_text()
+    assert invoke("check", out).exit_code == 0
+    decided = json.loads(
+        invoke("margin", out, "--no-period", "--most", 4, "--accuracy", 0.02, "--json").stdout
+    )
+    assert decided["stable_m"] == found["best"]["certified"] == 3
+    assert decided["mansd"] == 2
+    pasted = tmp_path / "pasted.toml"
+    pasted.write_text(found["lines"])
+    assert f"gain = [\n  {list(found['best']['K'][0])},\n]".replace("[[", "[") in found["lines"]
+
+
+@pytest.fixture(scope="module")
+def events() -> EventDesign:
+    """The pendulum's own trigger and gain, and better ones, with a certified bound of ‖x‖."""
+    wish = Wish(most=40, bounds={"state": 1.6}, effort=300)
+    found = design_for_network(shipped("unstable_pendulum"), wish, seed=5)
+    assert isinstance(found, EventDesign)
+    return found
+
+
+def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
+    events: EventDesign,
+) -> None:
+    search, best = events.search, events.best
+    assert best.m > events.given.m > 1
+    assert search.of_box
+    resolved = resolve(events.scenario)
+    conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
+    certificate = certify_box(resolved, conditions)
+    assert certificate is not None
+    assert certificate.constants is not None
+    assert certificate.constants.state <= 1.6
+    assert search.state_bound(best.loop, best.m + 1) > 1.6
+    measured = search.measured(best.loop, search._draws)
+    assert measured.cost <= search.limits.cost
+    assert measured.transmissions <= search.limits.transmissions
+    # Means of fresh draws differ by their own spread.
+    assert best.measured.transmissions == pytest.approx(measured.transmissions, rel=0.1)
+
+
+def test_runs_with_the_claimed_m_keep_the_certified_bound(events: EventDesign) -> None:
+    m = events.best.m
+    rng = np.random.default_rng(7)
+    largest = 0.0
+    for seed in range(12):
+        one = events.scenario.model_copy(update={"horizon_s": 5.0})
+        plant = one.plant.model_copy(update={"initial_state_halfwidth": None, "draw": "vertex"})
+        seeds = one.seeds.model_copy(update={"plant": seed})
+        resolved = resolve(one.model_copy(update={"plant": plant, "seeds": seeds}))
+        lost = 0
+
+        def fate(data: bytes, now_ns: int, often: float = rng.random()) -> int | None:
+            nonlocal lost
+            lost = lost + 1 if lost < m - 1 and rng.random() < often else 0
+            return None if lost else 0
+
+        x = simulate(resolved, fate)["plant_step"]["x"]
+        largest = max(largest, float(np.linalg.norm(x, axis=1).max()))
+    assert 0.2 <= largest <= events.search.state_bound(events.best.loop, m)
+
+
+def test_fewer_transmissions_of_events_for_the_same_network() -> None:
+    given = shipped("double_integrator")
+    found = design_for_network(given, Wish("transmissions", effort=300), seed=1)
+    assert isinstance(found, EventDesign)
+    assert found.scenario.network == given.network
+    assert found.best.measured.transmissions < 0.9 * found.given.measured.transmissions
+    assert found.search.certificate(found.best.loop, given.network.mansd + 1) is not None
+    assert found.best.m >= given.network.mansd + 1
+
+
+def test_the_lines_about_mistakes_are_those_that_were_approved(tmp_path: Path) -> None:
+    def mistake(line: str) -> list[str]:
+        words = shlex.split(line)
+        words[0] = str(ROOT / "scenarios" / f"{words[0]}.toml")
+        result = invoke("design", *words, "--page", tmp_path / "p.html")
+        assert result.exit_code == 2, result.output
+        assert result.stderr.count("\n") == 1
+        return [result.stderr.strip()]
+
+    compare_lines(Path(__file__).with_name("network_mistakes.txt"), mistake)
+    assert not [*tmp_path.iterdir()]
