@@ -16,10 +16,10 @@ from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import duration, number
-from noack.scenario.resolution import policy_of
+from noack.scenario.resolution import loop_of, policy_of
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
-from noack.theory.certificates.conditions import BOX
+from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
 from noack.theory.random_losses.moments import UnlimitedLosses
 
@@ -32,7 +32,8 @@ def print_certificates(
     if found.nonlinear is not None:
         console.print(
             f"[yellow]the plant is not linear[/] ({escape(found.nonlinear)}): what follows is "
-            "certified for the linear plant ẋ = Âx + B̂u in its place, not for the plant itself"
+            "certified for the linear plant ẋ = Âx + B̂u in its place, except under “region”: that "
+            "is certified for the plant itself"
         )
     console.print(terminal_table(constants))
     _print_notes(console, found)
@@ -89,7 +90,7 @@ def _in_words(found: Certificates) -> Iterator[str]:
         if under != SCHEDULE or constants is None:
             continue
         own = "the scenario's plant" if found.nonlinear is None else "the model as the plant"
-        plants = "every plant of the box" if certificate.scope == BOX else own
+        plants = {BOX: "every plant of the box", REGION: REGION}.get(certificate.scope, own)
         apart = ""
         if (spacing_s := certificate.inter_event_s) is not None:
             apart = f" The inter-event time is at least {_limit(spacing_s)}."
@@ -151,7 +152,8 @@ def _print_notes(console: Console, found: Certificates) -> None:
         console.print(
             "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
             "no hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
-            "scenario's plant. box: every plant of the uncertainty box. undelivered updates: "
+            "scenario's plant. box: every plant of the uncertainty box. region: the nonlinear "
+            "plant on a region that it does not leave. undelivered updates: "
             "updates not yet delivered (lost or in flight), maximum. none undelivered: the bound "
             "while every update has arrived. inter-event time: minimum.[/]"
         )
@@ -171,6 +173,11 @@ def _print_notes(console: Console, found: Certificates) -> None:
             console.print(
                 f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}"
             )
+        if certificate.region is not None:
+            loop, region = loop_of(found.scenario), certificate.region
+            limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
+            text = ", ".join(f"|{name}| ≤ {limit:.4g}" for name, limit in limits)
+            console.print(f"[green]region[/] ({under}): {escape(text)}", highlight=False)
     policy = found.scenario.trigger.policy
     exists = found.schedule.constants is not None  # else another norm is tried
     if (

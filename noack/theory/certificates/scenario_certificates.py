@@ -152,6 +152,11 @@ class CertificateScope:
         self._plant_at = plant_at
         self._plants: dict[float, PlantGains] = {}
 
+    @property
+    def is_simple(self) -> bool:
+        """Whether no causes are bounded apart from the start, and added."""
+        return self._resolved.coverage.is_undisturbed and not self._trigger.is_constant
+
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
         return completed_alone(self.search(conditions))
@@ -211,7 +216,7 @@ class CertificateScope:
             NotDecayingError: a mode of the loop decays too slowly.
         """
         try:
-            if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
+            if self.is_simple:
                 first, late = yield from self._phases(conditions, longest=longest)
                 return [(first, late, None)]
             pairs = yield from self._disturbed_phases(conditions, longest=longest)
