@@ -60,14 +60,16 @@ def scopes(resolved: Scenario, start_error: float = 0.0) -> list[CertificateScop
 class _Box(CertificateScope):
     """The plants of an inclusion."""
 
-    def __init__(self, resolved: Scenario, inclusion: Inclusion, start_error: float) -> None:
+    def __init__(
+        self, resolved: Scenario, inclusion: Inclusion, start_error: float, start: Matrix | None
+    ) -> None:
         A, B, half_A, half_B = inclusion
 
         def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
             return BoxGains(error, A, B, start, alpha_per_s, half_A, half_B)
 
         closed_loop = A + B @ loop_of(resolved).K
-        super().__init__(REGION, resolved, closed_loop, plant_at, start_error)
+        super().__init__(REGION, resolved, closed_loop, plant_at, start_error, start)
 
     def bounded(self, conditions: NetworkConditions) -> Search[tuple[list[Phases], Vector]]:
         """Search for constants, and for bounds of |x_j| and |u_i| at all times, (n + m,).
@@ -115,11 +117,13 @@ class _Box(CertificateScope):
 class RegionScope(_Box):
     """A nonlinear plant within a region; see :class:`CertificateScope`."""
 
-    def __init__(self, resolved: Scenario, start_error: float = 0.0) -> None:
+    def __init__(
+        self, resolved: Scenario, start_error: float = 0.0, start: Matrix | None = None
+    ) -> None:
         loop, self._regions = loop_of(resolved), dict[NetworkConditions, Region]()
         # The plants of the model; those of each region take their place.
         model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
-        super().__init__(resolved, model, start_error)
+        super().__init__(resolved, model, start_error, start)
 
     def search(self, conditions: NetworkConditions) -> Search[ScenarioCertificate]:
         """Search for the certificate under some conditions, and its region."""
@@ -135,7 +139,7 @@ class RegionScope(_Box):
         for _ in range(_ATTEMPTS):
             try:
                 inclusion = self._enclosed(widths)
-                box = _Box(self._resolved, inclusion, self._start_error)
+                box = _Box(self._resolved, inclusion, self._start_error, self._start)
                 phases, reached = yield from box.bounded(conditions)
             except NotEnclosedError as error:
                 why = f"{where}: {error}" if widths.any() else str(error)

@@ -129,6 +129,8 @@ class CertificateScope:
         start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
             at the start. The certificate exists only if its own π is at least that large, so that
             it covers these inputs.
+        start: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k); by default that
+            of the scenario.
     """
 
     def __init__(
@@ -138,11 +140,13 @@ class CertificateScope:
         closed_loop: Matrix,
         plant_at: PlantAt,
         start_error: float = 0.0,
+        start: Matrix | None = None,
     ) -> None:
         self._start_error = start_error
         self.name = name
         self._resolved = resolved
         self._loop = loop_of(resolved)
+        self._start = self._loop.x0[:, None] if start is None else start
         self._trigger = trigger_bounds(resolved)
         # Where events have a due time, a missed update is missed for a limited time.
         due = self._trigger.has_due_time
@@ -330,7 +334,7 @@ class CertificateScope:
     ) -> Search[Constants]:
         if alpha_per_s not in self._plants:
             error = error_gains(self._loop, alpha_per_s)
-            plant = self._plant_at(error, self._loop.x0[:, None], alpha_per_s)
+            plant = self._plant_at(error, self._start, alpha_per_s)
             plant = replace(plant, further_outputs=self._trigger.outputs)
             self._plants[alpha_per_s] = _first_equal(_KnownPlant(plant.identity, plant))
         plant = self._plants[alpha_per_s]
