@@ -47,7 +47,7 @@ def print_certificates(
     if (outside := outside_box(found.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
     console.print("assumptions of the certificates for the schedule:")
-    print_assumptions(console, found.schedule.assumptions)
+    print_assumptions(console, (found.schedule_region or found.schedule).assumptions)
     console.print("assumptions of the paper's theorems:")
     print_assumptions(console, assumptions(found.scenario))
     print_unlimited(console, found.unlimited, found.unpredictable)

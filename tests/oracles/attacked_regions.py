@@ -25,7 +25,7 @@ from noack.theory.certificates.region import RegionScope
 
 Reals = NDArray[np.float64]
 Field = Callable[[Reals, Reals], Reals]
-BATCH, STEPS = 1000, 1000
+BATCH, STEPS = 1000, 2000
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 

@@ -28,6 +28,7 @@ from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
+from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
 from noack.theory.certificates.conditions import REGION
 from noack.theory.certificates.scenario_certificates import (
@@ -130,7 +131,11 @@ class RegionScope(_Box):
         found = yield from super().search(conditions)
         if found.constants is None:
             return found
-        return replace(found, region=self._regions[conditions])
+        region = self._regions[conditions]
+        why = "the bounds on the region are inside it, so that there is no first exit"
+        stays = "x and u stay in the region over which the equations are enclosed"
+        proven = Assumption(stays, "certificate", AssumptionStatus.HOLDS, why)
+        return replace(found, region=region, assumptions=(*found.assumptions, proven))
 
     def _constants(
         self, conditions: NetworkConditions, *, longest: bool = True
