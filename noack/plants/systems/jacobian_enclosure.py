@@ -24,7 +24,6 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
@@ -78,9 +77,6 @@ class Enclosed:
 
     def __neg__(self) -> "Enclosed":
         return Enclosed(-self.value, [-slope for slope in self.slopes])
-
-    def __pos__(self) -> "Enclosed":
-        return self
 
     def __sub__(self, other: Operand) -> "Enclosed":
         return self + (-other)
@@ -292,7 +288,7 @@ class EnclosedMotion:
             Enclosed(_ball(0.0, width), [_ball(float(place == j)) for j in by])
             for place, width in enumerate(halfwidths.tolist())
         ]
-        x, u = _array(each[: self.n]), _array(each[self.n :])
+        x, u = np.split(np.array(each, dtype=object), [self.n])
         time = Enclosed(_ball(_LONGEST_S / 2, _LONGEST_S / 2), constant)
         found = self.system.expressions(time, x, u)  # type: ignore[attr-defined]
         if found is None:
@@ -328,12 +324,6 @@ def _box(columns: "Sequence[Sequence[arb]]") -> tuple[Matrix, Matrix]:
         for pair in zip(columns, centre.T.tolist(), strict=True)
     ]
     return centre, np.array(halves).T
-
-
-def _array(numbers: Sequence[Enclosed]) -> NDArray[np.object_]:
-    array = np.empty(len(numbers), dtype=object)
-    array[:] = numbers
-    return array
 
 
 def _is_wide(ball: "arb") -> bool:

@@ -143,10 +143,10 @@ class RegionScope(_Box):
         widths, where = np.zeros(self._loop.n + self._loop.m), "near 0"
         for _ in range(_ATTEMPTS):
             try:
-                inclusion = self._enclosed(widths)
+                inclusion = self._motion.over(widths)
                 box = _Box(self._resolved, inclusion, self._start_error, self._start)
                 phases, reached = yield from box.bounded(conditions)
-            except NotEnclosedError as error:
+            except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
                 why = f"{where}: {error}" if widths.any() else str(error)
                 raise NoCertificateError(why) from None
             except NoCertificateError as error:
@@ -169,12 +169,6 @@ class RegionScope(_Box):
             return f"|x_j| ≤ {widths[: self._loop.n].max():.3g}"
         names = (*self._loop.state_names, *self._loop.input_names)
         return ", ".join(f"|{name}| ≤ {w:.3g}" for name, w in zip(names, widths, strict=True))
-
-    def _enclosed(self, widths: Vector) -> Inclusion:
-        try:
-            return self._motion.over(widths)
-        except SystemFailedError as error:  # from the user's class
-            raise NotEnclosedError(str(error)) from None
 
     @cached_property
     def _motion(self) -> EnclosedMotion:

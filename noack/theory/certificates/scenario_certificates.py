@@ -153,6 +153,7 @@ class CertificateScope:
         self._held = not self._loop.H.any() and not due
         decays = math.inf if self._held or due else -spectral_abscissa(self._loop.H)
         self._decay = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
+        assert start is None or self.is_simple  # other starts are those of the scenario
         self._plant_at = plant_at
         self._plants: dict[float, PlantGains] = {}
 
