@@ -152,7 +152,7 @@ def _print_notes(console: Console, found: Certificates) -> None:
         console.print(
             "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
             "no hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
-            f"scenario's plant. box: {BOX}. region: {REGION}. undelivered updates: "
+            "scenario's plant. box: every plant of the uncertainty box. undelivered updates: "
             "updates not yet delivered (lost or in flight), maximum. none undelivered: the bound "
             "while every update has arrived. inter-event time: minimum.[/]"
         )
