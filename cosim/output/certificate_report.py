@@ -120,13 +120,15 @@ def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
     """Yield the certified constants, and the largest certified times of the schedule."""
     trigger = found.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
-    certificates = [certificate for _, certificate in found]
+    # A void region has a line below the table, and no column.
+    columns = [(under, one) for under, one in found if one.constants or one.scope != REGION]
+    certificates = [certificate for _, certificate in columns]
     guarantee = certificates[0].conditions.guarantee  # its longest burst counts all rules
     title = (
         f"{found.scenario.name}: certified bounds, "
         f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
-    headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in found)]
+    headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in columns)]
     printed = found.theorem_2 is not None
     headings += ["paper's\nTheorem 2"] if printed else []
     rows = [
