@@ -82,7 +82,7 @@ class _Box(CertificateScope):
         """
         try:
             phases = yield from self.without_decay(conditions)
-        except (NoCertificateError, NotDecayingError):
+        except (NoCertificateError, NotDecayingError, OverflowError, np.linalg.LinAlgError):
             phases = yield from self._constants(conditions)
         return phases, self._coordinate_bounds(phases, conditions)
 
