@@ -20,11 +20,13 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import (
     BOX,
     OWN_PLANT,
+    REGION,
     about_setpoint,
     ideal_conditions,
     nominal_conditions,
     void_at_setpoint,
 )
+from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import (
     NetworkLimits,
     box,
@@ -63,6 +65,7 @@ class Certificates:
         late_periods: allowed lateness in steps of the plant.
         weight: W, if noack chose it.
         given: W of the scenario, if it has one and noack chose another.
+        nonlinear: the same scenario with its nonlinear plant, certified on a region as well.
 
     Raises:
         CallerError: its updates are acknowledged, its plant or controller is nonlinear, or its
@@ -92,6 +95,7 @@ class Certificates:
         late_periods: int,
         weight: Matrix | None = None,
         given: Matrix | None = None,
+        nonlinear: Scenario | None = None,
     ) -> None:
         scenario.coverage.require_constant()
         scenario.coverage.require_certifiable()
@@ -104,6 +108,10 @@ class Certificates:
         conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self._scheduled}
         scopes = (own_plant(scenario), None if BOX in void else box(scenario))
         self._scopes = [scope for scope in scopes if scope is not None]
+        if nonlinear is not None:
+            self.nonlinear = f'plant.system.kind = "{nonlinear.plant.system.kind}"'
+            if REGION not in void_at_setpoint(nonlinear) and nonlinear.coverage.can_be_certified:
+                self._scopes.append(RegionScope(nonlinear))
         self._certificates = [
             (under, scope.certificate(of))
             for under, of in conditions.items()
@@ -129,12 +137,17 @@ class Certificates:
     @property
     def paper_box(self) -> ScenarioCertificate | None:
         """For every plant in the box, under the paper's conditions; None if there is no box."""
-        return next(iter(self._of(IDEAL)[1:]), None)
+        return self._covering(BOX, IDEAL)
 
     @property
     def schedule_box(self) -> ScenarioCertificate | None:
         """For every plant in the box, under the scenario's schedule; None if there is no box."""
-        return next(iter(self._of(SCHEDULE)[1:]), None)
+        return self._covering(BOX, SCHEDULE)
+
+    @property
+    def schedule_region(self) -> ScenarioCertificate | None:
+        """Of a nonlinear plant on its region, under the scenario's schedule."""
+        return self._covering(REGION, SCHEDULE)
 
     @property
     def error_in_given_norm(self) -> float | None:
@@ -203,6 +216,9 @@ class Certificates:
             return unlimited_losses(self.scenario, self._scopes[0], self._scheduled), None
         except NotPredictableError as error:
             return None, str(error)
+
+    def _covering(self, plants: str, conditions: str) -> ScenarioCertificate | None:
+        return next((one for one in self._of(conditions) if one.scope == plants), None)
 
     def _of(self, conditions: str) -> list[ScenarioCertificate]:
         return [one for under, one in self if under == conditions]
@@ -295,18 +311,17 @@ def certificates_of(
     Raises:
         CallerError: the choice is unknown, or no certificate covers this scenario.
     """
-    resolved, nonlinear = resolve(scenario), None
+    resolved, is_model = resolve(scenario), False
     if of_model and not resolved.coverage.is_linear:
-        nonlinear = f'plant.system.kind = "{resolved.plant.system.kind}"'
+        is_model, own = True, resolved.plant
         resolved = with_linear_plant(resolved)
     allowed = resolved.certificate.late_periods if late_periods is None else late_periods
     if not 0 <= allowed <= MOST_LATE:
         raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
     weighted, W = with_weight(resolved, weight, allowed, progress)
     given = getattr(resolved.trigger, "weight", None)
-    found = Certificates(weighted, allowed, W, None if given is None else np.array(given))
-    found.nonlinear = nonlinear
-    return found
+    nonlinear = weighted.model_copy(update={"plant": own}) if is_model else None
+    return Certificates(weighted, allowed, W, None if given is None else np.array(given), nonlinear)
 
 
 def in_chosen_norm(
@@ -333,8 +348,8 @@ _PERSISTENT = {
 
 
 def plants_of(certificate: ScenarioCertificate) -> str:
-    """Return which plants a certificate covers: "box" or "plant"."""
-    return "box" if certificate.scope == BOX else "plant"
+    """Return which plants a certificate covers: "box", "region" or "plant"."""
+    return {BOX: "box", REGION: "region"}.get(certificate.scope, "plant")
 
 
 def constant_rows(

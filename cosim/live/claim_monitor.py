@@ -21,7 +21,8 @@ from noack.protocol.record_tables import LOOP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolved_loops, tables_of
 from noack.scenario.scenario import Scenario, phases_ns
 from noack.theory.certificates.conditions import allowed_conditions
-from noack.theory.certificates.scenario_certificates import network_limit, own_plant
+from noack.theory.certificates.region import scopes
+from noack.theory.certificates.scenario_certificates import network_limit
 
 MOST_CHECKED = 100
 _TURN_S = 0.01
@@ -132,7 +133,7 @@ class ClaimMonitor:
         began_s = time.thread_time()
         try:
             scheduled = allowed_conditions(self._loops[loop])
-            limit_s = network_limit(own_plant(self._loops[loop]), scheduled, cause)
+            limit_s = network_limit(scopes(self._loops[loop])[0], scheduled, cause)
         except Exception:  # the claims report it
             return ""
         finally:

@@ -16,10 +16,10 @@ from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import duration, number
-from noack.scenario.resolution import policy_of
+from noack.scenario.resolution import loop_of, policy_of
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
-from noack.theory.certificates.conditions import BOX
+from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
 from noack.theory.random_losses.moments import UnlimitedLosses
 
@@ -32,7 +32,8 @@ def print_certificates(
     if found.nonlinear is not None:
         console.print(
             f"[yellow]the plant is not linear[/] ({escape(found.nonlinear)}): what follows is "
-            "certified for the linear plant ẋ = Âx + B̂u in its place, not for the plant itself"
+            "certified for the linear plant ẋ = Âx + B̂u in its place, except under “region”: that "
+            "is certified for the plant itself"
         )
     console.print(terminal_table(constants))
     _print_notes(console, found)
@@ -46,7 +47,7 @@ def print_certificates(
     if (outside := outside_box(found.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
     console.print("assumptions of the certificates for the schedule:")
-    print_assumptions(console, found.schedule.assumptions)
+    print_assumptions(console, (found.schedule_region or found.schedule).assumptions)
     console.print("assumptions of the paper's theorems:")
     print_assumptions(console, assumptions(found.scenario))
     print_unlimited(console, found.unlimited, found.unpredictable)
@@ -89,7 +90,7 @@ def _in_words(found: Certificates) -> Iterator[str]:
         if under != SCHEDULE or constants is None:
             continue
         own = "the scenario's plant" if found.nonlinear is None else "the model as the plant"
-        plants = "every plant of the box" if certificate.scope == BOX else own
+        plants = {BOX: "every plant of the box", REGION: REGION}.get(certificate.scope, own)
         apart = ""
         if (spacing_s := certificate.inter_event_s) is not None:
             apart = f" The inter-event time is at least {_limit(spacing_s)}."
@@ -119,13 +120,15 @@ def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
     """Yield the certified constants, and the largest certified times of the schedule."""
     trigger = found.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
-    certificates = [certificate for _, certificate in found]
+    # A void region has a line below the table, and no column.
+    columns = [(under, one) for under, one in found if one.constants or one.scope != REGION]
+    certificates = [certificate for _, certificate in columns]
     guarantee = certificates[0].conditions.guarantee  # its longest burst counts all rules
     title = (
         f"{found.scenario.name}: certified bounds, "
         f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
-    headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in found)]
+    headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in columns)]
     printed = found.theorem_2 is not None
     headings += ["paper's\nTheorem 2"] if printed else []
     rows = [
@@ -171,6 +174,11 @@ def _print_notes(console: Console, found: Certificates) -> None:
             console.print(
                 f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}"
             )
+        if certificate.region is not None:
+            loop, region = loop_of(found.scenario), certificate.region
+            limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
+            text = ", ".join(f"|{name}| ≤ {limit:.4g}" for name, limit in limits)
+            console.print(f"[green]region[/] ({under}): {escape(text)}", highlight=False)
     policy = found.scenario.trigger.policy
     exists = found.schedule.constants is not None  # else another norm is tried
     if (

@@ -1,10 +1,10 @@
 """A pole upright on a cart: the exact equations of motion, with the cart's friction."""
 
-import math
 from typing import ClassVar, Literal
 
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import EquationSettings, PlantEquations
+from noack.plants.systems.expressions import cos, sin
 from noack.settings.section import NonNegative, Positive
 
 
@@ -47,8 +47,9 @@ class CartPoleSettings(EquationSettings):
 
         def derivative(t_s: float, z: Vector, force: Vector) -> tuple[float, ...]:
             _, velocity, angle, rate = z.tolist()
-            sine, cosine = math.sin(angle), math.cos(angle)
-            push = float(force[0]) - friction * velocity + moment * sine * rate * rate
+            sine, cosine = sin(angle), cos(angle)
+            (applied,) = force.tolist()
+            push = applied - friction * velocity + moment * sine * rate * rate
             torque = moment * gravity * sine
             determinant = total * inertia - (moment * cosine) ** 2
             acceleration = (inertia * push - moment * cosine * torque) / determinant

@@ -1,6 +1,5 @@
 """The quadruple-tank process: Bernoulli's law at each outlet."""
 
-import math
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -8,6 +7,7 @@ from pydantic import Field, FiniteFloat
 
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import EquationSettings, PlantEquations
+from noack.plants.systems.expressions import sqrt
 from noack.settings.section import Positive
 
 Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
@@ -63,7 +63,7 @@ class FourTankSettings(EquationSettings):
 
         def derivative(t_s: float, h: Vector, v: Vector) -> tuple[float, ...]:
             out1, out2, out3, out4 = (
-                hole * math.sqrt(twice_gravity * max(level, 0.0))
+                hole * sqrt(twice_gravity * max(level, 0.0))
                 for hole, level in zip(holes, h.tolist(), strict=True)
             )
             in1, in2, in3, in4 = inflows(*v.tolist())

@@ -96,6 +96,10 @@ class PlantSettings(ScenarioSection):
     """The module that this kind needs, and the extra of noack that installs it."""
     has_own_step: ClassVar[bool] = False
     """Whether the system makes steps of one length only, which the plant's rate must be."""
+    has_equations: ClassVar[bool] = False
+    """Whether the system may have equations that can be enclosed, for a certificate on a region."""
+    runs_user_code: ClassVar[bool] = False
+    """Whether the system is a class of the user's."""
     scenario: ClassVar[str | None] = None
     """A shipped scenario with this kind, for tests and benchmarks."""
     variants: ClassVar[tuple[Table, ...]] = ({},)
@@ -184,6 +188,8 @@ class PlantEquations:
 class EquationSettings(PlantSettings):
     """Settings of a plant that is given by differential equations."""
 
+    has_equations: ClassVar = True
+
     @abstractmethod
     def equations(self) -> PlantEquations:
         """Return the equations.
@@ -229,6 +235,18 @@ class OdeSystem:
     def z(self) -> Vector:
         """The system's own state, shape (N,); empty if it is not recorded."""
         return self._state if self._equations.is_recorded else self._state[:0]
+
+    def expressions(self, t_s: float, x: Vector, u: Vector) -> tuple[Vector, Vector] | None:
+        """Return dz/dt and x, (n,), for z = z(0) + x − x(0); None if x has other entries than z.
+
+        The numbers may be of any kind, in arrays of objects.
+        """
+        here = self.x
+        if len(here) != len(self._state):
+            return None
+        z, equations = self._state + (x - here), self._equations
+        rates = equations.derivative(t_s, z, equations.physical(u))
+        return np.asarray(rates), equations.output(z)
 
     def rates(self, x: Vector, u: Vector) -> Vector | None:
         """Return dx/dt at t = 0, (n,); None unless x is z, or z minus a constant."""

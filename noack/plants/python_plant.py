@@ -41,6 +41,8 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
     """
 
     group: ClassVar = "noack.plants"
+    has_equations: ClassVar = True
+    runs_user_code: ClassVar = True
 
     kind: Literal["python"]
     on_record: Names = ()
@@ -90,6 +92,12 @@ class PythonSystem:
         """Return dx/dt, (n,); None if the class has no derivative of x."""
         return self._system.rates(x, u) if isinstance(self._system, OdeSystem) else None
 
+    def expressions(self, t_s: float, x: Vector, u: Vector) -> tuple[Vector, Vector] | None:
+        """See :meth:`OdeSystem.expressions`; None if the class has no derivative."""
+        with self._user_code():
+            system = self._system
+            return system.expressions(t_s, x, u) if isinstance(system, OdeSystem) else None
+
     def _copy_state(self) -> None:
         self.x = real_vector("x", self._system.x, len(self.x))
         if self._recorded:
@@ -112,6 +120,8 @@ class PythonSystem:
         def derivative(t_s: float, z: Vector, u: Vector) -> Vector:
             with self._user_code():
                 rates = plant.derivative(t_s, read_only(z), read_only(u))
+                if z.dtype == object:  # enclosed numbers
+                    return np.asarray(rates)
                 return real_vector("derivative(t_s, z, u)", rates, len(z0))
 
         derivative(0.0, z0, np.zeros(m))  # report its errors before the run

@@ -1,10 +1,10 @@
 """A quadrotor: the Newton-Euler equations of a rigid body in the air."""
 
-import math
 from typing import ClassVar, Literal
 
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import EquationSettings, PlantEquations
+from noack.plants.systems.expressions import cos, sin
 from noack.settings.section import NonNegative, Positive
 
 
@@ -49,9 +49,9 @@ class QuadrotorSettings(EquationSettings):
         def derivative(t_s: float, z: Vector, v: Vector) -> tuple[float, ...]:
             _, _, _, roll, pitch, yaw, v_x, v_y, v_z, p, q, r = z.tolist()
             beyond, torque_x, torque_y, torque_z = v.tolist()
-            sin_roll, cos_roll = math.sin(roll), math.cos(roll)
-            sin_pitch, cos_pitch = math.sin(pitch), math.cos(pitch)
-            sin_yaw, cos_yaw = math.sin(yaw), math.cos(yaw)
+            sin_roll, cos_roll = sin(roll), cos(roll)
+            sin_pitch, cos_pitch = sin(pitch), cos(pitch)
+            sin_yaw, cos_yaw = sin(yaw), cos(yaw)
             lift = gravity + beyond / mass
             turning = q * sin_roll + r * cos_roll
             return (

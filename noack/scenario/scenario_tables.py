@@ -312,6 +312,11 @@ class TheoryCoverage:
         return self.beyond_theory is None
 
     @property
+    def can_be_certified(self) -> bool:
+        """Whether certificates apply: those of linear plants, or that of a plant on a region."""
+        return (self._beyond_any_certificate or self.scenario.trigger.beyond_exact) is None
+
+    @property
     def is_undisturbed(self) -> bool:
         """Whether nothing disturbs the plant, and the sensor measures x."""
         return self.knows_state and not self.scenario.plant.disturbances
@@ -323,12 +328,18 @@ class TheoryCoverage:
 
     @property
     def _beyond_certificates(self) -> str | None:
-        """The first setting besides the trigger that certificates do not cover."""
+        """The first setting besides the trigger that certificates of linear plants do not cover."""
+        if not self.is_linear and not self.scenario.protocol.acknowledges:
+            kind = self.scenario.plant.system.kind
+            return f'plant.system.kind = "{kind}": the plant is not linear'
+        return self._beyond_any_certificate
+
+    @property
+    def _beyond_any_certificate(self) -> str | None:
+        """The first setting besides plant and trigger that no certificate covers."""
         scenario = self.scenario
         if scenario.protocol.acknowledges:
             return f'network.protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'
-        if not self.is_linear:
-            return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
         if not scenario.controller.is_linear:
             return f'controller.kind = "{scenario.controller.kind}": u is not K x_c'
         return self._beyond_actuation

@@ -66,7 +66,7 @@ from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import (
-    OWN_PLANT,
+    BOX,
     about_setpoint,
     allowed_conditions,
     void_at_setpoint,
@@ -240,7 +240,7 @@ class ClaimEvaluation(RunEvidence):
         for certificate in self.certificates:
             if (constants := certificate.constants) is None:
                 continue
-            outside = outside_box(scenario) if certificate.scope != OWN_PLANT else None
+            outside = outside_box(scenario) if certificate.scope == BOX else None
             for one in definitions(CertifiedClaim):
                 check = ClaimCheck(one.statement, certificate.source, until_s)
                 given = {"certificate": certificate, "constants": constants}
@@ -320,6 +320,11 @@ class RunClaims:
         return found
 
     @property
+    def _is_judged(self) -> bool:
+        """Whether the claims are known already."""
+        return "parts" in vars(self)
+
+    @property
     def conditions(self) -> dict[str, float | None]:
         """Largest observed value of each condition, over the whole run."""
         first = self.parts[0]
@@ -331,7 +336,7 @@ class RunClaims:
     def allowed(self) -> NetworkConditions | None:
         """The conditions of the scenario's certificates; None if it can have none."""
         scenario = self.record.scenario
-        return allowed_conditions(scenario) if scenario.coverage.is_certifiable else None
+        return allowed_conditions(scenario) if scenario.coverage.can_be_certified else None
 
     @property
     def certified_for(self) -> NetworkConditions | None:
@@ -370,6 +375,8 @@ class RunClaims:
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds, each over its own part of the run."""
+        if self.record.scenario.plant.system.runs_user_code and not self._is_judged:
+            self.certificates = ()  # reading a finished run does not run the code of its plant
         found: list[Envelope] = []
         for one in self.parts:
             # Other bounds hold for deviations from another set-point, or start later.

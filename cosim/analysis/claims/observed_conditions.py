@@ -310,7 +310,7 @@ def causes_of(scenario: Scenario) -> Collection[str]:
     """
     if scenario.protocol.acknowledges:
         return ()
-    if not scenario.coverage.is_certifiable:
+    if not scenario.coverage.can_be_certified:
         return ("sampling", *CLOCK_CAUSES)
     return (*guarantee_causes(scenario), *CAUSES)
 

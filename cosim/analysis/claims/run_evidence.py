@@ -59,7 +59,8 @@ from noack.theory.certificates.conditions import (
     ideal_conditions,
     nominal_conditions,
 )
-from noack.theory.certificates.scenario_certificates import box, certify, own_plant
+from noack.theory.certificates.region import scopes
+from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.certificates.solution import Search, completed
 from noack.theory.paper import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 
@@ -386,7 +387,7 @@ def late_certificates(runs: Sequence[RunEvidence]) -> list[Sequence[ScenarioCert
     due: list[tuple[int, LateSchedules, Sequence[ScenarioCertificate] | None]] = [
         (number, one.late_schedules(), None)
         for number, one in enumerate(runs)
-        if one.record.scenario.coverage.is_certifiable
+        if one.record.scenario.coverage.can_be_certified
     ]
     while due:
         tried: list[tuple[int, LateSchedules, NetworkConditions]] = []
@@ -428,13 +429,13 @@ def certificates_together(
     searches: list[Search[ScenarioCertificate]] = []
     numbers: list[int] = []
     for number, scenario in enumerate(scenarios):
-        if not scenario.coverage.is_certifiable:
+        if not scenario.coverage.can_be_certified:
             continue
         limits = allowed_conditions(scenario) if conditions is None else conditions[number]
         error = 0.0
         if start_errors is not None and (given := start_errors[number]) is not None:
             limits, error = limits._replace(start_s=0.0), given
-        for scope in filter(None, (own_plant(scenario, error), box(scenario, error))):
+        for scope in scopes(scenario, error):
             searches.append(scope.search(limits))
             numbers.append(number)
     found: list[list[ScenarioCertificate]] = [[] for _ in scenarios]

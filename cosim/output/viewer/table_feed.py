@@ -90,7 +90,8 @@ class ViewFeed:
         *,
         certified: bool = True,
     ) -> None:
-        self._columns, self._is_certified = columns, certified and scenario.coverage.is_certifiable
+        self._columns = columns
+        self._is_certified = certified and scenario.coverage.can_be_certified
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view

@@ -73,6 +73,16 @@ class BoxGains(PlantGains):
         """
         if start_s == 0:
             return np.zeros(()), dict.fromkeys(self.outputs, np.zeros(()))
+        error, impulse, w = self._started_late(start_s)
+        states = {
+            output: impulse * peaks.impulse + w @ peaks.from_w
+            for output, peaks in self._peaks.items()
+        }
+        states[Output.MISMATCH] += np.linalg.norm(self._scales * w, axis=-1)
+        return error, states
+
+    def _started_late(self, start_s: float) -> tuple[Vector, Vector, Vector]:
+        """Return sup‖p‖ over the start, ∫‖p‖, and the bound of |w| that follows."""
         R, box = self.error.split_K[1], spectral_norm(self.halfwidth_A)
         # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
         mu = max(float(logarithmic_norm(self.A) + box), 0.0) + self.alpha_per_s
@@ -84,13 +94,24 @@ class BoxGains(PlantGains):
         error = first + start_s * (rate * size + np.linalg.norm(R @ pushes, axis=0).sum())
         impulse = error * start_s
         peaks_of = np.array([peaks.impulse for peaks in self._coordinates])
-        w = self._bound_of_w(impulse[..., None] * peaks_of)
-        states = {
-            output: impulse * peaks.impulse + w @ peaks.from_w
-            for output, peaks in self._peaks.items()
-        }
-        states[Output.MISMATCH] += np.linalg.norm(self._scales * w, axis=-1)
-        return error, states
+        return error, impulse, self._bound_of_w(impulse[..., None] * peaks_of)
+
+    def coordinate_bounds(self, input_error: float, start_s: float) -> Vector:
+        """Bound each |x_j|, and each |u_i| with its disturbance, scaled, (n + m,).
+
+        ``input_error``: sup‖u − K x‖. Before ``start_s`` the input is 0.
+        """
+        n, from_start = len(self.A), self._from_start.items()
+        total = np.stack([bound for name, bound in from_start if name not in self.outputs], axis=-1)
+        w, impulse = self._free_model_error + self._forced_model_error * input_error, np.zeros(())
+        if start_s > 0:
+            _, impulse, late = self._started_late(start_s)
+            w = w + late
+        for place, peaks in enumerate(self._coordinates):
+            total[place] += peaks.forced * input_error + peaks.impulse * impulse + peaks.from_w @ w
+        total[n:] += np.linalg.norm(self.error.split_K[0], axis=1) * input_error
+        total[n:] += self._forcing.at_input
+        return np.asarray(total)
 
     @property
     def columns(self) -> Columns:

@@ -20,7 +20,9 @@ loop"):
    time, so the bounds of the two parts are added.
 4. ``scenario_certificates.py``. Which of these a scenario gets, for its own plant and for the box;
    and the largest sampling period, delay and age of inputs that are still certified.
-5. ``certified_bounds.py``. The guarantee as bounds over time; and sharper ones from the newest
+5. ``region.py``. A nonlinear plant is one of the plants of a box, as long as x and u stay in the
+   region over which its equations are enclosed; they do if the box's bounds are inside it.
+6. ``certified_bounds.py``. The guarantee as bounds over time; and sharper ones from the newest
    event on, at which the sensor knows x (docs/theory.md, "From the newest event").
 
 Certificates of several loops are computed together: a search (``solution.py``, ``Search``) yields

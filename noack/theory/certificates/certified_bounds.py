@@ -19,12 +19,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
+from noack.plants.systems.jacobian_enclosure import Inclusion
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import bound_forcing
@@ -32,9 +33,30 @@ from noack.theory.bounds.enclosure import KernelBounds, response
 from noack.theory.bounds.gains import Output, PlantGains, error_gains
 from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import Assumption
-from noack.theory.certificates.conditions import OWN_PLANT
+from noack.theory.certificates.conditions import BOX, OWN_PLANT
 
 Counts = NDArray[np.int64]
+
+
+class Region(NamedTuple):
+    """The region that a nonlinear plant does not leave, and the box that encloses it there."""
+
+    x: tuple[float, ...]
+    """Bounds of |x_j|."""
+    u: tuple[float, ...]
+    """Bounds of |u_i|."""
+    A: tuple[tuple[float, ...], ...]
+    """Centre of the box."""
+    B: tuple[tuple[float, ...], ...]
+    halfwidth_A: tuple[tuple[float, ...], ...]
+    halfwidth_B: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(cls, halfwidths: Vector, box: Inclusion) -> Self:
+        """Return the region |(x, u)_j| ≤ ``halfwidths``, (n + m,), with its box."""
+        n = len(box.A)
+        rows = (tuple(map(tuple, matrix.tolist())) for matrix in box)
+        return cls(tuple(halfwidths[:n].tolist()), tuple(halfwidths[n:].tolist()), *rows)
 
 
 @dataclass(frozen=True)
@@ -63,11 +85,14 @@ class ScenarioCertificate:
     ``constants`` under disturbances, noise, an observer or a constant threshold."""
     other: "ScenarioCertificate | None" = None
     """A second certificate of the same plants under the same conditions: both bounds hold."""
+    region: Region | None = None
+    """Of a nonlinear plant: where the certificate holds, and what x and u do not leave."""
 
     @property
     def source(self) -> str:
         """Name of the certificate as the source of a claim."""
-        return "certificate" if self.scope == OWN_PLANT else "box certificate"
+        kinds = {OWN_PLANT: "certificate", BOX: "box certificate"}
+        return kinds.get(self.scope, "region certificate")
 
     @property
     def floor_from_s(self) -> float:
@@ -125,6 +150,7 @@ class ScenarioCertificate:
             "other": None if self.other is None else self.other.to_json(),
             "inter_event_s": self.inter_event_s,
             "floor_from_s": None if self.floor == 0 else self.floor_from_s,
+            "region": None if self.region is None else self.region._asdict(),
         }
 
     def _envelope(self, t_s: Matrix, scale: Callable[[Constants, float], float]) -> Matrix:

@@ -22,6 +22,7 @@ from noack.theory.bounds.terms import NetworkConditions
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
+REGION = "the nonlinear plant on its region"
 """The plants that a certificate covers, by name."""
 _AT_REST = 1e-9
 """The plant rests if |A x_r + B u_r| is at most this share of its larger term."""
@@ -155,14 +156,16 @@ def constant_disturbance(resolved: Scenario) -> Vector:
 
 
 def void_at_setpoint(resolved: Scenario, *, knows_start: bool = False) -> Mapping[str, str]:
-    """Return by scope why there is no certificate at the set-point of a linear plant.
+    """Return by scope why there is no certificate at the set-point.
 
     Until the first input arrives, the input is 0, and not u_r; ``knows_start``: the certificate is
     for an error of that size (``start_error``), which a run shows.
     """
     setpoint = setpoint_of(resolved)
-    if setpoint is None or not resolved.coverage.is_linear:
+    if setpoint is None:
         return {}
+    if not resolved.coverage.is_linear:
+        return {REGION: "the region of a nonlinear plant is one about 0, and not about a set-point"}
     if resolved.observer is not None:
         why = "at a set-point the error of the observer's first estimate is not known"
         return {OWN_PLANT: why, BOX: why}

@@ -98,6 +98,16 @@ class DisturbedCertificate:
             divided = yield from self._of_constant_threshold(conditions, apart_s)
         return divided or [(constants, None)]
 
+    def with_plants(
+        self, first: Constants, rest: Constants | None
+    ) -> Sequence[tuple[PlantGains, Constants]]:
+        """Return constants of :meth:`constants` with the plants of their parts."""
+        if rest is None:
+            decays = first.rate_per_s > 0
+            plant = self._plant(first.rate_per_s) if decays else self._together.plant
+            return [(plant, first)]
+        return [(self._plant(first.rate_per_s), first), (self._persistent.plant, rest)]
+
     def _of_constant_threshold(
         self, conditions: NetworkConditions, apart_s: float
     ) -> Search[list[Added]]:

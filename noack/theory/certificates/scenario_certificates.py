@@ -127,6 +127,8 @@ class CertificateScope:
         start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
             at the start. The certificate exists only if its own π is at least that large, so that
             it covers these inputs.
+        start: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k); by default that
+            of the scenario.
     """
 
     def __init__(
@@ -136,19 +138,27 @@ class CertificateScope:
         closed_loop: Matrix,
         plant_at: PlantAt,
         start_error: float = 0.0,
+        start: Matrix | None = None,
     ) -> None:
         self._start_error = start_error
         self.name = name
         self._resolved = resolved
         self._loop = loop_of(resolved)
+        self._start = self._loop.x0[:, None] if start is None else start
         self._trigger = trigger_bounds(resolved)
         # Where events have a due time, a missed update is missed for a limited time.
         due = self._trigger.has_due_time
         self._held = not self._loop.H.any() and not due
         decays = math.inf if self._held or due else -spectral_abscissa(self._loop.H)
         self._decay = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
+        assert start is None or self.is_simple  # other starts are those of the scenario
         self._plant_at = plant_at
         self._plants: dict[float, PlantGains] = {}
+
+    @property
+    def is_simple(self) -> bool:
+        """Whether no causes are bounded apart from the start, and added."""
+        return self._resolved.coverage.is_undisturbed and not self._trigger.is_constant
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
@@ -209,7 +219,7 @@ class CertificateScope:
             NotDecayingError: a mode of the loop decays too slowly.
         """
         try:
-            if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
+            if self.is_simple:
                 first, late = yield from self._phases(conditions, longest=longest)
                 return [(first, late, None)]
             pairs = yield from self._disturbed_phases(conditions, longest=longest)
@@ -323,7 +333,7 @@ class CertificateScope:
     ) -> Search[Constants]:
         if alpha_per_s not in self._plants:
             error = error_gains(self._loop, alpha_per_s)
-            plant = self._plant_at(error, self._loop.x0[:, None], alpha_per_s)
+            plant = self._plant_at(error, self._start, alpha_per_s)
             plant = replace(plant, further_outputs=self._trigger.outputs)
             self._plants[alpha_per_s] = _first_equal(_KnownPlant(plant.identity, plant))
         plant = self._plants[alpha_per_s]

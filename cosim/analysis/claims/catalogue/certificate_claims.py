@@ -107,6 +107,22 @@ def state(
     )
 
 
+@certified("x stays in the region")
+def region(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+) -> Findings:
+    """The region of a nonlinear plant, coordinate by coordinate."""
+    if certificate.region is None:
+        return Findings()
+    here, limits = samples.with_x, np.array(certificate.region.x)
+    shares = (np.abs(samples.true_x[here]) / limits).max(axis=1)
+    names = run.record.loop.state_names
+    formula = ", ".join(
+        f"|{name}| ≤ {limit:.4g}" for name, limit in zip(names, limits, strict=True)
+    )
+    return Findings(Bound(formula, samples.t_s[here], shares, run.violation_of(certificate)))
+
+
 @certified("the state is bounded from the newest event on")
 def state_from_events(
     run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants

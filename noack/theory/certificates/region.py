@@ -1,0 +1,183 @@
+"""Certificates of a nonlinear plant on a region that it is proven not to leave.
+
+Over the region |x_j| ≤ r_j, |u_i| ≤ r_{n+i} the plant's equations are enclosed: they are A x + B u
+with some A and B of a box, which may change at any time (:mod:`jacobian_enclosure
+<noack.plants.systems.jacobian_enclosure>`). As long as x and u are in the region, the bounds of the
+box hold. If they are below r, x and u never leave it: a first exit would contradict them
+(docs/derivations.md, "Beyond linear plants").
+
+The bounds increase with the region. So the search starts with a small one, and takes a little more
+than the bounds that follow from it as the next, until a region's bounds are inside it. It tends to
+the smallest such region, which has the tightest bounds. If the bounds lose their loop gain below 1
+first, or the equations their enclosure, there is no certificate, and the report has the reason.
+"""
+
+import contextlib
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from noack.core.errors import NoackError
+from noack.core.linear_systems import Matrix, Vector
+from noack.plants.plant_settings import PlantStart, SystemFailedError
+from noack.plants.systems.jacobian_enclosure import EnclosedMotion, Inclusion, NotEnclosedError
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
+from noack.theory.bounds.box import BoxGains
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
+from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
+from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
+from noack.theory.certificates.conditions import REGION
+from noack.theory.certificates.scenario_certificates import (
+    CertificateScope,
+    Phases,
+    box,
+    own_plant,
+)
+from noack.theory.certificates.solution import Search
+
+_WIDER = 1.02
+"""The next region is larger than the bounds by this factor."""
+_LEAST = 1e-9
+"""Least width of a region in each direction, as a share of its largest."""
+_ATTEMPTS = 40
+_MOST_NAMES = 8
+
+
+def scopes(resolved: Scenario, start_error: float = 0.0) -> list[CertificateScope]:
+    """Return the plants of a resolved scenario for which certificates can exist.
+
+    These are its own plant and the box around it, if it is linear; otherwise its plant on a region.
+    """
+    if resolved.coverage.is_certifiable:
+        linear = own_plant(resolved, start_error), box(resolved, start_error)
+        return [scope for scope in linear if scope is not None]
+    return [RegionScope(resolved, start_error)] if resolved.coverage.can_be_certified else []
+
+
+class _Box(CertificateScope):
+    """The plants of an inclusion."""
+
+    def __init__(
+        self, resolved: Scenario, inclusion: Inclusion, start_error: float, start: Matrix | None
+    ) -> None:
+        A, B, half_A, half_B = inclusion
+
+        def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
+            return BoxGains(error, A, B, start, alpha_per_s, half_A, half_B)
+
+        closed_loop = A + B @ loop_of(resolved).K
+        super().__init__(REGION, resolved, closed_loop, plant_at, start_error, start)
+
+    def bounded(self, conditions: NetworkConditions) -> Search[tuple[list[Phases], Vector]]:
+        """Search for constants, and for bounds of |x_j| and |u_i| at all times, (n + m,).
+
+        Without decay the bounds at all times are often smaller, and exist for larger boxes.
+
+        Raises:
+            NoCertificateError, NotDecayingError: there are none.
+        """
+        try:
+            phases = yield from self.without_decay(conditions)
+        except (NoCertificateError, NotDecayingError, OverflowError, np.linalg.LinAlgError):
+            phases = yield from self._constants(conditions)
+        return phases, self._coordinate_bounds(phases, conditions)
+
+    def without_decay(self, conditions: NetworkConditions) -> Search[list[Phases]]:
+        """Search for constants of bounds without decay.
+
+        Raises: as :meth:`bounded`.
+        """
+        if not self.is_simple:
+            return (yield from self._constants(conditions, longest=False))
+        trigger = self._trigger
+        level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
+        tested, reached = trigger.tested(conditions), trigger.floor or None
+        first = yield from self._solve(tested, 0.0, level, reached, longest=False)
+        return [(*self._checked(first, None), None)]
+
+    def _coordinate_bounds(self, phases: list[Phases], conditions: NetworkConditions) -> Vector:
+        found = list[Vector]()
+        for first, _, rest in phases:
+            parts = (
+                [(self._plants[first.rate_per_s], first)]
+                if self.is_simple
+                else (self._disturbed.with_plants(first, rest))
+            )
+            total = np.zeros(self._loop.n + self._loop.m)
+            for plant, constants in parts:
+                assert isinstance(plant, BoxGains)
+                total += plant.coordinate_bounds(constants.input_error, conditions.start_s)
+            found.append(total)
+        return np.asarray(np.min(found, axis=0))
+
+
+class RegionScope(_Box):
+    """A nonlinear plant within a region; see :class:`CertificateScope`."""
+
+    def __init__(
+        self, resolved: Scenario, start_error: float = 0.0, start: Matrix | None = None
+    ) -> None:
+        loop, self._regions = loop_of(resolved), dict[NetworkConditions, Region]()
+        # The plants of the model; those of each region take their place.
+        model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
+        super().__init__(resolved, model, start_error, start)
+
+    def search(self, conditions: NetworkConditions) -> Search[ScenarioCertificate]:
+        """Search for the certificate under some conditions, and its region."""
+        found = yield from super().search(conditions)
+        if found.constants is None:
+            return found
+        region = self._regions[conditions]
+        why = "the bounds on the region are inside it, so that there is no first exit"
+        stays = "x and u stay in the region over which the equations are enclosed"
+        proven = Assumption(stays, "certificate", AssumptionStatus.HOLDS, why)
+        return replace(found, region=region, assumptions=(*found.assumptions, proven))
+
+    def _constants(
+        self, conditions: NetworkConditions, *, longest: bool = True
+    ) -> Search[list[Phases]]:
+        widths, where = np.zeros(self._loop.n + self._loop.m), "near 0"
+        for _ in range(_ATTEMPTS):
+            try:
+                inclusion = self._motion.over(widths)
+                box = _Box(self._resolved, inclusion, self._start_error, self._start)
+                phases, reached = yield from box.bounded(conditions)
+            except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
+                why = f"{where}: {error}" if widths.any() else str(error)
+                raise NoCertificateError(why) from None
+            except NoCertificateError as error:
+                raise NoCertificateError(f"{where}: {error}", error.loop_gain) from None
+            except NotDecayingError as error:
+                raise NotDecayingError(f"{where}: {error}") from None
+            if (reached < widths).all():
+                self._regions[conditions] = Region.of(widths, inclusion)
+                self._decay = box._decay
+                if longest:
+                    with contextlib.suppress(NoCertificateError, NotDecayingError):
+                        return (yield from box._constants(conditions))
+                return phases
+            widths = np.maximum(widths, _WIDER * reached + _LEAST * reached.max())
+            where = f"on the region {self._described(widths)}"
+        raise NoCertificateError(f"{where}: the bounds are not within it")
+
+    def _described(self, widths: Vector) -> str:
+        if len(widths) > _MOST_NAMES:
+            return f"|x_j| ≤ {widths[: self._loop.n].max():.3g}"
+        names = (*self._loop.state_names, *self._loop.input_names)
+        return ", ".join(f"|{name}| ≤ {w:.3g}" for name, w in zip(names, widths, strict=True))
+
+    @cached_property
+    def _motion(self) -> EnclosedMotion:
+        loop, timing = self._loop, self._resolved.timing
+        plant = self._resolved.plant.system
+        if not plant.has_equations:
+            raise NotEnclosedError(f'a plant of kind "{plant.kind}" has no equations to enclose')
+        start = PlantStart(np.zeros(loop.n), loop.A_model, loop.B_model, timing.plant_period_ns)
+        try:
+            return EnclosedMotion(plant.system(start), loop.n, loop.m)
+        except NoackError as error:  # a user's class that does not accept x = 0, for example
+            raise NotEnclosedError(str(error)) from None

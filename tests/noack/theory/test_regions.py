@@ -1,0 +1,166 @@
+"""Certificates of nonlinear plants on regions: enclosures, attacks, broken copies, reasons."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.claims.claim_evaluation import RunClaims
+from cosim.analysis.summary_model import ClaimVerdict
+from cosim.simulation.virtual_time import simulate
+from noack.core.linear_systems import Vector
+from noack.plants.plant_settings import PlantStart
+from noack.plants.systems import jacobian_enclosure
+from noack.plants.systems.jacobian_enclosure import Enclosed, EnclosedMotion, Inclusion, _ball
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
+from noack.theory.certificates.region import _Box
+from tests.oracles.attacked_regions import CASES, SCENARIOS, Case, Field, attacked, certificate_of
+
+pytest.importorskip("flint")
+REGIONS = {
+    "pendulum": [1.2, 2.0, 9.0],
+    "kinematic car": [0.4, 0.9, 5.0, 0.5],
+    "cart-pole": [1.0, 2.0, 0.5, 3.0, 20.0],
+    "four tanks": [4.0, 4.0, 1.2, 0.9, 2.0, 2.0],
+}
+STEEP = """class Steep:
+    def derivative(self, t_s, z, u):
+        return [z[1], z[0] + z[0] ** 7 + u[0]]
+"""
+
+
+def over(resolved: Scenario, widths: Vector) -> Inclusion:
+    loop = loop_of(resolved)
+    start = PlantStart(np.zeros(loop.n), loop.A, loop.B, 1_000_000)
+    return EnclosedMotion(resolved.plant.system.system(start), loop.n, loop.m).over(widths)
+
+
+def largest_excess(box: Inclusion, field: Field, widths: Vector) -> float:
+    """Return by how much f leaves the box at random points, and corners, of a region."""
+    rng, n = np.random.default_rng(1), len(box.A)
+    z = rng.uniform(-1, 1, (4000, len(widths)))
+    z[::2] = np.sign(z[::2])
+    z = (z * rng.uniform(0, 1, (4000, 1)) ** 0.2 * widths).T
+    middle, half = np.hstack([box.A, box.B]), np.hstack([box.halfwidth_A, box.halfwidth_B])
+    return float((np.abs(field(z[:n], z[n:]) - middle @ z) - half @ np.abs(z)).max())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_equations_lie_in_their_enclosure(name: str) -> None:
+    case, widths = CASES[name], np.array(REGIONS[name])
+    resolved = resolve(load(SCENARIOS / f"{case.scenario}.toml"))
+    for share in (1.0, 0.3):
+        assert largest_excess(over(resolved, share * widths), case.field, share * widths) < 1e-9
+    assert largest_excess(over(resolved, 0.5 * widths), case.field, widths) > 1e-3
+
+
+def test_a_sine_is_enclosed_almost_tightly() -> None:
+    box = over(CASES["pendulum"].resolved(), np.array([1.0, 1.0, 1.0]))
+    highest, lowest = (box.A[1, 0] + sign * box.halfwidth_A[1, 0] for sign in (1, -1))
+    exact = 9.81 * np.sin(1.0)  # times sin(r)/r to 1
+    assert highest >= 9.81 >= exact >= lowest
+    assert highest - lowest < 1.35 * (9.81 - exact)
+    assert not box.halfwidth_B.any()
+
+
+@pytest.mark.parametrize(
+    "of",
+    [
+        np.sin, np.cos, np.tan, np.arctan, np.tanh, np.exp, np.log, np.sqrt,
+        lambda x: x**3 - 2 / x + x**-1.5, lambda x: (1 - x * x) / (x + np.cos(x)),
+        lambda x: np.abs(-x) + max(x, 0.0), lambda x: np.array([x, 2 * x]) @ np.array([3.0, x]),
+    ],
+)  # fmt: skip
+def test_numbers_carry_enclosed_derivatives(of: Callable[[Enclosed | float], Enclosed]) -> None:
+    middle, radius, h = 0.9, 0.3, 1e-6
+    found = of(Enclosed(_ball(middle, radius), [_ball(1.0)]))
+    for x in np.linspace(middle - radius, middle + radius, 41):
+        slope = (of(x + h) - of(x - h)) / (2 * h)
+        assert abs(found.value - _ball(float(of(x)))).abs_lower() < 1e-12
+        assert abs(found.slopes[0] - _ball(float(slope))).abs_lower() < 1e-8
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_attack_exceeds_a_bound_or_leaves_the_region(name: str) -> None:
+    case = CASES[name]
+    resolved = case.resolved()
+    certificate = certificate_of(resolved, case.semi_axes)
+    worst = attacked(resolved, case, certificate, runs=100, steps=500)
+    assert all(0.05 < share < 1 for share in worst.values()), worst
+
+
+def test_broken_copies_are_refuted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, bounded = EnclosedMotion.over, _Box.bounded
+
+    def unchecked(self: Any, conditions: Any) -> Any:
+        phases, reached = yield from bounded(self, conditions)
+        return phases, reached * (not self._plants[0.0].halfwidth_A.any())
+
+    for power, semi_axes, *broken in (
+        (7, (1.3, 0.01), EnclosedMotion, "over", lambda self, r: whole(self, r / 2)),
+        (3, (0.01, 4.8), _Box, "bounded", unchecked),  # takes the first region
+    ):
+        code = STEEP.replace("7", str(power))
+        case = Case("", lambda x, u, p=power: np.stack([x[1], x[0] + x[0] ** p + u[0]]), semi_axes)
+        resolved = own_plant(tmp_path, code)
+        with monkeypatch.context() as patch:
+            patch.setattr(*broken)
+            certificate = certificate_of(resolved, semi_axes)
+        assert certificate.region is not None, broken
+        with np.errstate(all="ignore"):
+            found = attacked(resolved, case, certificate, runs=50, steps=2000)
+        assert found["x"] > 1, broken
+        assert certificate_of(resolved, semi_axes).constants is None
+
+
+def own_plant(folder: Path, code: str) -> Scenario:
+    (folder / "own.py").write_text(code)
+    (folder / "own.toml").write_text(f"""
+        name = "own"
+        horizon_s = 2.0
+        model = {{ A = [[0.0, 1.0], [1.0, 0.0]], B = [[0.0], [1.0]], gain = [[-4.0, -2.0]] }}
+        controller = {{ rate_hz = 2000.0 }}
+        trigger = {{ beta = 0.01, alpha_per_s = 0.2 }}
+        network = {{ mansd = 3, loss = {{ model = "bernoulli", probability = 0.5 }} }}
+        [plant]
+        rate_hz = 2000.0
+        system = {{ kind = "python", file = "own.py", name = "{code.split()[1][:-1]}" }}
+        initial_state = [0.1, 0.0]
+    """)
+    return resolve(load(folder / "own.toml"))
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ("return [z[1], math.sin(z[0]) + u[0]]", "must be real number"),
+        ("return [z[1], z[0] + u[0] if z[0] > 0 else u[0]]", "distinguish cases"),
+        ("return [z[1], z[0] + u[0] + (t_s > 1)]", "distinguish cases"),
+        ("return [z[1], z[0] + u[0] + 0.1]", "does not rest"),
+        ("return [z[1], np.sqrt(z[0]) + u[0]]", "not defined and smooth"),
+    ],
+)
+def test_without_a_certificate_the_reason_is_given(tmp_path: Path, body: str, reason: str) -> None:
+    code = "class Own:\n    def derivative(self, t_s, z, u):\n        import math, numpy as np\n"
+    code += f"        {body}\n"
+    assert reason in (certificate_of(own_plant(tmp_path, code), (0.1, 0.1)).void or "")
+
+
+def test_without_the_library_one_line_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jacobian_enclosure, "find_spec", lambda name: None)
+    void = certificate_of(own_plant(tmp_path, STEEP), (0.1, 0.1)).void
+    assert "pip install 'noack[regions]'" in str(void)
+
+
+def test_a_run_is_held_against_its_region() -> None:
+    for name, verdict in (("sine_pendulum", ClaimVerdict.HELD), ("cart_pole", ClaimVerdict.VOID)):
+        record = simulate(resolve(load(SCENARIOS / f"{name}.toml", ["horizon_s=1.0"])))
+        claims = [one for one in RunClaims(record).judge() if one.source == "region certificate"]
+        assert {one.verdict for one in claims} == {verdict}
+        assert ("x stays in the region" in {one.what for one in claims}) == (name != "cart_pole")
