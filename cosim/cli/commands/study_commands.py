@@ -29,6 +29,7 @@ with lazy_modules():
         design_page,
         design_search,
         design_space,
+        event_design,
         network_page,
         network_search,
     )
@@ -341,13 +342,12 @@ def _design_for_network(
     json: bool,
 ) -> int:
     with progress.work_bar("trying gains") as bar:
-        found = network_page.design_for_network(loaded, wish, seed, bar)
+        found = event_design.design_for_network(loaded, wish, seed, bar)
     path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}-network.html"
     written = network_page.write_page(found, path, figure_files)
     if out is not None and found.is_certified:
-        text = scenario_file.dumps(network_page.written_scenario(found))
-        written.append(write_whole(out, text))
-    cli.show_with_files(json, found.document(), written, network_page.print_design, found)
+        written.append(write_whole(out, found.written()))
+    cli.show_with_files(json, found.to_json(), written, network_page.print_design, found)
     return ExitStatus.OK if found.is_certified else ExitStatus.FAILED
 
 
