@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from benchmarks.report import Peer, Row, benchmark
 from cosim.shipped_files import find_shipped
@@ -48,9 +48,8 @@ def network_design(options: argparse.Namespace) -> Iterator[Row]:
             wish = Wish(bounds={"state": bound})
             kind = f"events, sup‖x‖ ≤ {bound:.4g} certified"
         found = design_for_network(given, wish)
-        loops: list[Any] = [found.document[loop] for loop in ("given", "best")]
         about = f"{' '.join((name, *settings[:1]))}, {kind}"
         keys = {"certified": "M", "cost": "cost", "transmissions": "transmissions"}
-        for key in [key for key in keys if key in loops[0]]:
-            before, after = (float(loop[key] or 0) for loop in loops)
+        for key in [key for key in keys if key in found.given]:
+            before, after = (float(loop[key] or 0) for loop in (found.given, found.best))
             yield Row(f"{about}: {keys[key]}", after, "", Peer("given loop", before))

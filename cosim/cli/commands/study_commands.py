@@ -218,11 +218,16 @@ class NetworkOptions:
             raise CallerError(f"--share: must be positive, not {self.share:g}")
         return network_search.Wish(
             goal="transmissions" if self.aim is DesignAim.TRANSMISSIONS else "network",
-            window=self.window, most=self.most, transmissions=self.share,
-            period_s=self.period, cost=self.cost, bounds=bounds,
-            weights=weights, modes=[mode for mode in network_search.MODES if mode in modes],
+            window=self.window,
+            most=self.most,
+            transmissions=self.share,
+            period_s=self.period,
+            cost=self.cost,
+            bounds=bounds,
+            weights=weights,
+            modes=[mode for mode in network_search.MODES if mode in modes],
             effort=self.effort,
-        )  # fmt: skip
+        )
 
 
 @cli.option_group
@@ -315,6 +320,23 @@ def design(
             figure_files,
             json,
         )
+    return _design_for_settling(
+        loaded, wanted, weights, feedback, draws, seed, out, page, figure_files, json
+    )
+
+
+def _design_for_settling(
+    loaded: "scenario.Scenario",
+    wanted: LimitOptions,
+    weights: str,
+    feedback: GainOptions,
+    draws: int,
+    seed: int,
+    out: Path | None,
+    page: Path | None,
+    figure_files: "figure_format.FigureFiles | None",
+    json: bool,
+) -> int:
     loaded.decaying  # noqa: B018 - raises for another policy
     limits = wanted.limits()
     norms = [norm.strip() for norm in weights.split(",") if norm.strip()]

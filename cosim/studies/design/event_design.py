@@ -106,8 +106,9 @@ class EventSearch:
             update={"alpha_per_s": loop.alpha_per_s, "beta": loop.beta}
         )
         update: dict[str, object] = {
-            "model": one.model.model_copy(update={"gain": loop.K}), "trigger": trigger,
-        }  # fmt: skip
+            "model": one.model.model_copy(update={"gain": loop.K}),
+            "trigger": trigger,
+        }
         if m is not None:
             update["network"] = one.network.model_copy(update={"mansd": m - 1})
         return one.model_copy(update=update)
@@ -247,58 +248,70 @@ def _rounded(entries: Vector, like: EventLoop, alpha_per_s: float, beta: float) 
 
 def event_outcome(search: EventSearch, given: Certified, best: Certified) -> DesignOutcome:
     """Return what is shown of a search."""
-    own, limits = search.scenario.network.mansd + 1, search.limits
+    limits = search.limits
     is_network = search.wish.goal == "network"
-
-    def reach(one: Certified) -> str:
-        top = ", the most examined" if one.m == search.most else ""
-        return f"M = {one.m}{top}" if one.m else "nothing certified"
-
-    def bound(one: Certified, m: int) -> str:
-        value = search.state_bound(one.loop, m) if m else math.inf
-        return f"{value:.4g}" if value < math.inf else NONE
-
-    def cells(one: Certified) -> dict[str, str]:
-        return {
-            "certified for": reach(one),
-            "sup‖x‖ there at most": bound(one, one.m),
-            f"sup‖x‖ with M = {own} at most": bound(one, own),
-            "cost, mean": f"{one.measured.cost:.4g}",
-            "transmissions, mean": f"{one.measured.transmissions:.4g}",
-            "α [1/s]": f"{one.loop.alpha_per_s:.4g}",
-            "β": f"{one.loop.beta:.4g}",
-            "K": gain_text(one.loop.K),
-        }
 
     def entry(one: Certified) -> dict[str, object]:
         return {"certified": one.m or None, **one.loop._asdict(), **one.measured._asdict()}
 
     plants = "for the whole box" if search.of_box else "for the scenario's own plant"
     sent = f"{given.measured.transmissions:.4g} to {best.measured.transmissions:.4g}"
-    verdict = (
-        f"certified {plants}: {reach(given)} before, {reach(best)} after; transmissions {sent}"
-    )
+    before, after = (_reach(search, one) for one in (given, best))
+    verdict = f"certified {plants}: {before} before, {after} after; transmissions {sent}"
     if best.loop == given.loop:
-        verdict = f"{reach(best)} for the given loop; no better one was found"
+        verdict = f"{after} for the given loop; no better one was found"
     limit = f"a mean cost of at most {limits.cost:.4g}"
     limit += f", at most {limits.transmissions:.4g} transmissions" if is_network else ""
     for name, most in search.wish.bounds.items():
         limit += f", {WORDS[name]} ≤ {most:g} certified"
     document: dict[str, object] = {
-        "goal": search.wish.goal, "of_box": search.of_box, "limits": limits._asdict(),
-        "tried": search.tried, "judged": search.judged,
-        "given": entry(given), "best": entry(best),
-    }  # fmt: skip
+        "goal": search.wish.goal,
+        "of_box": search.of_box,
+        "limits": limits._asdict(),
+        "tried": search.tried,
+        "judged": search.judged,
+    }
     notes = [
         f"the best of {search.tried:,} loops tried with {limit}; its certificate is proven, that "
         "it is the best is not",
         "costs and transmissions are means over fresh draws with the scenario's own network",
     ]
     return DesignOutcome(
-        search.scenario.name, verdict, notes, (cells(given), cells(best)),
+        search.scenario.name,
+        verdict,
+        notes,
+        (_cells(search, given), _cells(search, best)),
         search.scenario_of(best.loop, best.m if is_network and best.m else None),
-        best.m > 0, best.loop != given.loop, document, _figure(search, given, best),
-    )  # fmt: skip
+        best.m > 0,
+        best.loop != given.loop,
+        document,
+        entry(given),
+        entry(best),
+        _figure(search, given, best),
+    )
+
+
+def _reach(search: EventSearch, one: Certified) -> str:
+    top = ", the most examined" if one.m == search.most else ""
+    return f"M = {one.m}{top}" if one.m else "nothing certified"
+
+
+def _cells(search: EventSearch, one: Certified) -> dict[str, str]:
+    def bound(m: int) -> str:
+        value = search.state_bound(one.loop, m) if m else math.inf
+        return f"{value:.4g}" if value < math.inf else NONE
+
+    own = search.scenario.network.mansd + 1
+    return {
+        "certified for": _reach(search, one),
+        "sup‖x‖ there at most": bound(one.m),
+        f"sup‖x‖ with M = {own} at most": bound(own),
+        "cost, mean": f"{one.measured.cost:.4g}",
+        "transmissions, mean": f"{one.measured.transmissions:.4g}",
+        "α [1/s]": f"{one.loop.alpha_per_s:.4g}",
+        "β": f"{one.loop.beta:.4g}",
+        "K": gain_text(one.loop.K),
+    }
 
 
 def _figure(search: EventSearch, given: Certified, best: Certified) -> FigureDescription:

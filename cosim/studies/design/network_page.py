@@ -39,15 +39,21 @@ class DesignOutcome:
     is_better: bool
     """Whether it is another loop than the given one."""
     document: dict[str, object]
-    """The result as JSON."""
+    """The limits and the size of the search, as JSON."""
+    given: dict[str, object]
+    """The given loop as JSON."""
+    best: dict[str, object]
     figure: FigureDescription
 
     @property
     def lines(self) -> str:
         """What to change in the scenario, as TOML."""
         one = self.scenario.model_dump(mode="json", exclude_none=True)
-        keys = {"model": ("gain",), "network": ("mansd", "constraints"),
-                "trigger": ("policy", "period_s", "alpha_per_s", "beta")}  # fmt: skip
+        keys = {
+            "model": ("gain",),
+            "network": ("mansd", "constraints"),
+            "trigger": ("policy", "period_s", "alpha_per_s", "beta"),
+        }
         tables = {
             table: {key: one[table][key] for key in some if one[table].get(key, []) != []}
             for table, some in keys.items()
@@ -67,6 +73,8 @@ class DesignOutcome:
             "verdict": self.verdict,
             "lines": self.lines,
             **self.document,
+            "given": self.given,
+            "best": self.best,
         }
 
     def written(self) -> str:

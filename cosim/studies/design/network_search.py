@@ -386,9 +386,14 @@ class NetworkSearch:
                 objective,
                 np.zeros(K.size),
                 method="Nelder-Mead",
-                options={"maxfev": most, "adaptive": True, "initial_simplex": simplex,
-                         "xatol": 1e-4, "fatol": 1e-5},
-            )  # fmt: skip
+                options={
+                    "maxfev": most,
+                    "adaptive": True,
+                    "initial_simplex": simplex,
+                    "xatol": 1e-4,
+                    "fatol": 1e-5,
+                },
+            )
         except _FoundError as found:
             return found.candidate
         return None
@@ -421,14 +426,6 @@ def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> De
             return "nothing proven"
         return ladder[one.rung].name + (", the most examined" * (one.rung == len(ladder) - 1))
 
-    def beyond(one: Reached) -> str:
-        if one.beyond is None:
-            return "not examined"
-        what = "undecided"
-        if one.beyond.verdict == "destabilised":
-            what = f"{one.beyond.text} destabilises"
-        return f"{ladder[one.rung + 1].name}: {what}"
-
     def sent(one: Reached) -> float:
         period_ns = ladder[max(one.rung, 0)].period_ns
         return search.scenario.timing.measurement_period_ns / period_ns
@@ -438,7 +435,7 @@ def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> De
         return {
             "proven stable for": reach(one),
             "growth per period there": f"{found.lower:.5f} to {found.upper:.5f}" if found else NONE,
-            "the next one": beyond(one),
+            "the next one": _beyond(ladder, one),
             "cost without losses": f"{one.cost:.4g}",
             "share of measurements sent": f"{100 * sent(one):.3g} %",
             "between updates": _HOLDS[one.candidate.mode],
@@ -446,12 +443,9 @@ def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> De
         }
 
     def entry(one: Reached) -> dict[str, object]:
-        bounds = {
-            key: found and found._asdict() | {"pattern": found.text, "verdict": found.verdict}
-            for key, found in (("stability", one.found), ("beyond", one.beyond))
-        }
         certified = None if one.rung < 0 else ladder[one.rung].number
         known = {"certified": certified, "cost": one.cost, "transmitted": sent(one)}
+        bounds = {"stability": _document(one.found), "beyond": _document(one.beyond)}
         return {**known, **one.candidate._asdict(), **bounds}
 
     verdict = f"stable for every loss pattern: {reach(given)} before, {reach(best)} after"
@@ -463,16 +457,37 @@ def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> De
         "tolerates is proven, that it is the best is not"
     )
     document: dict[str, object] = {
-        "goal": wish.goal, "window": wish.window, "cost_limit": search.limit,
-        "tried": search.tried, "judged": search.judged,
-        "given": entry(given), "best": entry(best),
-    }  # fmt: skip
+        "goal": wish.goal,
+        "window": wish.window,
+        "cost_limit": search.limit,
+        "tried": search.tried,
+        "judged": search.judged,
+    }
     return DesignOutcome(
-        search.scenario.name, verdict, [note], (cells(given), cells(best)),
+        search.scenario.name,
+        verdict,
+        [note],
+        (cells(given), cells(best)),
         search.scenario_of(best.candidate, best.rung),
-        best.rung >= 0, best.candidate != given.candidate, document,
+        best.rung >= 0,
+        best.candidate != given.candidate,
+        document,
+        entry(given),
+        entry(best),
         _figure(search, given, best),
-    )  # fmt: skip
+    )
+
+
+def _beyond(ladder: Sequence[Rung], one: Reached) -> str:
+    if one.beyond is None:
+        return "not examined"
+    destabilised = one.beyond.verdict == "destabilised"
+    what = f"{one.beyond.text} destabilises" if destabilised else "undecided"
+    return f"{ladder[one.rung + 1].name}: {what}"
+
+
+def _document(found: Stability | None) -> dict[str, object] | None:
+    return found and found._asdict() | {"pattern": found.text, "verdict": found.verdict}
 
 
 def _figure(search: NetworkSearch, given: Reached, best: Reached) -> FigureDescription:
