@@ -2,12 +2,11 @@
 
 import argparse
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from benchmarks.report import Peer, Row, benchmark
 from cosim.shipped_files import find_shipped
-from cosim.studies.design.event_design import EventDesign, EventSearch
-from cosim.studies.design.network_page import design_for_network
+from cosim.studies.design.event_design import EventSearch, design_for_network
 from cosim.studies.design.network_search import Wish
 from noack.scenario.scenario_file import load
 
@@ -49,9 +48,8 @@ def network_design(options: argparse.Namespace) -> Iterator[Row]:
             wish = Wish(bounds={"state": bound})
             kind = f"events, sup‖x‖ ≤ {bound:.4g} certified"
         found = design_for_network(given, wish)
-        loops: list[Any] = [found.document()[loop] for loop in ("given", "best")]
         about = f"{' '.join((name, *settings[:1]))}, {kind}"
         keys = {"certified": "M", "cost": "cost", "transmissions": "transmissions"}
-        for key in list(keys)[: None if isinstance(found, EventDesign) else 2]:
-            before, after = (float(loop[key] or 0) for loop in loops)
+        for key in [key for key in keys if key in found.given]:
+            before, after = (float(loop[key] or 0) for loop in (found.given, found.best))
             yield Row(f"{about}: {keys[key]}", after, "", Peer("given loop", before))

@@ -29,6 +29,7 @@ with lazy_modules():
         design_page,
         design_search,
         design_space,
+        event_design,
         network_page,
         network_search,
     )
@@ -243,11 +244,16 @@ class NetworkOptions:
             raise CallerError(f"--share: must be positive, not {self.share:g}")
         return network_search.Wish(
             goal="transmissions" if self.aim is DesignAim.TRANSMISSIONS else "network",
-            window=self.window, most=self.most, transmissions=self.share,
-            period_s=self.period, cost=self.cost, bounds=bounds,
-            weights=weights, modes=[mode for mode in network_search.MODES if mode in modes],
+            window=self.window,
+            most=self.most,
+            transmissions=self.share,
+            period_s=self.period,
+            cost=self.cost,
+            bounds=bounds,
+            weights=weights,
+            modes=[mode for mode in network_search.MODES if mode in modes],
             effort=self.effort,
-        )  # fmt: skip
+        )
 
 
 @cli.option_group
@@ -340,6 +346,23 @@ def design(
             figure_files,
             json,
         )
+    return _design_for_settling(
+        loaded, wanted, weights, feedback, draws, seed, out, page, figure_files, json
+    )
+
+
+def _design_for_settling(
+    loaded: "scenario.Scenario",
+    wanted: LimitOptions,
+    weights: str,
+    feedback: GainOptions,
+    draws: int,
+    seed: int,
+    out: Path | None,
+    page: Path | None,
+    figure_files: "figure_format.FigureFiles | None",
+    json: bool,
+) -> int:
     loaded.decaying  # noqa: B018 - raises for another policy
     limits = wanted.limits()
     norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
@@ -367,13 +390,12 @@ def _design_for_network(
     json: bool,
 ) -> int:
     with progress.work_bar("trying gains") as bar:
-        found = network_page.design_for_network(loaded, wish, seed, bar)
+        found = event_design.design_for_network(loaded, wish, seed, bar)
     path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}-network.html"
     written = network_page.write_page(found, path, figure_files)
     if out is not None and found.is_certified:
-        text = scenario_file.dumps(network_page.written_scenario(found))
-        written.append(write_whole(out, text))
-    cli.show_with_files(json, found.document(), written, network_page.print_design, found)
+        written.append(write_whole(out, found.written()))
+    cli.show_with_files(json, found.to_json(), written, network_page.print_design, found)
     return ExitStatus.OK if found.is_certified else ExitStatus.FAILED
 
 

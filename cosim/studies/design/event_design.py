@@ -10,35 +10,41 @@ searched together without gradients (Nelder and Mead). The result is measured on
 """
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from cosim.output import palette
-from cosim.output.figure_description import Axis, FigureDescription, Line, Panel, one_panel
+from cosim.output.figure_description import Axis, FigureDescription, Line, Panel
+from cosim.output.palette import LOST, NETWORK
 from cosim.simulation.exact_simulation import Population, run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.design_search import WORDS, bounds_of
 from cosim.studies.design.design_space import lqr_gain
-from cosim.studies.design.network_search import COSTS_OF_INPUT, Progress, Wish, scaled_steps
+from cosim.studies.design.network_page import DesignOutcome, figure_of, gain_text
+from cosim.studies.design.network_search import (
+    COSTS_OF_INPUT,
+    NetworkSearch,
+    Progress,
+    Wish,
+    periodic_outcome,
+    scaled_steps,
+)
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector, spectral_abscissa
 from noack.core.number_format import NONE
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import toml_text
 from noack.settings.section import Rows, rows_of
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify, certify_box
+from noack.trigger.decaying import DecayingSettings
 
 DRAWS = 200
 _ALPHAS = (1.0, 0.5)
 """Factors of α of the starts."""
 _STARTS = 3
-_HEIGHT_IN = 3.8
 _FORBIDDEN = 1e3
 _MOST_M = 1000
 
@@ -100,8 +106,9 @@ class EventSearch:
             update={"alpha_per_s": loop.alpha_per_s, "beta": loop.beta}
         )
         update: dict[str, object] = {
-            "model": one.model.model_copy(update={"gain": loop.K}), "trigger": trigger,
-        }  # fmt: skip
+            "model": one.model.model_copy(update={"gain": loop.K}),
+            "trigger": trigger,
+        }
         if m is not None:
             update["network"] = one.network.model_copy(update={"mansd": m - 1})
         return one.model_copy(update=update)
@@ -239,135 +246,98 @@ def _rounded(entries: Vector, like: EventLoop, alpha_per_s: float, beta: float) 
     return EventLoop(K, alpha_per_s, beta)
 
 
-@dataclass(frozen=True)
-class EventDesign:
-    """The given loop and the best one found, with the M that they are certified for."""
+def event_outcome(search: EventSearch, given: Certified, best: Certified) -> DesignOutcome:
+    """Return what is shown of a search."""
+    limits = search.limits
+    is_network = search.wish.goal == "network"
 
-    search: EventSearch
-    given: Certified
-    best: Certified
+    def entry(one: Certified) -> dict[str, object]:
+        return {"certified": one.m or None, **one.loop._asdict(), **one.measured._asdict()}
 
-    @property
-    def name(self) -> str:
-        """Name of the given scenario."""
-        return self.search.scenario.name
+    plants = "for the whole box" if search.of_box else "for the scenario's own plant"
+    sent = f"{given.measured.transmissions:.4g} to {best.measured.transmissions:.4g}"
+    before, after = (_reach(search, one) for one in (given, best))
+    verdict = f"certified {plants}: {before} before, {after} after; transmissions {sent}"
+    if best.loop == given.loop:
+        verdict = f"{after} for the given loop; no better one was found"
+    limit = f"a mean cost of at most {limits.cost:.4g}"
+    limit += f", at most {limits.transmissions:.4g} transmissions" if is_network else ""
+    for name, most in search.wish.bounds.items():
+        limit += f", {WORDS[name]} ≤ {most:g} certified"
+    document: dict[str, object] = {
+        "goal": search.wish.goal,
+        "of_box": search.of_box,
+        "limits": limits._asdict(),
+        "tried": search.tried,
+        "judged": search.judged,
+    }
+    notes = [
+        f"the best of {search.tried:,} loops tried with {limit}; its certificate is proven, that "
+        "it is the best is not",
+        "costs and transmissions are means over fresh draws with the scenario's own network",
+    ]
+    return DesignOutcome(
+        search.scenario.name,
+        verdict,
+        notes,
+        (_cells(search, given), _cells(search, best)),
+        search.scenario_of(best.loop, best.m if is_network and best.m else None),
+        best.m > 0,
+        best.loop != given.loop,
+        document,
+        entry(given),
+        entry(best),
+        _figure(search, given, best),
+    )
 
-    @property
-    def is_certified(self) -> bool:
-        """Whether the best loop has a certificate for some M."""
-        return self.best.m > 0
 
-    @property
-    def is_better(self) -> bool:
-        """Whether it is another loop than the given one."""
-        return self.best.loop != self.given.loop
+def _reach(search: EventSearch, one: Certified) -> str:
+    top = ", the most examined" if one.m == search.most else ""
+    return f"M = {one.m}{top}" if one.m else "nothing certified"
 
-    @property
-    def _plants(self) -> str:
-        return "for the whole box" if self.search.of_box else "for the scenario's own plant"
 
-    @cached_property
-    def verdict(self) -> str:
-        """The verdict in one line."""
-        before, after = (self._m(one) for one in (self.given, self.best))
-        if not self.is_certified:
-            return "no loop was found that has a certificate"
-        if not self.is_better:
-            return f"{after} for the given loop; no better one was found"
-        sent = f"{self.given.measured.transmissions:.4g} to {self.best.measured.transmissions:.4g}"
-        return f"certified {self._plants}: {before} before, {after} after; transmissions {sent}"
+def _cells(search: EventSearch, one: Certified) -> dict[str, str]:
+    def bound(m: int) -> str:
+        value = search.state_bound(one.loop, m) if m else math.inf
+        return f"{value:.4g}" if value < math.inf else NONE
 
-    def _m(self, one: Certified) -> str:
-        if not one.m:
-            return "nothing certified"
-        return f"M = {one.m}" + (", the most examined" if one.m == self.search.most else "")
+    own = search.scenario.network.mansd + 1
+    return {
+        "certified for": _reach(search, one),
+        "sup‖x‖ there at most": bound(one.m),
+        f"sup‖x‖ with M = {own} at most": bound(own),
+        "cost, mean": f"{one.measured.cost:.4g}",
+        "transmissions, mean": f"{one.measured.transmissions:.4g}",
+        "α [1/s]": f"{one.loop.alpha_per_s:.4g}",
+        "β": f"{one.loop.beta:.4g}",
+        "K": gain_text(one.loop.K),
+    }
 
-    @property
-    def notes(self) -> list[str]:
-        """What the reader should know of the search."""
-        limits = self.search.limits
-        limit = f"a mean cost of at most {limits.cost:.4g}"
-        if self.search.wish.goal == "network":
-            limit += f", at most {limits.transmissions:.4g} transmissions"
-        for name, most in self.search.wish.bounds.items():
-            limit += f", {WORDS[name]} ≤ {most:g} certified"
-        return [
-            f"the best of {self.search.tried:,} loops tried with {limit}; its certificate is "
-            "proven, that it is the best is not",
-            "costs and transmissions are means over fresh draws with the scenario's own network",
-        ]
 
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario of the best loop, with the M that it is certified for."""
-        m = self.best.m if self.search.wish.goal == "network" and self.best.m else None
-        return self.search.scenario_of(self.best.loop, m)
-
-    @property
-    def lines(self) -> str:
-        """What to change in the scenario, as TOML."""
-        loop = self.best.loop
-        content: dict[str, object] = {
-            "model": {"gain": [list(row) for row in loop.K]},
-            "trigger": {"alpha_per_s": loop.alpha_per_s, "beta": loop.beta},
-            "network": {"mansd": self.scenario.network.mansd},
-        }
-        return toml_text(content)
-
-    def rows(self) -> list[tuple[str, str, str]]:
-        """Return the comparison of both loops."""
-        both = (self.given, self.best)
-
-        def row(heading: str, *cells: str) -> tuple[str, str, str]:
-            return heading, cells[0], cells[1]
-
-        def bound(one: Certified, m: int) -> str:
-            value = self.search.state_bound(one.loop, m) if m else math.inf
-            return f"{value:.4g}" if value < math.inf else NONE
-
-        own = self.search.scenario.network.mansd + 1
-        return [
-            row("certified for", *(self._m(one) for one in both)),
-            row("sup‖x‖ there at most", *(bound(one, one.m) for one in both)),
-            row(f"sup‖x‖ with M = {own} at most", *(bound(one, own) for one in both)),
-            row("cost, mean", *(f"{one.measured.cost:.4g}" for one in both)),
-            row("transmissions, mean", *(f"{one.measured.transmissions:.4g}" for one in both)),
-            row("α [1/s]", *(f"{one.loop.alpha_per_s:.4g}" for one in both)),
-            row("β", *(f"{one.loop.beta:.4g}" for one in both)),
-            row("K", *("\n".join(" ".join(f"{entry:.6g}" for entry in line) for line in one.loop.K)
-                       for one in both)),
-        ]  # fmt: skip
-
-    def document(self) -> dict[str, object]:
-        """Return the result as JSON."""
-
-        def loop(one: Certified) -> dict[str, object]:
-            return {"certified": one.m or None, **one.loop._asdict(), **one.measured._asdict()}
-
-        search = self.search
-        return {
-            "scenario": self.name, "goal": search.wish.goal, "of_box": search.of_box,
-            "limits": search.limits._asdict(), "tried": search.tried, "judged": search.judged,
-            "given": loop(self.given), "best": loop(self.best), "verdict": self.verdict,
-            "lines": self.lines,
-        }  # fmt: skip
-
-    def figure(self) -> FigureDescription:
-        """Describe the certified bounds of ‖x‖ over M, which end where the certificate does."""
-        most = max(self.given.m, self.best.m, 2)
-        numbers = np.unique(np.geomspace(1, most, 30).round().astype(int))
-        items = [
-            Line(x=numbers.astype(float), colour=colour, label=label, marker="o", size=3.0,
-                 y=np.array([self.search.state_bound(one.loop, int(m)) for m in numbers]))
-            for one, label, colour in (
-                (self.given, "given", palette.NETWORK), (self.best, "designed", palette.LOST),
-            )
-        ]  # fmt: skip
-        panel = Panel(
-            items=items,
-            x=Axis(label="M", logarithmic=True),
-            y=Axis(label="certified sup‖x‖", logarithmic=True),
+def _figure(search: EventSearch, given: Certified, best: Certified) -> FigureDescription:
+    """Describe the certified bounds of ‖x‖ over M, which end where the certificate does."""
+    numbers = np.unique(np.geomspace(1, max(given.m, best.m, 2), 30).round().astype(int))
+    items = []
+    for one, label, colour in ((given, "given", NETWORK), (best, "designed", LOST)):
+        bounds = np.array([search.state_bound(one.loop, int(m)) for m in numbers])
+        items.append(
+            Line(x=numbers.astype(float), y=bounds, colour=colour, label=label, marker="o")
         )
-        return one_panel("certified", panel, _HEIGHT_IN).captioned(
-            "Certified bound of the state over M. A curve ends where its certificate does."
-        )
+    x, y = Axis(label="M", logarithmic=True), Axis(label="certified sup‖x‖", logarithmic=True)
+    caption = "Certified bound of the state over M. A curve ends where its certificate does."
+    return figure_of("certified", Panel(items=items, x=x, y=y), caption)
+
+
+def design_for_network(
+    scenario: Scenario, wish: Wish, seed: int = 0, progress: Progress = lambda share: None
+) -> DesignOutcome:
+    """Search for a loop; with a period it is time-triggered. The result is deterministic.
+
+    Raises:
+        CallerError: the scenario does not permit it, or a wish is out of range.
+    """
+    if wish.period_s is None and isinstance(scenario.trigger, DecayingSettings):
+        events = EventSearch(scenario, wish, seed)
+        return event_outcome(events, *events.run(progress))
+    search = NetworkSearch(scenario, wish)
+    return periodic_outcome(search, *search.run(progress))

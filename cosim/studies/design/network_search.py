@@ -18,12 +18,24 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from cosim.output import palette
+from cosim.output.figure_description import (
+    Axis,
+    FigureDescription,
+    Item,
+    Line,
+    Marks,
+    Panel,
+    Rule,
+)
 from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.loop_growth import PatternGraph, QuickLoop
+from cosim.studies.design.network_page import DesignOutcome, figure_of, gain_text
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.core.number_format import NONE
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
@@ -42,6 +54,12 @@ _LONGER = 1.02
 """Ratio of successive periods of the ladder, where measurements are close enough."""
 _RUNGS = 400
 _MOST_M = 16
+_MOST_POINTS = 60
+_HOLDS = {"model": "the model's input", "zoh": "hold"}
+_CAPTION = (
+    "Growth of the worst loss pattern found, per period: a lower bound, quickly computed. Below 1 "
+    "every pattern may be stable; the marks are where this is proven."
+)
 _SLACK = 0.002
 """The search wants log growth below −_SLACK: a loop at the limit takes long to judge."""
 _STARTS = 4
@@ -368,9 +386,14 @@ class NetworkSearch:
                 objective,
                 np.zeros(K.size),
                 method="Nelder-Mead",
-                options={"maxfev": most, "adaptive": True, "initial_simplex": simplex,
-                         "xatol": 1e-4, "fatol": 1e-5},
-            )  # fmt: skip
+                options={
+                    "maxfev": most,
+                    "adaptive": True,
+                    "initial_simplex": simplex,
+                    "xatol": 1e-4,
+                    "fatol": 1e-5,
+                },
+            )
         except _FoundError as found:
             return found.candidate
         return None
@@ -392,3 +415,98 @@ class _FoundError(Exception):
     def __init__(self, candidate: Candidate) -> None:
         super().__init__()
         self.candidate = candidate
+
+
+def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> DesignOutcome:
+    """Return what is shown of a search."""
+    ladder, wish = search.ladder, search.wish
+
+    def reach(one: Reached) -> str:
+        if one.rung < 0:
+            return "nothing proven"
+        return ladder[one.rung].name + (", the most examined" * (one.rung == len(ladder) - 1))
+
+    def sent(one: Reached) -> float:
+        period_ns = ladder[max(one.rung, 0)].period_ns
+        return search.scenario.timing.measurement_period_ns / period_ns
+
+    def cells(one: Reached) -> dict[str, str]:
+        found = one.found
+        return {
+            "proven stable for": reach(one),
+            "growth per period there": f"{found.lower:.5f} to {found.upper:.5f}" if found else NONE,
+            "the next one": _beyond(ladder, one),
+            "cost without losses": f"{one.cost:.4g}",
+            "share of measurements sent": f"{100 * sent(one):.3g} %",
+            "between updates": _HOLDS[one.candidate.mode],
+            "K": gain_text(one.candidate.K),
+        }
+
+    def entry(one: Reached) -> dict[str, object]:
+        certified = None if one.rung < 0 else ladder[one.rung].number
+        known = {"certified": certified, "cost": one.cost, "transmitted": sent(one)}
+        bounds = {"stability": _document(one.found), "beyond": _document(one.beyond)}
+        return {**known, **one.candidate._asdict(), **bounds}
+
+    verdict = f"stable for every loss pattern: {reach(given)} before, {reach(best)} after"
+    if best.candidate == given.candidate:
+        verdict = f"{reach(best)} for the given loop; no better one was found"
+    limit = f"{search.limit:.4g}" if math.isfinite(search.limit) else "any size"
+    note = (
+        f"the best of {search.tried:,} loops tried, with a cost of at most {limit}; what it "
+        "tolerates is proven, that it is the best is not"
+    )
+    document: dict[str, object] = {
+        "goal": wish.goal,
+        "window": wish.window,
+        "cost_limit": search.limit,
+        "tried": search.tried,
+        "judged": search.judged,
+    }
+    return DesignOutcome(
+        search.scenario.name,
+        verdict,
+        [note],
+        (cells(given), cells(best)),
+        search.scenario_of(best.candidate, best.rung),
+        best.rung >= 0,
+        best.candidate != given.candidate,
+        document,
+        entry(given),
+        entry(best),
+        _figure(search, given, best),
+    )
+
+
+def _beyond(ladder: Sequence[Rung], one: Reached) -> str:
+    if one.beyond is None:
+        return "not examined"
+    destabilised = one.beyond.verdict == "destabilised"
+    what = f"{one.beyond.text} destabilises" if destabilised else "undecided"
+    return f"{ladder[one.rung + 1].name}: {what}"
+
+
+def _document(found: Stability | None) -> dict[str, object] | None:
+    return found and found._asdict() | {"pattern": found.text, "verdict": found.verdict}
+
+
+def _figure(search: NetworkSearch, given: Reached, best: Reached) -> FigureDescription:
+    """Describe the growth of both loops over the ladder."""
+    ladder, wish = search.ladder, search.wish
+    top = min(max(best.rung, given.rung) + 4, len(ladder))
+    rungs = np.unique(np.linspace(0, top - 1, min(top, _MOST_POINTS)).astype(int))
+    numbers = np.array([one.number for one in ladder])
+    items: list[Item] = [Rule(at=1.0, colour=palette.CERTIFIED, label="stable below")]
+    for one, label, colour in ((given, "given", palette.NETWORK), (best, "designed", palette.LOST)):
+        growth = np.exp(np.minimum([search.growth(one.candidate, int(i)) for i in rungs], 1.1))
+        items.append(Line(x=numbers[rungs], y=growth, colour=colour, label=label, marker="o"))
+        if one.found is not None:
+            x, y = numbers[[one.rung]], np.array([one.found.upper])
+            about = f"{label}: proven"
+            items.append(Marks(x=x, y=y, colour=colour, marker="*", size=12, label=about))
+    along = "M" if wish.window is None else f"losses in {wish.window} updates"
+    if wish.goal == "transmissions":
+        along = "time between updates [s]"
+    x_axis = Axis(label=along, whole=wish.goal == "network")
+    panel = Panel(items=items, x=x_axis, y=Axis(label="growth per period"))
+    return figure_of("growth", panel, _CAPTION)

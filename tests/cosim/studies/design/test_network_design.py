@@ -9,15 +9,27 @@ import shlex
 from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.design.event_design import EventDesign
+from cosim.studies.design.event_design import (
+    Certified,
+    EventSearch,
+    design_for_network,
+    event_outcome,
+)
 from cosim.studies.design.loop_growth import PatternGraph
-from cosim.studies.design.network_page import NetworkDesign, design_for_network
-from cosim.studies.design.network_search import Candidate, NetworkSearch, Wish
+from cosim.studies.design.network_page import DesignOutcome
+from cosim.studies.design.network_search import (
+    Candidate,
+    NetworkSearch,
+    Reached,
+    Wish,
+    periodic_outcome,
+)
 from noack.impairments.loss_guarantee import LossesInWindow, LossGuarantee, LossHistory
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
@@ -39,13 +51,41 @@ def shipped(name: str, *settings: str) -> Scenario:
     return load(ROOT / "scenarios" / f"{name}.toml", settings)
 
 
+class Found(NamedTuple):
+    """A search with its loops and what is shown of them."""
+
+    search: NetworkSearch
+    given: Reached
+    best: Reached
+    shown: DesignOutcome
+
+
+class FoundEvents(NamedTuple):
+    """The same of a loop with events."""
+
+    search: EventSearch
+    given: Certified
+    best: Certified
+    shown: DesignOutcome
+
+
+def searched(given: Scenario, wish: Wish) -> Found:
+    search = NetworkSearch(given, wish)
+    loops = search.run()
+    return Found(search, *loops, periodic_outcome(search, *loops))
+
+
+def searched_events(given: Scenario, wish: Wish, seed: int) -> FoundEvents:
+    search = EventSearch(given, wish, seed)
+    loops = search.run()
+    return FoundEvents(search, *loops, event_outcome(search, *loops))
+
+
 @pytest.fixture(scope="module")
-def pole() -> NetworkDesign:
+def pole() -> Found:
     """The pole on a cart, by regulators alone."""
     wish = Wish(period_s=PERIOD_S, effort=0)
-    found = design_for_network(shipped("cart_pole", LINEAR), wish)
-    assert isinstance(found, NetworkDesign)
-    return found
+    return searched(shipped("cart_pole", LINEAR), wish)
 
 
 def patterns(guarantee: LossGuarantee, length: int) -> Iterator[tuple[bool, ...]]:
@@ -75,12 +115,12 @@ def growths(scenario: Scenario, guarantee: LossGuarantee, length: int) -> dict[s
     return found
 
 
-def test_no_pattern_grows_faster_than_certified(pole: NetworkDesign) -> None:
+def test_no_pattern_grows_faster_than_certified(pole: Found) -> None:
     best, search = pole.best, pole.search
     assert best.found is not None
     assert best.rung > pole.given.rung
-    guarantee = pole.scenario.network.guarantee
-    found = growths(pole.scenario, guarantee, 10)
+    guarantee = pole.shown.scenario.network.guarantee
+    found = growths(pole.shown.scenario, guarantee, 10)
     assert len(found) > 500
     assert max(found.values()) <= best.found.upper < 1
     assert max(found.values()) >= best.found.lower * (1 - 1e-3)  # its pattern is longer
@@ -90,7 +130,7 @@ def test_no_pattern_grows_faster_than_certified(pole: NetworkDesign) -> None:
 
 
 def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
-    pole: NetworkDesign,
+    pole: Found,
 ) -> None:
     beyond = pole.best.beyond
     assert beyond is not None
@@ -126,26 +166,25 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
 def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
     name: str, settings: tuple[str, ...], wish: Wish
 ) -> None:
-    found = design_for_network(shipped(name, *settings), wish)
-    assert isinstance(found, NetworkDesign)
+    found = searched(shipped(name, *settings), wish)
     given, best = found.given, found.best
     assert best.rung >= given.rung
     assert best.cost <= found.search.limit or best == given
     if best.rung >= 0:
         assert best.found is not None
-        assert LossMargin(resolve(found.scenario)).is_stable().upper < 1
-        slower = growths(found.scenario, found.scenario.network.guarantee, 6)
+        assert LossMargin(resolve(found.shown.scenario)).is_stable().upper < 1
+        slower = growths(found.shown.scenario, found.shown.scenario.network.guarantee, 6)
         assert max(slower.values()) < 1
     if name != "double_integrator":
         assert best.rung > given.rung
     if wish.window:
-        assert isinstance(found.scenario.network.guarantee.rules[-1], LossesInWindow)
+        assert isinstance(found.shown.scenario.network.guarantee.rules[-1], LossesInWindow)
 
 
 def test_the_search_is_deterministic() -> None:
     wish = Wish(period_s=PERIOD_S, effort=60)
     first, second = (
-        design_for_network(shipped("cart_pole", LINEAR), wish).document() for _ in range(2)
+        design_for_network(shipped("cart_pole", LINEAR), wish).to_json() for _ in range(2)
     )
     assert first == second
 
@@ -203,21 +242,19 @@ def test_the_written_scenario_is_checked_and_decided_as_claimed(tmp_path: Path) 
 
 
 @pytest.fixture(scope="module")
-def events() -> EventDesign:
+def events() -> FoundEvents:
     """The pendulum's own trigger and gain, and better ones, with a certified bound of ‖x‖."""
     wish = Wish(most=40, bounds={"state": 1.6}, effort=300)
-    found = design_for_network(shipped("unstable_pendulum"), wish, seed=5)
-    assert isinstance(found, EventDesign)
-    return found
+    return searched_events(shipped("unstable_pendulum"), wish, seed=5)
 
 
 def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
-    events: EventDesign,
+    events: FoundEvents,
 ) -> None:
     search, best = events.search, events.best
     assert best.m > events.given.m > 1
     assert search.of_box
-    resolved = resolve(events.scenario)
+    resolved = resolve(events.shown.scenario)
     conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
     certificate = certify_box(resolved, conditions)
     assert certificate is not None
@@ -231,12 +268,12 @@ def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
     assert best.measured.transmissions == pytest.approx(measured.transmissions, rel=0.1)
 
 
-def test_runs_with_the_claimed_m_keep_the_certified_bound(events: EventDesign) -> None:
+def test_runs_with_the_claimed_m_keep_the_certified_bound(events: FoundEvents) -> None:
     m = events.best.m
     rng = np.random.default_rng(7)
     largest = 0.0
     for seed in range(12):
-        one = events.scenario.model_copy(update={"horizon_s": 5.0})
+        one = events.shown.scenario.model_copy(update={"horizon_s": 5.0})
         plant = one.plant.model_copy(update={"initial_state_halfwidth": None, "draw": "vertex"})
         seeds = one.seeds.model_copy(update={"plant": seed})
         resolved = resolve(one.model_copy(update={"plant": plant, "seeds": seeds}))
@@ -254,9 +291,8 @@ def test_runs_with_the_claimed_m_keep_the_certified_bound(events: EventDesign) -
 
 def test_fewer_transmissions_of_events_for_the_same_network() -> None:
     given = shipped("double_integrator")
-    found = design_for_network(given, Wish("transmissions", effort=300), seed=1)
-    assert isinstance(found, EventDesign)
-    assert found.scenario.network == given.network
+    found = searched_events(given, Wish("transmissions", effort=300), seed=1)
+    assert found.shown.scenario.network == given.network
     assert found.best.measured.transmissions < 0.9 * found.given.measured.transmissions
     assert found.search.certificate(found.best.loop, given.network.mansd + 1) is not None
     assert found.best.m >= given.network.mansd + 1
