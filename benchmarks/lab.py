@@ -22,7 +22,7 @@ from benchmarks.report import Goal, MeasurementError, Rounds, Row, benchmark, me
 from tests.cosim.lab.conftest import TEXT, Page, Served
 from tools.screenshot_recording import BROWSERS, Browser
 
-ROUNDS = 3
+ROUNDS = 1
 HORIZON_S = 10.0
 ALONE, OPEN = "run without the page", "page open"
 DRAGGED, VIEWED = "a slider moves", "viewer open"

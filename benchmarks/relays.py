@@ -46,7 +46,7 @@ from benchmarks.report import (
     say,
 )
 
-ROUNDS = 40
+ROUNDS = 2
 WORDS = "loss 5% mansd 4 seed 7"
 PLAIN, SEGMENTS, DIRECT = "ours", "ours, segments", "direct, no relay"
 REVERSE = "ours, with the reverse direction"
@@ -93,7 +93,7 @@ def rows_of(rounds: Rounds) -> Iterator[Row]:
         yield rounds.row(f"{ours}: cost", "µs CPU each", "cpu_us", ours, peer, paired=True)
 
 
-FLOW_ROUNDS, FLOWS = 30, 10_000
+FLOW_ROUNDS, FLOWS = 2, 10_000
 PATHS = "C relay, a socket per client"
 
 
@@ -150,8 +150,8 @@ def flow_rows(rounds: Rounds) -> Iterator[Row]:
         )
 
 
-PING_ROUNDS, PINGS = 60, 500
-LINE_ROUNDS, LINE_ROUND_S = 8, 2
+PING_ROUNDS, PINGS = 2, 500
+LINE_ROUNDS, LINE_ROUND_S = 1, 2
 PERIOD_NS = 970_000
 """Not a divisor of the delay: else each datagram would be due when the arrival of a later one has
 just woken the relay."""

@@ -250,7 +250,7 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
             yield from memory(single, alone)
 
 
-ROUNDS = 5
+ROUNDS = 1
 OURS, IMPORTS = "noack", "Python that imports the libraries"
 _CERTIFY = (*NOACK, "certify", "lane_following")
 _IMPORT_CONTROL = (sys.executable, "-c", "import control")
