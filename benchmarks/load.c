@@ -1,4 +1,4 @@
-/* The load of the relay benchmarks, a shared library that relays.py calls.
+/* The load of the relay benchmarks, a shared library that relay_load.py calls.
  *
  * Every datagram begins with its number, a 64-bit integer. Arrival times are the kernel's
  * timestamps (SO_TIMESTAMPNS, CLOCK_REALTIME), which do not depend on when the sink is read.

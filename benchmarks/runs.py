@@ -1,7 +1,6 @@
-"""Live runs as a user starts them: start, many loops, the demo, the lab page; the installation."""
+"""Live runs as a user starts them: start, many loops, the demo; the installation."""
 
 import argparse
-import itertools
 import json
 import os
 import re
@@ -9,11 +8,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -21,7 +19,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from benchmarks.programs import FREE_PORTS, NOACK, Processes, execute, imported_s, noack
+from benchmarks.programs import NOACK, Processes, execute, imported_s, noack
 from benchmarks.report import (
     Figures,
     Goal,
@@ -37,8 +35,6 @@ from benchmarks.report import (
 )
 from cosim.record.run_directory import LATEST
 from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
-from tests.cosim.lab.conftest import TEXT, Page, Served
-from tools.screenshot_recording import BROWSERS, Browser
 
 ROOT = Path(__file__).parents[1]
 CAP = 2
@@ -254,7 +250,7 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
             yield from memory(single, alone)
 
 
-ROUNDS = 5
+ROUNDS = 1
 OURS, IMPORTS = "noack", "Python that imports the libraries"
 _CERTIFY = (*NOACK, "certify", "lane_following")
 _IMPORT_CONTROL = (sys.executable, "-c", "import control")
@@ -398,193 +394,3 @@ def clone(options: argparse.Namespace) -> Iterator[Row]:
     compiler = "gcc present" if shutil.which("cc") else "no C compiler"
     yield Row(f"make demo from a clean clone to its verdict, {compiler}", spent_s, "s",
               goal=Goal("<=", 60))  # fmt: skip
-
-
-LAB_ROUNDS = 3
-HORIZON_S = 10.0
-ALONE, OPEN = "run without the page", "page open"
-DRAGGED, VIEWED = "a slider moves", "viewer open"
-_MOVE_S = 0.05
-_KEYS = [("ArrowLeft", 37)] * 20 + [("ArrowRight", 39)] * 20
-_SLIDER = "document.getElementById('lab-set-network.loss.probability')"
-_BUSY = 4
-_STROKES, _STROKE_S = 40, 0.15
-_DRAGGED = "document.getElementById('lab-set-trigger.beta')"
-_BOX = f"""(slider => {{
-  slider.scrollIntoView({{ block: "center" }});
-  const r = slider.getBoundingClientRect();
-  return [r.x, r.y + r.height / 2, r.width];
-}})({_DRAGGED})"""
-_NOTE_STROKES = """
-window.STROKES = [];
-let movedAt = 0;
-const NOTE = event => { movedAt = event.timeStamp; };
-addEventListener("pointermove", NOTE, true);
-const show = LabFigure.prototype.show;
-LabFigure.prototype.show = function (content) {
-  show.call(this, content);
-  const at = movedAt;
-  movedAt = 0;
-  if (at) requestAnimationFrame(() => {  // a message follows when the frame has been painted
-    const painted = new MessageChannel();
-    painted.port1.onmessage = () => STROKES.push(performance.now() - at);
-    painted.port2.postMessage(0);
-  });
-};
-0
-"""
-
-_DRAW_ALONE = """
-removeEventListener("pointermove", NOTE, true);
-STROKES.length = 0;
-const canvases = [...document.querySelectorAll("#lab-figure canvas")].map(one => {
-  const made = document.createElement("canvas");
-  [made.width, made.height] = [one.width, one.height];
-  return made;
-});
-const pens = canvases.map(one => one.getContext("2d", {willReadFrequently: true}));
-document.body.replaceChildren(...canvases);
-let moved = 0;
-addEventListener("pointermove", event => {
-  pens.forEach((pen, i) => {
-    const {width, height} = canvases[i];
-    pen.clearRect(0, 0, width, height);
-    pen.beginPath();
-    for (let x = 0; x < width; x++) pen.lineTo(x, (0.5 + 0.4 * Math.sin(x / 90 + moved)) * height);
-    pen.stroke();
-  });
-  moved++;
-  requestAnimationFrame(() => {
-    const painted = new MessageChannel();
-    painted.port1.onmessage = () => STROKES.push(performance.now() - event.timeStamp);
-    painted.port2.postMessage(0);
-  });
-});
-0
-"""
-"""Leaves only the canvases on the page, each with a curve that moves with the mouse."""
-
-
-@contextmanager
-def _opened(folder: Path, *settings: str) -> Iterator[Page]:
-    """Show the lab page in a headless browser."""
-    program = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if program is None:
-        raise MeasurementError("no Chromium or Chrome")
-    browser = Browser(program, str(folder / "profile"))
-    with closing(browser), Served(folder, "lane_following", *settings, *FREE_PORTS) as server:
-        page = Page(browser, server.address)
-        page.wait(f"{TEXT}.includes('certified')")
-        yield page
-
-
-@contextmanager
-def _moving(page: Page) -> Iterator[None]:
-    """Move a slider to and fro meanwhile."""
-    ended = threading.Event()
-
-    def move() -> None:
-        page.js(f"{_SLIDER}.focus()")
-        for key, code in itertools.cycle(_KEYS):
-            if ended.wait(_MOVE_S):
-                return
-            page.press(key, code)
-
-    mover = threading.Thread(target=move)
-    mover.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        mover.join()
-
-
-def _strokes_ms(page: Page, prepared: str, x: float, y: float, width: float) -> list[float]:
-    """Drag a slider; return the times from each move to its curve on the screen."""
-    page.js(prepared)
-
-    def mouse(kind: str, share: float) -> None:
-        page.call("Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y, button="left",
-                  buttons=1, clickCount=1)  # fmt: skip
-
-    mouse("mousePressed", 0.5)
-    time.sleep(1)  # the curve of this place is drawn
-    for i in range(1, _STROKES + 1):
-        mouse("mouseMoved", 0.5 + 0.005 * i)
-        time.sleep(_STROKE_S)
-    return [float(stroke_ms) for stroke_ms in page.js("STROKES")]
-
-
-def summary_of(side: str, folder: Path) -> dict[str, Any]:
-    """Run a side; return the summary."""
-    settings = ("--set", f"horizon_s={HORIZON_S}")
-    arguments = ("run", "lane_following", *settings)
-    if side == ALONE:
-        return noack(*arguments).summary
-    with _opened(folder, *settings) as page:
-        if side == OPEN:
-            return noack(*arguments).summary
-        if side == DRAGGED:
-            with _moving(page):
-                return noack(*arguments).summary
-        for button in ("live", "run live"):
-            page.press_button(button)
-        page.wait(f"{TEXT}.includes('completed {HORIZON_S:g} s')")
-    found: dict[str, Any] = json.loads((folder / "runs/latest/summary.json").read_bytes())
-    return found
-
-
-@contextmanager
-def _busy(processes: int) -> Iterator[None]:
-    """Keep the processor busy meanwhile."""
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
-    try:
-        yield
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
-
-
-@benchmark("stroke", "From a moved slider of the lab page to its curve on the screen")
-def stroke(options: argparse.Namespace) -> Iterator[Row]:
-    """Measure the median time from a move of a dragged slider until its curve is painted.
-
-    A frame of the browser is 17 ms. It draws by the processor, without a graphics card. Beside it,
-    the time of a page that has only the same canvases, draws a curve in each and asks nobody.
-    """
-    for name, processes, goal_ms in (("idle", 0, 60), (f"{_BUSY} busy processes", _BUSY, 120)):
-        say(name)
-        with (
-            tempfile.TemporaryDirectory(prefix="noack-bench-") as folder,
-            _opened(Path(folder), "--set", "horizon_s=20") as page,
-            _busy(processes),
-        ):
-            place = page.js(_BOX)
-            median_ms = median(_strokes_ms(page, _NOTE_STROKES, *place))
-            alone_ms = median(_strokes_ms(page, _DRAW_ALONE, *place))
-        yield Row(f"moved slider to painted curve, {name}", median_ms, "ms",
-                  goal=Goal("<=", goal_ms))  # fmt: skip
-        yield Row(f"moved mouse to a curve of the browser alone, {name}", alone_ms, "ms")
-
-
-@benchmark("lab", "A live run while the lab page is open")
-def lab(options: argparse.Namespace) -> Iterator[Row]:
-    """Measure the lateness of a live run while the lab page is open: it must not disturb the loop.
-
-    A run of the paper's example is measured alone; while the page is open in a headless browser;
-    while a slider of it moves without pause; and started by the page, which then shows the viewer.
-    Without a graphics card the browser draws by the processor, which is the worst case.
-    """
-    rounds, sides, roles = Rounds(), (ALONE, OPEN, DRAGGED, VIEWED), ("plant", "controller")
-    for i, side in itertools.product(range(LAB_ROUNDS), sides):
-        say(f"round {i + 1} of {LAB_ROUNDS}: {side}")
-        with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
-            summary = summary_of(side, Path(folder))
-        if summary["exit"]["status"] != 0:
-            raise MeasurementError(f"the run ended: {summary['exit']['reason']}")
-        late = summary["loops"][0]["lateness_us"]
-        rounds.add(side, {role: late[role]["p99"] for role in roles})
-    for side, role in itertools.product(sides[1:], roles):
-        name = f"{role} lateness, p99, {side}"
-        yield rounds.row(name, "µs", role, side, ALONE, Goal("<=", 1.2), paired=True)

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from benchmarks import relays
-from benchmarks.relays import (
+from benchmarks import relay_load, relays
+from benchmarks.relay_load import (
     Built,
     Burst,
     Ends,
@@ -81,7 +81,7 @@ def test_all_send_methods_continue_the_numbering(
     for count in (70, 70, 70, 0):
         ends.soak(state, 5, count, 1000)
     assert (state.sent, state.received, state.longest_gap) == (1050, 1050, 0)
-    monkeypatch.setattr(relays, "_PATIENCE_NS", 1_000_000)
+    monkeypatch.setattr(relay_load, "_PATIENCE_NS", 1_000_000)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:  # which does not reply
         mine.bind(("127.0.0.1", 0))
         ends.connect(mine.getsockname()[1])

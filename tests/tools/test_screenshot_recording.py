@@ -12,9 +12,9 @@ from PIL import Image
 
 import noack
 from cosim.output import palette
+from tools.screenshot_recording import BROWSERS
 
 TOOL = Path(__file__).parents[2] / "tools" / "screenshot_recording.py"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 CAR, SENSOR, CONTROLLER = palette.PLANT, palette.SENSOR, palette.CONTROLLER
 
 
