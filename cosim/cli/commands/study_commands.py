@@ -1,6 +1,5 @@
 """``noack campaign``, ``paper``, ``design``, ``capacity``: studies, which make many runs."""
 
-import json as json_module
 import math
 import re
 from collections.abc import Sequence
@@ -181,7 +180,7 @@ class GainOptions:
             raise CallerError(f'--gain: given or lqr, not "{self.gain}"')
         if self.gain == "lqr":
             n, m = given.model.dimensions
-            return _matrix("--Q", self.Q, n), _matrix("--R", self.R, m)
+            return cli.weight_matrix("--Q", self.Q, n), cli.weight_matrix("--R", self.R, m)
         if self.Q or self.R:
             raise CallerError("--Q, --R: are for --gain lqr only")
         return None
@@ -234,26 +233,6 @@ def design(
     if not found.confirmed:
         print_to_stderr(f"noack: {found.verdict()}")
     return ExitStatus.OK if found.confirmed else ExitStatus.FAILED
-
-
-def _matrix(option: str, text: str | None, size: int) -> "linear_systems.Matrix":
-    import numpy as np  # help and completion need none
-
-    if text is None:
-        return np.eye(size)
-    try:
-        value = np.array(scenario_file.value_of(text, option), dtype=np.float64)
-    except (CallerError, ValueError, TypeError):
-        value = np.empty(0)
-    if value.ndim == 1:
-        value = np.diag(value)
-    if value.shape != (size, size) or not np.isfinite(value).all():
-        example = json_module.dumps([1] * size)
-        raise CallerError(
-            f"{option} {text}: expected {size} x {size} numbers by rows, or {size} for the "
-            f"diagonal, e.g. '{example}'"
-        )
-    return value
 
 
 @cli.option_group

@@ -55,6 +55,16 @@ class LoopTimes(NamedTuple):
         """Time from the last tick before ``t_ns`` to ``t_ns``, above 0."""
         return (t_ns - self.phase_ns - 1) % self.tick_ns + 1
 
+    def occurrences(self, from_ns: int, until_ns: int) -> list[tuple[int, bool]]:
+        """Return the times of ticks (True) and of the plant's steps (False) in their order.
+
+        A tick at the end and a step at the start are excluded.
+        """
+        first = -(-(from_ns - self.phase_ns) // self.tick_ns)
+        ticks = range(first * self.tick_ns + self.phase_ns, until_ns, self.tick_ns)
+        steps = range((from_ns // self.step_ns + 1) * self.step_ns, until_ns + 1, self.step_ns)
+        return sorted([(t_ns, False) for t_ns in steps] + [(t_ns, True) for t_ns in ticks])
+
 
 class TimeTriggeredLoop:
     """The maps of a loop with the matrices A, (n, n), B, (n, m), K, (m, n), and H, (n, n)."""
@@ -165,14 +175,9 @@ class TimeTriggeredLoop:
         return rest @ power(self._occurrences(from_ns, from_ns + self._cycle_ns), cycles)
 
     def _occurrences(self, from_ns: int, until_ns: int) -> FixedPointMatrix:
-        times = self.times
-        first = -(-(from_ns - times.phase_ns) // times.tick_ns)
-        ticks = range(first * times.tick_ns + times.phase_ns, until_ns, times.tick_ns)
-        steps = range((from_ns // times.step_ns + 1) * times.step_ns, until_ns + 1, times.step_ns)
-        both = [(t_ns, 0, self._latch) for t_ns in steps]
-        both += [(t_ns, 1, self._tick) for t_ns in ticks]
         result, now_ns = fixed(np.eye(len(self._latch.entries))), from_ns
-        for t_ns, _, occurrence in sorted(both, key=lambda occurrence: occurrence[:2]):
+        for t_ns, is_tick in self.times.occurrences(from_ns, until_ns):
+            occurrence = self._tick if is_tick else self._latch
             result = occurrence @ self._flow(t_ns - now_ns) @ result
             now_ns = t_ns
         return self._flow(until_ns - now_ns) @ result

@@ -1,10 +1,11 @@
 """A time-triggered loop with random, unlimited losses: its growth in mean square and almost surely.
 
 From one transmission to the next the state z = (x, x_c, u, w) of the loop becomes M₀z if the update
-is delivered and M₁z if it is lost. The losses are a chain with matrix P and the probability ℓ_j of
-a loss in state j. The second moments X_j = E[z zᵀ; state j] therefore follow
+is delivered and M₁z if it is lost. The outcomes are a chain of states; P_ij is the probability that
+state j follows state i and the update is delivered, L_ij the same for a loss. The second moments
+X_j = E[z zᵀ; state j] therefore follow
 
-    X_j ← Σ_i P_ij (ℓ_j M₁ X_i M₁ᵀ + (1 − ℓ_j) M₀ X_i M₀ᵀ),
+    X_j ← Σ_i (L_ij M₁ X_i M₁ᵀ + P_ij M₀ X_i M₀ᵀ),
 
 and E‖z‖² grows exactly like the powers of this operator's spectral radius. Almost surely, ‖z‖ grows
 per period by at most the root of that (Jensen). If the losses are independent, another bound is
@@ -14,19 +15,21 @@ What bursts add that are too long to be listed is bounded by a geometric series.
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.impairments.loss_prediction import LossProcess
+from noack.impairments.loss_guarantee import LossGuarantee
+from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.contraction import Stack
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.loss_margin import LossMargin
 from noack.theory.margins.switched_system import Edge, SwitchedSystem
 
-_MOST_ENTRIES = 2600
+_MOST_ENTRIES = 2000
 """Largest size of the operator's matrix."""
 _ABOVE = 1e-7
 """The upper bound of the growth is this share above the computed one."""
@@ -72,7 +75,8 @@ def random_growth(margin: LossMargin, losses: LossProcess) -> RandomGrowth:
     if len(slots) > _MOST_SLOTS:
         raise NotPredictableError("the times of the loop repeat only after many periods")
     maps = [(margin.loop.period(slot, True), margin.loop.period(slot, False)) for slot in slots]
-    mean_square = almost_sure = mean_square_growth(maps, losses)
+    unlimited = losses.outcomes(LossGuarantee())
+    mean_square = almost_sure = mean_square_growth(maps, unlimited)
     p = losses.largest_probability
     if len(slots) == 1 and losses.is_independent and 0 < p < _MOST_LIKELY:
         bursts = range(math.ceil(math.log(_LEAST_LIKELY) / math.log(p)))
@@ -82,23 +86,24 @@ def random_growth(margin: LossMargin, losses: LossProcess) -> RandomGrowth:
     return RandomGrowth(mean_square, almost_sure)
 
 
-def mean_square_growth(maps: Sequence[tuple[Matrix, Matrix]], losses: LossProcess) -> float:
+def mean_square_growth(maps: Sequence[tuple[Matrix, Matrix]], outcomes: OutcomeChain) -> float:
     """Return the growth of √(E‖z‖²) per period, as an upper bound that is exact up to 1e-6.
 
     Args:
         maps: M₀ (delivered) and M₁ (lost), (N, N) each, for every slot: period k uses the pair
             k modulo their number.
-        losses: the losses.
+        outcomes: of the updates.
 
     Raises:
         NotPredictableError: there are too many states.
     """
     size = len(maps[0][0])
-    if len(losses.start) * size**2 > _MOST_ENTRIES:
-        raise NotPredictableError("loop and losses together have too many states to compute with")
-    operator = np.eye(len(losses.start) * size**2)
-    for delivered, lost in maps:
-        operator = _second_moments(delivered, lost, losses) @ operator
+    # In these coordinates no direction grows much more than others, so the check below is accurate.
+    edges = tuple(Edge(0, 0, exactly(map_)) for slot in maps for map_ in slot)
+    T = SwitchedSystem(edges).balancing()[0]
+    turned = T @ np.array(maps) @ np.linalg.inv(T)
+    steps = (second_moments(delivered, lost, outcomes) for delivered, lost in turned)
+    operator = reduce(lambda before, step: step @ before, steps)
     if not np.isfinite(operator).all():
         raise NotPredictableError("the loop's second moments exceed 1e308 within a few periods")
     radius = float(np.abs(np.linalg.eigvals(operator)).max())
@@ -108,14 +113,38 @@ def mean_square_growth(maps: Sequence[tuple[Matrix, Matrix]], losses: LossProces
     return float((radius * (1 + 2 * _ABOVE)) ** (0.5 / len(maps)))
 
 
-def _second_moments(delivered: Matrix, lost: Matrix, losses: LossProcess) -> Matrix:
-    """Return the operator of one period on the stacked X_j, by Kronecker products."""
-    pairs = (losses.lost, np.kron(lost, lost)), (1 - losses.lost, np.kron(delivered, delivered))
-    size = len(pairs[0][1]) * len(losses.start)
-    operator = np.zeros((size, size))
-    for share, step in pairs:
-        operator += np.kron((losses.moves * share).T, step)
-    return operator
+def second_moments(delivered: Matrix, lost: Matrix, outcomes: OutcomeChain) -> Matrix:
+    """Return the operator of one period on the stacked upper triangles of X_j.
+
+    Raises:
+        NotPredictableError: there are too many states.
+    """
+    size = len(delivered)
+    if len(outcomes.lost) * size * (size + 1) // 2 > _MOST_ENTRIES:
+        raise NotPredictableError("loop and losses together have too many states to compute with")
+    operator = np.kron(outcomes.lost.T, _on_triangle(lost))
+    return np.asarray(operator + np.kron(outcomes.delivered.T, _on_triangle(delivered)))
+
+
+def _on_triangle(matrix: Matrix) -> Matrix:
+    """Return the map of the upper triangle of X to that of M X Mᵀ."""
+    i, j = np.triu_indices(len(matrix))
+    straight = matrix[np.ix_(i, i)] * matrix[np.ix_(j, j)]
+    return np.asarray(straight + matrix[np.ix_(i, j)] * matrix[np.ix_(j, i)] * (i != j))
+
+
+def from_triangles(entries: Vector, size: int) -> Stack:
+    """Return the symmetric matrices with these upper triangles, (number, size, size)."""
+    i, j = np.triu_indices(size)
+    stack = np.zeros((len(entries) // len(i), size, size))
+    stack[:, i, j] = stack[:, j, i] = entries.reshape(-1, len(i))
+    return stack
+
+
+def triangles(stack: Stack) -> Vector:
+    """Return the upper triangles of symmetric matrices, one after the other."""
+    i, j = np.triu_indices(stack.shape[-1])
+    return stack[:, i, j].ravel()
 
 
 def _check(operator: Matrix, bound: float, size: int) -> None:
@@ -124,10 +153,11 @@ def _check(operator: Matrix, bound: float, size: int) -> None:
     Raises:
         NotPredictableError: the check fails numerically.
     """
-    identity = np.tile(np.eye(size).ravel(), len(operator) // size**2)
-    solution = np.linalg.solve(bound * np.eye(len(operator)) - operator, identity)
-    forms, images = (stack.reshape(-1, size, size) for stack in (solution, operator @ solution))
-    forms, images = ((form + form.transpose(0, 2, 1)) / 2 for form in (forms, images))
+    modes = 2 * len(operator) // (size * (size + 1))
+    identity = triangles(np.tile(np.eye(size), (modes, 1, 1)))
+    resolvent = bound * np.eye(len(operator)) - operator
+    solution = np.asarray(np.linalg.solve(resolvent, identity), dtype=np.float64)
+    forms, images = (from_triangles(part, size) for part in (solution, operator @ solution))
     rounding = 1e-13 * len(operator) * float(np.abs(forms).max()) * max(bound, 1.0)
     for positive in (forms, bound * forms - images):
         if not float(np.linalg.eigvalsh(positive).min()) > rounding:

@@ -5,7 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from noack.impairments.loss_prediction import LossProcess
+from noack.impairments.loss_guarantee import LossGuarantee
+from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
@@ -56,12 +57,16 @@ def losses(start: list[float], moves: list[list[float]], lost: list[float]) -> L
     return LossProcess(np.array(start), np.array(moves), np.array(lost))
 
 
+def unlimited(process: LossProcess) -> OutcomeChain:
+    return process.outcomes(LossGuarantee())
+
+
 BURSTY = losses([0.8, 0.2], [[0.9, 0.1], [0.4, 0.6]], [0.05, 0.8])
 
 
 @pytest.mark.parametrize("p", [0.0, 0.2, 0.6, 1.0])
 def test_a_scalar_grows_as_the_mean_of_its_squares(p: float) -> None:
-    found = mean_square_growth([(np.array([[0.5]]), np.array([[1.4]]))], independent(p))
+    found = mean_square_growth([(np.array([[0.5]]), np.array([[1.4]]))], unlimited(independent(p)))
     assert found == pytest.approx(((1 - p) * 0.25 + p * 1.96) ** 0.5, rel=1e-6)
 
 
@@ -85,7 +90,7 @@ def test_the_second_moment_of_all_patterns_grows_like_the_spectral_radius(
         return total
 
     grown = (second_moment(12) / second_moment(10)) ** 0.25
-    assert mean_square_growth(slots, process) == pytest.approx(grown, rel=0.01)
+    assert mean_square_growth(slots, unlimited(process)) == pytest.approx(grown, rel=0.01)
 
 
 def test_almost_all_runs_of_a_scalar_grow_as_the_mean_of_the_logarithm() -> None:
@@ -95,4 +100,5 @@ def test_almost_all_runs_of_a_scalar_grow_as_the_mean_of_the_logarithm() -> None
     exact = delivered ** (1 - p) * lost**p
     found = sure_growth(between, p, between[-1], np.array([[lost]]))
     assert found == pytest.approx(exact, rel=1e-6)
-    assert exact < 1 < mean_square_growth([(between[0], np.array([[lost]]))], independent(p))
+    slots = [(between[0], np.array([[lost]]))]
+    assert exact < 1 < mean_square_growth(slots, unlimited(independent(p)))
