@@ -343,6 +343,22 @@ class OutcomeChain(NamedTuple):
     lost: Array  # (n, n) Probabilities of a step whose packet is lost
     delivered: Array  # (n, n) The same of a delivery; both together are a stochastic matrix
 
+    def recurrent(self) -> "OutcomeChain":
+        """Return the states that occur again and again, in their order.
+
+        Raises:
+            NotPredictableError: which ones these are depends on the beginning.
+        """
+        from scipy.sparse.csgraph import connected_components  # slow to import
+
+        moves = self.lost + self.delivered > 0
+        _, labels = connected_components(moves, connection="strong")
+        left = labels[(moves & (labels[:, None] != labels)).any(axis=1)]
+        kept = ~np.isin(labels, left)
+        if len(set(labels[kept])) > 1:
+            raise NotPredictableError("the losses depend on what happens at the beginning")
+        return OutcomeChain(self.lost[np.ix_(kept, kept)], self.delivered[np.ix_(kept, kept)])
+
     def distribution(self, every: int = 1) -> Array:
         """Return the mean distribution before the packets 0, ``every``, 2 ``every``, …, (n,)."""
         moves = np.linalg.matrix_power(self.lost + self.delivered, every)

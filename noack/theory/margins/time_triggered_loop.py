@@ -104,15 +104,6 @@ class TimeTriggeredLoop:
         """
         return self._after(slot, losses).rows(self._kept).interval()
 
-    def state_after(self, slot: int, losses: int) -> Matrix:
-        """Return (x, x_c, u, w) at the transmission after the losses as a function of z, rounded.
-
-        Args:
-            slot: number of the first update, which is delivered, modulo the number of slots.
-            losses: number of lost updates after it.
-        """
-        return self._after(slot, losses).interval().middle
-
     def _after(self, slot: int, losses: int) -> FixedPointMatrix:
         period_ns = self.times.period_ns
         states = self._states.setdefault(slot, [])
@@ -123,23 +114,6 @@ class TimeTriggeredLoop:
             else:
                 states.append(self._first_period(from_ns))
         return states[losses]
-
-    def period(self, slot: int, delivered: bool) -> Matrix:
-        """Return the map of (x, x_c, u, w) from a transmission to the next one, rounded.
-
-        Args:
-            slot: number of the transmission, modulo the number of slots.
-            delivered: whether its update arrives.
-        """
-        from_ns, size = slot * self.times.period_ns, len(self._latch.entries)
-        until_ns, arrival_ns = from_ns + self.times.period_ns, from_ns + self.times.delay_ns
-        start = fixed(np.eye(size))
-        if not delivered:
-            return self._between(from_ns, until_ns).interval().middle
-        state = self._between(from_ns, arrival_ns) @ start
-        updated = exponential(self._H, self.times.delay_ns) @ start.rows(self._x)
-        state = stacked(state.rows(self._x), updated, state.rows(self._inputs))
-        return (self._between(arrival_ns, until_ns) @ state).interval().middle
 
     def _first_period(self, from_ns: int) -> FixedPointMatrix:
         state, until_ns = self._state(from_ns), from_ns + self.times.period_ns
