@@ -1,5 +1,6 @@
 """Loops under random losses: moments and growth, by closed forms, all patterns, Monte Carlo."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -13,6 +14,7 @@ from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.random_losses.mean_square_growth import mean_square_growth
 from noack.theory.random_losses.moments import moment_at_events, moments
 from noack.theory.random_losses.random_growth import sure_growth
+from tests.noack.theory.certificate_kinds.random_losses import certify, draw, simulate_runs
 
 
 def independent(p: float) -> LossProcess:
@@ -49,6 +51,21 @@ def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_solved_by_hand()
     assert found.controller_error == pytest.approx(e_c, rel=0.02)
     assert found.state == pytest.approx(x, rel=0.02)
     assert found.input_error == pytest.approx(gain * e_c, rel=0.02)
+
+
+def test_moments_at_a_lower_rate_than_the_triggers() -> None:
+    """Random loops without moments at the trigger's rate, against their runs."""
+    share, compared = 1e-3, 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        loop = draw(rng)
+        slower = replace(loop, system=replace(loop.system, alpha=share * loop.system.alpha))
+        if certify(loop) is not None or (bounds := certify(slower)) is None:
+            continue
+        compared += 1
+        for name, worst in simulate_runs(loop, rng, share).worst.items():
+            assert worst <= bounds[name], (seed, name)
+    assert compared >= 5
 
 
 def losses(start: list[float], moves: list[list[float]], lost: list[float]) -> LossProcess:
