@@ -162,7 +162,8 @@ class LoopMoments:
         added, _ = self._cycle(SecondMoments(np.zeros((len(shares), size, size)), shares))
         entries = self._solve(triangles(added.moments))
         start = SecondMoments(from_triangles(entries, size), shares)
-        return start, self._cycle(start)[1] / (len(self._slots) * self._period_s)
+        cycle_s = len(self._slots) * self._periods.times.period_ns / NS_PER_S
+        return start, self._cycle(start)[1] / cycle_s
 
     def transient(self, start: SecondMoments) -> Vector | None:
         """Return the costs of all periods from a start on without noise; None: infinite."""
@@ -192,16 +193,8 @@ class LoopMoments:
             costs = costs + more
         return now, costs
 
-    @property
-    def _period_s(self) -> float:
-        return self._periods.times.period_ns / NS_PER_S
-
     def _cycle(self, now: SecondMoments) -> tuple[SecondMoments, Vector]:
-        costs = np.zeros_like(self._slots[0][0].constants)
-        for slot in self._slots:
-            now, more = self._advance(now, slot)
-            costs = costs + more
-        return now, costs
+        return self.until(now, len(self._slots) * self._periods.times.period_ns)
 
     def _advance(
         self, now: SecondMoments, slot: tuple[MomentStep, ...]
@@ -219,10 +212,10 @@ class LoopMoments:
 
 def require_predictable(resolved: Scenario) -> None:
     """Raise CallerError unless the loop's second moments follow linear equations."""
-    coverage, scenario = resolved.coverage, resolved
-    coverage.require_direct_inputs()
-    coverage.require_unchanging()
-    if (why := coverage.beyond_theory) is not None:
+    scenario = resolved
+    resolved.coverage.require_direct_inputs()
+    resolved.coverage.require_unchanging()
+    if (why := resolved.coverage.beyond_theory) is not None:
         raise CallerError(f"{why}; the mean cost needs a linear plant with u = K x_c")
     if scenario.observer is not None:
         raise CallerError(f'observer.kind = "{scenario.observer.kind}": the mean cost needs none')

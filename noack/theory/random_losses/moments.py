@@ -327,9 +327,11 @@ def _moments(
         alpha = 0.0
     if decay <= 0:
         return [], "the models or A + BK do not decay"
-    level, bounds = max(trigger.beta, trigger.floor), []
+    bounds: list[Moments] = []
+    level = max(trigger.beta, trigger.floor)
     for order in ORDERS:
-        found, reason = [], None
+        found: list[Moments] = []
+        reason = None
         for share in _RATES:
             error = error_gains(loop, share * alpha)
             plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], share * alpha)
