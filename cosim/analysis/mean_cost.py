@@ -124,6 +124,8 @@ def find_mean_cost(
 
 def _under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarantee) -> CostUnder:
     outcomes = loss_process(resolved.network.link).outcomes(guarantee)
+    if resolved.network.initial_sync == "known_state":  # nothing is sent at t = 0
+        outcomes = outcomes.after_pause()
     moments, start = LoopMoments(periods, outcomes), start_of(resolved, outcomes)
     stationary, n = moments.stationary(), loop_of(resolved).n
     found = None

@@ -343,6 +343,12 @@ class OutcomeChain(NamedTuple):
     lost: Array  # (n, n) Probabilities of a step whose packet is lost
     delivered: Array  # (n, n) The same of a delivery; both together are a stochastic matrix
 
+    def after_pause(self) -> "OutcomeChain":
+        """Return the chain of a sensor that does not transmit at its first time, as if lost."""
+        lost, delivered = np.pad(self.lost, (0, 1)), np.pad(self.delivered, (0, 1))
+        lost[-1, -2] = 1.0
+        return OutcomeChain(lost, delivered)
+
     def recurrent(self) -> "OutcomeChain":
         """Return the states that occur again and again, in their order.
 

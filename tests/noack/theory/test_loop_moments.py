@@ -138,13 +138,16 @@ def test_without_losses_the_moments_solve_a_lyapunov_equation() -> None:
     assert found[0].moments.sum(axis=0) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
-def patterns(packets: int, longest: int) -> dict[tuple[bool, ...], float]:
-    """The probability of each pattern of losses of BURSTS with at most ``longest`` in 4."""
+def patterns(packets: int, longest: int, forced: int) -> dict[tuple[bool, ...], float]:
+    """The probability of each pattern of losses of BURSTS with at most ``longest`` in 4.
+
+    Each begins with ``forced`` deliveries, none or one.
+    """
     chain = np.array([[0.7, 0.3], [0.4, 0.6]])
     lost = np.array([0.1, 0.9])
     found = {}
-    for pattern in product([False, True], repeat=packets - 1):
-        states, outcomes = chain[0], [False]  # the first packet is delivered
+    for pattern in product([False, True], repeat=packets - forced):
+        states, outcomes = np.eye(2)[0] @ (chain if forced else np.eye(2)), [False] * forced
         for is_lost in pattern:
             allowed = sum(outcomes[-3:]) < longest
             states = (states @ chain) * (lost * allowed if is_lost else 1 - lost * allowed)
@@ -153,18 +156,22 @@ def patterns(packets: int, longest: int) -> dict[tuple[bool, ...], float]:
     return {outcomes: share for outcomes, share in found.items() if share}
 
 
-@pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_the_mean_over_all_patterns_of_simulated_runs(mode: str) -> None:
+@pytest.mark.parametrize(
+    ("mode", "sync"), [("model", "first_packet"), ("zoh", "first_packet"), ("model", "known_state")]
+)
+def test_the_mean_over_all_patterns_of_simulated_runs(mode: str, sync: str) -> None:
     """With a delay, ticks that drift, and a horizon within a period: three slots."""
     constraint = {"kind": "at_most", "losses": 2, "window": 4}
     timing = {"mode": mode, "controller.rate_hz": 16.0, "horizon_s": 1.4}
-    delay = [{"kind": "delay", "delay_s": 0.03}]
-    network = {"mansd": 5, "loss": BURSTS, "impairments": delay, "constraints": [constraint]}
+    always = {
+        "mansd": 5, "initial_sync": sync, "impairments": [{"kind": "delay", "delay_s": 0.03}],
+    }  # fmt: skip
+    network = {**always, "loss": BURSTS, "constraints": [constraint]}
     found = find_mean_cost(scenario(**timing, network=network)).with_guarantee
-    mean = 0.0
-    for outcomes, share in patterns(6, 2).items():
+    mean, forced = 0.0, int(sync == "first_packet")
+    for outcomes, share in patterns(5 + forced, 2, forced).items():
         lost = [number for number, is_lost in enumerate(outcomes) if is_lost]
-        scripted = {"mansd": 5, "loss": {"model": "scripted", "lost": lost}, "impairments": delay}
+        scripted = {**always, "loss": {"model": "scripted", "lost": lost}}
         run = scenario(**timing, network=scripted)
         mean += share * SampledWork(run, 0, None, None, 0.1, 10**6).run(range(1))["cost"][0]
     assert isinstance(found, CostUnder)

@@ -124,7 +124,8 @@ def test_almost_all_runs_of_a_scalar_grow_as_the_mean_of_the_logarithm(
 @pytest.mark.parametrize("process", [independent(0.6), BURSTY], ids=["independent", "bursty"])
 def test_almost_all_runs_of_random_loops_grow_at_most_by_the_bound(process: LossProcess) -> None:
     """40 runs of 2,000 periods, minus six standard errors; the bound is above by 4 % at most."""
-    chain, slack = unlimited(process), []
+    chain, slack, exceeded = unlimited(process), [], 0
+    fewer = unlimited(replace(process, lost=process.lost / 2))  # a broken copy
     for seed in range(6):
         rng = np.random.default_rng(seed)
         delivered, lost = 0.7 * rng.normal(size=(2, 3, 3))
@@ -141,4 +142,6 @@ def test_almost_all_runs_of_random_loops_grow_at_most_by_the_bound(process: Loss
         assert bound > grown.mean() - 6 * error
         assert bound <= np.log(mean_square_growth([(delivered, lost)], chain)) + 1e-6
         slack.append(bound - grown.mean())
+        exceeded += np.log(sure_growth(delivered, lost, fewer)) < grown.mean() - 6 * error
     assert np.median(slack) < 0.04
+    assert exceeded
