@@ -13,7 +13,7 @@ mean cost of a period is Σ_i Σ_j L_ij (trace(C₁ X_i) + π_i c₁) + P_ij (tr
 the cost between the samples (:mod:`noack.theory.random_losses.moment_steps`).
 """
 
-from functools import cached_property, reduce
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from noack.theory.margins.time_triggered_loop import LoopTimes
 from noack.theory.random_losses.mean_square_growth import (
     from_triangles,
     mean_square_growth,
+    resolved_by,
     second_moments,
     triangles,
 )
@@ -137,18 +138,13 @@ class LoopMoments:
         self.growth = mean_square_growth(maps, outcomes)
         """Of √E‖z‖² per period."""
 
-    @cached_property
-    def _operator(self) -> Matrix:
-        """The linear part over all slots, minus the identity, negative."""
+    def _sum(self, entries: Vector) -> Vector:
+        """Return the sum of what becomes of moments over all cycles of the slots."""
         steps = [
             second_moments(delivered.matrix, lost.matrix, self._outcomes)
             for delivered, lost in self._slots
         ]
-        operator = reduce(lambda before, step: step @ before, steps)
-        return np.asarray(np.eye(len(operator)) - operator)
-
-    def _solve(self, entries: Vector) -> Vector:
-        return np.asarray(np.linalg.solve(self._operator, entries), dtype=np.float64)
+        return resolved_by(reduce(lambda before, step: step @ before, steps), 1.0, entries)
 
     def stationary(self) -> tuple[SecondMoments, Vector] | None:
         """Return the moments at the transmissions of slot 0, and the mean costs per second.
@@ -160,7 +156,7 @@ class LoopMoments:
         shares = self._outcomes.distribution(len(self._slots))
         size = self._periods.size
         added, _ = self._cycle(SecondMoments(np.zeros((len(shares), size, size)), shares))
-        entries = self._solve(triangles(added.moments))
+        entries = self._sum(triangles(added.moments))
         start = SecondMoments(from_triangles(entries, size), shares)
         cycle_s = len(self._slots) * self._periods.times.period_ns / NS_PER_S
         return start, self._cycle(start)[1] / cycle_s
@@ -169,7 +165,7 @@ class LoopMoments:
         """Return the costs of all periods from a start on without noise; None: infinite."""
         if self.growth >= 1:
             return None
-        entries = self._solve(triangles(start.moments))
+        entries = self._sum(triangles(start.moments))
         all_cycles = from_triangles(entries, self._periods.size)
         return self._cycle(SecondMoments(all_cycles, 0 * start.shares))[1]
 

@@ -14,6 +14,7 @@ smaller bound.
 
 from collections.abc import Sequence
 from functools import reduce
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,8 +25,13 @@ from noack.theory.bounds.contraction import EPSILON, Stack
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.switched_system import Edge, SwitchedSystem
 
-_MOST_ENTRIES = 2000
-"""Largest size of the operator's matrix."""
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array  # slow to import
+
+_MOST_ENTRIES = 16_000
+"""Largest size of the operator's matrix, which is sparse: few states follow a state."""
+_MOST_DENSE = 500
+"""Size up to which all eigenvalues are computed."""
 _ABOVE = (1e-7, 1e-6, 1e-5, 1e-4)
 """The bound of the spectral radius is the first of these shares that the check confirms above the
 computed one."""
@@ -65,7 +71,7 @@ def balanced_maps(maps: Sequence[tuple[Matrix, Matrix]]) -> list[tuple[Matrix, M
     return [(delivered, lost) for delivered, lost in stack]
 
 
-def bounded_radius(operator: Matrix, size: int) -> float:
+def bounded_radius(operator: "csc_array[np.float64]", size: int) -> float:
     """Return an upper bound of the spectral radius of an operator, mostly exact up to 2e-7.
 
     Args:
@@ -75,26 +81,40 @@ def bounded_radius(operator: Matrix, size: int) -> float:
     Raises:
         NotPredictableError: it cannot be computed.
     """
-    if not np.isfinite(operator).all():
+    from scipy.sparse import linalg  # slow to import
+
+    if not np.isfinite(operator.data).all():
         raise NotPredictableError("the loop's second moments exceed 1e308 within a few periods")
-    radius = float(np.abs(np.linalg.eigvals(operator)).max())
+    if operator.shape[0] <= _MOST_DENSE:
+        radius = float(np.abs(np.linalg.eigvals(operator.toarray())).max())
+    else:
+        start = np.ones(operator.shape[0])
+        try:
+            radius = float(np.abs(linalg.eigs(operator, k=1, v0=start)[0]).max())
+        except linalg.ArpackNoConvergence:
+            raise NotPredictableError("the second moments' growth was not found") from None
     for above in _ABOVE:
         if radius == 0 or _is_below(operator, radius * (1 + above), size):
             return radius * (1 + 2 * above)
     raise NotPredictableError("the second moments could not be bounded numerically")
 
 
-def second_moments(delivered: Matrix, lost: Matrix, outcomes: OutcomeChain) -> Matrix:
+def second_moments(
+    delivered: Matrix, lost: Matrix, outcomes: OutcomeChain
+) -> "csc_array[np.float64]":
     """Return the operator of one period on the stacked upper triangles of X_j.
 
     Raises:
         NotPredictableError: there are too many states.
     """
+    from scipy import sparse  # slow to import
+
     size = len(delivered)
     if len(outcomes.lost) * size * (size + 1) // 2 > _MOST_ENTRIES:
         raise NotPredictableError("loop and losses together have too many states to compute with")
-    operator = np.kron(outcomes.lost.T, _on_triangle(lost))
-    return np.asarray(operator + np.kron(outcomes.delivered.T, _on_triangle(delivered)))
+    losing = sparse.kron(sparse.csr_array(outcomes.lost.T), _on_triangle(lost))
+    delivering = sparse.kron(sparse.csr_array(outcomes.delivered.T), _on_triangle(delivered))
+    return (losing + delivering).tocsc()
 
 
 def _on_triangle(matrix: Matrix) -> Matrix:
@@ -118,13 +138,23 @@ def triangles(stack: Stack) -> Vector:
     return stack[:, i, j].ravel()
 
 
-def _is_below(operator: Matrix, bound: float, size: int) -> bool:
+def resolved_by(operator: "csc_array[np.float64]", value: float, entries: Vector) -> Vector:
+    """Return the solution X of value · X − operator(X) = the entries."""
+    from scipy.sparse import eye_array, linalg  # slow to import
+
+    resolvent = (value * eye_array(operator.shape[0]) - operator).tocsc()
+    return np.asarray(linalg.splu(resolvent).solve(entries), dtype=np.float64)
+
+
+def _is_below(operator: "csc_array[np.float64]", bound: float, size: int) -> bool:
     """Return whether X_j > 0 with operator(X) < bound X prove that a bound is one, to rounding."""
-    modes = 2 * len(operator) // (size * (size + 1))
-    identity = triangles(np.tile(np.eye(size), (modes, 1, 1)))
-    resolvent = bound * np.eye(len(operator)) - operator
-    solution = np.asarray(np.linalg.solve(resolvent, identity), dtype=np.float64)
-    forms, images = (from_triangles(part, size) for part in (solution, operator @ solution))
-    rounding = 1e-13 * len(operator) * float(np.abs(forms).max()) * max(bound, 1.0)
+    entries = operator.shape[0]
+    identity = triangles(np.tile(np.eye(size), (2 * entries // (size * (size + 1)), 1, 1)))
+    solution = resolved_by(operator, bound, identity)
+    forms, images = (
+        from_triangles(part, size) for part in (solution, np.asarray(operator @ solution))
+    )
+    longest = int(np.diff(operator.tocsr().indptr).max())
+    rounding = 1e-13 * longest * float(np.abs(forms).max()) * max(bound, 1.0)
     parts = (forms, bound * forms - images)
     return all(float(np.linalg.eigvalsh(part).min()) > rounding for part in parts)
