@@ -12,7 +12,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import ACCURACY
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped
-from noack.theory.random_losses.mean_square_growth import RandomGrowth, random_growth
+from noack.theory.random_losses.random_growth import RandomGrowth, random_growth
 
 MOST_M = 16
 
@@ -208,16 +208,14 @@ def find_margin(
         margin.shortest_ns / NS_PER_S, margin.longest_ns / NS_PER_S,
         margin.loop.times.delay_ns / NS_PER_S, tuple(caps), every_m,
         find_longest_period(resolved, progress) if with_period else None,
-        _without_guarantee(resolved, margin, progress),
+        _without_guarantee(resolved, progress),
     )  # fmt: skip
 
 
-def _without_guarantee(
-    resolved: Scenario, margin: LossMargin, progress: MarginProgress
-) -> RandomGrowth | str:
+def _without_guarantee(resolved: Scenario, progress: MarginProgress) -> RandomGrowth | str:
     progress("random losses")
     try:
-        return random_growth(margin, loss_process(resolved.network.link))
+        return random_growth(resolved, loss_process(resolved.network.link))
     except NotPredictableError as error:
         return f"not known: {error}"
 

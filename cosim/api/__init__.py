@@ -25,6 +25,7 @@ from cosim.api.studies import CampaignResult as CampaignResult
 from cosim.api.studies import Measurement as Measurement
 from cosim.api.studies import campaign as campaign
 from cosim.api.studies import certify as certify
+from cosim.api.studies import cost as cost
 from cosim.api.studies import margin as margin
 from cosim.api.studies import measure as measure
 from cosim.api.studies import save_tables as save_tables

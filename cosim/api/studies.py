@@ -11,8 +11,11 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
+from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.runs import Run
 from cosim.api.scenarios import Source, load
 from cosim.lazy_modules import lazy_modules
@@ -98,6 +101,31 @@ def margin(
     return find_margin(
         resolve(load(scenario)), most_m=most_m, accuracy=accuracy, with_period=period
     )
+
+
+def cost(
+    scenario: Source, *, Q: Sequence[object] | None = None, R: Sequence[object] | None = None
+) -> MeanCost:
+    """Return the mean cost ∫ xᵀQx + uᵀRu dt, and the rms of all states, under random losses.
+
+    >>> import noack
+    >>> found = noack.cost("lane_periodic")
+    >>> round(found.with_guarantee.growth, 6)  # below 1: stable in mean square
+    0.862511
+
+    Args:
+        scenario: a scenario with a time-triggered sensor (policy ``periodic``), or a source that
+            :func:`noack.load` accepts.
+        Q: weight of the state, (n, n); None: the identity.
+        R: weight of the input, (m, m); None: the identity.
+
+    Raises:
+        NoackError: the scenario is wrong, or its loop is not covered; the message names the
+            setting.
+    """
+    resolved = resolve(load(scenario))
+    given = (None if one is None else np.array(one, np.float64) for one in (Q, R))
+    return find_mean_cost(resolved, *given)
 
 
 class Measurement(NetworkMeasurement):
@@ -347,8 +375,8 @@ def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:
     >>> folder.cleanup()
 
     Args:
-        result: a run, or what :func:`noack.certify`, :func:`noack.margin` or
-            :func:`noack.campaign` returned.
+        result: a run, or what :func:`noack.certify`, :func:`noack.margin`,
+            :func:`noack.cost` or :func:`noack.campaign` returned.
         folder: where the files are written; it is made if it does not exist.
 
     Returns:
@@ -365,6 +393,8 @@ def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:
             tables = certificate_report.certificate_tables(result)
         case MarginResult():
             tables = certificate_report.margin_tables(result)
+        case MeanCost():
+            tables = certificate_report.mean_cost_tables(result)
         case CampaignResult():
             tables = campaign_report.campaign_tables(result._finished.summary)
         case _:

@@ -37,7 +37,7 @@ from cosim.output.figure_format import FigureFiles, FigureFormat, figure_files
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.record.run_directory import chosen_run
 from cosim.shipped_files import find_shipped
-from noack.core.errors import ExitStatus, NoackError, printable, why
+from noack.core.errors import CallerError, ExitStatus, NoackError, printable, why
 from noack.core.process_limits import cores as cores
 from noack.core.process_limits import exhausted_limit
 from noack.runtime.command_line import StopRequestError, failed, stop_requests_raised
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from typer._click.core import Command, Context, Parameter
     from typer._click.formatting import HelpFormatter
 
+    from noack.core.linear_systems import Matrix
     from noack.scenario.scenario import Scenario
 
 NAME = "noack"
@@ -371,6 +372,45 @@ class LoopOptions(RunOptions):
     """An earlier run, or one of its loops."""
 
     loop: LoopOption = None
+
+
+def weight_matrix(option: str, text: str | None, size: int) -> "Matrix":
+    """Return the weight that an option gives by rows, or its diagonal; None: the identity."""
+    import numpy as np  # help and completion need none
+
+    if text is None:
+        return np.eye(size)
+    try:
+        value = np.array(scenario_file.value_of(text, option), dtype=np.float64)
+    except (CallerError, ValueError, TypeError):
+        value = np.empty(0)
+    if value.ndim == 1:
+        value = np.diag(value)
+    if value.shape != (size, size) or not np.isfinite(value).all():
+        example = dumps([1] * size)
+        raise CallerError(
+            f"{option} {text}: expected {size} x {size} numbers by rows, or {size} for the "
+            f"diagonal, e.g. '{example}'"
+        )
+    return value
+
+
+@option_group
+class CostOptions:
+    """The weights of a cost ∫ xᵀQx + uᵀRu dt.
+
+    Options:
+        Q: Weight of the state: rows, or a diagonal, e.g. '[1, 1]'; by default the identity.
+        R: Weight of the input: rows, or a diagonal; by default the identity.
+    """
+
+    Q: Annotated[str | None, Option("--Q")] = None
+    R: Annotated[str | None, Option("--R")] = None
+
+    def matrices(self, given: "Scenario") -> "tuple[Matrix, Matrix]":
+        """Return Q and R; raise CallerError if one is wrong."""
+        n, m = given.model.dimensions
+        return weight_matrix("--Q", self.Q, n), weight_matrix("--R", self.R, m)
 
 
 @option_group

@@ -2,7 +2,7 @@
 
 :func:`print_certificates` prints the constants, the limits of the schedule, the assumptions and, if
 losses are not limited, what holds for random ones; :func:`print_margin` prints the margin of a
-time-triggered loop.
+time-triggered loop, :func:`print_mean_cost` its mean cost under random losses.
 """
 
 from collections.abc import Iterator
@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, plants_of
 from cosim.analysis.margin_search import MarginResult
+from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
 from noack.core.linear_systems import Matrix
@@ -244,6 +245,49 @@ def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
     """Yield the bounds of the growth for each M."""
     rows = [*margin_rows(margin)]
     yield ResultTable("margin", margin_title(margin), MARGIN_HEADINGS, rows)
+
+
+def print_mean_cost(console: Console, found: MeanCost) -> None:
+    """Print the moments and costs with and without the guarantee."""
+    for table in mean_cost_tables(found):
+        console.print(terminal_table(table))
+    for name in ("with_guarantee", "without_guarantee"):
+        if isinstance(reason := getattr(found, name), str):
+            console.print(f"[yellow]{name.replace('_', ' the ')}:[/] {escape(reason)}")
+    console.print(
+        "[dim]The cost is ∫ xᵀQx + uᵀRu dt, between the samples, too; u: of the controller. "
+        "Rms: stationary, what the loop tends to from any start, over time. Growth below 1: stable "
+        "in mean square.[/]"
+    )
+
+
+def mean_cost_tables(found: MeanCost) -> Iterator[ResultTable]:
+    """Yield the moments and costs with and without the guarantee."""
+    both = (found.with_guarantee, found.without_guarantee)
+    known = [one for one in dict.fromkeys(both) if isinstance(one, CostUnder)]
+    mode = "model-based" if found.mode == "model" else "zero-order hold"
+    title = f"{found.scenario}: moments and cost, with an update every {found.period_s:g} s, {mode}"
+    headings = ["", *(one.guarantee for one in known)]
+    rows = [("growth of √E‖z‖² per period", *(f"{one.growth:.6g}" for one in known))]
+    for rms, names, where in (
+        ("state_rms", found.state_names, ""),
+        ("state_rms_at_transmissions", found.state_names, " at transmissions"),
+        ("input_rms", found.input_names, ""),
+        ("cost_per_s", None, ""),
+    ):
+        values = [one.stationary and getattr(one.stationary, rms) for one in known]
+        if names is None:
+            cells = ("∞" if v is None else f"{number(v, 6)} /s" for v in values)
+            rows.append(("mean cost, stationary", *cells))
+            continue
+        for i, name in enumerate(names):
+            cells = ("∞" if v is None else number(v[i], 6) for v in values)
+            rows.append((f"rms of {name}{where}", *cells))
+    until = (number(one.horizon_cost, 6) for one in known)
+    rows.append((f"mean cost from x(0) until {found.horizon_s:g} s", *until))
+    transient = ("∞" if (v := one.transient_cost) is None else number(v, 6) for one in known)
+    rows.append(("mean cost from x(0), without disturbances and noise", *transient))
+    yield ResultTable("cost", title, headings, rows)
 
 
 _RARE = 1e-4

@@ -50,6 +50,7 @@ from noack.impairments.markov_chain import (
     Pattern,
     constrained_rate,
     list_moves,
+    moves_by_outcome,
     pattern_rate,
     stochastic,
 )
@@ -264,6 +265,33 @@ class LossProcess:
             tails.append(self.start @ weights if stationary else weights.max())
         return np.array(tails), float(weights.max())
 
+    def outcomes(self, guarantee: LossGuarantee) -> "OutcomeChain":
+        """Return the chain of the packets' outcomes under a guarantee, with its reachable states.
+
+        Raises:
+            NotPredictableError: there are too many states.
+        """
+        n, most = len(self.start), _MOST_SQUARED // len(self.start)
+        after_delivery = list_moves(guarantee, most).after_delivery
+        losing, delivering = moves_by_outcome(self.moves, self.lost, guarantee)
+        count = len(after_delivery) * n
+        # The last state is that before the first packet.
+        lost, delivered = np.zeros((count + 1, count + 1)), np.zeros((count + 1, count + 1))
+        lost[:count, :count], delivered[:count, :count] = losing.toarray(), delivering.toarray()
+        if self.first_delivered:
+            first = after_delivery[0] * n
+            delivered[count, first : first + n] = self.start @ self.moves
+        else:
+            lost[count], delivered[count] = self.start @ lost[:n], self.start @ delivered[:n]
+        reached = np.arange(count + 1) == count
+        while not reached.all():
+            further = reached | ((lost + delivered)[reached].sum(axis=0) > 0)
+            if (further == reached).all():
+                break
+            reached = further
+        kept = np.ix_(reached, reached)
+        return OutcomeChain(lost[kept], delivered[kept])
+
     def keeps(self, guarantee: LossGuarantee, packets: int) -> float:
         """Return the probability that the first packets keep a guarantee by chance.
 
@@ -304,6 +332,43 @@ class LossProcess:
             reached = reached | (reached @ self.moves > 0)
         loss_given_state: Array = (self.moves @ self.lost)[reached]
         return loss_given_state
+
+
+class OutcomeChain(NamedTuple):
+    """A Markov chain with n states that advances with every packet, and the packets' outcomes.
+
+    The last state is that before the first packet.
+    """
+
+    lost: Array  # (n, n) Probabilities of a step whose packet is lost
+    delivered: Array  # (n, n) The same of a delivery; both together are a stochastic matrix
+
+    def after_pause(self) -> "OutcomeChain":
+        """Return the chain of a sensor that does not transmit at its first time, as if lost."""
+        lost, delivered = np.pad(self.lost, (0, 1)), np.pad(self.delivered, (0, 1))
+        lost[-1, -2] = 1.0
+        return OutcomeChain(lost, delivered)
+
+    def recurrent(self) -> "OutcomeChain":
+        """Return the states that occur again and again, in their order.
+
+        Raises:
+            NotPredictableError: which ones these are depends on the beginning.
+        """
+        from scipy.sparse.csgraph import connected_components  # slow to import
+
+        moves = self.lost + self.delivered > 0
+        _, labels = connected_components(moves, connection="strong")
+        left = labels[(moves & (labels[:, None] != labels)).any(axis=1)]
+        kept = ~np.isin(labels, left)
+        if len(set(labels[kept])) > 1:
+            raise NotPredictableError("the losses depend on what happens at the beginning")
+        return OutcomeChain(self.lost[np.ix_(kept, kept)], self.delivered[np.ix_(kept, kept)])
+
+    def distribution(self, every: int = 1) -> Array:
+        """Return the mean distribution before the packets 0, ``every``, 2 ``every``, …, (n,)."""
+        moves = np.linalg.matrix_power(self.lost + self.delivered, every)
+        return _stationary(np.eye(len(moves))[-1], moves)
 
 
 def loss_process(settings: LinkSettings) -> LossProcess:

@@ -167,6 +167,38 @@ def pattern_rate(lost: NDArray[np.bool_], guarantee: LossGuarantee) -> float:
     raise NotPredictableError("the losses repeat only after too many packets to compute with")
 
 
+def moves_by_outcome(
+    moves: Array, lost: Array, guarantee: LossGuarantee
+) -> "tuple[csr_array[np.float64], csr_array[np.float64]]":
+    """Return the joint chain's moves with a loss, and those with a delivery, under a guarantee.
+
+    The first n states have the state before the first packet of the guarantee's automaton.
+
+    Args:
+        moves: (n, n) transition matrix.
+        lost: (n,) probability in each state that the packet is lost, if it may be.
+        guarantee: the guarantee.
+
+    Raises:
+        NotPredictableError: there are too many states.
+    """
+    from scipy import sparse  # slow to import
+
+    after_loss, after_delivery = list_moves(guarantee, MOST_JOINT_STATES // len(moves))
+    count = len(after_loss)
+    allowed = after_loss >= 0
+
+    def to(targets: NDArray[np.int64], which: NDArray[np.bool_]) -> "csr_array[np.float64]":
+        places = np.flatnonzero(which)
+        shape = (count, count)
+        return sparse.csr_array((np.ones(len(places)), (places, targets[places])), shape)
+
+    losing = sparse.kron(to(after_loss, allowed), moves * lost)
+    delivering = sparse.kron(to(after_delivery, allowed), moves * (1 - lost))
+    forced = sparse.kron(to(after_delivery, ~allowed), moves)
+    return losing.tocsr(), (delivering + forced).tocsr()
+
+
 def constrained_rate(start: Array, moves: Array, lost: Array, guarantee: LossGuarantee) -> float:
     """Return the loss rate of a joint chain of n states.
 
@@ -179,27 +211,11 @@ def constrained_rate(start: Array, moves: Array, lost: Array, guarantee: LossGua
     Raises:
         NotPredictableError: there are too many states, or the rate depends on chance.
     """
-    from scipy import sparse  # slow to import
-
-    n = len(start)
-    after_loss, after_delivery = list_moves(guarantee, MOST_JOINT_STATES // n)
-    count = len(after_loss)
-    allowed = after_loss >= 0
-
-    def to(targets: NDArray[np.int64], which: NDArray[np.bool_]) -> "csr_array[np.float64]":
-        places = np.flatnonzero(which)
-        shape = (count, count)
-        return sparse.csr_array((np.ones(len(places)), (places, targets[places])), shape)
-
-    joint = (
-        sparse.kron(to(after_loss, allowed), moves * lost)
-        + sparse.kron(to(after_delivery, allowed), moves * (1 - lost))
-        + sparse.kron(to(after_delivery, ~allowed), moves)
-    ).tocsr()
-    at_start = np.zeros(count * n)
-    at_start[:n] = start
-    distribution = _stationary(joint, at_start).reshape(count, n)
-    return float((distribution[allowed] @ moves @ lost).sum())
+    losing, delivering = moves_by_outcome(moves, lost, guarantee)
+    at_start = np.zeros(losing.shape[0])
+    at_start[: len(start)] = start
+    distribution = _stationary((losing + delivering).tocsr(), at_start)
+    return float((losing.T @ distribution).sum())
 
 
 def _stationary(joint: "csr_array[np.float64]", start: Array) -> Array:

@@ -1,6 +1,5 @@
 """``noack campaign``, ``paper``, ``design``, ``capacity``: studies, which make many runs."""
 
-import json as json_module
 import math
 import re
 from collections.abc import Sequence
@@ -290,7 +289,7 @@ class GainOptions:
     ) -> "tuple[linear_systems.Matrix, linear_systems.Matrix]":
         """Return Q (n, n) and R (m, m); raise CallerError if one is wrong."""
         n, m = given.model.dimensions
-        return _matrix("--Q", self.Q, n), _matrix("--R", self.R, m)
+        return cli.weight_matrix("--Q", self.Q, n), cli.weight_matrix("--R", self.R, m)
 
 
 @cli.command(cli.CAMPAIGNS, 20, takes="up to a minute")
@@ -397,26 +396,6 @@ def _design_for_network(
         written.append(write_whole(out, found.written()))
     cli.show_with_files(json, found.to_json(), written, network_page.print_design, found)
     return ExitStatus.OK if found.is_certified else ExitStatus.FAILED
-
-
-def _matrix(option: str, text: str | None, size: int) -> "linear_systems.Matrix":
-    import numpy as np  # help and completion need none
-
-    if text is None:
-        return np.eye(size)
-    try:
-        value = np.array(scenario_file.value_of(text, option), dtype=np.float64)
-    except (CallerError, ValueError, TypeError):
-        value = np.empty(0)
-    if value.ndim == 1:
-        value = np.diag(value)
-    if value.shape != (size, size) or not np.isfinite(value).all():
-        example = json_module.dumps([1] * size)
-        raise CallerError(
-            f"{option} {text}: expected {size} x {size} numbers by rows, or {size} for the "
-            f"diagonal, e.g. '{example}'"
-        )
-    return value
 
 
 @cli.option_group

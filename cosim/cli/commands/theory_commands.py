@@ -1,4 +1,4 @@
-"""``noack certify``, ``margin``, ``adversary``: bounds for all patterns of losses; bad patterns."""
+"""``noack certify``, ``margin``, ``adversary``, ``cost``: all losses, bad ones, random ones."""
 
 from enum import StrEnum
 from typing import Annotated
@@ -14,7 +14,7 @@ from noack.core.errors import CallerError, ExitStatus
 with lazy_modules():
     import cosim.analysis.adversary.worst_run as worst_run
     from cosim.analysis import adversary as adversary_search
-    from cosim.analysis import certificates, margin_search
+    from cosim.analysis import certificates, margin_search, mean_cost
     from cosim.live import progress
     from cosim.output import certificate_report
     from cosim.output.export import mat_export
@@ -117,6 +117,34 @@ def margin(
         raise CallerError(f"--play: no destabilising pattern was found for M up to {most}")
     played = given.load(*pattern.settings)
     return run_processes(played, LiveOptions(runs=runs), server=context.obj)
+
+
+@cli.command(cli.THEORY, 35, takes="a second")
+def cost(
+    given: cli.ScenarioOptions,
+    *,
+    weights: cli.CostOptions,
+    tables: cli.TablesOption = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Compute the mean cost, and the rms of all states, under a scenario's random losses.
+
+    The sensor is time-triggered (policy periodic). Means are over losses, disturbances and noise;
+    nothing is sampled. The cost is integrated between the samples, too, with the losses' guarantee
+    and without it. Exit status 1: the second moments grow without a bound.
+
+    Examples:
+        noack cost lane_periodic   growth, stationary rms, mean cost
+        noack cost lane_periodic --R '[0.1, 0.1]' --json   with other weights; as JSON
+        noack cost lane_periodic --set 'plant.disturbances=[{kind="gaussian", std=[1, 1]}]'
+    """
+    resolved = resolution.resolve(given.load())
+    found = mean_cost.find_mean_cost(resolved, *weights.matrices(resolved))
+    cli.show(json, found.to_json, certificate_report.print_mean_cost, found)
+    cli.write_tables(certificate_report.mean_cost_tables(found), tables, json=json)
+    one = found.with_guarantee
+    grows = isinstance(one, str) or one.stationary is None
+    return ExitStatus.FAILED if grows else ExitStatus.OK
 
 
 class AdversaryAim(StrEnum):

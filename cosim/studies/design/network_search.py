@@ -19,15 +19,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cosim.output import palette
-from cosim.output.figure_description import (
-    Axis,
-    FigureDescription,
-    Item,
-    Line,
-    Marks,
-    Panel,
-    Rule,
-)
+from cosim.output.figure_description import Axis, FigureDescription, Item, Line, Marks, Panel, Rule
 from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.loop_growth import PatternGraph, QuickLoop

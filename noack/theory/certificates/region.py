@@ -31,12 +31,7 @@ from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
 from noack.theory.certificates.conditions import REGION
-from noack.theory.certificates.scenario_certificates import (
-    CertificateScope,
-    Phases,
-    box,
-    own_plant,
-)
+from noack.theory.certificates.scenario_certificates import CertificateScope, Phases, box, own_plant
 from noack.theory.certificates.solution import Search
 
 _WIDER = 1.02

@@ -199,7 +199,7 @@ class LossMargin:
 
     def __init__(self, resolved: Scenario, longest_ns: int | None = None) -> None:
         require_covered(resolved)
-        loop, timing = loop_of(resolved), resolved.timing
+        loop = loop_of(resolved)
         self.guarantee = resolved.network.guarantee
         self.shortest_ns, self.longest_ns = intervals_ns(resolved)
         if longest_ns is not None:
@@ -207,21 +207,11 @@ class LossMargin:
             self.shortest_ns = longest_ns if same else min(self.shortest_ns, longest_ns)
             self.longest_ns = longest_ns
         is_periodic = self.shortest_ns == self.longest_ns
-        self._unit_ns = unit_ns = self.longest_ns if is_periodic else timing.measurement_period_ns
-        self._times = EventTimes(self.shortest_ns // unit_ns, self.longest_ns // unit_ns)
-        times = LoopTimes(
-            timing.plant_period_ns,
-            timing.controller_period_ns,
-            timing.controller_phase_ns,
-            unit_ns,
-            update_delay_ns(resolved),
+        self._unit_ns = unit_ns = (
+            self.longest_ns if is_periodic else resolved.timing.measurement_period_ns
         )
-        if times.delay_ns >= unit_ns:
-            what = "two updates" if is_periodic else "two measurements"
-            raise CallerError(
-                f"network.impairments: a delay of {times.delay_ns / NS_PER_S:g} s; expected less "
-                f"than the period between {what}, {unit_ns / NS_PER_S:g} s"
-            )
+        self._times = EventTimes(self.shortest_ns // unit_ns, self.longest_ns // unit_ns)
+        times = loop_times(resolved, unit_ns)
         self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
         self.maps = cache(self.loop.map)
         """The loop's maps by slot and number of lost updates."""
@@ -296,6 +286,11 @@ def require_covered(resolved: Scenario) -> None:
     resolved.coverage.require_direct_inputs()
     resolved.coverage.require_exact()
     resolved.coverage.require_constant()
+    require_idle_watchdog(resolved)
+
+
+def require_idle_watchdog(resolved: Scenario) -> None:
+    """Raise CallerError if the watchdog may replace the controller's inputs."""
     timing = resolved.timing
     if timing.plant_period_ns + timing.controller_period_ns > timing.actuation_timeout_ns:
         raise CallerError(
@@ -321,6 +316,29 @@ def intervals_ns(resolved: Scenario) -> tuple[int, int]:
         return longest_ns, longest_ns
     least_ns = max(rule.idle_ns, 0.0 if rule.forecast is None else rule.shortest_ns, step_ns)
     return min(-int(-least_ns // step_ns) * step_ns, longest_ns), longest_ns
+
+
+def loop_times(resolved: Scenario, unit_ns: int) -> LoopTimes:
+    """Return the times of a loop with an update every ``unit_ns``, or at multiples of it.
+
+    Raises:
+        CallerError: the delay of the updates is longer.
+    """
+    timing, delay_ns = resolved.timing, update_delay_ns(resolved)
+    if delay_ns >= unit_ns:
+        is_every = unit_ns != timing.measurement_period_ns
+        what = "two updates" if is_every else "two measurements"
+        raise CallerError(
+            f"network.impairments: a delay of {delay_ns / NS_PER_S:g} s; expected less "
+            f"than the period between {what}, {unit_ns / NS_PER_S:g} s"
+        )
+    return LoopTimes(
+        timing.plant_period_ns,
+        timing.controller_period_ns,
+        timing.controller_phase_ns,
+        unit_ns,
+        delay_ns,
+    )
 
 
 def update_delay_ns(resolved: Scenario) -> int:

@@ -55,6 +55,16 @@ class LoopTimes(NamedTuple):
         """Time from the last tick before ``t_ns`` to ``t_ns``, above 0."""
         return (t_ns - self.phase_ns - 1) % self.tick_ns + 1
 
+    def occurrences(self, from_ns: int, until_ns: int) -> list[tuple[int, bool]]:
+        """Return the times of ticks (True) and of the plant's steps (False) in their order.
+
+        A tick at the end and a step at the start are excluded.
+        """
+        first = -(-(from_ns - self.phase_ns) // self.tick_ns)
+        ticks = range(first * self.tick_ns + self.phase_ns, until_ns, self.tick_ns)
+        steps = range((from_ns // self.step_ns + 1) * self.step_ns, until_ns + 1, self.step_ns)
+        return sorted([(t_ns, False) for t_ns in steps] + [(t_ns, True) for t_ns in ticks])
+
 
 class TimeTriggeredLoop:
     """The maps of a loop with the matrices A, (n, n), B, (n, m), K, (m, n), and H, (n, n)."""
@@ -94,15 +104,6 @@ class TimeTriggeredLoop:
         """
         return self._after(slot, losses).rows(self._kept).interval()
 
-    def state_after(self, slot: int, losses: int) -> Matrix:
-        """Return (x, x_c, u, w) at the transmission after the losses as a function of z, rounded.
-
-        Args:
-            slot: number of the first update, which is delivered, modulo the number of slots.
-            losses: number of lost updates after it.
-        """
-        return self._after(slot, losses).interval().middle
-
     def _after(self, slot: int, losses: int) -> FixedPointMatrix:
         period_ns = self.times.period_ns
         states = self._states.setdefault(slot, [])
@@ -113,23 +114,6 @@ class TimeTriggeredLoop:
             else:
                 states.append(self._first_period(from_ns))
         return states[losses]
-
-    def period(self, slot: int, delivered: bool) -> Matrix:
-        """Return the map of (x, x_c, u, w) from a transmission to the next one, rounded.
-
-        Args:
-            slot: number of the transmission, modulo the number of slots.
-            delivered: whether its update arrives.
-        """
-        from_ns, size = slot * self.times.period_ns, len(self._latch.entries)
-        until_ns, arrival_ns = from_ns + self.times.period_ns, from_ns + self.times.delay_ns
-        start = fixed(np.eye(size))
-        if not delivered:
-            return self._between(from_ns, until_ns).interval().middle
-        state = self._between(from_ns, arrival_ns) @ start
-        updated = exponential(self._H, self.times.delay_ns) @ start.rows(self._x)
-        state = stacked(state.rows(self._x), updated, state.rows(self._inputs))
-        return (self._between(arrival_ns, until_ns) @ state).interval().middle
 
     def _first_period(self, from_ns: int) -> FixedPointMatrix:
         state, until_ns = self._state(from_ns), from_ns + self.times.period_ns
@@ -165,14 +149,9 @@ class TimeTriggeredLoop:
         return rest @ power(self._occurrences(from_ns, from_ns + self._cycle_ns), cycles)
 
     def _occurrences(self, from_ns: int, until_ns: int) -> FixedPointMatrix:
-        times = self.times
-        first = -(-(from_ns - times.phase_ns) // times.tick_ns)
-        ticks = range(first * times.tick_ns + times.phase_ns, until_ns, times.tick_ns)
-        steps = range((from_ns // times.step_ns + 1) * times.step_ns, until_ns + 1, times.step_ns)
-        both = [(t_ns, 0, self._latch) for t_ns in steps]
-        both += [(t_ns, 1, self._tick) for t_ns in ticks]
         result, now_ns = fixed(np.eye(len(self._latch.entries))), from_ns
-        for t_ns, _, occurrence in sorted(both, key=lambda occurrence: occurrence[:2]):
+        for t_ns, is_tick in self.times.occurrences(from_ns, until_ns):
+            occurrence = self._tick if is_tick else self._latch
             result = occurrence @ self._flow(t_ns - now_ns) @ result
             now_ns = t_ns
         return self._flow(until_ns - now_ns) @ result

@@ -1,4 +1,4 @@
-"""Loops whose losses are random and not limited: probabilities and moments instead of bounds.
+"""Loops whose losses are random: probabilities and moments instead of bounds for all patterns.
 
 The paper and the certificates assume at most M − 1 consecutive losses. If nothing enforces this
 limit, a run stays within it with some probability (docs/theory.md, "Without a limit on the
@@ -14,6 +14,9 @@ losses"). The losses are a Markov chain over the packets
    as e^{−αt} gives almost sure decay at every smaller rate (Borel and Cantelli). 1 and 2 are
    ``moments.py``.
 3. Time-triggered loops. From one transmission to the next the state becomes M₀z or M₁z. The second
-   moments follow a linear map, so its spectral radius decides stability in mean square exactly; the
-   mean logarithm of products bounds the growth almost surely (``mean_square_growth.py``).
+   moments follow a linear map, so its spectral radius decides stability in mean square exactly
+   (``mean_square_growth.py``). The same map with weighted outcomes bounds the growth almost surely
+   (``random_growth.py``).
+4. The same map with disturbances and noise has the stationary moments and the mean cost, with or
+   without a limit on the losses: ``loop_moments.py``, from intervals of ``moment_steps.py``.
 """

@@ -12,7 +12,8 @@ every fixed time
 A missing event's part of e_c is what E x and B p have added since the event before it. So all lost
 events together contribute at most ρ (∫‖C e^{(H+αI)s} L_E‖ ds m + ∫‖C e^{(H+αI)s} B U‖ ds π). If the
 trigger is tested every h, they contribute at most ρ a Σ_j sup_{τ≥jh} ‖C e^{(H+αI)τ} W⁻¹‖, too. The
-inequalities are linear; their solution bounds every moment if their spectral radius is below 1.
+inequalities are linear; their solution bounds every moment if their spectral radius is below 1. It
+is smaller at a rate below the trigger's, whose threshold decays faster than needed then.
 
 At an event of the continuous trigger, where ‖e_s‖_W = β, the number of missing events is known in
 distribution, and (I1) gives a bound by itself: :func:`moment_at_events`. Almost surely, x decays at
@@ -48,6 +49,10 @@ ORDERS = (1, 2)
 _MOST_BURST = 64
 _CERTAIN = 1 - 1e-9
 _SLOWER = 0.9
+_RATES = (1.0, 0.5, 0.25, 1e-3)
+"""Shares of the trigger's rate at which moments are tried, until one of the smaller ones has a loop
+gain that is clearly below 1: near 1 the bounds are large."""
+_CLEARLY = 0.9
 
 
 class Moments(NamedTuple):
@@ -322,16 +327,24 @@ def _moments(
         alpha = 0.0
     if decay <= 0:
         return [], "the models or A + BK do not decay"
-    error = error_gains(loop, alpha)
-    plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], alpha)
-    level, bounds = max(trigger.beta, trigger.floor), []
+    bounds: list[Moments] = []
+    level = max(trigger.beta, trigger.floor)
     for order in ORDERS:
-        try:
-            bounds.append(
-                moments(error, plant, conditions, level, losses.largest_probability, order)
-            )
-        except (NoCertificateError, NotDecayingError) as reason:
-            return bounds, str(reason)
+        found: list[Moments] = []
+        reason = None
+        for share in _RATES:
+            error = error_gains(loop, share * alpha)
+            plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], share * alpha)
+            p = losses.largest_probability
+            try:
+                found.append(moments(error, plant, conditions, level, p, order))
+            except (NoCertificateError, NotDecayingError) as error_found:
+                reason = str(error_found)
+            if found and (share == 1 or found[-1].loop_gain < _CLEARLY):
+                break
+        if not found:
+            return bounds, reason
+        bounds.append(found[-1])
     return bounds, None
 
 

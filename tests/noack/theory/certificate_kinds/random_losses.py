@@ -54,8 +54,8 @@ def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds
     }  # fmt: skip
 
 
-def simulate_runs(loop: RandomLoop, rng: np.random.Generator) -> Observed:
-    """The largest moments over time, each minus five standard errors."""
+def simulate_runs(loop: RandomLoop, rng: np.random.Generator, rate_share: float = 1.0) -> Observed:
+    """The largest moments over time, scaled at a share of α, each minus five standard errors."""
     system = loop.system
     lost = rng.uniform(size=(_RUNS, system.events)) < loop.probability
     if not system.known_start:
@@ -64,7 +64,7 @@ def simulate_runs(loop: RandomLoop, rng: np.random.Generator) -> Observed:
     if rng.uniform() < 0.5:
         delays[:] = system.delay_steps
     trace = simulate(system, ~lost, delays)
-    growth, worst = np.exp(system.alpha * times_s(system)), {}
+    growth, worst = np.exp(rate_share * system.alpha * times_s(system)), {}
     for name, field in _SIGNALS.items():
         powers = (growth * getattr(trace, field)) ** loop.order
         assert powers.shape == (_RUNS, STEPS)

@@ -1,0 +1,147 @@
+"""The mean cost of a time-triggered loop under random losses, with and without its guarantee."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix
+from noack.impairments.constraints import join_guarantee
+from noack.impairments.loss_guarantee import LossGuarantee
+from noack.impairments.loss_prediction import loss_process
+from noack.impairments.markov_chain import NotPredictableError
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
+from noack.theory.random_losses.loop_moments import LoopMoments, LoopPeriods, periods_of, start_of
+
+
+class Stationary(NamedTuple):
+    """What the loop tends to, whatever its start; root mean squares in the model's units."""
+
+    state_rms: tuple[float, ...]
+    """Of each entry of x, over time."""
+    state_rms_at_transmissions: tuple[float, ...]
+    input_rms: tuple[float, ...]
+    """Of each entry of u, without disturbances at the input."""
+    cost_per_s: float
+    """Mean of xᵀQx + uᵀRu over time."""
+
+
+@dataclass(frozen=True)
+class CostUnder:
+    """What holds under a guarantee, or without one."""
+
+    guarantee: str
+    growth: float
+    """Of √E‖z‖² per period; z is the state of plant, model and inputs."""
+    stationary: Stationary | None
+    """None: the second moments grow without a bound."""
+    horizon_cost: float
+    """Mean of ∫ xᵀQx + uᵀRu dt from x(0) until the horizon, with disturbances and noise."""
+    transient_cost: float | None
+    """The same from x(0) for all time, without disturbances and noise; None: infinite."""
+
+
+@dataclass(frozen=True)
+class MeanCost:
+    """The mean cost of a loop; ``print`` shows it in words."""
+
+    scenario: str
+    mode: str
+    period_s: float
+    horizon_s: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    with_guarantee: CostUnder | str
+    """Or why it is not known."""
+    without_guarantee: CostUnder | str
+
+    def to_json(self) -> dict[str, object]:
+        """Return all fields for JSON."""
+        document: dict[str, object] = dict(vars(self))
+        for name in ("with_guarantee", "without_guarantee"):
+            found = getattr(self, name)
+            if isinstance(found, CostUnder):
+                stationary = found.stationary and found.stationary._asdict()
+                document[name] = vars(found) | {"stationary": stationary}
+        return document
+
+    def __repr__(self) -> str:
+        """Return what holds with the guarantee, in words."""
+        found = self.with_guarantee
+        if isinstance(found, str):
+            return found
+        text = f"mean cost until {self.horizon_s:g} s: {found.horizon_cost:.6g}"
+        if found.stationary is None:
+            return f"{text}; the second moments grow by {found.growth:.6g} per period"
+        return f"{text}; stationary: {found.stationary.cost_per_s:.6g} /s"
+
+
+def find_mean_cost(
+    resolved: Scenario, Q: Matrix | None = None, R: Matrix | None = None
+) -> MeanCost:
+    """Return the mean of the cost ∫ xᵀQx + uᵀRu dt.
+
+    Args:
+        resolved: the resolved scenario, with a time-triggered sensor.
+        Q: weight of the state, (n, n); None: the identity.
+        R: weight of the input, (m, m); None: the identity.
+
+    Raises:
+        CallerError: the loop is not covered; the message names the setting.
+    """
+    loop, link = loop_of(resolved), resolved.network.link
+    n, size = loop.n, loop.n + loop.m
+    forms = np.zeros((size + 1, size, size))
+    each = np.arange(size)
+    forms[each, each, each] = 1.0
+    for name, weight, width in (("Q", Q, n), ("R", R, loop.m)):
+        if weight is not None and weight.shape != (width, width):
+            raise CallerError(f"{name}: expected {width} x {width} numbers")
+    forms[size, :n, :n] = np.eye(n) if Q is None else (Q + Q.T) / 2
+    forms[size, n:, n:] = np.eye(loop.m) if R is None else (R + R.T) / 2
+    periods = periods_of(resolved, forms)
+
+    def attempt(guarantee: LossGuarantee) -> CostUnder | str:
+        try:
+            return _under(resolved, periods, guarantee)
+        except NotPredictableError as error:
+            return f"not known: {error}"
+
+    return MeanCost(
+        resolved.name,
+        resolved.mode,
+        periods.times.period_ns / NS_PER_S,
+        resolved.timing.horizon_ns / NS_PER_S,
+        loop.state_names or tuple(f"x_{i + 1}" for i in range(n)),
+        loop.input_names or tuple(f"u_{j + 1}" for j in range(loop.m)),
+        attempt(join_guarantee(link.mansd, link.constraints)),
+        attempt(LossGuarantee()),
+    )
+
+
+def _under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarantee) -> CostUnder:
+    outcomes = loss_process(resolved.network.link).outcomes(guarantee)
+    if resolved.network.initial_sync == "known_state":  # nothing is sent at t = 0
+        outcomes = outcomes.after_pause()
+    moments, start = LoopMoments(periods, outcomes), start_of(resolved, outcomes)
+    stationary, n = moments.stationary(), loop_of(resolved).n
+    found = None
+    if stationary is not None:
+        means, at = stationary[1], np.diag(stationary[0].moments.sum(axis=0))
+        roots = np.sqrt(np.maximum(np.concatenate([means[:-1], at[:n]]), 0.0)).tolist()
+        found = Stationary(
+            tuple(roots[:n]), tuple(roots[-n:]), tuple(roots[n:-n]), float(means[-1])
+        )
+    with np.errstate(over="ignore"):
+        _, until = moments.until(start, resolved.timing.horizon_ns)
+    transient = moments.transient(start)
+    return CostUnder(
+        guarantee.meaning,
+        moments.growth,
+        found,
+        float(until[-1]),
+        None if transient is None else float(transient[-1]),
+    )

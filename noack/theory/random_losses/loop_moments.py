@@ -1,0 +1,256 @@
+"""Second moments and quadratic cost of a time-triggered loop under random losses, without bounds.
+
+From one transmission to the next, z = (x, x_c, u, w) becomes M₀z + v₀ if the update is delivered
+and M₁z + v₁ if it is lost. v has the covariance W₀ or W₁ of what the disturbances and the noise of
+the measurement add; it is independent of z and of the losses. With the outcomes L_ij and P_ij and
+the probability π_i of the state i (:mod:`noack.theory.random_losses.mean_square_growth`),
+
+    X_j ← Σ_i L_ij (M₁ X_i M₁ᵀ + π_i W₁) + P_ij (M₀ X_i M₀ᵀ + π_i W₀).
+
+If the spectral radius of the linear part is below 1, there is one fixed point, the stationary
+second moments, and the sum over all periods from x(0) on is a system of linear equations, too. The
+mean cost of a period is Σ_i Σ_j L_ij (trace(C₁ X_i) + π_i c₁) + P_ij (trace(C₀ X_i) + π_i c₀), with
+the cost between the samples (:mod:`noack.theory.random_losses.moment_steps`).
+"""
+
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.impairments.loss_prediction import OutcomeChain
+from noack.impairments.markov_chain import NotPredictableError
+from noack.scenario.resolution import LoopMatrices, loop_of
+from noack.scenario.scenario import Scenario
+from noack.theory.bounds.contraction import Stack
+from noack.theory.margins.loss_margin import intervals_ns, loop_times, require_idle_watchdog
+from noack.theory.margins.time_triggered_loop import LoopTimes
+from noack.theory.random_losses.mean_square_growth import (
+    from_triangles,
+    mean_square_growth,
+    resolved_by,
+    second_moments,
+    triangles,
+)
+from noack.theory.random_losses.moment_steps import MomentStep, flow, jump
+
+_MOST_SLOTS = 100
+_MOST_PERIODS = 100_000
+
+
+class SecondMoments(NamedTuple):
+    """At a transmission: X_i, (modes, S, S), and π_i, (modes,)."""
+
+    moments: Stack
+    shares: Vector
+
+
+class LoopPeriods:
+    """The periods of a loop, of which each is a ``MomentStep`` of z = (x, x_c, u, w).
+
+    Args:
+        loop: the loop's matrices.
+        times: its times; a period is from a transmission to the next one.
+        disturbance: covariance of what is added to ẋ, held over each step of the plant, (n, n).
+        noise: covariance of the noise of a measurement, (n, n).
+        forms: quadratic forms of (x, u), u the input of the controller, (K, n + m, n + m).
+    """
+
+    def __init__(
+        self, loop: LoopMatrices, times: LoopTimes, disturbance: Matrix, noise: Matrix, forms: Stack
+    ) -> None:
+        n, m = loop.n, loop.m
+        # The states are (x, x_c, u, w), the held disturbance d, and the state s in flight.
+        sizes = np.cumsum([n, n, m, m, n])
+        x, x_c, u, w, d, s = np.split(np.eye(4 * n + 2 * m), sizes)
+        self.times, self.size = times, 2 * (n + m)
+        self._generator = x.T @ (loop.A @ x + loop.B @ u + d) + x_c.T @ (loop.H @ x_c)
+        xu = np.vstack([x, u])
+        self._forms = np.einsum("ia,kij,jb->kab", xu, forms, xu, optimize=True)
+        count, fresh, nothing = len(forms), d.T @ disturbance @ d, 0 * d
+        self._fresh = jump(np.vstack([x, x_c, u, w, nothing, s]), count, fresh)
+        self._latch = jump(np.vstack([x, x_c, w, w, nothing, s]), count, fresh)
+        self._tick = jump(np.vstack([x, x_c, u, loop.K @ x_c, d, s]), count)
+        self._send = jump(np.vstack([x, x_c, u, w, d, x]), count, s.T @ noise @ s)
+        held = flow(loop.H, 0 * loop.H, np.zeros((0, n, n)), times.delay_ns / NS_PER_S).matrix
+        self._receive = jump(np.vstack([x, held @ s, u, w, d, s]), count)
+        self._flows: dict[int, MomentStep] = {}
+
+    def step(self, slot: int, delivered: bool, duration_ns: int | None = None) -> MomentStep:
+        """Return a period, or what of it is before a time, from just before its transmission.
+
+        Args:
+            slot: number of the transmission, modulo the number of slots.
+            delivered: whether its update arrives.
+            duration_ns: by default the period.
+        """
+        from_ns, duration = slot * self.times.period_ns, duration_ns or self.times.period_ns
+        until_ns, arrival_ns = from_ns + duration, from_ns + self.times.delay_ns
+        if not delivered or arrival_ns > until_ns:
+            return self._fresh.then(self._between(from_ns, until_ns)).of_first(self.size)
+        sent = self._fresh.then(self._send).then(self._between(from_ns, arrival_ns))
+        received = sent.then(self._receive).then(self._between(arrival_ns, until_ns))
+        return received.of_first(self.size)
+
+    def _between(self, from_ns: int, until_ns: int) -> MomentStep:
+        """Return an interval; a tick at its end is excluded, a step at its start."""
+        cycle_ns = np.lcm(self.times.step_ns, self.times.tick_ns)
+        cycles, rest_ns = divmod(until_ns - from_ns, int(cycle_ns))
+        rest = self._interval(from_ns, from_ns + rest_ns)
+        if not cycles:
+            return rest
+        cycle = self._interval(from_ns + rest_ns, from_ns + rest_ns + int(cycle_ns))
+        return rest.then(cycle.repeated(cycles))
+
+    def _interval(self, from_ns: int, until_ns: int) -> MomentStep:
+        parts, now_ns = [], from_ns
+        for t_ns, is_tick in self.times.occurrences(from_ns, until_ns):
+            parts += [self._flow(t_ns - now_ns), self._tick if is_tick else self._latch]
+            now_ns = t_ns
+        return reduce(MomentStep.then, [*parts, self._flow(until_ns - now_ns)])
+
+    def _flow(self, dt_ns: int) -> MomentStep:
+        if dt_ns not in self._flows:
+            G = self._generator
+            self._flows[dt_ns] = flow(G, 0 * G, self._forms, dt_ns / NS_PER_S)
+        return self._flows[dt_ns]
+
+
+class LoopMoments:
+    """Moments of the loop of some periods under random outcomes.
+
+    Raises:
+        NotPredictableError: loop and losses have too many states.
+    """
+
+    def __init__(self, periods: LoopPeriods, outcomes: OutcomeChain) -> None:
+        if periods.times.slots > _MOST_SLOTS:
+            raise NotPredictableError("the times of the loop repeat only after many periods")
+        self._periods, self._outcomes = periods, outcomes
+        self._slots = [
+            (periods.step(slot, delivered=True), periods.step(slot, delivered=False))
+            for slot in range(periods.times.slots)
+        ]
+        maps = [(delivered.matrix, lost.matrix) for delivered, lost in self._slots]
+        self.growth = mean_square_growth(maps, outcomes)
+        """Of √E‖z‖² per period."""
+
+    def _sum(self, entries: Vector) -> Vector:
+        """Return the sum of what becomes of moments over all cycles of the slots."""
+        steps = [
+            second_moments(delivered.matrix, lost.matrix, self._outcomes)
+            for delivered, lost in self._slots
+        ]
+        return resolved_by(reduce(lambda before, step: step @ before, steps), 1.0, entries)
+
+    def stationary(self) -> tuple[SecondMoments, Vector] | None:
+        """Return the moments at the transmissions of slot 0, and the mean costs per second.
+
+        For periodic losses they are means over the periods. None: they grow without a bound.
+        """
+        if self.growth >= 1:
+            return None
+        shares = self._outcomes.distribution(len(self._slots))
+        size = self._periods.size
+        added, _ = self._cycle(SecondMoments(np.zeros((len(shares), size, size)), shares))
+        entries = self._sum(triangles(added.moments))
+        start = SecondMoments(from_triangles(entries, size), shares)
+        cycle_s = len(self._slots) * self._periods.times.period_ns / NS_PER_S
+        return start, self._cycle(start)[1] / cycle_s
+
+    def transient(self, start: SecondMoments) -> Vector | None:
+        """Return the costs of all periods from a start on without noise; None: infinite."""
+        if self.growth >= 1:
+            return None
+        entries = self._sum(triangles(start.moments))
+        all_cycles = from_triangles(entries, self._periods.size)
+        return self._cycle(SecondMoments(all_cycles, 0 * start.shares))[1]
+
+    def until(self, start: SecondMoments, horizon_ns: int) -> tuple[SecondMoments, Vector]:
+        """Return the moments at a time, and the mean costs until then.
+
+        Raises:
+            NotPredictableError: there are too many periods.
+        """
+        number, rest_ns = divmod(horizon_ns, self._periods.times.period_ns)
+        if number > _MOST_PERIODS:
+            raise NotPredictableError("there are too many periods until the horizon")
+        now, costs = start, np.zeros_like(self._slots[0][0].constants)
+        for k in range(number):
+            now, more = self._advance(now, self._slots[k % len(self._slots)])
+            costs = costs + more
+        if rest_ns:
+            slot = number % len(self._slots)
+            last = tuple(self._periods.step(slot, way, rest_ns) for way in (True, False))
+            now, more = self._advance(now, last)
+            costs = costs + more
+        return now, costs
+
+    def _cycle(self, now: SecondMoments) -> tuple[SecondMoments, Vector]:
+        return self.until(now, len(self._slots) * self._periods.times.period_ns)
+
+    def _advance(
+        self, now: SecondMoments, slot: tuple[MomentStep, ...]
+    ) -> tuple[SecondMoments, Vector]:
+        """Return the moments after a period, and its mean costs."""
+        moments, shares = np.zeros_like(now.moments), np.zeros_like(now.shares)
+        costs = np.zeros_like(slot[0].constants)
+        for step, moves in zip(slot, (self._outcomes.delivered, self._outcomes.lost), strict=True):
+            before, weights = np.einsum("ij,iab->jab", moves, now.moments), now.shares @ moves
+            moments += step.matrix @ before @ step.matrix.T + weights[:, None, None] * step.noise
+            shares += weights
+            costs += np.einsum("kab,jab->k", step.costs, before) + weights.sum() * step.constants
+        return SecondMoments(moments, shares), costs
+
+
+def require_predictable(resolved: Scenario) -> None:
+    """Raise CallerError unless the loop's second moments follow linear equations."""
+    scenario = resolved
+    resolved.coverage.require_direct_inputs()
+    resolved.coverage.require_unchanging()
+    if (why := resolved.coverage.beyond_theory) is not None:
+        raise CallerError(f"{why}; the mean cost needs a linear plant with u = K x_c")
+    if scenario.observer is not None:
+        raise CallerError(f'observer.kind = "{scenario.observer.kind}": the mean cost needs none')
+    for number, one in enumerate(scenario.plant.disturbances):
+        if any(one.entries) and not one.variance.any():
+            raise CallerError(
+                f"plant.disturbances.{number}: {one.kind} is not random; the mean cost needs "
+                "disturbances of kind gaussian or uniform"
+            )
+    if any(scenario.controller.safe_input or ()):
+        raise CallerError("controller.safe_input: the mean cost needs the input 0 at the start")
+    require_idle_watchdog(resolved)
+    shortest_ns, longest_ns = intervals_ns(resolved)
+    if shortest_ns != longest_ns:
+        raise CallerError(
+            f'trigger.policy = "{scenario.trigger.policy}": the mean cost needs a time-triggered '
+            "sensor: --set 'trigger={policy=\"periodic\", period_s=0.5}'"
+        )
+
+
+def periods_of(resolved: Scenario, forms: Stack) -> LoopPeriods:
+    """Return the periods of a scenario's loop.
+
+    Raises:
+        CallerError: the loop is not covered; the message names the setting.
+    """
+    require_predictable(resolved)
+    loop, noise = loop_of(resolved), resolved.plant.noise_variances(*resolved.model.dimensions)
+    disturbance = np.diag(noise.at_state) + loop.B @ np.diag(noise.at_input) @ loop.B.T
+    times = loop_times(resolved, intervals_ns(resolved)[0])
+    return LoopPeriods(loop, times, disturbance, np.diag(noise.output), forms)
+
+
+def start_of(resolved: Scenario, outcomes: OutcomeChain) -> SecondMoments:
+    """Return the moments before the first packet: x = x(0), and the input is 0."""
+    loop, n = loop_of(resolved), resolved.model.dimensions[0]
+    z = np.zeros(2 * (n + loop.m))
+    z[:n] = loop.x0
+    if resolved.network.initial_sync == "known_state":
+        z[n : 2 * n] = loop.x0
+    shares = np.eye(len(outcomes.lost))[-1]
+    return SecondMoments(np.multiply.outer(shares, np.outer(z, z)), shares)
