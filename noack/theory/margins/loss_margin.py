@@ -160,6 +160,19 @@ class Stability(NamedTuple):
             return "stable"
         return "destabilised" if self.lower > 1 else "undecided"
 
+    def with_upper_of(self, other: "Stability") -> "Stability":
+        """Return the same, with the upper bound of a guarantee that allows all these patterns."""
+        if other.upper >= self.upper:
+            return self
+        return self._replace(upper=other.upper, vertices=other.vertices)
+
+    def with_lower_of(self, other: "Stability") -> "Stability":
+        """Return the same, with the lower bound of a guarantee that allows some of these patterns."""
+        if other.lower <= self.lower:
+            return self
+        return self._replace(lower=other.lower, pattern=other.pattern,
+                             intervals_s=other.intervals_s)  # fmt: skip
+
     @property
     def is_periodic(self) -> bool:
         """Whether the updates of the pattern are equally far apart."""
