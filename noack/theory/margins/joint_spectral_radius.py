@@ -13,7 +13,7 @@ threshold is much shorter than one for a growth just above the radius.
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -22,8 +22,10 @@ import numpy as np
 from noack.theory.margins.branch_and_bound import bound_by_products
 from noack.theory.margins.invariant_polytopes import InvariantPolytopes, initial_vertices
 from noack.theory.margins.quadratic_norms import (
-    QuadraticNorms,
-    quadratic_norms,
+    FEW_ENTRIES,
+    MOST_ENTRIES,
+    NormSearch,
+    entries_of,
     remembering,
     representatives,
 )
@@ -42,9 +44,9 @@ _COARSER, _COARSEST = 4.0, 1e15
 _MOST_CYCLE_EDGES = 60
 """Largest length of the cycles that are tried, also in a graph of more nodes."""
 MOST_VERTICES = 800
-_MORE_VERTICES = 4000
-"""Limit of the second attempt to compare with a threshold."""
-_FEW_PRODUCTS, _PRODUCTS, _MORE_PRODUCTS = 4000, 30_000, 300_000
+_FEW_VERTICES, _MORE_VERTICES = 300, 4000
+"""Limits of the two attempts to compare with a threshold."""
+_PRODUCTS, _MORE_PRODUCTS = 30_000, 300_000
 MOST_LEAVING = 60
 """Largest number of edges that leave a node for which polytopes are tried."""
 _REMEMBERED = 3
@@ -121,16 +123,18 @@ class _Enclosure:
         self.upper, self.vertices = math.inf, 0
         leaving = Counter(edge.source for edge in system.edges)
         self._is_large = not most_vertices or max(leaving.values()) > MOST_LEAVING
+        self._searches: dict[bool, NormSearch] = {}
         only = only_cycle(system)
         if only is not None:
             bounds = [growth_bounds(part, only) for part in (system, self._balanced)]
             lowers, uppers = zip(*bounds, strict=True)
             self.cycle, self.upper = Cycle(only if max(lowers) else (), max(lowers)), min(uppers)
         elif self._is_large:
-            self.upper = self._norms.upper
-            numbers = representatives(system, self._norms.growths)
+            norms = self._search().improve(0.0)
+            self._improve(norms.upper)
+            numbers = representatives(system, norms.growths)
             fastest = SwitchedSystem(tuple(system.edges[number] for number in numbers))
-            turned = fastest.in_coordinates(self._norms.forms) or fastest
+            turned = fastest.in_coordinates(norms.forms) or fastest
             cycle = _best_cycle(fastest, turned, _SEARCH)
             path = tuple(numbers[number] for number in cycle.path)
             self.cycle = cycle._replace(path=path)
@@ -142,21 +146,26 @@ class _Enclosure:
         return self._system.balanced()
 
     @cached_property
-    def _norms(self) -> QuadraticNorms:
-        return quadratic_norms(self._system)
-
-    @cached_property
-    def _in_norms(self) -> SwitchedSystem:
-        """The system in the coordinates of the norms, for which short products suffice."""
-        self._improve(self._norms.upper)
-        return self._system.in_coordinates(self._norms.forms) or self._balanced
+    def _longest_cycle(self) -> Cycle:
+        return _best_cycle(self._system, self._balanced, _LONG_SEARCH)
 
     @cached_property
     def _remembering(self) -> SwitchedSystem:
-        system = remembering(self._system, _REMEMBERED)
-        norms = quadratic_norms(system)
-        self._improve(norms.upper)
-        return system.in_coordinates(norms.forms) or system
+        """The same system with more nodes, if they are not too many for the search for norms."""
+        reaching = Counter(edge.target for edge in self._system.edges)
+        for classes in (_REMEMBERED,) if self._is_large else (max(reaching.values()), _REMEMBERED):
+            system = remembering(self._system, classes)
+            if entries_of(system) <= FEW_ENTRIES:
+                return system
+        return self._system
+
+    def _search(self, remembers: bool = False) -> NormSearch:
+        if remembers not in self._searches:
+            system, most = self._system, FEW_ENTRIES
+            if remembers:
+                system, most = self._remembering, MOST_ENTRIES
+            self._searches[remembers] = NormSearch(system, most)
+        return self._searches[remembers]
 
     def _improve(self, upper: float, vertices: int = 0) -> None:
         self.upper, self.vertices = min((self.upper, self.vertices), (upper, vertices))
@@ -167,71 +176,64 @@ class _Enclosure:
 
     def compare(self, threshold: float, effort: float) -> float:
         """Try to decide whether the radius is below a threshold; return the effort if it failed."""
-        system, few = self._balanced, int(MOST_VERTICES * effort)
         needed = math.inf
-        for attempt in range(5):
-            growth = threshold - _WITHIN * (threshold - self.cycle.growth)
-            if attempt == 0:
-                self._prove_by_polytopes(growth, few)
-            elif attempt == 1:
-                self._search_longer()
-                self._prove_by_products(system, growth, int(_FEW_PRODUCTS * effort))
-            elif attempt == 2:
-                system = self._in_norms
-                self._prove_by_products(system, growth, int(_PRODUCTS * effort))
-            elif attempt == 3:
-                self._prove_by_polytopes(growth, int(_MORE_VERTICES * effort))
-            else:
-                if self._is_large:
-                    system = self._remembering
-                needed = self._prove_by_products(system, growth, int(_MORE_PRODUCTS * effort))
+        attempts: tuple[Callable[[float], float], ...] = (
+            lambda growth: self._prove_by_polytopes(growth, int(_FEW_VERTICES * effort)),
+            self._search_longer,
+            lambda growth: self._prove_by_norms(growth, int(_PRODUCTS * effort)),
+            lambda growth: self._prove_by_polytopes(growth, int(_MORE_VERTICES * effort)),
+            lambda growth: self._prove_by_norms(growth, int(_MORE_PRODUCTS * effort), True),
+        )
+        for attempt in attempts:
+            needed = attempt(threshold - _WITHIN * (threshold - self.cycle.growth))
             if self.is_decided(threshold):
                 return 0.0
         return needed * effort
 
     def sharpen(self, accuracy: float) -> None:
         """Bring the bounds together as far as the limits of the work allow."""
-        if self._is_large:
-            if self.upper > self.cycle.growth * (1 + accuracy):
-                _ = self._remembering
-            return
         is_first = True
         while self.cycle.growth * (1 + accuracy) < self.upper and accuracy < _COARSEST:
             least = _LEAST_GROWTH * _largest(self._balanced)
             growth = max(self.cycle.growth, least) * (1 + accuracy)
-            if self._prove_by_polytopes(growth, self._most_vertices):
+            self._prove_by_polytopes(growth, self._most_vertices)
+            if self.upper <= growth:
                 break
             if is_first:  # if a longer cycle grows faster, no proof can be completed
                 is_first, before = False, self.cycle.growth
-                self._search_longer()
+                self._search_longer(growth)
                 if self.cycle.growth > before * (1 + accuracy / 2):
                     continue
-                self._prove_by_products(self._balanced, growth, _FEW_PRODUCTS)
-                if self.upper > growth:
-                    self._prove_by_products(self._in_norms, growth, _PRODUCTS)
+                self._prove_by_norms(growth, _PRODUCTS, remembers=self._is_large)
+            if self._is_large:
+                break
             accuracy *= _COARSER
 
-    @cached_property
-    def _longest_cycle(self) -> Cycle:
-        return _best_cycle(self._system, self._balanced, _LONG_SEARCH)
-
-    def _search_longer(self) -> None:
+    def _search_longer(self, growth: float) -> float:
         if not self._is_large:
             self.cycle = max(self.cycle, self._longest_cycle, key=lambda one: one.growth)
+        return math.inf
 
-    def _prove_by_polytopes(self, growth: float, most_vertices: int) -> bool:
-        """Return whether polytopes for a growth were completed."""
-        if self._is_large:
-            return False
-        start = initial_vertices(self._balanced, self.cycle, growth)
-        polytopes = InvariantPolytopes(self._balanced, growth, start)
-        complete = polytopes.grow(most_vertices)
-        self._improve(polytopes.bound(), polytopes.count)
-        return complete
+    def _prove_by_polytopes(self, growth: float, most_vertices: int) -> float:
+        if not self._is_large:
+            start = initial_vertices(self._balanced, self.cycle, growth)
+            polytopes = InvariantPolytopes(self._balanced, growth, start)
+            if polytopes.grow(most_vertices) or most_vertices == self._most_vertices:
+                # Incomplete polytopes prove a larger growth.
+                self._improve(polytopes.bound(), polytopes.count)
+        return math.inf
 
-    def _prove_by_products(self, system: SwitchedSystem, growth: float, most: int) -> float:
+    def _prove_by_norms(self, growth: float, most: int, remembers: bool = False) -> float:
         """Try to prove a growth; return the effort that this is estimated to need, 1: the limit."""
-        found = bound_by_products(system, growth, most, slowest=self.cycle.growth)
+        norms = self._search(remembers).improve(growth)
+        self._improve(norms.upper)
+        if self.upper <= growth:
+            return 1.0
+        system = self._remembering if remembers else self._system
+        turned = system.in_coordinates(norms.forms)
+        if turned is None:
+            return math.inf
+        found = bound_by_products(turned, growth, most, slowest=self.cycle.growth)
         self._improve(found.upper)
         return found.needed / most
 

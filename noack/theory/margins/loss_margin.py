@@ -167,7 +167,7 @@ class Stability(NamedTuple):
         return self._replace(upper=other.upper, vertices=other.vertices)
 
     def with_lower_of(self, other: "Stability") -> "Stability":
-        """Return the same, with the lower bound of a guarantee that allows some of these patterns."""
+        """Return the same, with the lower bound of a guarantee whose patterns are among these."""
         if other.lower <= self.lower:
             return self
         return self._replace(lower=other.lower, pattern=other.pattern,
