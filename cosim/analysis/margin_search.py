@@ -1,11 +1,19 @@
 """The margin of a loop: the largest M, and the longest time between events for its own M."""
 
-from collections.abc import Callable
+import math
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from cosim.analysis.guarantee_comparison import (
+    GuaranteeComparison,
+    compare_guarantees,
+    read_guarantee,
+)
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
+from noack.core.number_format import duration
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
@@ -15,6 +23,8 @@ from noack.theory.margins.loss_margin import LossMargin, Stability, capped
 from noack.theory.random_losses.random_growth import RandomGrowth, random_growth
 
 MOST_M = 16
+_LARGEST_EFFORT = 1e6
+_NOT_COMPARED = GuaranteeComparison()
 
 MarginProgress = Callable[[str], None]
 """Receives what is examined next."""
@@ -26,6 +36,20 @@ class LossCap(NamedTuple):
     m: int
     """M; at most M − 1 consecutive losses."""
     found: Stability
+    took_s: float = 0.0
+    """CPU time."""
+
+    def undecided_text(self, effort: float) -> str:
+        """Return the bounds, and what more time would give, as a sentence."""
+        lower, upper, needed = self.found.lower, self.found.upper, self.found.needed_effort
+        text = f"M = {self.m} is undecided: growth between {lower:.6g} and {upper:.6g}, gap "
+        text += f"{upper - lower:.2g}; if it is the lower bound, "
+        if not needed < _LARGEST_EFFORT:
+            return f"{text}it is too close to 1 for a proof"
+        about_s = self.took_s * needed / effort
+        return f"{text}--effort {max(needed, 2 * effort):.2g} is estimated to prove stability, " + (
+            f"in about {duration(about_s)}"
+        )
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -100,6 +124,10 @@ class MarginResult:
     """None if it was not searched for."""
     without_guarantee: RandomGrowth | str
     """The growth under the scenario's losses if nothing limits them, or why it is not known."""
+    effort: float = 1.0
+    """Factor of the limits of the work for a decision."""
+    compared: GuaranteeComparison = _NOT_COMPARED
+    """The scenario's guarantee and others, if there are others."""
 
     @property
     def is_periodic(self) -> bool:
@@ -128,9 +156,9 @@ class MarginResult:
         elif most is not None:
             parts = [f"stable for every pattern with M ≤ {most}"]
         parts += [
-            f"M = {m} is undecided (growth between {found.lower:.6g} and {found.upper:.6g})"
-            for m, found in self.caps
-            if found.verdict == "undecided" and m > (most or 0)  # of fewer losses all are stable
+            cap.undecided_text(self.effort)
+            for cap in self.caps  # of fewer losses all are stable
+            if cap.found.verdict == "undecided" and cap.m > (most or 0)
         ]
         if (last := self.destabilised) is not None:
             parts.append(f"this pattern destabilises M = {last.m}: {last.found.text}")
@@ -139,7 +167,8 @@ class MarginResult:
     def __repr__(self) -> str:
         """Return the verdicts."""
         period = [self.period.text] if self.period else []
-        return "\n".join([self.verdict, *period, self.random_text])
+        relations = self.compared.relations
+        return "\n".join([self.verdict, *relations, *period, self.random_text])
 
     @property
     def random_text(self) -> str:
@@ -158,13 +187,21 @@ class MarginResult:
             "verdict": self.verdict,
             "stable_m": self.stable_m,
             "caps": [{"m": cap.m, **_document(cap.found)} for cap in self.caps],
+            "compared": [
+                {"guarantee": one.meaning, **_document(one.found)}
+                for one in self.compared.guarantees
+            ],
+            "relations": self.compared.relations,
             "period": period,
             "without_guarantee": found if isinstance(found, str) else found._asdict(),
         }
 
 
 def _document(found: Stability) -> dict[str, object]:
-    return found._asdict() | {"pattern": found.text, "verdict": found.verdict}
+    needed = found.needed_effort if math.isfinite(found.needed_effort) else None
+    return found._asdict() | {
+        "pattern": found.text, "verdict": found.verdict, "needed_effort": needed
+    }  # fmt: skip
 
 
 def find_margin(
@@ -173,6 +210,8 @@ def find_margin(
     most_m: int = MOST_M,
     accuracy: float = ACCURACY,
     with_period: bool = True,
+    guarantees: Sequence[str] = (),
+    effort: float = 1.0,
     progress: MarginProgress = lambda text: None,
 ) -> MarginResult:
     """Find the margin of a scenario's loop.
@@ -182,6 +221,8 @@ def find_margin(
         most_m: largest M to examine.
         accuracy: wanted ratio of upper and lower bound, minus 1.
         with_period: whether to search for the longest period, too.
+        guarantees: other guarantees to examine, in words such as ``mansd 4 atmost 3 in 10``.
+        effort: factor of the limits of the work for a decision.
         progress: receives what is examined next.
 
     Raises:
@@ -191,7 +232,10 @@ def find_margin(
         raise CallerError(f"most_m {most_m}: expected the largest M to examine, 1 or more")
     if not 1e-8 <= accuracy < 1:
         raise CallerError(f"accuracy {accuracy:g}: expected a number from 1e-8 to 1, e.g. 1e-4")
+    if not 0 < effort <= _LARGEST_EFFORT:
+        raise CallerError(f"effort {effort:g}: expected a factor of the work up to 1e6, e.g. 10")
     margin, network = LossMargin(resolved), resolved.network
+    others_read = [read_guarantee(words) for words in guarantees]
     others = LossGuarantee(
         tuple(rule for rule in network.guarantee.rules if not isinstance(rule, LongestBurst))
     )
@@ -199,16 +243,26 @@ def find_margin(
     every_m = False
     for m in range(1, most_m + 1):
         progress(f"M = {m}")
-        caps.append(LossCap(m, margin.stability(capped(others, m - 1), accuracy)))
+        begun_s = time.process_time()
+        found = margin.stability(capped(others, m - 1), accuracy, effort=effort)
+        caps.append(LossCap(m, found, time.process_time() - begun_s))
         every_m = others.longest_burst is not None and others.longest_burst < m
         if every_m or caps[-1].found.verdict == "destabilised":
             break
+
+    def examine(guarantee: LossGuarantee) -> Stability:
+        progress(guarantee.meaning)
+        return margin.stability(guarantee, accuracy, effort=effort)
+
+    compared = _NOT_COMPARED
+    if others_read:
+        compared = compare_guarantees([network.guarantee, *others_read], examine)
     return MarginResult(
         resolved.name, resolved.mode, network.mansd, network.guarantee.meaning,
         margin.shortest_ns / NS_PER_S, margin.longest_ns / NS_PER_S,
         margin.loop.times.delay_ns / NS_PER_S, tuple(caps), every_m,
         find_longest_period(resolved, progress) if with_period else None,
-        _without_guarantee(resolved, progress),
+        _without_guarantee(resolved, progress), effort, compared,
     )  # fmt: skip
 
 

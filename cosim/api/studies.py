@@ -79,7 +79,13 @@ def certify(scenario: Source, *, weight: str = "given", late: int | None = None)
 
 
 def margin(
-    scenario: Source, *, most_m: int = MOST_M, accuracy: float = ACCURACY, period: bool = True
+    scenario: Source,
+    *,
+    most_m: int = MOST_M,
+    accuracy: float = ACCURACY,
+    period: bool = True,
+    guarantees: Sequence[str] = (),
+    effort: float = 1.0,
 ) -> MarginResult:
     """Return the largest M for which a loop is stable under every loss pattern.
 
@@ -93,13 +99,20 @@ def margin(
         most_m: largest M to examine.
         accuracy: wanted ratio of upper and lower bound of the growth, minus 1.
         period: whether to search for the longest period with the scenario's own M, too.
+        guarantees: other guarantees to examine, in words such as ``mansd 4 atmost 3 in 10``.
+        effort: factor of the work that a decision may take.
 
     Raises:
         NoackError: the scenario is wrong; or its trigger has no longest time, its loop is not
             linear, or its delay varies or is not below the shortest period.
     """
     return find_margin(
-        resolve(load(scenario)), most_m=most_m, accuracy=accuracy, with_period=period
+        resolve(load(scenario)),
+        most_m=most_m,
+        accuracy=accuracy,
+        with_period=period,
+        guarantees=guarantees,
+        effort=effort,
     )
 
 

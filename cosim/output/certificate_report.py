@@ -203,6 +203,7 @@ def _limit(value_s: float) -> str:
 _MARGIN_STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}
 
 
+_COMPARED_HEADINGS = ("guarantee", "at least", "at most", "worst pattern", "verdict")
 MARGIN_HEADINGS = ("M", "maximum consecutive losses (M − 1)", "at least", "at most", "verdict")
 
 
@@ -221,16 +222,17 @@ def margin_title(margin: MarginResult) -> str:
 
 def margin_rows(margin: MarginResult) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of the bounds."""
-    for m, found in margin.caps:
+    for m, found, _ in margin.caps:
         yield str(m), str(m - 1), f"{found.lower:.9f}", f"{found.upper:.9f}", found.verdict
 
 
 def print_margin(console: Console, margin: MarginResult) -> None:
     """Print the bounds for each M, and the verdicts."""
-    (table,) = margin_tables(margin)
-    last = len(MARGIN_HEADINGS) - 1
-    console.print(terminal_table(table, left=[last], styles=_MARGIN_STYLES))
-    console.print(margin.verdict, soft_wrap=True, highlight=False)
+    for table in margin_tables(margin):
+        last = len(table.headings) - 1
+        console.print(terminal_table(table, left=[last], styles=_MARGIN_STYLES))
+    for text in (margin.verdict, *margin.compared.relations):
+        console.print(text, soft_wrap=True, highlight=False)
     if margin.period is not None:
         text = f"for {margin.guarantee}: {margin.period.text}"
         console.print(text, soft_wrap=True, highlight=False)
@@ -242,9 +244,16 @@ def print_margin(console: Console, margin: MarginResult) -> None:
 
 
 def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
-    """Yield the bounds of the growth for each M."""
+    """Yield the bounds of the growth for each M, and for guarantees that are compared."""
     rows = [*margin_rows(margin)]
     yield ResultTable("margin", margin_title(margin), MARGIN_HEADINGS, rows)
+    if margin.compared.guarantees:
+        rows = [
+            (meaning, f"{found.lower:.9f}", f"{found.upper:.9f}", found.text, found.verdict)
+            for meaning, found in margin.compared.guarantees
+        ]
+        title = f"{margin.scenario}: the scenario's guarantee, and others"
+        yield ResultTable("guarantees", title, _COMPARED_HEADINGS, rows)
 
 
 def print_mean_cost(console: Console, found: MeanCost) -> None:

@@ -78,6 +78,8 @@ def margin(
     most: Annotated[int, Option(min=1, max=1000)] = 16,
     accuracy: float = 2e-4,
     period: bool = True,
+    guarantee: Annotated[list[str] | None, Option("--guarantee", metavar="WORDS")] = None,
+    effort: float = 1.0,
     play: Annotated[bool, Option("--play")] = False,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     tables: cli.TablesOption = None,
@@ -94,11 +96,14 @@ def margin(
         most: Largest M to examine.
         accuracy: Wanted ratio of the bounds, minus 1; finer where they include 1.
         period: Search for the longest period with the scenario's own M, too.
+        guarantee: Another guarantee to examine, e.g. "mansd 4 atmost 3 in 10"; can be repeated.
+        effort: Factor of the work that a decision may take.
         play: Play the destabilising pattern in a live run.
 
     Examples:
         noack margin lane_periodic   the largest M and the longest period
         noack margin lane_periodic --play   play the destabilising pattern live
+        noack margin lane_periodic --guarantee "atmost 5 in 9"   compare two guarantees
         noack margin lane_periodic --set mode=zoh --no-period --json   hold the input; as JSON
     """
     if play and json:
@@ -107,6 +112,7 @@ def margin(
     with cli.status("examining") as status:
         found = margin_search.find_margin(
             resolved, most_m=most, accuracy=accuracy, with_period=period,
+            guarantees=guarantee or (), effort=effort,
             progress=lambda text: status.update(f"examining {text}"),
         )  # fmt: skip
     cli.show(json, found.to_json, certificate_report.print_margin, found)

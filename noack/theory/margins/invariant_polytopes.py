@@ -173,10 +173,10 @@ class InvariantPolytopes:
     def grow(self, most_vertices: int) -> bool:
         """Add images until all are inside.
 
-        Return False at ``most_vertices`` vertices, or when the vertices show that a path grows
-        faster than γ, or after 60 rounds.
+        Return False when ``most_vertices`` vertices have been added, or when the vertices show that
+        a path grows faster than γ, or after 60 rounds.
         """
-        pending = dict(self.vertices)
+        pending, most_vertices = dict(self.vertices), self.count + most_vertices
         for _ in range(_ROUNDS):
             images: dict[int, list[Matrix]] = {}
             for edge in self.system.edges:

@@ -2,28 +2,33 @@
 
 It is the largest growth per unit of time that a path can have in the long run; all paths are stable
 exactly if it is below 1. A cycle bounds it from below
-(:mod:`noack.theory.margins.switched_system`), polytopes
-(:mod:`noack.theory.margins.invariant_polytopes`) or quadratic norms from above. All bounds include
-all rounding.
+(:mod:`noack.theory.margins.switched_system`). From above, three kinds of proofs complement each
+other: polytopes (:mod:`noack.theory.margins.invariant_polytopes`), quadratic norms
+(:mod:`noack.theory.margins.quadratic_norms`), and products of many steps in such norms
+(:mod:`noack.theory.margins.branch_and_bound`). All bounds include all rounding.
 
-Quadratic norms, one per node: if ‖T_w M x‖ ≤ γ^d ‖T_v x‖ for every edge from v to w with the matrix
-M and the duration d, no path grows faster than γ. The matrices T_v are chosen so that the largest γ
-is as small as possible; the bound is then computed from them, so it does not depend on the search.
-Many edges, for which polytopes would need many vertices, cost little more here; but the bound may
-stay above the joint spectral radius.
+Whether the radius is below a threshold is decided first, since a proof for a growth just below the
+threshold is much shorter than one for a growth just above the radius.
 """
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, Vector
-from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
+from noack.theory.margins.branch_and_bound import bound_by_products
 from noack.theory.margins.invariant_polytopes import InvariantPolytopes, initial_vertices
+from noack.theory.margins.quadratic_norms import (
+    FEW_ENTRIES,
+    MOST_ENTRIES,
+    NormSearch,
+    entries_of,
+    remembering,
+    representatives,
+)
 from noack.theory.margins.switched_system import (
     Cycle,
     Edge,
@@ -39,22 +44,17 @@ _COARSER, _COARSEST = 4.0, 1e15
 _MOST_CYCLE_EDGES = 60
 """Largest length of the cycles that are tried, also in a graph of more nodes."""
 MOST_VERTICES = 800
+_FEW_VERTICES, _MORE_VERTICES = 300, 4000
+"""Limits of the two attempts to compare with a threshold."""
+_PRODUCTS, _MORE_PRODUCTS = 30_000, 300_000
 MOST_LEAVING = 60
 """Largest number of edges that leave a node for which polytopes are tried."""
-_FASTEST, _STEADY = 8, 17
 _REMEMBERED = 3
 """Classes of edges that a node remembers in the second search for quadratic norms."""
 _LEAST_GROWTH = 1e-3
 """Growth of the polytopes if no cycle grows, relative to the largest norm of a matrix."""
-MOST_ENTRIES = 300
-"""Largest number of entries of all T_v; for more, the search takes too long: they are all equal."""
-_SHARPNESS = (10.0, 100.0, 1000.0, 10000.0)
-_STEPS = 200
-_FIRST_EDGES, _FURTHER_EDGES = 48, 24
-_ATTEMPTS = 8
-_SETTLED = 1e-4
-_SMALLEST = 1e-300
-_ENLARGED = 1 + 2.0**-40
+_WITHIN = 0.1
+"""A growth below the threshold by this share of its distance from the lower bound is proven."""
 
 
 class _CycleSearch(NamedTuple):
@@ -75,10 +75,18 @@ class JointSpectralRadius(NamedTuple):
     """Numbers of the edges of the cycle that attains the lower bound, in their order of time."""
     vertices: int
     """Number of vertices of the polytopes that prove the upper bound; 0: it has another proof."""
+    needed: float = 0.0
+    """If the threshold is between the bounds: an estimate of the effort that would prove the radius
+    to be below, if it is the lower bound; infinity if the two hardly differ."""
 
 
 def joint_spectral_radius(
-    edges: Sequence[Edge], *, accuracy: float = ACCURACY, most_vertices: int = MOST_VERTICES
+    edges: Sequence[Edge],
+    *,
+    accuracy: float = ACCURACY,
+    most_vertices: int = MOST_VERTICES,
+    threshold: float | None = None,
+    effort: float = 1.0,
 ) -> JointSpectralRadius:
     """Enclose the joint spectral radius.
 
@@ -87,79 +95,147 @@ def joint_spectral_radius(
         accuracy: wanted upper/lower − 1.
         most_vertices: limit of the work; at the limit the bounds are farther apart. 0: quadratic
             norms take the place of polytopes.
+        threshold: a number with which the radius is compared, with more work than its enclosure.
+        effort: factor of the limits of the work for this comparison.
     """
     numbers = {id(edge): number for number, edge in enumerate(edges)}
-    lower, upper, vertices = 0.0, 0.0, 0
+    lower, upper, vertices, needed = 0.0, 0.0, 0, 0.0
     path: tuple[int, ...] = ()
     for part in strongly_connected(edges):
-        bounds = _connected(part, accuracy, most_vertices)
-        if bounds.lower > lower:
-            lower = bounds.lower
-            path = tuple(numbers[id(part.edges[i])] for i in bounds.cycle)
-        upper, vertices = max(upper, bounds.upper), vertices + bounds.vertices
-    return JointSpectralRadius(lower, upper, path, vertices)
+        enclosure = _Enclosure(part, most_vertices)
+        if threshold is not None and not enclosure.is_decided(threshold):
+            needed = max(needed, enclosure.compare(threshold, effort))
+        enclosure.sharpen(accuracy)
+        if enclosure.cycle.growth > lower:
+            lower = enclosure.cycle.growth
+            path = tuple(numbers[id(part.edges[i])] for i in enclosure.cycle.path)
+        upper, vertices = max(upper, enclosure.upper), vertices + enclosure.vertices
+    if threshold is not None and not lower <= threshold <= upper:
+        needed = 0.0
+    return JointSpectralRadius(lower, upper, path, vertices, needed)
 
 
-def _connected(system: SwitchedSystem, accuracy: float, most_vertices: int) -> JointSpectralRadius:
-    only = only_cycle(system)
-    leaving = Counter(edge.source for edge in system.edges)
-    if only is None and (not most_vertices or max(leaving.values()) > MOST_LEAVING):
-        return _by_quadratic_norms(system, accuracy)
-    balanced = system.balanced()
-    upper, vertices, searched = math.inf, 0, False
-    if only is None:
-        cycle = _best_cycle(system, balanced, _SEARCH)
-    else:
-        lowers, uppers = zip(
-            *(growth_bounds(part, only) for part in (system, balanced)), strict=True
+class _Enclosure:
+    """The bounds of a system in which every node can be reached from any other."""
+
+    def __init__(self, system: SwitchedSystem, most_vertices: int) -> None:
+        self._system, self._most_vertices = system, most_vertices
+        self.upper, self.vertices = math.inf, 0
+        leaving = Counter(edge.source for edge in system.edges)
+        self._is_large = not most_vertices or max(leaving.values()) > MOST_LEAVING
+        self._searches: dict[bool, NormSearch] = {}
+        only = only_cycle(system)
+        if only is not None:
+            bounds = [growth_bounds(part, only) for part in (system, self._balanced)]
+            lowers, uppers = zip(*bounds, strict=True)
+            self.cycle, self.upper = Cycle(only if max(lowers) else (), max(lowers)), min(uppers)
+        elif self._is_large:
+            norms = self._search().improve(0.0)
+            self._improve(norms.upper)
+            numbers = representatives(system, norms.growths)
+            fastest = SwitchedSystem(tuple(system.edges[number] for number in numbers))
+            turned = fastest.in_coordinates(norms.forms) or fastest
+            cycle = _best_cycle(fastest, turned, _SEARCH)
+            path = tuple(numbers[number] for number in cycle.path)
+            self.cycle = cycle._replace(path=path)
+        else:
+            self.cycle = _best_cycle(system, self._balanced, _SEARCH)
+
+    @cached_property
+    def _balanced(self) -> SwitchedSystem:
+        return self._system.balanced()
+
+    @cached_property
+    def _longest_cycle(self) -> Cycle:
+        return _best_cycle(self._system, self._balanced, _LONG_SEARCH)
+
+    @cached_property
+    def _remembering(self) -> SwitchedSystem:
+        """The same system with more nodes, if they are not too many for the search for norms."""
+        reaching = Counter(edge.target for edge in self._system.edges)
+        for classes in (_REMEMBERED,) if self._is_large else (max(reaching.values()), _REMEMBERED):
+            system = remembering(self._system, classes)
+            if entries_of(system) <= FEW_ENTRIES:
+                return system
+        return self._system
+
+    def _search(self, remembers: bool = False) -> NormSearch:
+        if remembers not in self._searches:
+            system, most = self._system, FEW_ENTRIES
+            if remembers:
+                system, most = self._remembering, MOST_ENTRIES
+            self._searches[remembers] = NormSearch(system, most)
+        return self._searches[remembers]
+
+    def _improve(self, upper: float, vertices: int = 0) -> None:
+        self.upper, self.vertices = min((self.upper, self.vertices), (upper, vertices))
+
+    def is_decided(self, threshold: float) -> bool:
+        """Return whether the radius is known to be below or above a threshold."""
+        return not self.cycle.growth <= threshold <= self.upper
+
+    def compare(self, threshold: float, effort: float) -> float:
+        """Try to decide whether the radius is below a threshold; return the effort if it failed."""
+        needed = math.inf
+        attempts: tuple[Callable[[float], float], ...] = (
+            lambda growth: self._prove_by_polytopes(growth, int(_FEW_VERTICES * effort)),
+            self._search_longer,
+            lambda growth: self._prove_by_norms(growth, int(_PRODUCTS * effort)),
+            lambda growth: self._prove_by_polytopes(growth, int(_MORE_VERTICES * effort)),
+            lambda growth: self._prove_by_norms(growth, int(_MORE_PRODUCTS * effort), True),
         )
-        cycle, upper = Cycle(only if max(lowers) else (), max(lowers)), min(uppers)
-    while cycle.growth * (1 + accuracy) < upper and accuracy < _COARSEST:
-        growth = max(cycle.growth, _LEAST_GROWTH * _largest(balanced)) * (1 + accuracy)
-        start = initial_vertices(balanced, cycle, growth)
-        polytopes = InvariantPolytopes(balanced, growth, start)
-        complete = polytopes.grow(most_vertices)
-        upper, vertices = min((upper, vertices), (polytopes.bound(), polytopes.count))
-        if complete:
-            break
-        if not searched:  # if a longer cycle grows faster, the polytopes cannot be completed
-            searched, before = True, cycle.growth
-            upper, vertices = min((upper, vertices), (quadratic_norms(system).upper, 0))
-            cycle = max(
-                cycle, _best_cycle(system, balanced, _LONG_SEARCH), key=lambda one: one.growth
-            )
-            if cycle.growth > before * (1 + accuracy / 2):
-                continue
-        accuracy *= _COARSER
-    return JointSpectralRadius(cycle.growth, upper, cycle.path, vertices)
+        for attempt in attempts:
+            needed = attempt(threshold - _WITHIN * (threshold - self.cycle.growth))
+            if self.is_decided(threshold):
+                return 0.0
+        return needed * effort
 
+    def sharpen(self, accuracy: float) -> None:
+        """Bring the bounds together as far as the limits of the work allow."""
+        is_first = True
+        while self.cycle.growth * (1 + accuracy) < self.upper and accuracy < _COARSEST:
+            least = _LEAST_GROWTH * _largest(self._balanced)
+            growth = max(self.cycle.growth, least) * (1 + accuracy)
+            self._prove_by_polytopes(growth, self._most_vertices)
+            if self.upper <= growth:
+                break
+            if is_first:  # if a longer cycle grows faster, no proof can be completed
+                is_first, before = False, self.cycle.growth
+                self._search_longer(growth)
+                if self.cycle.growth > before * (1 + accuracy / 2):
+                    continue
+                self._prove_by_norms(growth, _PRODUCTS, remembers=self._is_large)
+            if self._is_large:
+                break
+            accuracy *= _COARSER
 
-def _by_quadratic_norms(system: SwitchedSystem, accuracy: float) -> JointSpectralRadius:
-    """Enclose the joint spectral radius of a system with too many edges for polytopes."""
-    norms = quadratic_norms(system)
-    numbers = _representatives(system, norms.growths)
-    fastest = SwitchedSystem(tuple(system.edges[number] for number in numbers))
-    cycle = _best_cycle(fastest, fastest.in_coordinates(norms.forms) or fastest, _SEARCH)
-    upper = norms.upper
-    if upper > cycle.growth * (1 + accuracy):
-        upper = min(upper, quadratic_norms(remembering(system, _REMEMBERED)).upper)
-    path = tuple(numbers[number] for number in cycle.path)
-    return JointSpectralRadius(cycle.growth, upper, path, 0)
+    def _search_longer(self, growth: float) -> float:
+        if not self._is_large:
+            self.cycle = max(self.cycle, self._longest_cycle, key=lambda one: one.growth)
+        return math.inf
 
+    def _prove_by_polytopes(self, growth: float, most_vertices: int) -> float:
+        if not self._is_large:
+            start = initial_vertices(self._balanced, self.cycle, growth)
+            polytopes = InvariantPolytopes(self._balanced, growth, start)
+            if polytopes.grow(most_vertices) or most_vertices == self._most_vertices:
+                # Incomplete polytopes prove a larger growth.
+                self._improve(polytopes.bound(), polytopes.count)
+        return math.inf
 
-def _representatives(system: SwitchedSystem, growths: Vector) -> list[int]:
-    """Return some edges that leave each node: those that grow most, and some of each duration."""
-    leaving: dict[int, list[int]] = {}
-    for number, edge in enumerate(system.edges):
-        leaving.setdefault(edge.source, []).append(number)
-    chosen: set[int] = set()
-    for members in leaving.values():
-        fastest = sorted(members, key=lambda number: -growths[number])[:_FASTEST]
-        steady = sorted(members, key=lambda number: system.edges[number].duration)
-        places = np.linspace(0, len(steady) - 1, min(_STEADY, len(steady)))
-        chosen.update(fastest)
-        chosen.update(steady[index] for index in places.round().astype(int).tolist())
-    return sorted(chosen)
+    def _prove_by_norms(self, growth: float, most: int, remembers: bool = False) -> float:
+        """Try to prove a growth; return the effort that this is estimated to need, 1: the limit."""
+        norms = self._search(remembers).improve(growth)
+        self._improve(norms.upper)
+        if self.upper <= growth:
+            return 1.0
+        system = self._remembering if remembers else self._system
+        turned = system.in_coordinates(norms.forms)
+        if turned is None:
+            return math.inf
+        found = bound_by_products(turned, growth, most, slowest=self.cycle.growth)
+        self._improve(found.upper)
+        return found.needed / most
 
 
 def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _CycleSearch) -> Cycle:
@@ -173,188 +249,3 @@ def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _Cycle
 
 def _largest(system: SwitchedSystem) -> float:
     return max(float(np.abs(edge.matrix.middle).max()) for edge in system.edges)
-
-
-class QuadraticNorms(NamedTuple):
-    """The norms ‖T_v x‖ of all nodes, and what they prove."""
-
-    forms: dict[int, Matrix]
-    """T_v of every node, (n, n)."""
-    growths: Vector
-    """Upper bounds of ‖T_w M T_v^{−1}‖^{1/d} of every edge; rounding is included, (k,)."""
-
-    @property
-    def upper(self) -> float:
-        """Upper bound of the joint spectral radius."""
-        return float(self.growths.max())
-
-
-def quadratic_norms(system: SwitchedSystem) -> QuadraticNorms:
-    """Return the best norms found, beginning with the Euclidean one."""
-    dimensions = system.dimensions
-    if sum(n * (n + 1) // 2 for n in dimensions.values()) > MOST_ENTRIES:
-        if len(dimensions) > 1 and len(set(dimensions.values())) == 1:
-            common = tuple(edge._replace(source=0, target=0) for edge in system.edges)
-            forms, growths = quadratic_norms(SwitchedSystem(common))
-            return QuadraticNorms(dict.fromkeys(dimensions, forms[0]), growths)
-        search = _Search(system)
-        return QuadraticNorms(search.forms, search.bounds())
-    search = _Search(system)
-    best = QuadraticNorms(search.forms, search.bounds())
-    numbers = np.unique(np.linspace(0, len(system.edges) - 1, _FIRST_EDGES).astype(np.int64))
-    for _ in range(_ATTEMPTS):
-        search.improve(numbers)
-        growths = search.growths()
-        if growths.max() <= growths[numbers].max() + _SETTLED:
-            break
-        numbers = np.union1d(numbers, np.argsort(-growths)[:_FURTHER_EDGES])
-    return min(best, QuadraticNorms(search.forms, search.bounds()), key=lambda norms: norms.upper)
-
-
-def remembering(system: SwitchedSystem, classes: int) -> SwitchedSystem:
-    """Return the same system with nodes that also remember the class of the last edge.
-
-    The classes have equal numbers of edges, in the order of the edges. More norms give a smaller
-    bound (Ahmadi, Jungers, Parrilo and Roozbehani, *SIAM J. Control Optim.* 52, 2014). Each edge
-    becomes ``classes`` successive ones.
-    """
-    ends: dict[int, list[int]] = {}
-    for number, edge in enumerate(system.edges):
-        ends.setdefault(edge.target, []).append(number)
-    kinds = {
-        number: index * classes // len(members)
-        for members in ends.values()
-        for index, number in enumerate(members)
-    }
-    return SwitchedSystem(tuple(
-        Edge(edge.source * classes + kind, edge.target * classes + kinds[number], *edge[2:])
-        for number, edge in enumerate(system.edges) for kind in range(classes)
-    ))  # fmt: skip
-
-
-def norms_above(matrices: IntervalMatrix) -> Vector:
-    """Return upper bounds of the Euclidean norms of all matrices of enclosures, (k, m, n) → (k,).
-
-    With the computed eigenvectors V of MᵀM, ‖MᵀM‖ ≤ ‖VᵀMᵀMV‖ ‖V^{−1}‖². The first norm is at most
-    the largest sum of a row, and ‖V^{−1}‖² ≤ 1/(1 − ‖I − VᵀV‖).
-    """
-    M, transposed = matrices, IntervalMatrix(*(part.swapaxes(1, 2) for part in matrices))
-    V = exactly(np.linalg.eigh(transposed.middle @ M.middle)[1])
-    turned = exactly(V.middle.swapaxes(1, 2))
-    square = turned @ (transposed @ M) @ V
-    defect = exactly(np.eye(M.middle.shape[2])) - turned @ V
-    size, missed = (matrix.magnitude.sum(axis=2).max(axis=1) for matrix in (square, defect))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bounds = np.sqrt(size / (1 - missed)) * _ENLARGED
-    return np.where(missed < 0.5, bounds, np.inf)
-
-
-class _Steps(NamedTuple):
-    """Edges between the same two nodes."""
-
-    source: int
-    target: int
-    numbers: NDArray[np.int64]
-    matrices: IntervalMatrix
-    """(k, m, n)."""
-
-
-class _Search:
-    """Looks for T_v, lower triangular, that minimise the largest γ of all edges."""
-
-    def __init__(self, system: SwitchedSystem) -> None:
-        self._edges = system.edges
-        self._nodes = {node: np.tril_indices(n) for node, n in system.dimensions.items()}
-        self.forms: dict[int, Matrix] = {node: np.eye(n) for node, n in system.dimensions.items()}
-        """T_v of every node."""
-        self._durations = np.array([float(edge.duration) for edge in self._edges])
-        self._shares = self._durations / self._durations.max()
-        self._all = list(self._grouped(range(len(self._edges))))
-
-    def growths(self) -> Vector:
-        """Return the logarithm of γ per longest duration, of every edge, (k,)."""
-        logarithms = np.zeros(len(self._edges))
-        for steps in self._all:
-            turned = self.forms[steps.target] @ steps.matrices.middle
-            turned = turned @ _inverse(self.forms[steps.source])
-            norms = np.linalg.norm(turned, 2, axis=(1, 2))
-            logarithms[steps.numbers] = np.log(np.maximum(norms, _SMALLEST))
-        return np.asarray(logarithms / self._shares)
-
-    def bounds(self) -> Vector:
-        """Return upper bounds of γ of every edge, with all rounding, (k,)."""
-        bounds = np.full(len(self._edges), np.inf)
-        for steps in self._all:
-            undone = inverse(self.forms[steps.source])
-            if undone is not None:
-                turned = exactly(self.forms[steps.target]) @ steps.matrices @ undone
-                roots = norms_above(turned) ** (1 / self._durations[steps.numbers])
-                bounds[steps.numbers] = roots * (1 + 1e-15)
-        return bounds
-
-    def improve(self, numbers: NDArray[np.int64]) -> None:
-        """Minimise the maximum over some edges: a smooth one that becomes sharper and sharper."""
-        from scipy.optimize import minimize  # slow to import
-
-        groups = list(self._grouped(numbers.tolist()))
-        for sharpness in _SHARPNESS:
-            entries = np.concatenate([self.forms[v][lower] for v, lower in self._nodes.items()])
-            minimum = minimize(
-                self._smooth_maximum, entries, (groups, sharpness), "L-BFGS-B", jac=True,
-                options={"maxiter": _STEPS},
-            )  # fmt: skip
-            self.forms = self._matrices(minimum.x)
-
-    def _grouped(self, numbers: Iterable[int]) -> Iterator[_Steps]:
-        groups: dict[tuple[int, int], list[int]] = {}
-        for number in numbers:
-            edge = self._edges[number]
-            groups.setdefault((edge.source, edge.target), []).append(number)
-        for (source, target), members in groups.items():
-            matrices = [self._edges[number].matrix for number in members]
-            stack = IntervalMatrix(*(np.array(part) for part in zip(*matrices, strict=True)))
-            yield _Steps(source, target, np.array(members), stack)
-
-    def _matrices(self, entries: Vector) -> dict[int, Matrix]:
-        matrices, begin = {}, 0
-        for node, lower in self._nodes.items():
-            size = len(lower[0])
-            matrices[node] = np.zeros_like(self.forms[node])
-            matrices[node][lower] = entries[begin : begin + size]
-            begin += size
-        return matrices
-
-    def _smooth_maximum(
-        self, entries: Vector, groups: list[_Steps], sharpness: float
-    ) -> tuple[float, Vector]:
-        """Return log(Σ e^{s g})/s of the logarithms g of γ, and its gradient.
-
-        For σ = uᵀ T_w M T_v^{−1} v: dσ = uᵀ dT_w M T_v^{−1} v − σ vᵀ dT_v T_v^{−1} v.
-        """
-        forms = self._matrices(entries)
-        try:
-            undone = {node: _inverse(form) for node, form in forms.items()}
-        except np.linalg.LinAlgError:
-            return math.inf, np.zeros_like(entries)
-        parts = []
-        for steps in groups:
-            turned = forms[steps.target] @ steps.matrices.middle @ undone[steps.source]
-            U, sizes, Vt = np.linalg.svd(turned)
-            sigma = np.maximum(sizes[:, 0], _SMALLEST)
-            g = np.log(sigma) / self._shares[steps.numbers]
-            right = Vt[:, 0] @ undone[steps.source].T  # T_v^{−1} v
-            moved = np.einsum("kij,kj->ki", steps.matrices.middle, right) / sigma[:, None]
-            parts.append((steps, g, U[:, :, 0], moved, Vt[:, 0], right))
-        largest = max(float(g.max()) for _, g, *_ in parts)
-        total = sum(float(np.exp(sharpness * (g - largest)).sum()) for _, g, *_ in parts)
-        gradients = {node: np.zeros_like(form) for node, form in forms.items()}
-        for steps, g, u, moved, v, right in parts:
-            share = np.exp(sharpness * (g - largest)) / total / self._shares[steps.numbers]
-            gradients[steps.target] += (share[:, None] * u).T @ moved
-            gradients[steps.source] -= (share[:, None] * v).T @ right
-        slope = np.concatenate([gradients[v][lower] for v, lower in self._nodes.items()])
-        return largest + math.log(total) / sharpness, slope
-
-
-def _inverse(matrix: Matrix) -> Matrix:
-    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)

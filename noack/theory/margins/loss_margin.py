@@ -28,7 +28,6 @@ from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import (
     ACCURACY,
     MOST_VERTICES,
-    JointSpectralRadius,
     joint_spectral_radius,
 )
 from noack.theory.margins.switched_system import Edge
@@ -39,7 +38,6 @@ MOST_EDGES = 5000
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
 _FIRST_ACCURACY = 1e-2
 _QUICK_ACCURACY = 3e-2
-_LAST_ACCURACY = 1e-8
 
 
 class EventTimes(NamedTuple):
@@ -151,6 +149,9 @@ class Stability(NamedTuple):
     """The time from each update of the pattern to the next one."""
     vertices: int
     """Number of vertices of the polytopes that prove the upper bound; 0: it has another proof."""
+    needed_effort: float = 0.0
+    """If undecided: an estimate of the effort (1: the default) that would prove stability, if the
+    growth is the lower bound; infinite if that is too close to 1."""
 
     @property
     def verdict(self) -> str:
@@ -158,6 +159,19 @@ class Stability(NamedTuple):
         if self.upper < 1:
             return "stable"
         return "destabilised" if self.lower > 1 else "undecided"
+
+    def with_upper_of(self, other: "Stability") -> "Stability":
+        """Return the same, with the upper bound of a guarantee that allows all these patterns."""
+        if other.upper >= self.upper:
+            return self
+        return self._replace(upper=other.upper, vertices=other.vertices)
+
+    def with_lower_of(self, other: "Stability") -> "Stability":
+        """Return the same, with the lower bound of a guarantee whose patterns are among these."""
+        if other.lower <= self.lower:
+            return self
+        return self._replace(lower=other.lower, pattern=other.pattern,
+                             intervals_s=other.intervals_s)  # fmt: skip
 
     @property
     def is_periodic(self) -> bool:
@@ -221,14 +235,16 @@ class LossMargin:
         guarantee: LossGuarantee | None = None,
         accuracy: float = ACCURACY,
         *,
-        refine: bool = True,
+        decide: bool = True,
+        effort: float = 1.0,
     ) -> Stability:
         """Bound the growth of all patterns of a guarantee, by default the scenario's.
 
         Args:
             guarantee: the guarantee.
             accuracy: wanted upper/lower − 1.
-            refine: whether the accuracy is refined if the bounds are on both sides of 1.
+            decide: whether bounds on both sides of 1 are improved.
+            effort: factor of the limits of the work for that.
 
         Raises:
             CallerError: the loop grows so much between deliveries that products overflow.
@@ -236,38 +252,28 @@ class LossMargin:
         bursts = list_bursts(guarantee or self.guarantee, self.loop.times.slots, self._times)
         try:
             with np.errstate(over="raise"):
-                return self._bounded(bursts, accuracy, refine=refine)
+                return self._bounded(bursts, accuracy, decide=decide, effort=effort)
         except (OverflowError, FloatingPointError):
             raise CallerError(
                 "the loop grows beyond 1e308 within some deliveries; reduce mansd or the period"
             ) from None
 
-    def _bounded(self, bursts: list[Burst], accuracy: float, *, refine: bool) -> Stability:
+    def _bounded(
+        self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float
+    ) -> Stability:
         edges = [
             Edge(burst.source, burst.target, self.maps(burst.slot, burst.steps - 1), burst.steps)
             for burst in bursts
         ]
         # Short steps would need many vertices.
         vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
-        while True:
-            radius = joint_spectral_radius(
-                edges, accuracy=accuracy / self._times.longest, most_vertices=vertices
-            )
-            finest = _LAST_ACCURACY if radius.vertices else ACCURACY  # of quadratic norms
-            decided = not radius.lower <= 1 <= radius.upper
-            if decided or not refine or accuracy < finest:
-                return self._stability(radius, bursts)
-            accuracy = min(accuracy / 10, (1 - radius.lower) / 2)
-
-    def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
-        """Return coarser bounds, which decide whether all patterns are stable."""
-        return self.stability(guarantee, _FIRST_ACCURACY)
-
-    def first_bounds(self) -> Stability:
-        """Return bounds that take less than a second; they may leave stability undecided."""
-        return self.stability(accuracy=_QUICK_ACCURACY, refine=False)
-
-    def _stability(self, radius: JointSpectralRadius, bursts: list[Burst]) -> Stability:
+        radius = joint_spectral_radius(
+            edges,
+            accuracy=accuracy / self._times.longest,
+            most_vertices=vertices,
+            threshold=1.0 if decide else None,
+            effort=effort,
+        )
         path = [bursts[number] for number in radius.cycle]
         pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
         intervals_s = (
@@ -277,8 +283,16 @@ class LossMargin:
         )
         return Stability(
             radius.lower**self._times.longest, radius.upper**self._times.longest,
-            tuple(pattern), tuple(intervals_s), radius.vertices,
+            tuple(pattern), tuple(intervals_s), radius.vertices, radius.needed,
         )  # fmt: skip
+
+    def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
+        """Return coarser bounds, which decide whether all patterns are stable."""
+        return self.stability(guarantee, _FIRST_ACCURACY)
+
+    def first_bounds(self) -> Stability:
+        """Return bounds that take less than a second; they may leave stability undecided."""
+        return self.stability(accuracy=_QUICK_ACCURACY, decide=False)
 
 
 def require_covered(resolved: Scenario) -> None:

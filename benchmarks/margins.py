@@ -1,0 +1,142 @@
+"""Random time-triggered loops: how many margins are decided, and how long that takes."""
+
+import argparse
+import time
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag, solve_continuous_are
+
+from benchmarks.report import Goal, Row, benchmark, median, say
+from cosim.cli import find_scenario
+from noack.core.linear_systems import Matrix
+from noack.impairments.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossesInWindow,
+    LossGuarantee,
+    LossRule,
+)
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load, validate
+from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
+from noack.theory.margins.loss_margin import LossMargin, Stability, list_bursts
+from noack.theory.margins.switched_system import Edge, find_cycle, strongly_connected
+
+GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
+NEAREST = 1e-3
+"""Loops whose growth is nearer to 1 need not be decided."""
+MEDIAN_S = 2.0
+
+
+class RandomLoop(NamedTuple):
+    """A loop whose growth has been scaled to a chosen distance from 1."""
+
+    margin: LossMargin
+    guarantee: LossGuarantee
+    kind: str
+    growth: float
+    """The growth of the worst pattern that a search of its own found, after scaling."""
+
+
+def _matrices(rng: np.random.Generator, largest: int) -> tuple[Matrix, Matrix, Matrix]:
+    n, m = int(rng.integers(1, largest + 1)), int(rng.integers(1, largest // 2 + 1))
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    K = -B.T @ solve_continuous_are(A, B, np.eye(n), np.eye(m))
+    return A, B, K
+
+
+def random_loop(seed: int) -> RandomLoop:
+    """Return the loop with a number: linear-quadratic regulators of random plants.
+
+    One of six consists of two loops that do not influence each other. The maps between deliveries
+    are multiplied by s^duration, so that the worst pattern's growth is 10^-3 to 0.1
+    above 1, or below for three of four.
+    """
+    rng = np.random.default_rng([seed, 43])
+    if rng.random() < 1 / 6:
+        both = zip(_matrices(rng, 2), _matrices(rng, 2), strict=True)
+        A, B, K = (block_diag(one, other) for one, other in both)
+    else:
+        A, B, K = _matrices(rng, 4)
+    mode, step_s = ("model", "zoh")[seed % 2], 0.02
+    period_s = step_s * int(rng.integers(2, 21))
+    delay_s = 0.0 if rng.random() < 0.7 else 0.4 * step_s
+    content = load(find_scenario("double_integrator")).model_dump(mode="json", exclude_none=True)
+    content |= {
+        "mode": mode,
+        "model": {"A": A.tolist(), "B": B.tolist(), "gain": K.tolist()},
+        "plant": {"initial_state": [1.0] * len(A), "rate_hz": 1 / step_s},
+        "controller": {"rate_hz": 1 / step_s},
+        "trigger": {"policy": "periodic", "period_s": period_s},
+    }
+    content["network"]["impairments"] = [{"kind": "delay", "delay_s": delay_s}] * (delay_s > 0)
+    margin = LossMargin(resolve(validate(content, f"loop {seed}")))
+    which = seed // 2 % len(GUARANTEES)
+    burst = int(rng.integers(1, 8))
+    rules: list[LossRule] = [LongestBurst(burst)]
+    if which % 2:
+        rules.append(
+            LossesInWindow(int(rng.integers(1, burst + 2)), burst + int(rng.integers(2, 6)))
+        )
+    if which >= 2:
+        rules.append(DeliveriesBetweenBursts(int(rng.integers(2, 4))))
+    guarantee = LossGuarantee(tuple(rules))
+    distance = 10 ** rng.uniform(-3, -1)
+    wanted = 1 + distance if rng.random() < 0.25 else 1 - distance
+    scale = wanted / _fastest(margin, guarantee)
+    original = margin.maps
+
+    def scaled(slot: int, losses: int) -> IntervalMatrix:
+        matrix = original(slot, losses)
+        return matrix @ exactly(np.eye(len(matrix.middle[0])) * scale ** (losses + 1))
+
+    margin.maps = scaled  # type: ignore[assignment]
+    return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[which]}", wanted)
+
+
+def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:
+    edges = [
+        Edge(burst.source, burst.target, margin.maps(burst.slot, burst.steps - 1), burst.steps)
+        for burst in list_bursts(guarantee, margin.loop.times.slots)
+    ]
+    parts = [part.balanced() for part in strongly_connected(edges)]
+    return max(find_cycle(part, 30, 200).growth for part in parts)
+
+
+class Examined(NamedTuple):
+    """What was found about a loop."""
+
+    loop: RandomLoop
+    found: Stability
+    took_s: float
+
+
+@benchmark(
+    "margins",
+    "Random time-triggered loops: decided margins",
+    {
+        "--margin-loops": {"type": int, "default": 200, "help": "margins: number of loops"},
+        "--margin-first": {"type": int, "default": 0, "help": "margins: number of the first loop"},
+    },
+)
+def margins(options: argparse.Namespace) -> Iterator[Row]:
+    """Bound the growth of random loops as ``noack margin`` does, and count what is undecided."""
+    examined: list[Examined] = []
+    for seed in range(options.margin_first, options.margin_first + options.margin_loops):
+        loop = random_loop(seed)
+        begun_s = time.process_time()
+        found = loop.margin.stability(loop.guarantee)
+        took_s = time.process_time() - begun_s
+        examined.append(Examined(loop, found, took_s))
+        bounds = f"{found.lower:.6f} to {found.upper:.6f}"
+        say(f"{seed}: {loop.kind}, growth {loop.growth:.6f}: {found.verdict}, {bounds}, "
+            f"{took_s:.2f} s, {loop.guarantee.meaning}")  # fmt: skip
+    for kind in [*sorted({one.loop.kind for one in examined}), "all"]:
+        some = [one for one in examined if kind in (one.loop.kind, "all")]
+        times_s = [one.took_s for one in some]
+        undecided = [one for one in some if one.found.verdict == "undecided"]
+        note = f"{len(some)} loops, worst {max(times_s):.1f} s"
+        yield Row(f"{kind}: undecided", len(undecided), "", goal=Goal("==", 0), note=note)
+        yield Row(f"{kind}: CPU time, median", median(times_s), "s", goal=Goal("<=", MEDIAN_S))
