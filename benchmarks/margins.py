@@ -38,6 +38,8 @@ class RandomLoop(NamedTuple):
     kind: str
     growth: float
     """The growth of the worst pattern that a search of its own found, after scaling."""
+    scale: float
+    """s."""
 
 
 def _matrices(rng: np.random.Generator, largest: int) -> tuple[Matrix, Matrix, Matrix]:
@@ -93,7 +95,7 @@ def random_loop(seed: int) -> RandomLoop:
         return matrix @ exactly(np.eye(len(matrix.middle[0])) * scale ** (losses + 1))
 
     margin.maps = scaled  # type: ignore[assignment]
-    return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[which]}", wanted)
+    return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[which]}", wanted, scale)
 
 
 def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:

@@ -2,9 +2,8 @@
 
 If ‖T_w M x‖ ≤ γ^d ‖T_v x‖ for every edge from v to w with the matrix M and the duration d, no path
 grows faster than γ. With P = TᵀT these are linear matrix inequalities, F = P_v − NᵀP_wN ≻ 0 with
-N = M γ^−d. The smallest γ is approached by the method of centers (Boyd and El Ghaoui, 1993): the
-minimum of Σ tr P_v − Σ log det F for some γ is found by Newton's method; it satisfies the
-inequalities for a smaller γ, too, and the next γ is a little above that.
+N = M γ^−d. The smallest γ is approached from inside, as interior-point methods do: the sum
+c log γ + Σ tr P_v − Σ log det F is made small by Newton's method, for larger and larger c.
 
 The bound is computed from the norms with all rounding, so it does not depend on the search. It may
 stay above the joint spectral radius. Then there are more norms if the nodes also remember the last
@@ -26,16 +25,17 @@ from noack.theory.margins.switched_system import Edge, SwitchedSystem
 _FASTEST, _STEADY = 8, 17
 FEW_ENTRIES, MOST_ENTRIES = 1200, 2500
 """Numbers of entries of all P_v with which the search takes some seconds, and up to a minute."""
-_CENTERS, _NEWTON_STEPS = 100, 6
-_NEXT = 0.1
-"""The next γ is above the one that holds by this share of the distance from the last one."""
-_FIRST, _AGAIN = 0.3, 0.02
-"""Distance of the first γ, as a logarithm per longest duration; later ones start near the end."""
+_STAGES, _NEWTON_STEPS = 40, 40
+_HEAVIER = 4.0
+"""Factor of the weight of log γ from stage to stage."""
+_FIRST = 0.3
+"""Distance of the first log γ from the one that holds, per longest duration."""
 _CLOSE = 2e-5
 _DECREASE, _SHORTEST, _CENTERED = 0.1, 1e-6, 0.5
 _FIRST_EDGES, _FURTHER_EDGES = 200, 50
 _ATTEMPTS = 8
 _SETTLED = 1e-4
+_LARGEST_LOGARITHM = 300.0
 _SMALLEST = 1e-300
 _ENLARGED = 1 + 2.0**-40
 _Stack = NDArray[np.float64]
@@ -91,7 +91,6 @@ class NormSearch:
         count = max(self._nodes.values()) + 1
         self._squares: _Stack = np.tile(np.eye(n) * len(self._edges) / count, (count, 1, 1))
         """P_v in balanced coordinates; they are enlarged to the largest dimension."""
-        self._first = _FIRST
 
     def improve(self, wanted: float) -> QuadraticNorms:
         """Improve the norms until they prove a growth, or hardly become better."""
@@ -103,8 +102,7 @@ class NormSearch:
             self._squares = _Centers(
                 self._matrices[numbers], self._sources[numbers], self._targets[numbers],
                 self._durations[numbers],
-            ).approach(self._squares, goal, self._first)  # fmt: skip
-            self._first = _AGAIN
+            ).approach(self._squares, goal)  # fmt: skip
             growths = self._growths()
             if growths.max() <= max(growths[numbers].max() + settled, goal):
                 break
@@ -149,79 +147,96 @@ class _Centers(NamedTuple):
     targets: NDArray[np.int64]
     durations: Vector
 
-    def approach(self, P: _Stack, goal: float, first: float) -> _Stack:
+    def approach(self, P: _Stack, goal: float) -> _Stack:
         """Return P for a smaller log γ, at most ``goal`` if that is found."""
+        longest, count = float(self.durations.max()), self.matrices[:, 0].size
         known = float(_log_growths(P, *self).max())
-        level = known + first / float(self.durations.max())
-        for _ in range(_CENTERS):
-            if known < goal or level - known < _CLOSE / self.durations.max():
-                break
-            level = known + _NEXT * (level - known)
-            steps = self.matrices * np.exp(-level * self.durations)[:, None, None]
-            P = self._center(P, steps)
-            known = min(float(_log_growths(P, *self).max()), level)
-        return P
-
-    def _center(self, P: _Stack, steps: _Stack) -> _Stack:
-        value = self._value(P, steps)
-        for _ in range(_NEWTON_STEPS):
-            try:
-                change, decrement = self._newton_step(P, steps)
-            except (np.linalg.LinAlgError, RuntimeError):  # singular by rounding
-                break
-            share = 1.0
-            while share > _SHORTEST:
-                tried = self._value(P + share * change, steps)
-                if tried < value - _DECREASE * share * decrement:
+        level = known + _FIRST / longest
+        weight = count * longest
+        for _ in range(_STAGES):
+            for _ in range(_NEWTON_STEPS):
+                moved = self._moved(P, level, weight)
+                if moved is None:
                     break
-                share /= 2
-            else:
+                P, level, decrement = moved
+                if decrement < _CENTERED:
+                    break
+            known = min(float(_log_growths(P, *self).max()), level)
+            if known < goal or count / weight < _CLOSE / longest:
                 break
-            P, value = P + share * change, tried
-            if decrement < _CENTERED:
-                break
+            weight *= _HEAVIER
         return P
 
-    def _slacks(self, P: _Stack, steps: _Stack) -> _Stack:
-        """Return F of each edge."""
-        return P[self.sources] - steps.swapaxes(1, 2) @ P[self.targets] @ steps
+    def _moved(self, P: _Stack, level: float, weight: float) -> tuple[_Stack, float, float] | None:
+        """Return P and log γ after a step of Newton's method, and twice what it promised.
 
-    def _value(self, P: _Stack, steps: _Stack) -> float:
-        """Return Σ tr P − Σ log det F; infinity outside."""
+        None: no step along its direction makes the value smaller.
+        """
         try:
-            roots = np.linalg.cholesky(self._slacks(P, steps))
+            change, further, decrement = self._direction(P, level, weight)
+        except (np.linalg.LinAlgError, RuntimeError):  # singular by rounding
+            return None
+        value, share = self._value(P, level, weight), 1.0
+        while share > _SHORTEST:
+            new = P + share * change, level + share * further
+            if self._value(*new, weight) < value - _DECREASE * share * decrement:
+                return *new, decrement
+            share /= 2
+        return None
+
+    def _value(self, P: _Stack, level: float, weight: float) -> float:
+        """Return weight · log γ + Σ tr P − Σ log det F; infinity outside."""
+        if not -level * float(self.durations.max()) < _LARGEST_LOGARITHM:
+            return math.inf
+        try:
+            steps = self._steps(level)
+            roots = np.linalg.cholesky(P[self.sources] - self._carried(P, steps))
             np.linalg.cholesky(P)
         except np.linalg.LinAlgError:
             return math.inf
         diagonals = np.diagonal(roots, axis1=1, axis2=2)
-        return float(np.trace(P, axis1=1, axis2=2).sum() - 2 * np.log(diagonals).sum())
+        traces = np.trace(P, axis1=1, axis2=2)
+        return float(weight * level + traces.sum() - 2 * np.log(diagonals).sum())
 
-    def _newton_step(self, P: _Stack, steps: _Stack) -> tuple[_Stack, float]:
-        """Return Newton's change of P, and the decrease of the value that it promises, times 2.
+    def _steps(self, level: float) -> _Stack:
+        """Return N of each edge."""
+        return np.asarray(self.matrices * np.exp(-level * self.durations)[:, None, None])
 
-        With G = F^{−1} and a change dP: tr(G dF G dF), dF = dP_v − NᵀdP_wN, has the parts
-        G ⊗ G, NGNᵀ ⊗ NGNᵀ and −GNᵀ ⊗ GNᵀ.
+    def _carried(self, P: _Stack, steps: _Stack) -> _Stack:
+        """Return NᵀP_wN of each edge."""
+        return np.asarray(steps.swapaxes(1, 2) @ P[self.targets] @ steps)
+
+    def _direction(self, P: _Stack, level: float, weight: float) -> tuple[_Stack, float, float]:
+        """Return Newton's change of P and of log γ, and twice the decrease that it promises.
+
+        With G = F^{−1}, the curvature is tr(G dF G dF) with dF = dP_v − NᵀdP_wN + S dlog γ,
+        S = 2d NᵀP_wN, and 2d tr(G S) for log γ; the rest would make it indefinite.
         """
         from scipy.sparse import coo_array  # slow to import
         from scipy.sparse.linalg import splu
 
-        count, n = P.shape[:2]
+        (count, n), steps = P.shape[:2], self._steps(level)
         basis = _symmetric_basis(n)
-        size = basis.shape[1]
-        G = np.asarray(np.linalg.inv(self._slacks(P, steps)), dtype=np.float64)
-        mixed = G @ steps.swapaxes(1, 2)
-        ahead = steps @ mixed
-        slopes = np.tile(np.eye(n), (count, 1, 1))
-        np.add.at(slopes, self.sources, -G)
-        np.add.at(slopes, self.targets, ahead)
-        slope = (slopes.reshape(count, n * n) @ basis).ravel()
+        size, carried = basis.shape[1], self._carried(P, steps)
+        G = np.asarray(np.linalg.inv(P[self.sources] - carried), dtype=np.float64)
+        S = 2 * self.durations[:, None, None] * carried
+        mixed, turned = G @ steps.swapaxes(1, 2), G @ S
+
+        def of_nodes(edges: _Stack, first: Matrix) -> Vector:
+            """Return Σ tr(X dF) as a function of all P, for X of each edge, and tr(Y dP_v)."""
+            total = np.tile(first, (count, 1, 1))
+            np.add.at(total, self.sources, edges)
+            np.add.at(total, self.targets, -steps @ edges @ steps.swapaxes(1, 2))
+            return np.asarray((total.reshape(count, n * n) @ basis).ravel())
 
         def products(factors: _Stack) -> _Stack:
             squares = np.einsum("eij,ekl->eikjl", factors, factors)
             return np.asarray(basis.T @ squares.reshape(-1, n * n, n * n) @ basis)
 
         crossed = -products(mixed)
-        blocks = np.concatenate([products(G), products(ahead), crossed, crossed.swapaxes(1, 2)])
+        blocks = np.concatenate(
+            [products(G), products(steps @ mixed), crossed, crossed.swapaxes(1, 2)]
+        )
         rows = np.concatenate([self.sources, self.targets, self.sources, self.targets]) * size
         columns = np.concatenate([self.sources, self.targets, self.targets, self.sources]) * size
         inner = np.arange(size)
@@ -230,8 +245,16 @@ class _Centers(NamedTuple):
         shape = (count * size, count * size)
         curvature = coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=shape).tocsc()
         solver = splu(curvature, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        change = -solver.solve(slope)
-        return (change.reshape(count, size) @ basis.T).reshape(P.shape), -float(slope @ change)
+        slope, border = of_nodes(-G, np.eye(n)), of_nodes(turned @ G, np.zeros((n, n)))
+        along, across = solver.solve(slope), solver.solve(border)
+        sums = np.trace(turned, axis1=1, axis2=2)
+        own_slope = weight - float(sums.sum())
+        corner = float(np.einsum("eij,eji->", turned, turned) + 2 * self.durations @ sums)
+        corner -= float(border @ across)
+        further = -(own_slope - float(border @ along)) / corner
+        change = -along - further * across
+        decrement = -float(slope @ change) - own_slope * further
+        return (change.reshape(count, size) @ basis.T).reshape(P.shape), further, decrement
 
 
 def _symmetric_basis(n: int) -> Matrix:

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.analysis.margin_search import find_longest_period, find_margin
+from cosim.analysis.margin_search import LossCap, find_longest_period, find_margin
 from cosim.cli.command import load_scenario
 from noack.core.linear_systems import discretise
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
+from noack.theory.margins.loss_margin import Stability
 from tests.command_line import invoke
 
 HELD = {
@@ -99,6 +100,9 @@ def test_events_at_unknown_times() -> None:
         (["lane_periodic", "--play", "--json"], 2, "--play"),
         (["lane_periodic", "--play", "--most", "1", "--no-period"], 2, "no destabilising pattern"),
         (["lane_periodic", "--accuracy", "2"], 2, "accuracy 2: expected"),
+        (["lane_periodic", "--effort", "0"], 2, "effort 0: expected"),
+        (["lane_periodic", "--guarantee", "loss 5%"], 2, "expected only mansd"),
+        (["lane_periodic", "--guarantee", "recover 2"], 2, "needs a maximum"),
         (["lane_periodic", "--set", "trigger.period_s=9", "--no-period"], 1, "destabilises M = 1"),
     ],
 )
@@ -118,3 +122,33 @@ def test_the_played_settings_are_the_pattern() -> None:
     pattern = found.found.pattern
     expected = [pattern[i % len(pattern)] for i in range(len(received))]
     assert received[:-1] == expected[:-1]
+
+
+def test_guarantees_are_compared() -> None:
+    words = ["atmost 6 in 7", "mansd 4 recover 2"]
+    found = noack.margin("lane_periodic", most_m=1, period=False, guarantees=words)
+    own, weaker, stronger = found.compared.guarantees
+    assert (own.found.verdict, stronger.found.verdict) == ("stable", "stable")
+    assert weaker.found.verdict == "destabilised"
+    assert stronger.found.upper <= own.found.upper <= weaker.found.upper
+    first, second, third = found.compared.relations
+    cap, window = "at most M − 1 = 4 consecutive losses", "at most 6 losses in 7"
+    assert first.startswith(f"“{cap}” implies “{window}")
+    assert first.endswith("which also allows LLLLL")
+    assert second.endswith(f"implies “{cap}”, which also allows LDL")
+    assert f"implies “{window}" in third
+    assert [one["verdict"] for one in found.to_json()["compared"]] == [
+        "stable", "destabilised", "stable"
+    ]  # fmt: skip
+    options = ["--no-period", "--most", "1", "--guarantee", "atmost 6 in 7"]
+    shown = " ".join(invoke("margin", "lane_periodic", *options).output.split())
+    assert first in shown
+
+
+def test_an_undecided_m_states_the_gap_and_the_effort() -> None:
+    bounds = Stability(0.99, 1.01, (True,), (0.5,), 0, needed_effort=30.0)
+    text = LossCap(3, bounds, took_s=4.0).undecided_text(effort=2.0)
+    assert "growth between 0.99 and 1.01, gap 0.02" in text
+    assert "--effort 30 is estimated to prove stability, in about 60 s" in text
+    never = bounds._replace(needed_effort=np.inf)
+    assert "too close to 1" in LossCap(3, never, took_s=4.0).undecided_text(effort=1.0)

@@ -13,10 +13,17 @@ import numpy as np
 import pytest
 
 from noack.core.linear_systems import Matrix
+from noack.theory.margins.branch_and_bound import bound_by_products
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, exponential, inverse
 from noack.theory.margins.invariant_polytopes import InvariantPolytopes
 from noack.theory.margins.joint_spectral_radius import joint_spectral_radius
-from noack.theory.margins.switched_system import Edge, spectral_radius_bounds, strongly_connected
+from noack.theory.margins.quadratic_norms import NormSearch, remembering
+from noack.theory.margins.switched_system import (
+    Edge,
+    SwitchedSystem,
+    spectral_radius_bounds,
+    strongly_connected,
+)
 
 GOLDEN_RATIO = (1 + 5**0.5) / 2
 
@@ -90,6 +97,66 @@ def test_no_polytopes_prove_too_much(seed: int) -> None:
     assert polytopes.bound() >= value
     polytopes.grow(30)
     assert polytopes.bound() >= value
+
+
+def scaled(edges: list[Edge], factor: float) -> list[Edge]:
+    """The same system, whose growth is multiplied by a factor."""
+    return [edge(one.source, one.target, one.matrix.middle * factor**one.duration, one.duration)
+            for one in edges]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_growth_near_the_threshold_is_decided(seed: int) -> None:
+    edges = random_graph(np.random.default_rng(seed))
+    sharp = joint_spectral_radius(edges, accuracy=1e-5).lower
+    for wanted in (0.999, 1.001):
+        found = joint_spectral_radius(scaled(edges, wanted / sharp), accuracy=0.1, threshold=1.0)
+        assert (found.upper < 1) == (wanted < 1)
+        assert (found.lower > 1) == (wanted > 1)
+        assert found.needed == 0
+        assert fastest_cycle(scaled(edges, wanted / sharp), 4) <= found.upper
+
+
+def test_the_estimate_of_the_work_is_mostly_that_of_a_complete_search() -> None:
+    ratios = []
+    for seed in range(24):
+        (system,) = strongly_connected(random_graph(np.random.default_rng(seed)))
+        slowest = joint_spectral_radius(system.edges, accuracy=1e-3).lower
+        balanced, growth = system.balanced(), 1.05 * slowest
+        complete = bound_by_products(balanced, growth, 60_000, slowest=slowest)
+        assert complete.upper <= growth
+        assert complete.needed == complete.products
+        part = bound_by_products(balanced, growth, complete.products // 4, slowest=slowest)
+        ratios.append(part.needed / complete.products)
+    assert min(ratios) > 0.2
+    assert 0.5 < np.median(ratios) < 2
+
+
+def test_a_growth_that_is_the_threshold_is_undecided() -> None:
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    found = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, turn.T)], threshold=1.0)
+    assert found.lower <= 1 <= found.upper < 1 + 1e-3
+    assert found.needed == np.inf
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_no_norms_and_no_products_prove_too_much(seed: int) -> None:
+    """Their bounds hold in any coordinates; a broken copy without the best cycle is caught."""
+    rng = np.random.default_rng(seed)
+    (system,) = strongly_connected(random_graph(rng))
+    found = joint_spectral_radius(system.edges, accuracy=1e-3)
+    norms = NormSearch(system).improve(0.0)
+    assert found.lower <= norms.upper
+    assert found.lower <= NormSearch(remembering(system, 3)).improve(0.0).upper
+    forms = {v: np.eye(n) + 0.5 * rng.normal(size=(n, n)) for v, n in system.dimensions.items()}
+    for coordinates in (norms.forms, forms):
+        turned = system.in_coordinates(coordinates)
+        assert turned is not None
+        for growth in (0.5 * found.lower, 1.01 * found.lower):
+            assert bound_by_products(turned, growth, 300).upper >= found.lower
+    zero = [one._replace(matrix=exactly(0 * one.matrix.middle)) if number in found.cycle else one
+            for number, one in enumerate(system.edges)]  # fmt: skip
+    assert NormSearch(SwitchedSystem(tuple(zero))).improve(0.0).upper < found.lower
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -1,0 +1,35 @@
+"""The random loops of the benchmark: no pattern that is allowed contradicts a proven bound."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from benchmarks.margins import random_loop
+from noack.impairments.loss_guarantee import LossHistory
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_patterns_of_random_loops_grow_as_proven(seed: int) -> None:
+    """Patterns are played step by step, without the maps between deliveries or their graph."""
+    random = random_loop(seed)
+    found = random.margin.stability(random.guarantee)
+    loop, slots = random.margin.loop, random.margin.loop.times.slots
+    steps = [[loop.period(slot, fate) for fate in (False, True)] for slot in range(slots)]
+    fastest, longest = 0.0, 9
+    for length in range(1, longest + 1):
+        for pattern in product((True, False), repeat=length):
+            history, whole = LossHistory(random.guarantee.rules), pattern * 12
+            if not pattern[0] or any(history.add(not fate) for fate in whole):
+                continue
+            repeated = np.lcm(length, slots)
+            Π = np.eye(len(steps[0][0]))
+            for k in range(repeated):
+                Π = steps[k % slots][pattern[k % length]] @ Π
+            radius = np.abs(np.linalg.eigvals(Π)).max() ** (1 / repeated) * random.scale
+            fastest = max(fastest, float(radius))
+    assert found.verdict == ("stable" if random.growth < 1 else "destabilised")
+    assert fastest <= found.upper * (1 + 1e-9)
+    if len(found.pattern) <= longest:
+        assert fastest == pytest.approx(found.lower, rel=1e-6)
+    assert found.lower >= random.growth * (1 - 1e-9)
