@@ -79,6 +79,7 @@ def _relation(one: tuple[str, Pattern | None], other: tuple[str, Pattern | None]
         return f"“{meaning}” and “{other_meaning}” allow the same patterns"
     if pattern is None:
         (meaning, pattern), (other_meaning, other_pattern) = other, one
+    assert pattern is not None
     if other_pattern is None:
         return (
             f"“{other_meaning}” implies “{meaning}”, which also allows {outcome_letters(pattern)}"
