@@ -133,8 +133,8 @@ def margins(options: argparse.Namespace) -> Iterator[Row]:
         took_s = time.process_time() - begun_s
         examined.append(Examined(loop, found, took_s))
         bounds = f"{found.lower:.6f} to {found.upper:.6f}"
-        say(f"{seed}: {loop.kind}, growth {loop.growth:.6f}: {found.verdict}, {bounds}, "
-            f"{took_s:.2f} s, {loop.guarantee.meaning}")  # fmt: skip
+        text = f"growth {loop.growth:.6f}: {found.verdict}, {bounds}, {took_s:.2f} s"
+        say(f"{seed}: {loop.kind}, {text}, {loop.guarantee.meaning}")
     for kind in [*sorted({one.loop.kind for one in examined}), "all"]:
         some = [one for one in examined if kind in (one.loop.kind, "all")]
         times_s = [one.took_s for one in some]

@@ -1,4 +1,4 @@
-"""Relays, ours (``python -m netem``) and others, under load: rate, cost, delay, flows, memory.
+"""Relays, ours (``python -m netem``) and others, under load; and a shell beside others.
 
 ``relays`` and ``relay_flows``: a relay is stopped, its receive buffer is filled with thousands of
 datagrams of 72 bytes, and the relay is continued. The rate is the number of datagrams received and
@@ -10,15 +10,23 @@ each relay, and ratios are the median over rounds of the ratio within a round.
 """
 
 import argparse
+import json
 import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import psutil
 
 from benchmarks.latency import KERNEL, cyclictest
-from benchmarks.programs import BEFORE_OTHERS, LOAD_CORE, RELAY_CORE, on_core, scheduled
+from benchmarks.programs import BEFORE_OTHERS, LOAD_CORE, RELAY_CORE, compiled, on_core, scheduled
 from benchmarks.relay_load import (
     BURST,
     Built,
@@ -45,6 +53,9 @@ from benchmarks.report import (
     median,
     say,
 )
+from netem.relay_links import LinkSpec
+from netem.shell.devices import open_devices
+from noack.impairments.link_settings import LinkSettings
 
 ROUNDS = 2
 WORDS = "loss 5% mansd 4 seed 7"
@@ -320,3 +331,81 @@ def _soak_rows(relay: Relay, seconds: int, maximum_per_s: float) -> list[Row]:
         Row("the relay waited for its core", 100 * waited, "% of the time",
             note="others had its core: a loss may be theirs" if waited > _STARVED else None),
     ]  # fmt: skip
+
+
+_SHELL_ROUNDS = 5
+_PINGS = 500
+_SECONDS = 3
+_PORT = 5209
+_SHELL, _BARE_FORWARDER, _LOSS, _DELAY = (
+    "noack netem shell",
+    "bare forwarder in C",
+    "mm-loss",
+    "mm-delay",
+)
+_SHELLS = {
+    _SHELL: [sys.executable, "-m", "netem", "shell", "--"],
+    _LOSS: ["mm-loss", "uplink", "0"],
+    _DELAY: ["mm-delay", "0"],
+}
+_Run = Callable[[str], str]
+"""Runs a command line of sh inside, where ``$TO`` is the outside; returns its output."""
+
+
+def _bare(command: str, forwarder: Path) -> str:
+    link = open_devices(LinkSpec("bare", ("", 0), ("", 0), LinkSettings(), LinkSettings()))
+    with ExitStack() as stack:
+        stack.callback(link.close)
+        words = [str(forwarder), *map(str, link.devices)]
+        process = stack.enter_context(subprocess.Popen(words, pass_fds=link.devices))
+        stack.callback(process.kill)
+        with link.inside():
+            variables = os.environ | {"TO": link.spec.to[0]}
+            words = ["sh", "-c", command]
+            inner = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=variables)
+        return inner.communicate()[0]
+
+
+def _in_shell(name: str, command: str) -> str:
+    script = f"TO=${{NOACK_OUTSIDE:-$MAHIMAHI_BASE}}; {command}"
+    words = [*_SHELLS[name], "sh", "-c", script]
+    return subprocess.run(
+        words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ).stdout
+
+
+def _shell_figures(run: _Run) -> dict[str, float] | str:
+    """Measure throughput from inside to outside, and the time to there and back."""
+    try:
+        end = json.loads(run(f"iperf3 -J -c $TO -p {_PORT} -t {_SECONDS}"))["end"]
+        pings = run(f"ping -q -i 0.002 -c {_PINGS} $TO")
+        (trip_ms,) = re.findall(r"= [\d.]+/([\d.]+)/", pings)
+        return {"mbit": end["sum_received"]["bits_per_second"] / 1e6, "us": 1e3 * float(trip_ms)}
+    except (ValueError, KeyError):
+        return "its programs did not report"
+
+
+@benchmark("shell", "A shell: throughput of TCP, and time to the outside and back")
+def shell(_options: argparse.Namespace) -> Iterator[Row]:
+    """Measure a shell without impairments, in turn with the alternatives; needs root for these."""
+    if missing := [one for one in ("iperf3", "ping", "ip") if shutil.which(one) is None]:
+        raise MeasurementError(f"there is no {', '.join(missing)}")
+    rounds = Rounds()
+    with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder, ExitStack() as stack:
+        forwarder = compiled("tun.c", Path(folder))
+        server = ["iperf3", "-s", "-p", str(_PORT)]
+        process = stack.enter_context(subprocess.Popen(server, stdout=subprocess.DEVNULL))
+        stack.callback(process.kill)
+        for _ in range(_SHELL_ROUNDS):
+            rounds.add(_BARE_FORWARDER, _shell_figures(lambda command: _bare(command, forwarder)))
+            for name, words in _SHELLS.items():
+                if shutil.which(words[0]) is None:
+                    rounds.add(name, f"there is no {words[0]}")
+                else:
+                    rounds.add(
+                        name, _shell_figures(lambda command, one=name: _in_shell(one, command))
+                    )
+    for peer in (_BARE_FORWARDER, _LOSS, _DELAY):
+        goal = Goal(">=", 0.9) if peer == _BARE_FORWARDER else None
+        yield rounds.row("TCP", "Mbit/s", "mbit", _SHELL, peer, goal, paired=True)
+        yield rounds.row("ping, mean", "µs", "us", _SHELL, peer, paired=True)

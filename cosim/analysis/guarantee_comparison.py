@@ -78,13 +78,14 @@ def _relation(one: tuple[str, Pattern | None], other: tuple[str, Pattern | None]
     if pattern is None and other_pattern is None:
         return f"“{meaning}” and “{other_meaning}” allow the same patterns"
     if pattern is None:
-        (meaning, pattern), (other_meaning, other_pattern) = other, one
-    assert pattern is not None
+        return _implication(meaning, other_meaning, other_pattern or ())
     if other_pattern is None:
-        return (
-            f"“{other_meaning}” implies “{meaning}”, which also allows {outcome_letters(pattern)}"
-        )
+        return _implication(other_meaning, meaning, pattern)
     return (
         f"neither of “{meaning}” and “{other_meaning}” implies the other: only the first allows "
         f"{outcome_letters(pattern)}, only the second {outcome_letters(other_pattern)}"
     )
+
+
+def _implication(meaning: str, implied: str, beyond: Pattern) -> str:
+    return f"“{meaning}” implies “{implied}”, which also allows {outcome_letters(beyond)}"

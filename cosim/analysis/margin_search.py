@@ -1,7 +1,6 @@
 """The margin of a loop: the largest M, and the longest time between events for its own M."""
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -30,26 +29,22 @@ MarginProgress = Callable[[str], None]
 """Receives what is examined next."""
 
 
+def undecided_text(found: Stability, effort: float) -> str:
+    """Return the bounds of an undecided growth, and what more time would give."""
+    lower, upper, needed = found.lower, found.upper, max(found.needed_effort, 2 * effort)
+    text = f"growth between {lower:.6g} and {upper:.6g}, gap {upper - lower:.2g}; if it is the "
+    if not needed < _LARGEST_EFFORT:
+        return f"{text}lower bound, no effort up to {_LARGEST_EFFORT:g} is estimated to prove it"
+    about = duration(found.took_s * needed / effort)
+    return f"{text}lower bound, --effort {needed:.2g} is estimated to prove it, in about {about}"
+
+
 class LossCap(NamedTuple):
     """An M, and what is known about the loop with it."""
 
     m: int
     """M; at most M − 1 consecutive losses."""
     found: Stability
-    took_s: float = 0.0
-    """CPU time."""
-
-    def undecided_text(self, effort: float) -> str:
-        """Return the bounds, and what more time would give, as a sentence."""
-        lower, upper, needed = self.found.lower, self.found.upper, self.found.needed_effort
-        text = f"M = {self.m} is undecided: growth between {lower:.6g} and {upper:.6g}, gap "
-        text += f"{upper - lower:.2g}; if it is the lower bound, "
-        if not needed < _LARGEST_EFFORT:
-            return f"{text}it is too close to 1 for a proof"
-        about_s = self.took_s * needed / effort
-        return f"{text}--effort {max(needed, 2 * effort):.2g} is estimated to prove stability, " + (
-            f"in about {duration(about_s)}"
-        )
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -90,7 +85,7 @@ class PeriodLimit(NamedTuple):
             return (
                 f"stable for every pattern with {apart} {self.stable_s:g} s, the longest examined"
             )
-        longer = f"{apart} {self.unstable_s:g} s: undecided"
+        longer = f"{apart} {self.unstable_s:g} s: undecided, {undecided_text(self.found, 1.0)}"
         if self.found.verdict == "destabilised":
             longer = f"{apart} {self.unstable_s:g} s: this pattern destabilises: {self.found.text}"
         if self.stable_s is None:
@@ -156,7 +151,12 @@ class MarginResult:
         elif most is not None:
             parts = [f"stable for every pattern with M ≤ {most}"]
         parts += [
-            cap.undecided_text(self.effort)
+            f"{one.meaning}: undecided, {undecided_text(one.found, self.effort)}"
+            for one in self.compared.guarantees
+            if one.found.verdict == "undecided"
+        ]
+        parts += [
+            f"M = {cap.m} is undecided: {undecided_text(cap.found, self.effort)}"
             for cap in self.caps  # of fewer losses all are stable
             if cap.found.verdict == "undecided" and cap.m > (most or 0)
         ]
@@ -199,9 +199,10 @@ class MarginResult:
 
 def _document(found: Stability) -> dict[str, object]:
     needed = found.needed_effort if math.isfinite(found.needed_effort) else None
-    return found._asdict() | {
-        "pattern": found.text, "verdict": found.verdict, "needed_effort": needed
-    }  # fmt: skip
+    known = {"pattern": found.text, "verdict": found.verdict, "needed_effort": needed}
+    document = found._asdict() | known
+    document.pop("took_s")  # differs from run to run
+    return document
 
 
 def find_margin(
@@ -243,9 +244,7 @@ def find_margin(
     every_m = False
     for m in range(1, most_m + 1):
         progress(f"M = {m}")
-        begun_s = time.process_time()
-        found = margin.stability(capped(others, m - 1), accuracy, effort=effort)
-        caps.append(LossCap(m, found, time.process_time() - begun_s))
+        caps.append(LossCap(m, margin.stability(capped(others, m - 1), accuracy, effort=effort)))
         every_m = others.longest_burst is not None and others.longest_burst < m
         if every_m or caps[-1].found.verdict == "destabilised":
             break

@@ -222,7 +222,7 @@ def margin_title(margin: MarginResult) -> str:
 
 def margin_rows(margin: MarginResult) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of the bounds."""
-    for m, found, _ in margin.caps:
+    for m, found in margin.caps:
         yield str(m), str(m - 1), f"{found.lower:.9f}", f"{found.upper:.9f}", found.verdict
 
 

@@ -142,7 +142,7 @@ def cost(
     Examples:
         noack cost lane_periodic   growth, stationary rms, mean cost
         noack cost lane_periodic --R '[0.1, 0.1]' --json   with other weights; as JSON
-        noack cost lane_periodic --set 'plant.disturbances=[{kind="gaussian", std=[1, 1]}]'
+        noack cost lane_periodic --set mansd=2   with a stricter guarantee
     """
     resolved = resolution.resolve(given.load())
     found = mean_cost.find_mean_cost(resolved, *weights.matrices(resolved))

@@ -9,6 +9,7 @@ pattern of losses, and of such times, is a path. The edges, with the loop's maps
 (:mod:`noack.theory.margins.switched_system`).
 """
 
+import time
 from functools import cache
 from typing import NamedTuple
 
@@ -152,6 +153,8 @@ class Stability(NamedTuple):
     needed_effort: float = 0.0
     """If undecided: an estimate of the effort (1: the default) that would prove stability, if the
     growth is the lower bound; infinite if that is too close to 1."""
+    took_s: float = 0.0
+    """CPU time."""
 
     @property
     def verdict(self) -> str:
@@ -170,8 +173,9 @@ class Stability(NamedTuple):
         """Return the same, with the lower bound of a guarantee whose patterns are among these."""
         if other.lower <= self.lower:
             return self
-        return self._replace(lower=other.lower, pattern=other.pattern,
-                             intervals_s=other.intervals_s)  # fmt: skip
+        return self._replace(
+            lower=other.lower, pattern=other.pattern, intervals_s=other.intervals_s
+        )
 
     @property
     def is_periodic(self) -> bool:
@@ -250,13 +254,15 @@ class LossMargin:
             CallerError: the loop grows so much between deliveries that products overflow.
         """
         bursts = list_bursts(guarantee or self.guarantee, self.loop.times.slots, self._times)
+        begun_s = time.process_time()
         try:
             with np.errstate(over="raise"):
-                return self._bounded(bursts, accuracy, decide=decide, effort=effort)
+                found = self._bounded(bursts, accuracy, decide=decide, effort=effort)
         except (OverflowError, FloatingPointError):
             raise CallerError(
                 "the loop grows beyond 1e308 within some deliveries; reduce mansd or the period"
             ) from None
+        return found._replace(took_s=time.process_time() - begun_s)
 
     def _bounded(
         self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float

@@ -67,9 +67,9 @@ class NormSearch:
     def __init__(self, system: SwitchedSystem, most_entries: int = MOST_ENTRIES) -> None:
         dimensions = system.dimensions
         is_common = entries_of(system) > most_entries and len(set(dimensions.values())) == 1
-        self._nodes = dict.fromkeys(dimensions, 0) if is_common else {
-            node: number for number, node in enumerate(dimensions)
-        }  # fmt: skip
+        self._nodes = {node: number for number, node in enumerate(dimensions)}
+        if is_common:
+            self._nodes = dict.fromkeys(dimensions, 0)
         self._edges, self._dimensions = system.edges, dimensions
         if is_common:
             system = SwitchedSystem(
@@ -100,9 +100,11 @@ class NormSearch:
         numbers = np.union1d(firsts, spread)
         for _ in range(_ATTEMPTS):
             self._squares = _Centers(
-                self._matrices[numbers], self._sources[numbers], self._targets[numbers],
+                self._matrices[numbers],
+                self._sources[numbers],
+                self._targets[numbers],
                 self._durations[numbers],
-            ).approach(self._squares, goal)  # fmt: skip
+            ).approach(self._squares, goal)
             growths = self._growths()
             if growths.max() <= max(growths[numbers].max() + settled, goal):
                 break
@@ -267,9 +269,12 @@ def _symmetric_basis(n: int) -> Matrix:
 
 
 def _log_growths(
-    P: _Stack, matrices: _Stack, sources: NDArray[np.int64], targets: NDArray[np.int64],
+    P: _Stack,
+    matrices: _Stack,
+    sources: NDArray[np.int64],
+    targets: NDArray[np.int64],
     durations: Vector,
-) -> Vector:  # fmt: skip
+) -> Vector:
     """Return log γ of every edge, (k,)."""
     forms = np.linalg.cholesky(P).swapaxes(1, 2)
     turned = forms[targets] @ matrices @ np.linalg.inv(forms)[sources]
