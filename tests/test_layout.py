@@ -51,7 +51,7 @@ LINES = {
     "controller_node": 405,
     "benchmarks": 4850,
     "native": 10595,
-    "tests": 47840,
+    "tests": 47855,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
