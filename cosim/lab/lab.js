@@ -277,7 +277,6 @@ function labBegin() {
     + 'shows. The settings are in the address of this page, after the "?".';
   const remembered = localStorage.getItem('lab-drawer');
   labDrawer(remembered ? remembered === 'open' : !LAB.narrow.matches, false);
-  LAB.narrow.addEventListener('change', event => event.matches && labDrawer(false, false));
   labById('state').addEventListener('change', event =>
     labSay('state', {number: Number(event.target.value)}));
   document.addEventListener('keydown', event => {
