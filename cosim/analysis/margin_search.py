@@ -181,14 +181,16 @@ class MarginResult:
         period = None
         if self.period is not None:
             period = self.period._asdict() | {"text": self.period.text}
-            period["found"] = None if self.period.found is None else _document(self.period.found)
+            period["found"] = (
+                None if self.period.found is None else stability_document(self.period.found)
+            )
         found = self.without_guarantee
         return vars(self) | {
             "verdict": self.verdict,
             "stable_m": self.stable_m,
-            "caps": [{"m": cap.m, **_document(cap.found)} for cap in self.caps],
+            "caps": [{"m": cap.m, **stability_document(cap.found)} for cap in self.caps],
             "compared": [
-                {"guarantee": one.meaning, **_document(one.found)}
+                {"guarantee": one.meaning, **stability_document(one.found)}
                 for one in self.compared.guarantees
             ],
             "relations": self.compared.relations,
@@ -197,11 +199,12 @@ class MarginResult:
         }
 
 
-def _document(found: Stability) -> dict[str, object]:
+def stability_document(found: Stability) -> dict[str, object]:
+    """Return what is known of a guarantee as JSON; the same in each run."""
     needed = found.needed_effort if math.isfinite(found.needed_effort) else None
     known = {"pattern": found.text, "verdict": found.verdict, "needed_effort": needed}
     document = found._asdict() | known
-    document.pop("took_s")  # differs from run to run
+    document.pop("took_s")
     return document
 
 

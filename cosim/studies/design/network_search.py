@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from cosim.analysis.margin_search import stability_document
 from cosim.output import palette
 from cosim.output.figure_description import Axis, FigureDescription, Item, Line, Marks, Panel, Rule
 from cosim.studies.design.design_search import Bounds
@@ -479,7 +480,7 @@ def _beyond(ladder: Sequence[Rung], one: Reached) -> str:
 
 
 def _document(found: Stability | None) -> dict[str, object] | None:
-    return found and found._asdict() | {"pattern": found.text, "verdict": found.verdict}
+    return found and stability_document(found)
 
 
 def _figure(search: NetworkSearch, given: Reached, best: Reached) -> FigureDescription:
