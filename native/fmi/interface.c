@@ -179,11 +179,18 @@ status fmi3SerializedFMUStateSize(fmu *instance, const void *state, size_t *coun
     return instance == NULL ? FMI_ERROR : FMI_OK;
 }
 
+/* The check sum of a state, which differs from that of the same bytes in another FMU. */
+static void tag_state(const fmu *instance, const noack_fmu_image *state, uint8_t *tag) {
+    tag_image(state, tag);
+    for (int k = 0; k < NOACK_TAG_BYTES; k++)
+        tag[k] ^= instance->initial->tag[k];
+}
+
 status fmi3SerializeFMUState(fmu *instance, const void *state, uint8_t *bytes, size_t count) {
     if (instance == NULL || state == NULL || count != (size_t)instance->initial->bytes)
         return FMI_ERROR;
     memcpy(bytes, state, count);
-    tag_image(state, bytes);
+    tag_state(instance, state, bytes);
     return FMI_OK;
 }
 
@@ -196,9 +203,10 @@ status fmi3DeserializeFMUState(fmu *instance, const uint8_t *bytes, size_t count
     if (save(instance, bytes, state) != FMI_OK)
         return FMI_ERROR;
     noack_fmu_image *image = *state;
-    if (image->bytes == instance->initial->bytes)
-        tag_image(image, tag);
-    if (memcmp(image->tag, tag, sizeof tag) != 0) {
+    int has_size = image->bytes == instance->initial->bytes;
+    if (has_size)
+        tag_state(instance, image, tag);
+    if (!has_size || memcmp(image->tag, tag, sizeof tag) != 0) {
         fmi3FreeFMUState(instance, state);
         return fail(instance, "the state is not one of this FMU, or it is damaged");
     }
