@@ -202,8 +202,9 @@ class NodeDriver(LiveDriver):
             goes_on = self._exchange(wait_s, select.POLLIN)
             self._take_frames(sink)
         self._pass_rows(sink)
-        if goes_on or self._program.wait(_PATIENCE_S):
-            raise PeerError(f"{self._named}: {self._how_it_ended()}")
+        why = self._how_it_ended()
+        if goes_on or self._program.returncode != 0:
+            raise PeerError(f"{self._named}: {why}")
 
     def _put(self, kind: int, content: bytes) -> None:
         self._to_send += _HEAD.pack(kind, len(content)) + content
@@ -266,6 +267,8 @@ class NodeDriver(LiveDriver):
             table.count += 1
             if kind == core.NOACK_TICKS:
                 sequence = struct.unpack_from("<q", content, 8)[0]
+                if not machine.first_number <= sequence < 2**62:
+                    raise PeerError(f"{self._named}: has sent a tick with the number {sequence}")
                 machine.step = sequence - machine.first_number + 1
             if table.count == table.places:
                 self._pass_rows(sink)
@@ -275,5 +278,8 @@ class NodeDriver(LiveDriver):
             code = self._program.wait(_PATIENCE_S)
         except subprocess.TimeoutExpired:
             return f"the program has not answered for {_PATIENCE_S:g} s"
-        how = f"exit status {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
+        how = f"exit status {code}"
+        if code < 0:  # real-time signals have no names
+            names = {one.value: one.name for one in signal.Signals}
+            how = f"killed by {names.get(-code, f'signal {-code}')}"
         return f"the program has ended: {how}"

@@ -105,6 +105,8 @@ def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
         CallerError: the scenario has something that an FMU cannot have.
         MachineError: a file cannot be written.
     """
+    if not path.stem or path.is_dir():
+        raise CallerError(f"{path}: must be the name of a file, such as loop{SUFFIX}")
     alone(scenario)
     kind = scenario.controller.kind
     if scenario.network.flows != (Flow.UPDATE,):
