@@ -201,11 +201,17 @@ def _slot_loads(
         for begin, direction, demands in stages:
             loop, window = demands[entry], _window(direction)
             bits = 8 * loop.payload_bytes
-            carried_bps, must_pass = bits * len(slots[number]) / round_s, bits * _share(window)
+            must_pass = bits * _share(window)
             yield LinkLoad(
-                f"{begin}loop {number + 1}, ", key, flow, window, carried_bps,
-                must_pass / loop.least_s, must_pass / loop.largest_s, _known([delays_s[number]]),
-            )  # fmt: skip
+                begin=f"{begin}loop {number + 1}, ",
+                key=key,
+                flow=flow,
+                window=window,
+                rate_bps=bits * len(slots[number]) / round_s,
+                mandatory_at_most_bps=must_pass / loop.least_s,
+                mandatory_at_least_bps=must_pass / loop.largest_s,
+                delay_bound_s=_known([delays_s[number]]),
+            )
 
 
 def _slots(one: Schedule, stages: Sequence[_Stage]) -> list[list[int]]:
@@ -264,15 +270,13 @@ def _slot_delays_s(
         round_ns, copies = len(one.order) * one.slot_ns, 2 if copied else 1
         bounds = [math.inf]
         if copies * round_ns <= count * least_ns:
-            bounds.append(max(
-                one.wait_ns(slots, n + 1) - n // copies * least_ns for n in range(copies * count)
-            ))  # fmt: skip
+            waits_ns = (one.wait_ns(slots, n + 1) for n in range(copies * count))
+            bounds.append(max(t_ns - n // copies * least_ns for n, t_ns in enumerate(waits_ns)))
         if slots and share == 0:
             bounds.append(one.wait_ns(slots, one.queue))
         elif slots and round_ns * share <= count * least_ns:
-            bounds.append(max(
-                one.wait_ns(slots, one.queue + n + 1) - n * least_ns / share for n in range(count)
-            ))  # fmt: skip
+            waits_ns = (one.wait_ns(slots, one.queue + n + 1) for n in range(count))
+            bounds.append(max(t_ns - n * least_ns / share for n, t_ns in enumerate(waits_ns)))
         found.append(min(bounds) / NS_PER_S + spread_s)
     return found
 
