@@ -321,7 +321,9 @@ def require_capacity(scenario: Scenario) -> None:
             missing = set(range(1, loops + 1)) - set(one.order) if isinstance(one, Schedule) else ()
             if isinstance(one, Schedule) and (missing or max(one.order) > loops):
                 wrong = (
-                    f"loop {min(missing)} has no slot" if missing else f"{max(one.order)} has one"
+                    f"loop {min(missing)} has no slot"
+                    if missing
+                    else f"a slot is for loop {max(one.order)}"
                 )
                 raise CallerError(
                     f"{path}.impairments.{place}.order: {wrong}; the run has the loops "

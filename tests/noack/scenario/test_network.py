@@ -192,7 +192,7 @@ def test_recorded_opportunities_are_a_bottleneck(content: dict[str, Any]) -> Non
     ("order", "says"),
     [
         ([1, 3, 1], "order: loop 2 has no slot; the run has the loops 1 to 3"),
-        ([1, 2, 3, 4], "order: 4 has one; the run has the loops 1 to 3"),
+        ([1, 2, 3, 4], "order: a slot is for loop 4; the run has the loops 1 to 3"),
         ([1, 1, 1, 2, 3], "loop 2, the datagrams that must pass, 1 of any 3 of each loop, need"),
     ],
 )
