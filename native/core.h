@@ -49,7 +49,7 @@ typedef void stage_function(packet *packet, const noack_stage *stage, noack_stag
    depend on other stages. */
 stage_function apply_bernoulli, apply_four_state, apply_gilbert_elliott, apply_periodic,
     apply_scripted, apply_worst_case, apply_tail_drop, apply_blackout, apply_corrupt, apply_delay,
-    apply_duplicate, apply_opportunities, apply_reorder, apply_replay;
+    apply_duplicate, apply_opportunities, apply_reorder, apply_replay, apply_schedule;
 
 /* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. */
 static inline void refuse(noack_decision *decision, int64_t fate) {

@@ -19,6 +19,7 @@ static stage_function *const APPLY[NOACK_STAGE_KINDS] = {
     [NOACK_OPPORTUNITIES] = apply_opportunities,
     [NOACK_REORDER] = apply_reorder,
     [NOACK_REPLAY] = apply_replay,
+    [NOACK_SCHEDULE] = apply_schedule,
 };
 
 void noack_link_start_flow(

@@ -76,6 +76,24 @@ static const char *check_replay(const noack_link *link, const noack_replay *own)
     return NULL;
 }
 
+static const char *check_schedule(const noack_link *link, const noack_schedule *own) {
+    int64_t flows = own->flows, count = link->integer_count;
+    if (!is_between(1, own->slots, MOST_EVER) || !is_between(1, flows, MOST_EVER)
+        || !is_between(1, own->slot_ns, FAR_NS / 4 / own->slots)
+        || !is_between(1, own->queue, MOST_EVER))
+        return "a schedule has no slots, flows or queue, or a round of more than 18 years";
+    if (!is_between(0, own->begin, count - flows - 1)
+        || !ascends(link->integers, own->begin, own->begin + flows + 1, 0, own->slots)
+        || link->integers[own->begin] != 0
+        || link->integers[own->begin + flows] > count - own->begin - flows - 1)
+        return "the slots of a schedule are outside the table of integers";
+    const int64_t *firsts = link->integers + own->begin;
+    for (int64_t i = 0, begin = own->begin + flows + 1; i < flows; i++)
+        if (!ascends(link->integers, begin + firsts[i], begin + firsts[i + 1], 0, own->slots - 1))
+            return "the slots of a flow do not ascend, or exceed the round";
+    return NULL;
+}
+
 static const char *check_stage(const noack_link *link, const noack_stage *stage) {
     if (!is_between(0, stage->queue_places, MOST_EVER)
         || (stage->queue_places > 0
@@ -120,6 +138,8 @@ static const char *check_stage(const noack_link *link, const noack_stage *stage)
         return check_opportunities(link, stage);
     case NOACK_REPLAY:
         return check_replay(link, &stage->replay);
+    case NOACK_SCHEDULE:
+        return check_schedule(link, &stage->schedule);
     default:
         return "a stage has no kind";
     }

@@ -63,6 +63,7 @@ enum noack_stage_kind { /* native/impairments has a file for each */
     NOACK_OPPORTUNITIES,
     NOACK_REORDER,
     NOACK_REPLAY,
+    NOACK_SCHEDULE,
     NOACK_STAGE_KINDS
 };
 
@@ -143,6 +144,13 @@ typedef struct {
     int64_t once;
 } noack_replay;
 
+typedef struct { /* slots for flows; the table of integers has from begin on: flows + 1 places, then
+                    the numbers of the slots in a round, of flow k from the k-th to the next place */
+    int64_t begin, flows;
+    int64_t slots, slot_ns; /* in a round, and the length of one */
+    int64_t queue;          /* most own slots that may be taken after a packet's arrival */
+} noack_schedule;
+
 typedef struct {
     int64_t kind;
     int64_t key0, key1;   /* key of its random stream: two words of 32 bits */
@@ -159,6 +167,7 @@ typedef struct {
         noack_delay delay;
         noack_opportunities opportunities;
         noack_replay replay;
+        noack_schedule schedule;
     };
 } noack_stage;
 

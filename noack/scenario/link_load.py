@@ -17,6 +17,15 @@ enters the queue in the order of its transmission, and after a time between thes
 what enters within t was transmitted within t + J. Then D is at most (Q max b + Σ b + m J)/(r − m),
 or (Σ b + e J)/r. If they may send datagrams twice, each counts twice in the second bound.
 
+A loop has slots of a static schedule for itself. Let W(n) be the longest time until n of them have
+begun; a round has c of them and takes T. The n-th datagram since none waited leaves within W(n) of
+the first, and was transmitted at least (n - 1) d - J after it. So D is at most the largest
+W(n) - (n - 1) d + J. If T <= c d, only n up to c count, since W(n + c) = W(n) + T. If datagrams may
+be sent twice, n - 1 is halved and rounded down.
+Without constraints, and if T <= c M d, there is another bound. A datagram that finds its queue full
+must pass. Of these, since the last datagram that found a place, the n-th leaves within W(Q + n) of
+that one, and (n - 1) M d - J lie between. So D is at most the largest W(Q + n) - (n - 1) M d + J.
+
 The delay in the network is at most the sum L of the bounds of its impairments. A datagram that is
 held back for the guarantee leaves with an earlier one of its loop, which leaves within L of its own
 transmission: so L bounds this delay, too. A live run adds the lateness of its processes.
@@ -32,6 +41,7 @@ from noack.impairments.constraints import join_guarantee
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.scenario.resolution import policy_of, resolve
@@ -63,7 +73,7 @@ class LinkLoad(NamedTuple):
     """What the loops need of a bottleneck; rates in bits per second."""
 
     begin: str
-    """From when on, in words; empty: from the start of the run."""
+    """From when on, and for which loop's slots, in words; empty: from the start, for all."""
     key: str
     flow: Flow
     window: LossWindow
@@ -114,8 +124,10 @@ def update_delay(scenario: Scenario) -> DelayBound:
     Raises:
         CallerError: as :func:`link_loads`.
     """
-    delays_s, largest_s = _largest_delays_s(_stages(scenario)[0])
-    own_s = {f"network.impairments.{place}": t_s for place, t_s in enumerate(delays_s) if t_s}
+    delays, largest_s = _largest_delays(_stages(scenario)[0])
+    own_s = {
+        f"network.impairments.{place}": max(one) for place, one in enumerate(delays) if any(one)
+    }
     certified_s = scenario.certificate.network_delay_s
     if certified_s is None:
         certified_s = scenario.network.link.longest_delay_s
@@ -144,12 +156,15 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
     found: list[LinkLoad] = []
     if not stages:
         return found
-    delays_s, _ = _largest_delays_s(stages)
+    delays, _ = _largest_delays(stages)
     for place, one in enumerate(stages[0].direction.impairments):
+        if isinstance(one, Schedule):
+            key = f"{path}.impairments.{place}"
+            found += _slot_loads(one, stages, (key, flow), delays[place])
         if not isinstance(one, Rate | Opportunities):
             continue
         before: LinkLoad | None = None
-        delay_s = delays_s[place] if math.isfinite(delays_s[place]) else None
+        delay_s = _known(delays[place])
         for begin, direction, loops in stages:
             window = _window(direction)
             bits = [int(one.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
@@ -168,6 +183,43 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
     return found
 
 
+def _known(delays_s: Sequence[float]) -> float | None:
+    """Return the largest of the bounds of a delay; None: one is not known."""
+    return max(delays_s) if math.isfinite(max(delays_s)) else None
+
+
+def _slot_loads(
+    one: Schedule, stages: Sequence[_Stage], path: tuple[str, Flow], delays_s: Sequence[float]
+) -> Iterator[LinkLoad]:
+    """Yield for each entry of [[loops]] what its loop with the fewest slots needs of them."""
+    key, flow = path
+    first, slots = 0, _slots(one, stages)
+    round_s = len(one.order) * one.slot_ns / NS_PER_S
+    for entry, loops in enumerate(stages[0].loops):
+        number = min(range(first, first + loops.loops), key=lambda loop: len(slots[loop]))
+        first += loops.loops
+        for begin, direction, demands in stages:
+            loop, window = demands[entry], _window(direction)
+            bits = 8 * loop.payload_bytes
+            must_pass = bits * _share(window)
+            yield LinkLoad(
+                begin=f"{begin}loop {number + 1}, ",
+                key=key,
+                flow=flow,
+                window=window,
+                rate_bps=bits * len(slots[number]) / round_s,
+                mandatory_at_most_bps=must_pass / loop.least_s,
+                mandatory_at_least_bps=must_pass / loop.largest_s,
+                delay_bound_s=_known([delays_s[number]]),
+            )
+
+
+def _slots(one: Schedule, stages: Sequence[_Stage]) -> list[list[int]]:
+    """Return the slots of each loop of the run."""
+    loops = sum(demand.loops for demand in stages[0].loops)
+    return [*one.slots, *([] for _ in range(loops))][:loops]
+
+
 def _window(direction: DirectionSection) -> LossWindow:
     link = direction.link
     windows = join_guarantee(link.mansd, link.constraints).windows
@@ -178,20 +230,55 @@ def _share(window: LossWindow) -> float:
     return (window.packets - window.losses) / window.packets
 
 
-def _largest_delays_s(stages: Sequence[_Stage]) -> tuple[list[float], float]:
-    """Return the bound of the delay in each impairment, and in all of them; infinite: none."""
+def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], float]:
+    """Return the bounds of the delay in each impairment, and the bound in all of them, in seconds.
+
+    A schedule has a bound for each loop, another impairment one for all; infinite: there is none.
+    """
     least_s = largest_s = 0.0
-    found_s, copied = list[float](), False
+    found, copied = list[list[float]](), False
     for one in stages[0].direction.impairments:  # they cannot change
-        if isinstance(one, Rate):
-            own_s = _queue_delay_s(one, stages, largest_s - least_s, copied=copied)
-            largest_s += own_s
+        spread_s = largest_s - least_s
+        if isinstance(one, Schedule):
+            found.append(_slot_delays_s(one, stages, spread_s, copied=copied))
+            largest_s += max(found[-1])
+        elif isinstance(one, Rate):
+            found.append([_queue_delay_s(one, stages, spread_s, copied=copied)])
+            largest_s += max(found[-1])
         else:
-            own_s = one.longest_s if one.is_bounded else math.inf
+            found.append([one.longest_s if one.is_bounded else math.inf])
             least_s, largest_s = one.delay_range_s(least_s, largest_s)
-        found_s.append(own_s)
         copied = copied or one.copies
-    return found_s, largest_s
+    return found, largest_s
+
+
+def _slot_delays_s(
+    one: Schedule, stages: Sequence[_Stage], spread_s: float, *, copied: bool
+) -> list[float]:
+    """Return the bounds for the slots of each loop; see :func:`_queue_delay_s`."""
+    least_s = [
+        min(stage.loops[entry].least_s for stage in stages)
+        for entry, demand in enumerate(stages[0].loops)
+        for _ in range(demand.loops)
+    ]
+    share = max(_share(_window(stage.direction)) for stage in stages)
+    if any(stage.direction.constraints for stage in stages):
+        share = math.inf
+    found = []
+    for slots, own_s in zip(_slots(one, stages), least_s, strict=True):
+        least_ns, count = round(own_s * NS_PER_S), len(slots)
+        round_ns, copies = len(one.order) * one.slot_ns, 2 if copied else 1
+        bounds = [math.inf]
+        if copies * round_ns <= count * least_ns:
+            waits_ns = (one.wait_ns(slots, n + 1) for n in range(copies * count))
+            bounds.append(max(t_ns - n // copies * least_ns for n, t_ns in enumerate(waits_ns)))
+        if slots and share == 0:
+            bounds.append(one.wait_ns(slots, one.queue))
+        elif slots and round_ns * share <= count * least_ns:
+            waits_ns = (one.wait_ns(slots, one.queue + n + 1) for n in range(count))
+            bounds.append(max(t_ns - n * least_ns / share for n, t_ns in enumerate(waits_ns)))
+        found.append(min(bounds) / NS_PER_S + spread_s)
+    return found
 
 
 def _queue_delay_s(one: Rate, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> float:
@@ -224,7 +311,24 @@ def _queue_delay_s(one: Rate, stages: Sequence[_Stage], spread_s: float, *, copi
 
 
 def require_capacity(scenario: Scenario) -> None:
-    """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass."""
+    """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass.
+
+    A schedule needs slots for each loop, and for no other.
+    """
+    loops = sum(section.count for section in loop_sections(scenario))
+    for path, section in scenario.network.directions.items():
+        for place, one in enumerate(section.impairments):
+            missing = set(range(1, loops + 1)) - set(one.order) if isinstance(one, Schedule) else ()
+            if isinstance(one, Schedule) and (missing or max(one.order) > loops):
+                wrong = (
+                    f"loop {min(missing)} has no slot"
+                    if missing
+                    else f"a slot is for loop {max(one.order)}"
+                )
+                raise CallerError(
+                    f"{path}.impairments.{place}.order: {wrong}; the run has the loops "
+                    f"1 to {loops}, and each needs a slot (0: an idle slot)"
+                )
     for load in link_loads(scenario):
         if load.mandatory_at_least_bps > load.rate_bps:
             losses, packets = load.window

@@ -34,7 +34,8 @@ from noack.theory.certificates.conditions import allowed_conditions
 from tests.extras import skip_without_plant
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
-SHARED = ("different_loops", "shared_bottleneck", "shared_channel")  # several loops on one network
+SHARED = ("different_loops", "scheduled_channel", "shared_bottleneck", "shared_channel")
+"""Several loops on one network."""
 NAMES = sorted({path.stem for path in SCENARIOS.glob("*.toml")} - {*SHARED})
 ENDS_BELOW = {"f16_lateral": 0.5, "pendulum_observed": 0.5, "lane_5g_rural": 0.5}
 """‖x(T)‖ / ‖x(0)‖. The F-16 starts with sideslip in rad and ends with a small rudder angle in °;

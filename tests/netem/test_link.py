@@ -204,7 +204,7 @@ def test_it_does_what_the_plain_network_does(
     number: int,
 ) -> None:
     named = (first, 5, "update"), (second, 5, "actuation")
-    forward, reverse = (Link(*one, first_number=number) for one in named)
+    forward, reverse = (Link(*one, first_number=number, loops=LOOPS) for one in named)
     expected = Duplex(forward, reverse, first_number=number, loops=LOOPS)
     links = [LinkState(*one, rows=LOOPS) for one in named]
     channel = SteppedChannel(Channel(links, loops=LOOPS, first_number=number))

@@ -54,6 +54,7 @@ class Link:
         schedule: announced changes of the settings; None: nothing can be announced.
         restarted: the link has replaced another in a run; see
             :class:`netem.link_state.LinkState`.
+        loops: loops of a run, whose numbers are their rows; 0: rows in the order of first packets.
     """
 
     def __init__(
@@ -65,7 +66,9 @@ class Link:
         first_number: int = 0,
         schedule: ChangeSchedule | None = None,
         restarted: bool = False,
+        loops: int = 0,
     ) -> None:
+        self._loops = loops
         self._state = LinkState(settings, seed, *name, decisions=decisions, restarted=restarted)
         self._schedule = schedule
         self._reached_ns = -1
@@ -158,7 +161,7 @@ class Link:
         """Decide for a flow's next packet; the next call overwrites the ``noack_decision``."""
         row = self._rows.get(flow)
         if row is None:
-            row = self._rows[flow] = len(self._rows)
+            row = self._rows[flow] = flow % self._loops if self._loops else len(self._rows)
             self._state.start_flow(row, flow)
         return self._state.decide(row, size_bytes, now_ns)
 

@@ -39,6 +39,7 @@ from cosim.studies.capacity.capacity_result import (
 )
 from noack.core.file_access import write_whole
 from noack.core.number_format import number
+from noack.scenario.link_load import update_delay
 
 PAGE, RESULTS = "capacity.html", "capacity.json"
 _SENTENCES = {
@@ -64,6 +65,7 @@ class CapacityResult(NamedTuple):
         plan = self.plan
         return {
             "scenario": plan.scenario.name, "rate_bps": plan.rate_bps,
+            "delay_bounds_s": delay_bounds_s(self),
             "deadline_s": plan.deadline_s, "periodic_loops_by_rate": plan.periodic_loops,
             "mixture": [
                 {"name": kind.name, "count": kind.given, "period_s": kind.period_s}
@@ -103,10 +105,10 @@ def page(result: CapacityResult) -> str:
     plan = result.plan
     return templates(Path(__file__).parent).get_template("capacity.html.jinja").render(
         title=plan.scenario.name,
-        subtitle=f"{plan.rate_bps / 1000:g} kbit/s, {plan.draws:,} draws at each number of loops, "
+        subtitle=f"{plan.link}, {plan.draws:,} draws at each number of loops, "
         f"seed {plan.seed}",
         verdict=f"{by_rate(plan).capitalize()}.",
-        comparisons=[*comparisons(result), *mixtures(result), *caveats(plan)],
+        comparisons=[*comparisons(result), *mixtures(result), *waiting(result), *caveats(plan)],
         counts=", ".join(map(str, plan.counts)),
         deadline=f"{plan.deadline_s:g} s",
         from_s=f"{plan.counted_from_s:g} s",
@@ -132,16 +134,15 @@ def rows(result: CapacityResult) -> Iterator[tuple[str, ...]]:
 
 
 def by_rate(plan: CapacityPlan) -> str:
-    """Say how many periodic loops the rate carries."""
+    """Say how many periodic loops the rate carries, or the slots."""
+    what = "the slots carry" if plan.rate_bps is None else "the rate carries"
     if plan.is_one_kind:
         (kind,) = plan.kinds
-        return (
-            f"the rate carries {plan.periodic_loops:.1f} loops, periodic every {kind.period_s:g} s"
-        )
+        return f"{what} {plan.periodic_loops:.1f} loops, periodic every {kind.period_s:g} s"
     periods = ", ".join(f"{kind.name} every {kind.period_s:g} s" for kind in plan.kinds)
     factor = plan.factor(plan.periodic_loops)
     return (
-        f"the rate carries {factor:.2f} × the given mixture, {plan.periodic_loops:.1f} loops, "
+        f"{what} {factor:.2f} × the given mixture, {plan.periodic_loops:.1f} loops, "
         f"periodic: {periods}"
     )
 
@@ -159,6 +160,28 @@ def mixtures(result: CapacityResult) -> Iterator[str]:
         else:
             text += f"; {_listed(plan.composition(plan.counts[0]))} already reach a limit"
         yield f"{one.policy}, disturbance {one.disturbance}: {text}"
+
+
+def delay_bounds_s(result: CapacityResult) -> dict[str, list[float]]:
+    """Return the bound of an update's delay for each number of loops, by policy; infinite: none."""
+    found = {
+        (one.point.labels[POLICY], one.point.labels[LOOPS]): one.point.scenario
+        for one in result.summary.found
+    }
+    counts = [*map(str, result.plan.counts)]
+    return {
+        policy: [update_delay(found[policy, count]).largest_s for count in counts]
+        for policy in result.plan.policies
+    }
+
+
+def waiting(result: CapacityResult) -> Iterator[str]:
+    """Yield the bounds of each policy that has one."""
+    for policy, bounds_s in delay_bounds_s(result).items():
+        if any(map(math.isfinite, bounds_s)):
+            shown = ", ".join(f"{t_s:.4g}" if math.isfinite(t_s) else "∞" for t_s in bounds_s)
+            counts = ", ".join(map(str, result.plan.counts))
+            yield f"{policy}: updates of {counts} loops wait at most {shown} s in virtual time"
 
 
 def caveats(plan: CapacityPlan) -> Iterator[str]:
@@ -265,7 +288,7 @@ def _shown(one: Capacity, last: int) -> str:
 def print_result(console: Console, result: CapacityResult) -> None:
     """Print the capacities, the comparisons and the live runs."""
     plan, columns = result.plan, slice(4)  # the table must fit into 80 columns
-    title = f"{plan.scenario.name}: loops on {plan.rate_bps / 1000:g} kbit/s"
+    title = f"{plan.scenario.name}: loops on {plan.link}"
     shown = [row[columns] for row in rows(result)]
     table = ResultTable("capacity", title, HEADINGS[columns], shown)
     console.print(terminal_table(table, left=range(4)))
@@ -274,6 +297,7 @@ def print_result(console: Console, result: CapacityResult) -> None:
         by_rate(plan),
         *mixtures(result),
         *comparisons(result),
+        *waiting(result),
         *caveats(plan),
         *(f"live: {one.policy}, {one.loops} loops: {live_row(one)[-1]}" for one in result.live),
     ]

@@ -9,6 +9,9 @@ The draws have common random numbers: loop k of draw i is the same for any polic
 of one kind, it is the same for any number of loops, too, and the reference of their cost is that of
 one loop. The reference of loops of several kinds is the same loops on a link that is as many times
 as fast as there are loops.
+
+A static schedule is the bottleneck if the network has no other: 1 datagram for each slot. For every
+number of loops, each loop has one slot in turn.
 """
 
 import math
@@ -25,6 +28,8 @@ from cosim.studies.campaign.sampled_draws import cost_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.schedule import Schedule
+from noack.impairments.words import time_text
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.run_sections import LoopSection
@@ -200,9 +205,18 @@ class CapacityPlan:
     seed: int
 
     @property
-    def rate_bps(self) -> int:
-        """Rate of the bottleneck."""
-        return bottleneck(self.scenario).rate_bps
+    def rate_bps(self) -> int | None:
+        """Rate of the bottleneck; None: it is a schedule."""
+        one = bottleneck(self.scenario)
+        return one.rate_bps if isinstance(one, Rate) else None
+
+    @property
+    def link(self) -> str:
+        """The bottleneck, in words."""
+        one = bottleneck(self.scenario)
+        if isinstance(one, Rate):
+            return f"{one.rate_bps / 1000:g} kbit/s"
+        return f"slots of {time_text(one.slot_s)}"
 
     @property
     def periodic_loops(self) -> float:
@@ -262,7 +276,7 @@ class CapacityPlan:
             axes.append(Axis.model_validate({"name": DISTURBANCE, "variants": variants}))
         return Campaign(
             name=self.scenario.name,
-            description=f"How many loops does a link of {self.rate_bps / 1000:g} kbit/s carry?",
+            description=f"How many loops does a link of {self.link} carry?",
             scenario=str(self.file.resolve()),
             settings=dict(self.settings),
             time="sampled",
@@ -282,20 +296,22 @@ class CapacityPlan:
     def _numbers(self) -> Axis:
         """Return the axis of the numbers of loops."""
         title = "number of loops"
-        if self.is_one_kind:
+        if self.is_one_kind and isinstance(bottleneck(self.scenario), Rate):
             return Axis(name=LOOPS, title=title, key="loops", values=self.counts)
-        shared: dict[str, Entry] = {str(count): {"loops": count} for count in self.counts}
-        own: dict[str, Entry] = {
-            unshared(count): {"loops": count, **self._faster(count)} for count in self.counts
-        }
-        return Axis(name=LOOPS, title=title, variants={**shared, **own})
+        variants = {str(count): self._network(count, 1) for count in self.counts}
+        if not self.is_one_kind:
+            variants |= {unshared(count): self._network(count, count) for count in self.counts}
+        return Axis(name=LOOPS, title=title, variants=variants)
 
-    def _faster(self, factor: int) -> Entry:
-        """Return the settings of bottlenecks that are so many times as fast, with longer queues."""
-        settings: Entry = {}
+    def _network(self, loops: int, factor: int) -> Entry:
+        """Return the settings of loops on bottlenecks so many times as fast, with longer queues."""
+        settings: Entry = {"loops": loops}
         for place, one in enumerate(self.scenario.network.impairments):
-            if isinstance(one, Rate):
-                key = f"network.impairments.{place}"
+            key = f"network.impairments.{place}"
+            if isinstance(one, Schedule):
+                settings[f"{key}.order"] = [*range(1, loops + 1)]
+                settings[f"{key}.slot_s"] = max(one.slot_s / factor, 1e-6)
+            if isinstance(one, Rate) and factor > 1:
                 settings[f"{key}.rate_bps"] = min(one.rate_bps * factor, 10**12)
                 settings[f"{key}.queue"] = min(one.queue * factor, 10**6)
         return settings
@@ -306,27 +322,32 @@ def unshared(count: int) -> str:
     return f"{count} unshared"
 
 
-def bottleneck(scenario: Scenario) -> Rate:
-    """Return the slowest bottleneck of the network.
+def bottleneck(scenario: Scenario) -> Rate | Schedule:
+    """Return the slowest bottleneck of the network; without a rate, its schedule.
 
     Raises:
         CallerError: it has none.
     """
-    rates = [one for one in scenario.network.impairments if isinstance(one, Rate)]
-    if not rates:
+    stages = scenario.network.impairments
+    rates = [one for one in stages if isinstance(one, Rate)]
+    schedules = [one for one in stages if isinstance(one, Schedule)]
+    if not rates and not schedules:
         raise CallerError(
             "network.impairments: no bottleneck that the loops could share; "
-            "give --rate-bps, or an impairment of kind rate"
+            "give --rate-bps, or an impairment of kind rate or schedule"
         )
-    return min(rates, key=lambda one: one.rate_bps)
+    return min(rates, key=lambda one: one.rate_bps) if rates else schedules[0]
 
 
 def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
     """Return how many periodic loops, in the kinds' proportions, a bottleneck of R bit/s carries.
 
-    A loop needs b / h bits per second, so it is R / (mean of b / h); of one kind, R h / b.
+    A loop needs b / h bits per second, so it is R / (mean of b / h); of one kind, R h / b. In slots
+    that the loops have in turn, the shortest h counts.
     """
     queue = bottleneck(scenario)
+    if isinstance(queue, Schedule):
+        return min(kind.period_s for kind in kinds) / queue.slot_s
     loops = sum(kind.given for kind in kinds)
     needed_bps = sum(
         kind.given

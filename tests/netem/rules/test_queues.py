@@ -1,4 +1,4 @@
-"""Queues: rates in exact fractions, CoDel by RFC 8289, opportunities by mahimahi's model."""
+"""Queues: rates in fractions, CoDel by RFC 8289, mahimahi's opportunities, slots one by one."""
 
 import math
 from collections import deque
@@ -18,6 +18,7 @@ from noack.core.core_library import core
 from noack.impairments.disciplines.codel import Codel
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.link_settings import LinkSettings
 from tests.oracles.link import Link
 
@@ -341,3 +342,75 @@ def test_the_longest_delay_is_that_of_a_full_queue() -> None:
             left_ns = [link.decide(0, 1472, first_ns).release_ns for _ in range(queue + 1)]
             longest = max(longest, max(left_ns) - first_ns)
         assert longest / 1e9 <= settings.longest_s <= (longest + 3 * times_ms[-1] * MS) / 1e9
+
+
+class Slots:
+    """A channel with a schedule, slot by slot, with a list of waiting packets for each flow."""
+
+    def __init__(self, order: tuple[int, ...], slot_ns: int, places: int) -> None:
+        self.order, self.slot_ns, self.places, self.slot = order, slot_ns, places, 0
+        self.queues: dict[int, list[int]] = {flow: [] for flow in order if flow}
+        self.departures: dict[int, int] = {}
+        self.sent_ns: dict[int, int] = {}
+
+    def run_before(self, now_ns: int) -> None:
+        while self.slot * self.slot_ns < now_ns:
+            flow = self.order[self.slot % len(self.order)]
+            if self.queues.get(flow):
+                number = self.queues[flow].pop(0)
+                self.departures[number] = self.sent_ns[flow] = self.slot * self.slot_ns
+            self.slot += 1
+
+    def enqueue(self, flow: int, number: int, now_ns: int, must_pass: bool) -> bool:
+        """Return whether it is lost; nothing waits for a slot that begins now, and is free."""
+        self.run_before(now_ns)
+        begins = self.slot * self.slot_ns == now_ns
+        own = begins and self.order[self.slot % len(self.order)] == flow
+        queue = self.queues.get(flow)
+        if queue is None:
+            self.departures[number] = now_ns if must_pass else -1
+        elif must_pass or len(queue) - (own and bool(queue)) < self.places:
+            queue.append(number)
+        else:
+            self.departures[number] = -1
+        return self.departures.get(number) == -1
+
+
+@given(
+    st.lists(st.integers(0, 4), min_size=1, max_size=9).filter(any),
+    st.sampled_from([1000, MS, 5 * MS + 1]),
+    st.lists(
+        st.tuples(st.integers(1, 5), st.sampled_from([0, 0, 1, 999, 1000, MS, 5 * MS, 20 * MS])),
+        max_size=80,
+    ),
+    st.integers(1, 4),
+    st.sampled_from([None, 0, 1, 3]),
+)
+def test_a_packet_leaves_in_its_flows_next_free_slot(
+    order: list[int], slot_ns: int, steps: Any, places: int, mansd: int | None
+) -> None:
+    """Against slots one by one; at most mansd successive packets of a flow are lost."""
+    schedule = Schedule(order=tuple(order), slot_s=slot_ns / 1e9, queue=places)
+    link = Link(LinkSettings(impairments=(schedule,), mansd=mansd, limit=1000), 0, "a")
+    model, losses, found, now_ns = Slots(tuple(order), slot_ns, places), [0] * 6, [], 0
+    names: dict[int, int] = {}
+    for number, (name, gap_ns) in enumerate(steps):
+        now_ns += gap_ns
+        flow = names.setdefault(name, len(names) + 1)  # in the order of the first packets
+        found.append(link.decide(name, 100, now_ns).release_ns)
+        lost = model.enqueue(flow, number, now_ns, losses[flow] == mansd)
+        losses[flow] = (losses[flow] + 1) * lost
+        assert link.decision.consecutive_losses == losses[flow] <= (80 if mansd is None else mansd)
+    model.run_before(now_ns + 81 * len(order) * slot_ns)
+    assert found == [model.departures[number] for number in range(len(steps))]
+
+
+def test_copies_take_slots_and_a_changed_schedule_goes_on_after_those_that_are_taken() -> None:
+    link = Link(settings_of("duplicate 100% schedule 1,2 slot 1ms queue 4"), 0, "a")
+    decisions = []
+    for now_ns in (0, 0, 0):
+        decision = link.decide(0, 100, now_ns)
+        decisions.append((decision.fate, decision.release_ns // MS, decision.copy_ns // MS))
+    assert decisions == [(0, 0, 2), (0, 4, 6), (0, 8, -1)]
+    link.change(settings_of("duplicate 0% schedule 2,1 slot 3ms queue 9"))
+    assert link.decide(0, 100, 1).release_ns == 9 * MS

@@ -17,6 +17,7 @@ from noack.impairments.feature import Impairment
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.link_settings import LinkSettings, require_scores
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_models.trace import TraceLoss
@@ -187,6 +188,30 @@ def test_recorded_opportunities_are_a_bottleneck(content: dict[str, Any]) -> Non
         require_capacity(less)
 
 
+@pytest.mark.parametrize(
+    ("order", "says"),
+    [
+        ([1, 3, 1], "order: loop 2 has no slot; the run has the loops 1 to 3"),
+        ([1, 2, 3, 4], "order: a slot is for loop 4; the run has the loops 1 to 3"),
+        ([1, 1, 1, 2, 3], "loop 2, the datagrams that must pass, 1 of any 3 of each loop, need"),
+    ],
+)
+def test_a_schedule_has_enough_slots_for_each_loop(
+    content: dict[str, Any], order: list[int], says: str
+) -> None:
+    """Loop 2 needs a slot in 3 × 50 ms; of five of these, it has one."""
+    loops = {"name": "a", "count": 3, "trigger": PERIODIC}
+
+    def given(slot_s: float) -> Scenario:
+        one = {"kind": "schedule", "order": order, "slot_s": slot_s}
+        return scenario_of(content, 1, 1, loops, impairments=[one])
+
+    with pytest.raises(CallerError, match=re.escape(says)):
+        require_capacity(given(0.031))
+    if len(order) == 5:
+        require_capacity(given(0.03))
+
+
 def longest_delay_s(scenario: Scenario, loops: int, seed: int, together: bool) -> float:
     """Return the longest delay of 200 updates of each loop, 50 ms apart or more."""
     rng = np.random.default_rng(seed)
@@ -216,11 +241,16 @@ QUEUES = [
     Rate(rate_bps=round(7 * BITS / 0.05 * share), queue=queue)
     for share in (0.4, 0.7, 1.1, 2.5) for queue in (1, 4)
 ]  # fmt: skip
+SCHEDULES = [
+    Schedule(order=order, slot_s=round_s / len(order), queue=queue)
+    for order in ((1, 2, 3, 4, 5, 6, 7), (*(1, 2, 1) * 2, *range(1, 8)), (7, *range(1, 7), *(1, 7)))
+    for round_s in (0.04, 0.05, 0.11, 0.2) for queue in (1, 4)
+]  # fmt: skip
 
 
 @settings(max_examples=40, deadline=None)
 @given(
-    stages=st.lists(st.sampled_from(EXAMPLES) | st.sampled_from(QUEUES), max_size=5),
+    stages=st.lists(st.sampled_from([*SCHEDULES, *QUEUES]) | st.sampled_from(EXAMPLES), max_size=5),
     loops=st.integers(1, 7),
     seed=st.integers(0, 2**32),
     together=st.booleans(),

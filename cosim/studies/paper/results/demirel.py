@@ -101,6 +101,7 @@ RESULT = PublishedResult(
     rows=_rows,
     notes=(
         "not available: the paper's text; the plants are those that the authors' program draws",
-        "not run: links of noack have no schedule; this is the loss on an ideal channel",
+        "not run: links can have such slots (`schedule`), but plants of runs are in continuous "
+        "time; this is the loss on an ideal channel",
     ),
 )

@@ -145,3 +145,20 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
     assert (live["policy"], live["loops"], live["status"]) == ("model", 2, 0)
     assert live["values"]["transmissions"] > 0
     assert "crosses are live runs" in (tmp_path / "capacity.html").read_text()
+
+
+def test_a_schedule_carries_as_many_loops_as_its_delay_allows(tmp_path: Path) -> None:
+    """Loops that transmit every 60 ms, or every 20 ms, in turn in slots of 10 ms; M = 4, Q = 1."""
+    result = capacity(
+        "scheduled_channel", "--loops", "2,5,9", "--update-period", "0.06", "--late-after", "0.05",
+        "--set", "network.impairments.0.slot_s=0.01", "--set", "network.loss.probability=0",
+        "--workers", "1", "--json", "--out", str(tmp_path), *SHORT,
+    )  # fmt: skip
+    found = json.loads(result.stdout)
+    assert found["periodic_loops_by_rate"] == pytest.approx(6.0)
+    inf = None  # of JSON
+    assert found["delay_bounds_s"]["periodic"] == pytest.approx([0.01, 0.02, 0.05, 0.18])
+    assert found["delay_bounds_s"]["model"] == pytest.approx([0.01, 0.02, 0.1, inf])
+    one, *_ = found["capacities"]
+    assert (one["policy"], one["median"]) == ("periodic", 5.0)
+    assert result.exit_code == 0

@@ -1,0 +1,108 @@
+"""A channel with a static schedule of slots; see native/impairments/schedule.c."""
+
+from collections.abc import Sequence
+from itertools import accumulate, chain
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
+
+from noack.core.clock import NS_PER_S
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import Impairment, Stage, StageTables, add_numbers
+from noack.impairments.words import COUNT, OWN_TIME_S, list_of, time_text
+
+MOST_FLOWS = 65_535
+_EXAMPLE = "schedule 1,2,1,3 slot 5ms"
+_MOST_SHOWN = 12
+
+
+class Schedule(Impairment):
+    """Slots of a fixed length in a periodic order, each for one packet of one flow."""
+
+    kind: Literal["schedule"] = "schedule"
+    order: Annotated[
+        tuple[Annotated[int, Field(ge=0, le=MOST_FLOWS)], ...],
+        Field(min_length=1, max_length=MOST_FLOWS),
+    ]
+    """The flow of each slot, counted from 1; 0: an idle slot. In a run: the number of the loop."""
+    slot_s: Annotated[FiniteFloat, Field(ge=1e-6, le=3600)]
+    """Length of a slot in seconds; the first slot begins at time 0."""
+    queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
+    """Maximum number of packets of a flow that wait for a slot; further packets are dropped."""
+
+    clauses: ClassVar = (
+        Clause(
+            "schedule",
+            _EXAMPLE,
+            Part("order", list_of(COUNT, "numbers of flows from 1, e.g. 1,2,1,3"), "N,N,..."),
+            Part("slot_s", OWN_TIME_S, "T", "slot", _EXAMPLE),
+            Part("queue", COUNT, "N", "queue", f"{_EXAMPLE} queue 1"),
+        ),
+    )
+    delays: ClassVar = True
+    tc_missing: ClassVar = "a schedule of slots"
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not any(self.order):
+            raise ValueError("order: no slot is for a flow; flows are counted from 1")
+        return self
+
+    @property
+    def slots(self) -> list[list[int]]:
+        """The numbers of the slots in a round, of each flow; without a slot: none."""
+        found: list[list[int]] = [[] for _ in range(max(self.order))]
+        for place, flow in enumerate(self.order):
+            if flow:
+                found[flow - 1].append(place)
+        return found
+
+    @property
+    def slot_ns(self) -> int:
+        """Length of a slot."""
+        return round(self.slot_s * NS_PER_S)
+
+    def wait_ns(self, slots: Sequence[int], count: int) -> int:
+        """Return the longest time until so many of these slots have begun."""
+        rounds, rest = divmod(count, len(slots))
+        begins = np.array(slots)
+        ends = np.concatenate((begins, begins + len(self.order)))[rest:][: len(slots)]
+        return (rounds * len(self.order) + int((ends - begins).max())) * self.slot_ns
+
+    @property
+    def longest_s(self) -> float:
+        """Longest time until a full queue has left; packets that must pass may take longer."""
+        return max(self.wait_ns(one, self.queue) for one in self.slots if one) / NS_PER_S
+
+    @property
+    def is_bounded(self) -> bool:
+        return False
+
+    @property
+    def prediction_note(self) -> str:
+        return "as long as every flow has slots, and no queue overflows"
+
+    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
+        return True, False  # a flow's packets leave in the order of arrival
+
+    def meaning(self) -> str:
+        more = ",..." if len(self.order) > _MOST_SHOWN else ""
+        return (
+            f"delivers one packet at the begin of each slot of {time_text(self.slot_s)}, of the "
+            f"flows {','.join(map(str, self.order[:_MOST_SHOWN]))}{more} in turn; of each flow "
+            f"{self.queue} may wait, more are dropped, and all of a flow without a slot"
+        )
+
+    def stage(self, tables: StageTables) -> Stage:
+        slots = self.slots
+        firsts = accumulate(map(len, slots), initial=0)
+        begin, _ = add_numbers(tables.integers, chain(firsts, *slots))
+        numbers = {
+            "begin": begin,
+            "flows": len(slots),
+            "slots": len(self.order),
+            "slot_ns": self.slot_ns,
+            "queue": self.queue,
+        }
+        return Stage(self.kind, numbers)
