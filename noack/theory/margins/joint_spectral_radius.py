@@ -229,7 +229,7 @@ class _Enclosure:
         norms = self._search(remembers).improve(growth)
         self._improve(norms.upper)
         if self.upper <= growth * _ROUNDED:
-            return 1.0
+            return math.inf  # if the threshold is not above the bound, by rounding only
         system = self._remembering if remembers else self._system
         turned = system.in_coordinates(norms.forms)
         if turned is None:
