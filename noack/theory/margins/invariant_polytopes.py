@@ -32,6 +32,7 @@ UNIT = 0.1
 _INSIDE = 1 - 1e-9
 _MUCH_LARGER = 1.3
 _ROUNDS = 60
+_WORK_PER_VERTEX = 1_000_000
 _FARTHEST = 1e3
 """Entries of a vertex, whose first ones have at most 1; products are rarely that much larger."""
 
@@ -59,6 +60,8 @@ class PolytopeNorm:
 
     def __init__(self, vertices: Matrix) -> None:
         self.vertices = vertices
+        self.work = 0
+        """Number of entries of vertices that were compared."""
 
     @property
     def _units(self) -> Vector:
@@ -107,6 +110,7 @@ class PolytopeNorm:
                 break
             # The vertex that violates the dual's inequalities most enters the basis.
             scores = undone.sum(axis=2) @ V.T
+            self.work += scores.size * n
             scores[without[active] != _NONE, without[active][without[active] != _NONE]] = 0.0
             entering = np.abs(scores).argmax(axis=1)
             value = scores[np.arange(len(active)), entering]
@@ -164,6 +168,7 @@ class InvariantPolytopes:
     """By node, (m, n)."""
     _examined: dict[int, int] = field(default_factory=dict)
     """Number of vertices after the last search for redundant ones, by node."""
+    _work: int = 0
 
     @property
     def count(self) -> int:
@@ -173,9 +178,10 @@ class InvariantPolytopes:
     def grow(self, most_vertices: int) -> bool:
         """Add images until all are inside.
 
-        Return False when ``most_vertices`` vertices have been added, or when the vertices show that
-        a path grows faster than γ, or after 60 rounds.
+        Return False when ``most_vertices`` vertices have been added, or after the work that they
+        should cost, or when the vertices show that a path grows faster than γ, or after 60 rounds.
         """
+        most_work = (most_vertices + self.count) * _WORK_PER_VERTEX
         pending, most_vertices = dict(self.vertices), self.count + most_vertices
         for _ in range(_ROUNDS):
             images: dict[int, list[Matrix]] = {}
@@ -191,7 +197,7 @@ class InvariantPolytopes:
             if not pending:
                 return True
             farthest = max(float(np.abs(points).max()) for points in pending.values())
-            if self.count > most_vertices or not farthest < _FARTHEST:
+            if self.count > most_vertices or self._work > most_work or not farthest < _FARTHEST:
                 break
         return False
 
@@ -201,6 +207,7 @@ class InvariantPolytopes:
         while len(points):
             norm = PolytopeNorm(self.vertices[node])
             norms = norm.combinations(points, enough=_INSIDE).norms
+            self._work += norm.work
             order = np.argsort(-norms)
             order = order[norms[order] > _INSIDE]
             first, points = np.split(points[order], [max(4, len(order) // 4)])
@@ -209,7 +216,9 @@ class InvariantPolytopes:
             return points
         # Without points in its interior it is the same polytope.
         everywhere = len(self.vertices[node]) > _MUCH_LARGER * self._examined.get(node, 0)
-        kept = ~PolytopeNorm(self.vertices[node]).redundant(0 if everywhere else before, _INSIDE)
+        norm = PolytopeNorm(self.vertices[node])
+        kept = ~norm.redundant(0 if everywhere else before, _INSIDE)
+        self._work += norm.work
         added = self.vertices[node][before:][kept[before:]]
         self.vertices[node] = self.vertices[node][kept]
         if everywhere:

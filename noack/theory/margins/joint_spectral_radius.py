@@ -53,6 +53,7 @@ _REMEMBERED = 3
 """Classes of edges that a node remembers in the second search for quadratic norms."""
 _LEAST_GROWTH = 1e-3
 """Growth of the polytopes if no cycle grows, relative to the largest norm of a matrix."""
+_ROUNDED = 1 + 1e-8
 _WITHIN = 0.1
 """A growth below the threshold by this share of its distance from the lower bound is proven."""
 
@@ -197,7 +198,7 @@ class _Enclosure:
             least = _LEAST_GROWTH * _largest(self._balanced)
             growth = max(self.cycle.growth, least) * (1 + accuracy)
             self._prove_by_polytopes(growth, self._most_vertices)
-            if self.upper <= growth:
+            if self.upper <= growth * _ROUNDED:
                 break
             if is_first:  # if a longer cycle grows faster, no proof can be completed
                 is_first, before = False, self.cycle.growth
@@ -227,8 +228,8 @@ class _Enclosure:
         """Try to prove a growth; return the effort that this is estimated to need, 1: the limit."""
         norms = self._search(remembers).improve(growth)
         self._improve(norms.upper)
-        if self.upper <= growth:
-            return 1.0
+        if self.upper <= growth * _ROUNDED:
+            return math.inf  # if the threshold is not above the bound, by rounding only
         system = self._remembering if remembers else self._system
         turned = system.in_coordinates(norms.forms)
         if turned is None:
