@@ -19,18 +19,18 @@ PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", 
 EXEMPT = ("__init__", "__main__")
 MOST_MODULES = 431
 LINES = {
-    "noack/scenario": 3865,
+    "noack/scenario": 3965,
     "noack/controllers": 275,
     "noack/core": 1555,
     "noack/disturbances": 220,
-    "noack/impairments": 4125,
+    "noack/impairments": 4235,
     "noack/machines": 405,
     "noack/observers": 390,
     "noack/plants": 3260,
     "noack/protocol": 1240,
     "noack/runtime": 5400,
     "noack/settings": 590,
-    "noack/theory": 9555,
+    "noack/theory": 9565,
     "noack/traces": 1335,
     "noack/trigger": 1060,
     "netem": 6550,
@@ -45,13 +45,13 @@ LINES = {
     "cosim/output": 8550,
     "cosim/record": 3510,
     "cosim/simulation": 1870,
-    "cosim/studies": 8880,
+    "cosim/studies": 8925,
     "plant_server": 415,
     "sensor_node": 375,
     "controller_node": 405,
     "benchmarks": 4850,
-    "native": 10605,
-    "tests": 47855,
+    "native": 10705,
+    "tests": 47980,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
