@@ -132,12 +132,10 @@ def moments(
         _Inequalities(error, plant, conditions, beta, largest_probability, one).solve()
         for one in ORDERS[order - 1 :]  # a mean is at most the root mean square
     ]
-    best = min(found, key=lambda one: one.state)
-    if not np.isfinite(best.state):
-        raise NoCertificateError(
-            f"the loop gain of the moments is {best.loop_gain:.3g}, not below 1"
-        )
-    return best._replace(order=order)
+    if not any(np.isfinite(one.state) for one in found):
+        loop_gain = min(one.loop_gain for one in found)
+        raise NoCertificateError(f"the loop gain of the moments is {loop_gain:.3g}, not below 1")
+    return Moments(order, *map(min, zip(*(one[1:] for one in found), strict=True)))
 
 
 class _Inequalities:
