@@ -319,8 +319,8 @@ def _usable_folder(folder: Path | None) -> Path | None:
     if folder is not None:
         place = next(one for one in (folder, *folder.absolute().parents) if one.exists())
         if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
-            reason = "not permitted" if place.is_dir() else f"{place} is not a folder"
-            raise CallerError(f"--tables {folder}: cannot be written: {reason}")
+            reason = "may not be written to" if place.is_dir() else "is not a folder"
+            raise typer.BadParameter(f"{place} {reason}")
     return folder
 
 
