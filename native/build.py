@@ -78,8 +78,10 @@ def compiler(target: str = OWN) -> list[str]:
         if importlib.util.find_spec("ziglang"):
             return [*ziglang, "-target", PLATFORMS[target]]
         raise NoCompilerError("the core of another platform needs the Python package ziglang")
-    if os.environ.get("CC"):
-        return shlex.split(os.environ["CC"])
+    if own := shlex.split(os.environ.get("CC", "")):
+        if shutil.which(own[0]) is None:
+            raise NoCompilerError(f"CC={shlex.quote(os.environ['CC'])}: there is no {own[0]}")
+        return own
     for name in ("cc", "gcc", "clang"):
         if shutil.which(name):
             return [name]

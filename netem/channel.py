@@ -263,7 +263,10 @@ def alone(network: Scenario) -> Scenario:
     """
     for name, given in (("changes", network.changes), ("loops", network.loops)):
         if given:
-            raise CallerError(f"network: the scenario has {name}; the channel needs one without")
+            raise CallerError(
+                f"network: the scenario has {name}; outside a run of noack a network serves one "
+                f"loop and does not change: remove {name}"
+            )
     if network.network.protocol != "none":
         raise CallerError('network: nothing is acknowledged here; set protocol = "none"')
     return network

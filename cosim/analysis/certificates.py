@@ -97,6 +97,7 @@ class Certificates:
         given: Matrix | None = None,
         nonlinear: Scenario | None = None,
     ) -> None:
+        self._given_arguments = (scenario, late_periods, weight, given, nonlinear)
         scenario.coverage.require_constant()
         scenario.coverage.require_certifiable()
         self.setpoint, void = scenario.controller.setpoint, void_at_setpoint(scenario)
@@ -120,6 +121,10 @@ class Certificates:
         self._given = np.eye(loop_of(scenario).n) if given is None else given
         self.theorem_2 = _theorem_2(scenario, self.paper)
         self.unlimited, self.unpredictable = self._unlimited()
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle what they are computed from; it is computed again."""
+        return Certificates, self._given_arguments
 
     def __iter__(self) -> Iterator[tuple[str, ScenarioCertificate]]:
         return iter(self._certificates)

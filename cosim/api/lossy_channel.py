@@ -191,7 +191,11 @@ class LossyChannel(
 def _loaded(network: Source | ReadTable) -> Scenario:
     if isinstance(network, Mapping):
         base = toml_file.read(find_shipped("double_integrator", "scenarios"), Scenario)
-        return load({**base, "network": dict(network), "seeds": {}})
+        try:
+            return load({**base, "network": dict(network), "seeds": {}})
+        except CallerError as error:
+            lines = str(error).replace("scenario: ", "").splitlines()
+            raise CallerError(f"LossyChannel: {'; '.join(lines)}") from None
     if not isinstance(network, Scenario | str | PathLike):
         raise CallerError(
             f"network: {network!r}; give a table as {{'mansd': 3, 'loss': ...}}, or a scenario"

@@ -3,6 +3,7 @@
 import inspect
 import io
 import math
+import os
 import pkgutil
 import re
 import sys
@@ -311,10 +312,23 @@ WidthOption = Annotated[
         "column for pdf, 10 in for svg and png.",
     ),
 ]
+
+
+def _usable_folder(folder: Path | None) -> Path | None:
+    """Refuse a folder in which nothing can be written, before anything is computed."""
+    if folder is not None:
+        place = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+        if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+            reason = "may not be written to" if place.is_dir() else "is not a folder"
+            raise typer.BadParameter(f"{place} {reason}")
+    return folder
+
+
 TablesOption = Annotated[
     Path | None,
     Option(
         "--tables",
+        callback=_usable_folder,
         metavar="FOLDER",
         help="Write the tables into this folder, as LaTeX (booktabs) and as CSV.",
     ),

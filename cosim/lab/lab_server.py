@@ -9,10 +9,12 @@ another secret, which leads to the page for processes of this user only.
 """
 
 import asyncio
+import logging
 import os
 import secrets
 import socket
 import sys
+import traceback
 import webbrowser
 from collections.abc import Callable
 from contextlib import suppress
@@ -31,7 +33,7 @@ from cosim.lab.lab_page import show_page
 from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.lab.run_views import report_page
 from cosim.output.viewer.rerun_program import HOST, OWN_HOST, socket_user
-from noack.core.errors import MachineError, NoackError
+from noack.core.errors import MachineError, NoackError, one_line, printable, shortened
 
 
 @dataclass(frozen=True)
@@ -84,9 +86,26 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
             if options.open_browser:
                 webbrowser.open(f"{origin}/{opening if _CAN_CHECK else secret}/{query}")
 
+        for logger in ("engineio.server", "asyncio"):
+            logging.getLogger(logger).addFilter(refused_message)
         server = _Server(config, announced, reports.give_up)
         with listener, suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
             asyncio.run(server.serve(sockets=[listener]))
+
+
+def refused_message(record: logging.LogRecord) -> bool:
+    """Make one line of the traceback of a message that the socket's libraries could not read."""
+    error = record.exc_info[1] if record.exc_info else None
+    files = [
+        frame.filename for frame in traceback.extract_tb(error.__traceback__ if error else None)
+    ]
+    in_library = any("/socketio/" in file for file in files)
+    if error is not None and in_library and not any("/cosim/" in file for file in files):
+        reason = shortened(one_line(error))
+        record.msg = "noack lab: a message on the page's socket is refused: %s: %s"
+        record.args = (type(error).__name__, printable(reason))
+        record.exc_info = None
+    return True
 
 
 _CAN_CHECK = sys.platform == "linux"

@@ -31,10 +31,15 @@ def print_certificates(
     """Print the tables, and what is certified in a norm that noack chose instead."""
     constants, *limits = certificate_tables(found)
     if found.nonlinear is not None:
+        region = found.schedule_region
+        if region is None or region.constants is None:
+            why = "" if region is None else f": {region.void}"
+            own = f". The plant itself has no certificate from its x(0){why}"
+        else:
+            own = ", except under “region”: that is certified for the plant itself"
         console.print(
             f"[yellow]the plant is not linear[/] ({escape(found.nonlinear)}): what follows is "
-            "certified for the linear plant ẋ = Âx + B̂u in its place, except under “region”: that "
-            "is certified for the plant itself"
+            f"certified for the linear plant ẋ = Âx + B̂u in its place{escape(own)}"
         )
     console.print(terminal_table(constants))
     _print_notes(console, found)

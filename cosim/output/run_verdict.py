@@ -148,7 +148,7 @@ def _states(loops: Sequence[LoopSummary]) -> str:
 
 def transmission_line(events: int, deliveries: int, ideal: int | None = None) -> VerdictLine:
     """Return the numbers of transmissions and deliveries, and that of the ideal loop."""
-    beside = "" if ideal is None else f" (ideal loop: {ideal})"
+    beside = "" if ideal is None else f" ({ideal} in the ideal loop)"
     sent = "1 transmission" if events == 1 else f"{events} transmissions"
     return VerdictLine(f"{sent}{beside}, {deliveries} delivered", NEUTRAL)
 

@@ -310,11 +310,8 @@ def _queue_delay_s(one: Rate, stages: Sequence[_Stage], spread_s: float, *, copi
     return math.inf
 
 
-def require_capacity(scenario: Scenario) -> None:
-    """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass.
-
-    A schedule needs slots for each loop, and for no other.
-    """
+def require_slots(scenario: Scenario) -> None:
+    """Raise CallerError if a schedule has no slot for a loop, or one for another loop."""
     loops = sum(section.count for section in loop_sections(scenario))
     for path, section in scenario.network.directions.items():
         for place, one in enumerate(section.impairments):
@@ -329,6 +326,14 @@ def require_capacity(scenario: Scenario) -> None:
                     f"{path}.impairments.{place}.order: {wrong}; the run has the loops "
                     f"1 to {loops}, and each needs a slot (0: an idle slot)"
                 )
+
+
+def require_capacity(scenario: Scenario) -> None:
+    """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass.
+
+    So it does if a schedule does not fit the loops.
+    """
+    require_slots(scenario)
     for load in link_loads(scenario):
         if load.mandatory_at_least_bps > load.rate_bps:
             losses, packets = load.window

@@ -113,7 +113,8 @@ def new(
 ) -> None:
     """Write a complete scenario for a plant, with comments, and settings that are certified.
 
-    The gain is chosen, too, unless the plant is a file that gain wrote. If no certificate is found,
+    The gain is chosen, too, unless the plant is a file that gain wrote. Choose it by weights or
+    poles there: `noack gain PLANT --q 10,1 --r 0.1 --out pole.json`. If no certificate is found,
     the scenario is written all the same, with the reason. --set fixes settings.
 
     Options:

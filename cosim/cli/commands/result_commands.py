@@ -187,7 +187,7 @@ def export(
 
     Options:
         file_format: Format of the file, or of the folder's files.
-        out: File, or folder of CSV; RUN.mat and so on by default.
+        out: File, or folder of CSV or FMUs; RUN.mat and so on by default.
         certificates: Certificates of each loop in a file of MATLAB; about a second for each loop.
 
     Examples:
@@ -207,6 +207,9 @@ def export(
                 chosen, path, file_format, loop=run.loop, certificates=certificates
             )
     else:
+        if run.loop or not certificates:
+            option = "--loop" if run.loop else "--no-certificates"
+            raise CallerError(f"{option}: not with {file_format}, which is made of a scenario")
         scenario = cli.load_scenario(_scenario_name(run), settings)
         path = out or Path(f"{scenario.name}{export_suffix(file_format)}")
         written = export_scenario(scenario, path, file_format)

@@ -99,7 +99,7 @@ def paper(
 
     Options:
         name: Name of another published result; --list shows them.
-        list_names: List the other published results.
+        list_names: List the other published results, or show one of these.
         draws: Number of random plants, losses and initial states; 1,000 by default.
         out: Folder for paper.md and its figures; runs/paper by default.
 
@@ -110,7 +110,8 @@ def paper(
         noack paper selivanov_fridman   one of them
     """
     if list_names:
-        known = {one: paper_results.named(one).about for one in paper_results.NAMES}
+        names = paper_results.NAMES if name is None else [name]
+        known = {one: paper_results.named(one).about for one in names}
         cli.print_lines(json, known, *(f"{one:<18} {about}" for one, about in known.items()))
         return ExitStatus.OK
     if name is not None:

@@ -101,11 +101,15 @@ def write(run: "ExportedRun", path: Path, *, certificates: bool = True) -> list[
 def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
     """Write ``NAME_channel.fmu`` and ``NAME_controller.fmu`` beside a path ``NAME.fmu``.
 
+    Of a folder, the files are in it, and NAME is that of the scenario.
+
     Raises:
         CallerError: the scenario has something that an FMU cannot have.
         MachineError: a file cannot be written.
     """
-    if not path.stem or path.is_dir():
+    if path.is_dir():
+        path /= scenario.name
+    if not (name := path.name.removesuffix(SUFFIX)):
         raise CallerError(f"{path}: must be the name of a file, such as loop{SUFFIX}")
     alone(scenario)
     kind = scenario.controller.kind
@@ -119,7 +123,7 @@ def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
         )
     (resolved,) = resolved_loops(scenario)
     return [
-        write_whole(path.with_name(f"{path.stem}_{role}{SUFFIX}"), _archive(resolved, role))
+        write_whole(path.with_name(f"{name}_{role}{SUFFIX}"), _archive(resolved, role))
         for role in ("channel", "controller")
     ]
 

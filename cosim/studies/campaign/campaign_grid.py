@@ -22,6 +22,7 @@ from cosim.studies.campaign.sampled_draws import SampledWork, SharedNetworkWork,
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario import toml_file
+from noack.scenario.link_load import require_slots
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put
@@ -109,6 +110,7 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
             content[LOOPS] = _scaled(content[LOOPS], value, source)
         scenario = completed(content, scenario_path, source)
         try:
+            require_slots(scenario)
             work, certified = _work(campaign, scenario)
         except (CallerError, ValueError) as error:
             raise CallerError(f"{source}: {error}") from None

@@ -330,7 +330,7 @@ def _notes(
     if certificate.constants is None:
         yield (
             f"No certificate was found for {plant}: {certificate.void}. A faster rate, a slower "
-            "gain (a larger --r) or a smaller network.mansd may have one."
+            "gain (a larger --r of noack gain) or a smaller network.mansd may have one."
         )
     else:
         bound = envelope_formula("‖x‖", certificate, "state").format(certificate.constants.state)

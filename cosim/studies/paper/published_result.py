@@ -29,6 +29,8 @@ class Row(NamedTuple):
     quantity: str
     where: str
     """Where the published value stands."""
+    relation: str
+    """What the computed value is to be: =, <, ≤, > or ≥ the published one, or among these."""
     published: str
     computed: str
     how: str
@@ -75,8 +77,8 @@ class Reproduction(NamedTuple):
     @property
     def table(self) -> ResultTable:
         """Published against computed."""
-        headings = ("quantity", "where", "published", "computed", "verdict")
-        cells = [(*row[:4], row.verdict) for row in self.rows]
+        headings = ("quantity", "where", "relation", "published", "computed", "verdict")
+        cells = [(*row[:5], row.verdict) for row in self.rows]
         return ResultTable(self.name, self.result.reference, headings, cells)
 
     def remarks(self) -> list[str]:
@@ -94,7 +96,7 @@ class Reproduction(NamedTuple):
 
 def print_rows(console: "Console", found: Reproduction) -> None:
     """Print published against computed, and what is to be known about it."""
-    console.print(terminal_table(found.table, left=range(2), styles=_STYLES))
+    console.print(terminal_table(found.table, left=range(3), styles=_STYLES, dense=True))
     for remark in found.remarks():
         console.print(remark, markup=False, highlight=False)
     verdict = f"{sum(row.agrees for row in found.rows)} of {len(found.rows)} reproduced"
@@ -107,7 +109,7 @@ def number(
     """Return the row of a number that is published with so many digits after the point."""
     agrees = abs(computed - published) <= 0.5000001 * 10.0**-digits
     texts = f"{published:.{digits}f}", f"{computed:.{digits + 1}f}"
-    return Row(quantity, where, *texts, how, agrees)
+    return Row(quantity, where, "=", *texts, how, agrees)
 
 
 def stored(name: str) -> dict[str, dict[str, Matrix]]:

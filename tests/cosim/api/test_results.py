@@ -1,6 +1,7 @@
 """Campaigns and certificates of the library give what the commands write."""
 
 import json
+import pickle
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,7 @@ def test_what_is_not_there_is_named(found: noack.CampaignResult) -> None:
 
 def test_a_system_is_certified(scenario: noack.Scenario) -> None:
     found = noack.certify(scenario)
+    assert pickle.loads(pickle.dumps(found)).to_json() == found.to_json()
     for certificate in (found.paper, found.schedule):
         assert certificate.void is None
         assert certificate.constants is not None

@@ -221,7 +221,7 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
     lines = [line for line in page.js(VERDICT).split("\n") if line]
     assert lines[0].startswith("completed 4 s: stable, ‖x‖ fell from ")
     assert lines[1].startswith("guarantee ")
-    assert " transmissions (ideal loop: " in lines[2]
+    assert " in the ideal loop), " in lines[2]
     assert violations(page) == []
     (run,) = [path for path in (folder / "runs").iterdir() if not path.is_symlink()]
     report = page.js("[...document.links].find(e => e.innerText.startsWith('report')).href")
