@@ -286,14 +286,13 @@ class _Hop:
         differs = first_bytes(headers) != first_bytes(expected)
         for row in np.flatnonzero(differs.any(axis=1) | (sizes != size_bytes)).tolist():
             head, size = self._rows["head"][row].tobytes(), int(sizes[row])
+            what = "differs from the message sent"
             if not known[row]:
                 kind = _CONTENT if sequences[row] < 0 else _SENT
                 self._differs(row, "was never sent", "head", head, kind=kind)
             elif differs[row].any():
-                what = "differs from the message sent"
                 self._differs(row, what, "head", head, expected[row].tobytes())
             else:
-                what = "differs from the message sent"
                 self._differs(row, what, "size_bytes", size, size_bytes)
 
     def _compare_flows(self) -> None:
