@@ -194,6 +194,15 @@ class Processes:
                 found[role] = Sample.of(process)
         return found
 
+    def are_alive(self, roles: Sequence[str]) -> bool:
+        """Whether a process of these roles, once seen by :meth:`sample`, has not ended."""
+        ended = (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+        for role in roles:
+            with contextlib.suppress(KeyError, psutil.Error):
+                if self._known[role].status() not in ended:
+                    return True
+        return False
+
     def left_behind(self, patience_s: float) -> list[str]:
         """Return the roles of processes that are alive although the run is over."""
         _, alive = psutil.wait_procs(list(self._known.values()), timeout=patience_s)

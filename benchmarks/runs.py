@@ -74,7 +74,11 @@ _KIBI = 1024
 _POLL_S = 2.0
 _SINGLE_S = 60.0
 _FLAT_MIB = 32.0
-_STEP_US, _MEMORY_MIB, _END_SHARE = Goal("<=", 5), Goal("<=", 80), Goal("<=", 0.1)
+_LOOK_S = 0.1
+_MEMORY_MIB, _END_SHARE = Goal("<=", 80), Goal("<=", 0.1)
+_STEP_US = {50.0: Goal("<=", 5)}
+"""By the rate of the loops, Hz. Not of 20 loops at 500 Hz, of which a step is due every 100 µs:
+steps that share a wake-up would be later than :data:`_LATE_MS`."""
 _LATE_MS = {50.0: Goal("<=", 1.0), 500.0: Goal("<=", 0.3)}
 """By the rate of the loops, Hz."""
 _LIBRARIES = "import numpy, zenoh; print(); input()"
@@ -147,15 +151,17 @@ def _follow(
     """Return memory and CPU time of a run's processes from its start, when a path exists."""
     processes = Processes(process.pid)
     memory, cpu_s = defaultdict[str, list[float]](list), defaultdict[str, list[float]](list)
-    ended_s = time.monotonic()
+    ended_s = sampled_s = time.monotonic()
     while process.poll() is None:
-        if started.exists():
+        if time.monotonic() >= sampled_s + _POLL_S and started.exists():
+            sampled_s = time.monotonic()
             for role, one in processes.sample().items():
                 memory[role].append(one.uss_kib / _KIBI)
                 if role in LOOP_ROLES:
                     cpu_s[role].append(one.cpu_s)
-                    ended_s = time.monotonic()
-        time.sleep(_POLL_S)
+        if processes.are_alive(LOOP_ROLES):
+            ended_s = time.monotonic()
+        time.sleep(_LOOK_S)
     used_s = {role: total_s[-1] - total_s[0] for role, total_s in cpu_s.items()}
     return memory, used_s, time.monotonic() - ended_s
 
@@ -181,7 +187,7 @@ def figures(load: Load, found: Measured, single_us: float) -> list[Row]:
         ),
         Row("loops and network not replayed bit for bit", 1 + len(loops) - equal, "",
             goal=_NOTHING),
-        Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US,
+        Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US.get(load.rate_hz),
             note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in found.cpu_s.items())),
         Row("the same", step_us, "µs", Peer("one loop alone", single_us)),
         Row("growth of memory in the second half, worst process", growth, "MiB",

@@ -182,7 +182,8 @@ class _TableReader:
         while self.next_ns() is not None:
             later = self._rows["now_ns"] >= end_ns
             count = int(np.argmax(later)) if later.any() else len(later)
-            found.append(self._rows[:count])
+            if count:  # a part of its own need not be copied
+                found.append(self._rows[:count])
             self._rows = self._rows[count:]
             if len(self._rows):
                 break

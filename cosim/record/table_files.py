@@ -36,6 +36,8 @@ from noack.protocol.wire_format import MAX_LOOPS
 _MOST_GROUP_ROWS = 2 * BATCH_ROWS
 """Largest number of rows of a group that is read; earlier versions wrote so many."""
 _LEAST_GROUP_ROWS = 3 * BATCH_ROWS // 4
+_ROWS_IN_CACHE = 2048
+"""Rows that stay in the processor's cache while they are filled column by column."""
 MOST_ROWS = 2**62
 """More than any file has."""
 _ENCODINGS = {
@@ -240,12 +242,15 @@ class TableFile:
         # One thread, whose memory is used again.
         table = file.read_row_group(group, columns=names, use_threads=False).combine_chunks()
         table.validate(full=True)
-        rows, columns = np.empty(len(table), dtype), iter(names)
+        rows, columns, copies = np.empty(len(table), dtype), iter(names), []
         for name in dtype.names or ():
             field = dtype[name]
             for entry in rows[name].T if field.shape else [rows[name]]:
                 column = next(columns)
-                entry[...] = _values(self._path, column, table[column], field.base)
+                copies.append((entry, _values(self._path, column, table[column], field.base)))
+        for first in range(0, len(rows), _ROWS_IN_CACHE):
+            for entry, values in copies:
+                entry[first : first + _ROWS_IN_CACHE] = values[first : first + _ROWS_IN_CACHE]
         return rows
 
 
