@@ -37,11 +37,11 @@ def test_the_end_of_each_array_is_known() -> None:
     ("tests/fuzz/test_parsers.py", "tests/netem/capture/test_pcapng.py",
      "tests/noack/protocol/test_wire_format.py", "-k", "link_numbers or pcapng or wire"),
     ("tests/netem/test_link.py", "tests/netem/test_mansd.py",
-     "tests/cosim/simulation/test_event_order.py", "tests/cosim/analysis/test_replay.py",
-     "tests/cosim/analysis/adversary/test_worst_patterns.py", "-k",
-     "plain_network or no_network or in_time or event_order or restarted or (test_replay and "
-     "(numbers or exact or bit_for_bit or runs_end)) or (test_worst_patterns and (machines or "
-     "early))"),
+     "tests/cosim/simulation/test_event_order.py", "tests/cosim/simulation/test_several_loops.py",
+     "tests/cosim/analysis/test_replay.py", "tests/cosim/analysis/adversary/test_worst_patterns.py",
+     "-k", "plain_network or no_network or in_time or restarted or several_loops or "
+     "(event_order and not random) or (test_replay and (numbers or exact or bit_for_bit or "
+     "runs_end)) or (test_worst_patterns and (machines or early))"),
     ("tests/noack/runtime/test_live_driver.py", "tests/noack/runtime/test_peer_sockets.py"),
     ("tests/cosim/output/export/test_fmu_export.py", "-k",
      "not plain and not slow and not command"),
