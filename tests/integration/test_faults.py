@@ -223,23 +223,6 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, smal
     assert not list(run_dir.rglob("*.partial"))
 
 
-def test_a_removed_run_directory_ends_the_run_with_clear_lines(start: Start) -> None:
-    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0))
-    running.wait_recording()
-    run_dir = (running.runs / "latest").resolve()
-    run_dir.rename(running.runs.parent / "removed")  # at once; rmtree would race with new files
-    _, stderr = running.process.communicate(timeout=live.PATIENCE_S)
-    assert running.process.returncode == 1
-    lines = [line for line in stderr.splitlines() if line.startswith("noack")]
-    assert len(lines) == 2, stderr
-    assert lines[0].startswith(f"noack: the run failed: recorder: {run_dir}")
-    assert lines[0].endswith(": was deleted or moved during the run")
-    assert lines[1].startswith(f"noack: {run_dir}: the run cannot be written: No such file")
-    assert "Traceback" not in stderr
-    assert running.left_behind() == []
-    assert not run_dir.exists()
-
-
 DISTURBED_S = 36.0
 PAUSE_S = 0.7
 """Well below zenoh's lease, and far above every delay that a certificate allows."""

@@ -1,6 +1,5 @@
 """The help and the completion: examples that work, and the words that fit."""
 
-import json
 import re
 import shlex
 from pathlib import Path
@@ -63,46 +62,6 @@ def test_every_example_has_valid_arguments(
     monkeypatch.chdir(tmp_path)
     PROGRAM.make_context("noack", words_of(example))
     COMMANDS[command].make_context(command, words_of(example)[1:])
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder, with a run in virtual time if needed."""
-    folder = tmp_path_factory.mktemp("examples")
-    words = ["simulate", "lane_following", "--set", "horizon_s=2", "--no-report"]
-    done = CliRunner().invoke(app, [*words, "--runs", str(folder / "runs")])
-    assert done.exit_code == 0, done.output
-    return folder
-
-
-AS_THEY_ARE = (
-    "archive", "check", "export", "schema", "summary", "replay", "fidelity", "report", "scenarios",
-    "measure", "certify", "linearise", "gain",
-)  # fmt: skip
-MORE = dict.fromkeys(AS_THEY_ARE, ()) | {
-    "margin": ("--most", "2", "--no-period"),
-    "simulate": ("--set", "horizon_s=1", "--no-report"),
-    "adversary": ("--nodes", "200", "--beam", "2", "--set", "horizon_s=0.5"),
-}
-"""Commands of which the first and last example (for slow ones the first) are run, shortened."""
-
-
-def run_examples() -> list[str]:
-    found = []
-    for command in MORE:
-        first, *_, last = examples_of(COMMANDS[command])
-        found += [first] if command in ("certify", "margin", "report") else [first, last]
-    return found
-
-
-@pytest.mark.parametrize("example", run_examples())
-def test_examples_work(example: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    words = words_of(example)
-    done = CliRunner().invoke(app, [*words, *MORE[words[0]]])
-    assert done.exit_code == 0, done.output
-    if "--json" in words or words[0] == "schema":
-        json.loads(done.stdout)
 
 
 def completed(line: str) -> list[str]:
