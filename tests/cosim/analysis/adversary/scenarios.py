@@ -1,5 +1,6 @@
-"""Random scenarios with few events, and the simulation of one pattern of dropouts."""
+"""Random scenarios with few events, so that every pattern of dropouts can be tried."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -14,8 +15,10 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from tests.oracles.lossy_loops import System, systems
 
+ALL_LOST = (False,) * 1000
+
 _ATTEMPTS = 6
-_PROBES = ((False,) * 1000, (), (False, True) * 500)
+_PROBES = (ALL_LOST, (), (False, True) * 500)
 
 
 def scenario_of(system: System, horizon_s: float, mode: str, floor: float) -> Scenario:
@@ -107,6 +110,24 @@ def may_be_lost(resolved: Scenario, so_far: str) -> bool:
         if not allowed:
             return False
     return True
+
+
+def every_run(resolved: Scenario) -> Iterator[ContinuousRun]:
+    """All admissible patterns, each simulated from the start.
+
+    Counts like an odometer: the next pattern delivers the last lost update and loses all later
+    updates that may be lost.
+    """
+    first = int(resolved.network.initial_sync == "first_packet")
+    prefix: Pattern = ()
+    while True:
+        run = simulate(resolved, prefix + ALL_LOST)
+        yield run
+        decided = tuple(run.delivered.tolist())
+        lost = [i for i in range(first, len(decided)) if not decided[i]]
+        if not lost:
+            return
+        prefix = (*decided[: lost[-1]], True)
 
 
 def flow_of(

@@ -1,7 +1,4 @@
-"""The search in continuous time: its value is that of its pattern; and the command.
-
-``test_worst_patterns.py`` compares the search with all patterns, tried one by one, in sampled time.
-"""
+"""The search in continuous time against all patterns tried one by one, and the command."""
 
 import json
 import math
@@ -20,6 +17,7 @@ from scipy.integrate import quad
 from cosim.analysis.adversary import Worst
 from cosim.analysis.adversary.loop_flows import evaluate
 from cosim.analysis.adversary.objective import Objective, measure_of
+from cosim.analysis.adversary.pattern_search import PatternSearch, search_tree
 from cosim.analysis.adversary.worst_pattern_search import find_worst as find_any
 from noack.core.errors import ExitStatus
 from noack.scenario.resolution import resolve
@@ -28,7 +26,9 @@ from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from tests.command_line import invoke
-from tests.cosim.analysis.adversary.scenarios import flow_of, scenarios, simulate
+from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate
+
+MANY = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate])
 
 find_worst = partial(find_any, continuous=True)
 
@@ -42,6 +42,23 @@ def signed(worst: Worst) -> float:
 def rate_of(resolved: Scenario) -> float | None:
     constants = certify(resolved, ideal_conditions(resolved)).constants
     return None if constants is None else constants.rate_per_s
+
+
+@given(resolved=scenarios(5, mansd=2, window=(2, 5), recovery=2))
+@settings(MANY, max_examples=4)
+def test_the_search_finds_the_worst_of_all_patterns(resolved: Scenario) -> None:
+    """Also without initial patterns, so that only the tree's own branches can find it."""
+    runs = list(every_run(resolved))
+    for objective in Objective:
+        flow = flow_of(resolved, objective, rate_of(resolved))
+        expected = max(evaluate(run, flow.measure).value for run in runs)
+        worst = find_worst(resolved, objective, beam=0)
+        assert worst.exact
+        assert signed(worst) == pytest.approx(expected, rel=1e-9)
+        assert objective is Objective.COST or not worst.breaches, worst
+        tree = PatternSearch(flow, resolved.network.guarantee)
+        assert search_tree(tree, 10**6)
+        assert tree.value == pytest.approx(expected, rel=1e-6)
 
 
 @given(
@@ -69,7 +86,7 @@ def test_a_certificate_that_forgets_a_dropout_is_refuted() -> None:
     refuted = []
 
     @given(resolved=scenarios(16, mansd=1, window=(1, 1), n=2, alpha_share=0.2))
-    @settings(max_examples=4, suppress_health_check=list(HealthCheck), phases=[Phase.generate])
+    @settings(MANY, max_examples=4)
     def attempt(resolved: Scenario) -> None:
         broken = certify(resolved, ideal_conditions(resolved)._replace(dropouts=0))
         worst = find_worst(resolved, Objective.ERROR, certificate=broken, most_nodes=2000, beam=0)
