@@ -29,27 +29,6 @@ Start = Callable[..., live.Running]
 LONG = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0)]
 
 
-def test_a_killed_recorder_is_named_and_no_recorded_row_is_lost(start: Start) -> None:
-    reason = "recorder died: killed by SIGKILL"
-    running = start(*LONG, "--report")
-    running.wait_recording()
-    running.child("recorder").send_signal(signal.SIGKILL)
-    finished = running.finish()
-    assert finished.status == 1
-    assert finished.summary["exit"]["reason"] == reason
-    assert f"{reason}; the run ends, and its record is completed\n" in finished.stderr
-    record = load_record(finished.run_dir)
-    for table in ("plant_step", "sensor_measurement", "controller_step"):
-        rows = record[table]
-        assert len(rows) > 10
-        assert np.array_equal(rows["sequence"], np.arange(len(rows)))
-    live.assert_complete(finished.loop)  # the others kept their final reports
-    assert (finished.run_dir / "recording.rrd").stat().st_size > 0
-    assert reason in (finished.run_dir / "report.html").read_text()
-    assert not (finished.run_dir / "spool").exists()
-    assert running.left_behind() == []
-
-
 def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     """The run ends because it has no recorder; the other processes store their rows themselves."""
     running = start(*LONG, impatient=True)
