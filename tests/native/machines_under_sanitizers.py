@@ -125,7 +125,7 @@ def drive(own: SteppedMachines, given_inputs: list[Any]) -> None:
         own.handle(Message(own.role.receives, number, t_ns, vector, loop), t_ns)
 
 
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(
     roles, st.lists(st.tuples(sizes(), st.integers(0, 2**16)), min_size=1, max_size=3), scales,
     st.sampled_from([1, 5, 1024]), inputs,
@@ -146,7 +146,7 @@ def test_large_machines(
         drive(machines_of(role, [(of, seed)], scale), given_inputs)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(roles, sizes(3), st.integers(0, 2**16), inputs, st.data())
 def test_machines_of_any_numbers_are_refused_or_run_clean(
     role: str, of: Sizes, seed: int, given_inputs: list[Any], data: st.DataObject
