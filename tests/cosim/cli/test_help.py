@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.cli.command import examples_of
 from netem.control.emulator_commands import COMMANDS as EMULATOR_COMMANDS
+from tests.approved import compare_lines
 
 PROGRAM: Any = get_command(app)
 COMMANDS: dict[str, Any] = dict(PROGRAM.commands)
@@ -73,29 +74,11 @@ def completed(line: str) -> list[str]:
     return done.stdout.split()
 
 
-@pytest.mark.parametrize(("line", "offered"), [
-    ("noack ca", ["campaign", "capacity"]),
-    ("noack rep", ["replay", "report", "reproduce"]),
-    ("noack certify lane_f", ["lane_following"]),
-    ("noack doctor quad", ["quadrotor_hover"]),
-    ("noack campaign mb", ["mb_vs_zoh"]),
-    ("noack run lane_following --set trigger.be", ["trigger.beta="]),
-    ("noack run lane_following --set network.mansd", ["network.mansd="]),
-    ("noack view runs/l", ["runs/latest"]),
-    ("noack replay runs/2", ["runs/20260102-000000-b", "runs/20260101-000000-a"]),
-    ("noack run lane_following --set loss", ["loss=", "loss.p="]),
-    ("noack set loss", ["loss", "loss.p"]),
-    ("noack set network.loss", ["network.loss", "network.loss.probability"]),
-    ("noack simulate lane_following --tri", ["--trigger"]),
-    ("noack simulate lane_following --trigger c", ["continuous"]),
-])  # fmt: skip
-def test_words_are_completed(
-    line: str, offered: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_words_are_completed_as_approved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("20260101-000000-a", "20260102-000000-b"):
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "scenario.toml").touch()
     (tmp_path / "runs" / "campaigns").mkdir()
     (tmp_path / "runs" / "latest").symlink_to("20260102-000000-b")
-    assert completed(line) == offered
+    compare_lines(Path(__file__).with_name("completions.txt"), completed)
