@@ -12,7 +12,7 @@ from tests.noack.theory.certificate_kinds.continuous import (
 )
 
 FEW, MOST = 6, 60
-LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 40, "continuous time": 20}
+LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 25, "continuous time": 15}
 BROKEN = [(name, next(iter(kind.broken))) for name, kind in KINDS.items() if kind.broken]
 """One of each kind; `python -m tests.noack.theory.certificate_kinds` tries all."""
 
