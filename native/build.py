@@ -260,7 +260,7 @@ def main() -> int:
             build_node(given.node or given.machines, example)
         elif given.check:
             with tempfile.TemporaryDirectory() as scratch:
-                _compile(Path(scratch), ("-Werror",))
+                _compile(Path(scratch), ("-Werror", "-O1"))  # in half of the time
         else:
             flags = SANITIZERS if given.sanitized else ()
             build(given.into, *flags, library_alone=given.library)

@@ -37,11 +37,11 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 SHORTER = {
-    "simulate": ("--no-report", "--set", "horizon_s=4"),
+    "simulate": ("--no-report", "--set", "horizon_s=1"),
     "demo": ("--no-report",),
     "run": ("--no-report",),
     "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
-    "design": ("--draws", "100"),
+    "design": ("--draws", "80"),
     "capacity": ("--draws", "1", "--loops", "11", "--set", "horizon_s=1"),
     "margin": ("--no-period",),
     "doctor": ("--seconds", "0.1"),

@@ -11,13 +11,10 @@ from noack.trigger.mixed import mixed_rule as given_mixed_rule
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import (
     NEVER_NS,
-    QuadraticForm,
     TriggerRule,
-    empty_map,
     error_form,
     quadratic_form,
     require_rule,
-    state_map,
 )
 
 EXAMPLES: dict[str, Table] = {
@@ -142,9 +139,3 @@ def quadratic_rule(
         quadratic_form(Q), floor=float(np.sqrt(epsilon)), grid_ns=period_ns, longest_ns=longest_ns,
         weight=weight,
     )  # fmt: skip
-
-
-def lyapunov_rule(factor: Matrix, rate_per_s: float, weight: Matrix | None = None) -> TriggerRule:
-    n = len(factor)
-    form = QuadraticForm(state_map(n, factor), empty_map(n))
-    return TriggerRule(form, rate_per_s=rate_per_s / 2, from_event=True, weight=weight)

@@ -4,7 +4,6 @@ import argparse
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from benchmarks.__main__ import (
@@ -19,7 +18,6 @@ from benchmarks.__main__ import (
 from benchmarks.report import (
     Benchmark,
     Goal,
-    Load,
     MeasurementError,
     Peer,
     Rounds,
@@ -50,14 +48,6 @@ def test_a_row_holds_fails_or_cannot_be_judged(row: Row, holds: bool | None) -> 
     assert row.holds is holds
 
 
-def test_a_busy_machine_is_reported() -> None:
-    load = Load()
-    load._before = tuple(np.subtract(load._before, (100.0, 60.0, 2.0, 20.0)))
-    others, steal = load.rows()
-    assert (others.value, steal.value) == pytest.approx((40.0, 2.0), abs=1.0)
-    assert others.note == steal.note == "the machine was busy: figures are doubtful"
-
-
 def named(name: str, *rows: Row, done: list[str] | None = None) -> Benchmark:
     def measure(options: argparse.Namespace) -> list[Row]:
         if done is not None:
@@ -85,23 +75,6 @@ def test_rows_and_reasons_are_printed_and_written_as_json(
     said = capsys.readouterr().out
     assert "Example" in said
     assert "no such program" in said
-
-
-def test_benchmarks_are_chosen_by_name_and_get_their_options(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    done: list[str] = []
-    benchmarks = by_name(*(named(name, done=done) for name in "abc"))
-    assert run(benchmarks, ["c", "a"]) == run(benchmarks, []) == 0
-    assert done == ["a", "c", "a", "b", "c"]
-    with pytest.raises(SystemExit):
-        run(benchmarks, ["d"])
-    assert "no benchmark 'd'; benchmarks: a, b, c" in capsys.readouterr().err
-    seen: list[argparse.Namespace] = []
-    options = {"--install": {"action": "store_true"}}
-    own = Benchmark("example", "An example", lambda given: seen.append(given) or [], options)
-    run(by_name(own), ["--install"])
-    assert seen[0].install
 
 
 def rounds_of(ours: list[float], theirs: list[float]) -> Rounds:

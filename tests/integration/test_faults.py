@@ -29,27 +29,6 @@ Start = Callable[..., live.Running]
 LONG = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0)]
 
 
-def test_a_killed_recorder_is_named_and_no_recorded_row_is_lost(start: Start) -> None:
-    reason = "recorder died: killed by SIGKILL"
-    running = start(*LONG, "--report")
-    running.wait_recording()
-    running.child("recorder").send_signal(signal.SIGKILL)
-    finished = running.finish()
-    assert finished.status == 1
-    assert finished.summary["exit"]["reason"] == reason
-    assert f"{reason}; the run ends, and its record is completed\n" in finished.stderr
-    record = load_record(finished.run_dir)
-    for table in ("plant_step", "sensor_measurement", "controller_step"):
-        rows = record[table]
-        assert len(rows) > 10
-        assert np.array_equal(rows["sequence"], np.arange(len(rows)))
-    live.assert_complete(finished.loop)  # the others kept their final reports
-    assert (finished.run_dir / "recording.rrd").stat().st_size > 0
-    assert reason in (finished.run_dir / "report.html").read_text()
-    assert not (finished.run_dir / "spool").exists()
-    assert running.left_behind() == []
-
-
 def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     """The run ends because it has no recorder; the other processes store their rows themselves."""
     running = start(*LONG, impatient=True)
@@ -221,23 +200,6 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, smal
     assert lines[0] == f"noack: the run failed: {failed}"
     assert failed in (run_dir / "report.html").read_text()
     assert not list(run_dir.rglob("*.partial"))
-
-
-def test_a_removed_run_directory_ends_the_run_with_clear_lines(start: Start) -> None:
-    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0))
-    running.wait_recording()
-    run_dir = (running.runs / "latest").resolve()
-    run_dir.rename(running.runs.parent / "removed")  # at once; rmtree would race with new files
-    _, stderr = running.process.communicate(timeout=live.PATIENCE_S)
-    assert running.process.returncode == 1
-    lines = [line for line in stderr.splitlines() if line.startswith("noack")]
-    assert len(lines) == 2, stderr
-    assert lines[0].startswith(f"noack: the run failed: recorder: {run_dir}")
-    assert lines[0].endswith(": was deleted or moved during the run")
-    assert lines[1].startswith(f"noack: {run_dir}: the run cannot be written: No such file")
-    assert "Traceback" not in stderr
-    assert running.left_behind() == []
-    assert not run_dir.exists()
 
 
 DISTURBED_S = 36.0

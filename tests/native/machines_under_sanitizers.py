@@ -125,7 +125,7 @@ def drive(own: SteppedMachines, given_inputs: list[Any]) -> None:
         own.handle(Message(own.role.receives, number, t_ns, vector, loop), t_ns)
 
 
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(
     roles, st.lists(st.tuples(sizes(), st.integers(0, 2**16)), min_size=1, max_size=3), scales,
     st.sampled_from([1, 5, 1024]), inputs,
@@ -137,7 +137,7 @@ def test_random_machines(
         drive(machines_of(role, loops, scale, rows=rows), given_inputs)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(roles, sizes(64), st.integers(0, 2**16), st.sampled_from([1.0, 1e308]), inputs)
 def test_large_machines(
     role: str, of: Sizes, seed: int, scale: float, given_inputs: list[Any]
@@ -146,7 +146,7 @@ def test_large_machines(
         drive(machines_of(role, [(of, seed)], scale), given_inputs)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(roles, sizes(3), st.integers(0, 2**16), inputs, st.data())
 def test_machines_of_any_numbers_are_refused_or_run_clean(
     role: str, of: Sizes, seed: int, given_inputs: list[Any], data: st.DataObject
@@ -174,7 +174,7 @@ sizes_and_policies = st.one_of(
 )
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(st.integers(0, 2**32), sizes_and_policies, st.integers(1, 3))
 def test_random_batches(seed: int, size_and_policy: tuple[int, str], m: int) -> None:
     (n, policy), rng = size_and_policy, np.random.default_rng(seed)

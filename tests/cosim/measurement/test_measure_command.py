@@ -162,7 +162,7 @@ def measured_again(source: Path | str, path: Path, form: str) -> tuple[noack.Mea
     first.write_network(path, form)  # type: ignore[arg-type]
     sent_ns = first.trace.sent_ns
     if form == "model":
-        sent_ns = PERIOD_NS * np.arange(40_000)
+        sent_ns = PERIOD_NS * np.arange(25_000)
     again = through(path, sent_ns)
     csv = path.with_suffix(".again.csv")
     csv.write_text(trace_csv(again))

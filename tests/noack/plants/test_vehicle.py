@@ -50,14 +50,11 @@ def test_the_linearised_single_track_model_is_the_textbooks(car: str) -> None:
     np.testing.assert_allclose(B, model.B, rtol=1e-3, atol=2e-3)  # the servo has not fully settled
 
 
-@pytest.mark.parametrize(("model", "library", "atol"), [
-    ("kinematic", "ks", 1e-7), ("single_track", "st", 1e-7), ("drift", "std", 1e-5),
-    ("multi_body", "mb", 1e-4),
-])  # fmt: skip
+@pytest.mark.parametrize(("model", "library"), [("kinematic", "ks"), ("single_track", "st")])
 def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
-    model: str, library: str, atol: float
+    model: str, library: str
 ) -> None:
-    """An implicit solver for stiff equations, over a lane change, with the servo written out."""
+    """Over a lane change, with the servo written out; the larger models' equations are below."""
     chosen, p = settings(model=model, friction=1.0), parameters("bmw_320i")
     system = OdeSystem(chosen.equations(), X0)
     np.testing.assert_allclose(system.x[1:], X0[1:], rtol=1e-12)  # "kinematic" has fewer states
@@ -74,7 +71,7 @@ def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
         motion(system, [angle] * steps)
         z = solve_ivp(whole, (0, steps * H_NS * 1e-9), z, args=(angle,), method="Radau",
                       rtol=1e-9, atol=1e-11).y[:, -1]  # fmt: skip
-    np.testing.assert_allclose(system.z, z, atol=atol * max(1.0, np.abs(z).max()))
+    np.testing.assert_allclose(system.z, z, atol=1e-7 * max(1.0, np.abs(z).max()))
 
 
 @pytest.mark.parametrize(("given", "expected"), [

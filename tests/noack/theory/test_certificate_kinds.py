@@ -1,4 +1,4 @@
-"""Certificates of random loops: no bound is exceeded, and those of each broken copy are."""
+"""Certificates of random loops: no bound is exceeded, and those of broken copies are."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,9 @@ from tests.noack.theory.certificate_kinds.continuous import (
 )
 
 FEW, MOST = 6, 60
-LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 40, "continuous time": 20}
-BROKEN = [(name, mistake) for name, kind in KINDS.items() for mistake in kind.broken]
+LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 25, "continuous time": 15}
+BROKEN = [(name, next(iter(kind.broken))) for name, kind in KINDS.items() if kind.broken]
+"""One of each kind; `python -m tests.noack.theory.certificate_kinds` tries all."""
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -25,7 +26,7 @@ def test_no_bound_of_a_random_loop_is_exceeded(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "mistake"), BROKEN)
-def test_each_broken_copy_is_detected(name: str, mistake: str) -> None:
+def test_a_broken_copy_of_each_kind_is_detected(name: str, mistake: str) -> None:
     """Within 60 loops in which the mistake matters; true certificates stand in the same loop."""
     kind = KINDS[name]
     broken = kind.broken[mistake]

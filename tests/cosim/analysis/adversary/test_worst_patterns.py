@@ -110,8 +110,10 @@ def value_of(
     return worst
 
 
-@pytest.mark.parametrize("mode", ["model", "zoh"])
-@pytest.mark.parametrize("policy", EXAMPLES)
+@pytest.mark.parametrize(
+    ("policy", "mode"),
+    [*((one, "model") for one in EXAMPLES), ("decaying", "zoh"), ("mixed", "zoh")],
+)
 def test_the_search_finds_the_worst_of_all_patterns(policy: str, mode: str) -> None:
     trigger = EXAMPLES[policy] | OWN.get(policy, {})
     resolved = scenario_of(trigger, mode=mode)

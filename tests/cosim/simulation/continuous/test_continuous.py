@@ -324,7 +324,7 @@ def step_by_step(
 
 @pytest.mark.parametrize("delay", [False, True])
 def test_it_is_what_one_exponential_after_another_gives(delay: bool) -> None:
-    for number in range(POLICIES.index("decaying"), 240, len(POLICIES)):
+    for number in range(POLICIES.index("decaying"), 120, len(POLICIES)):
         record = simulated(number)
         whole = live_run(record).schedule
         late = replace(whole, measured=whole.measured & (np.arange(len(whole.measured)) > 3))
@@ -340,7 +340,7 @@ def test_it_is_what_one_exponential_after_another_gives(delay: bool) -> None:
 @pytest.mark.parametrize("first", range(len(POLICIES)))
 def test_with_all_effects_it_is_what_the_machines_do(first: int) -> None:
     """Losses, delays, reordering, all kinds of rates and phases."""
-    for number in range(first, 6 * len(POLICIES), len(POLICIES)):
+    for number in range(first, 4 * len(POLICIES), len(POLICIES)):
         record = simulated(number)
         live = live_run(record)
         found = on_the_grid(record, live.schedule, delay=True, hold=True)
