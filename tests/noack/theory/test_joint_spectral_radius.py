@@ -253,6 +253,17 @@ def test_nilpotent_systems_do_not_grow() -> None:
     assert found.upper < 0.01
 
 
+def test_sizes_beyond_the_range_of_doubles_prove_nothing_false() -> None:
+    zero = joint_spectral_radius([edge(0, 0, [[0.0]]), edge(0, 0, [[0.0]], 3)], threshold=1.0)
+    assert (zero.lower, zero.cycle) == (0, ())
+    assert zero.upper < 1e-90
+    turn = np.array([[0.0, 1e300], [1e-300, 0.0]])
+    with np.errstate(all="ignore"):
+        found = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, 0.9 * np.eye(2))])
+    assert found.lower == pytest.approx(1)
+    assert found.upper >= 1
+
+
 def test_paths_that_end_do_not_count() -> None:
     edges = [edge(0, 0, [[0.5]]), edge(0, 1, [[100.0]]), edge(1, 2, [[100.0]])]
     assert joint_spectral_radius(edges).upper < 0.51
