@@ -158,7 +158,7 @@ def test_a_pattern_repeated_from_the_first_update_grows_as_claimed(losses: int) 
             for one, following in pairwise([*places, places[0] + len(fates)])
         ]
         radius = np.abs(np.linalg.eigvals(np.linalg.multi_dot(maps[::-1]))).max()
-        return float(radius) ** (1 / len(fates))
+        return float(radius ** (1 / len(fates)))
 
     assert growth(0) == pytest.approx(found.lower, rel=1e-9)
     assert min(growth(slot) for slot in range(1, slots)) < 0.95 * found.lower
