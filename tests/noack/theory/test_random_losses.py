@@ -162,3 +162,14 @@ def test_growth_does_not_depend_on_units_and_holds_for_fast_modes() -> None:
             assert found == pytest.approx(expected, rel=1e-5)
     with pytest.raises(NotPredictableError, match="beyond 1e308"):
         mean_square_growth([(np.eye(2), np.full((2, 2), np.inf))], chain)
+
+
+def test_a_spectral_radius_that_was_computed_too_small_is_not_accepted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    maps, chain = [(0.5 * np.eye(2), np.diag([1.4, 0.3]))], unlimited(BURSTY)
+    assert mean_square_growth(maps, chain) > 0
+    values = np.linalg.eigvals
+    monkeypatch.setattr(np.linalg, "eigvals", lambda matrix: 0.999 * values(matrix))
+    with pytest.raises(NotPredictableError, match="bounded numerically"):
+        mean_square_growth(maps, chain)
