@@ -6,25 +6,9 @@ these, 1/M or 1 − m/K. Let b be the bits of loop k's datagram on the link, d t
 largest time between two of its transmissions. The datagrams that must pass need between Σ s b/D and
 Σ s b/d bits per second. For actuations d and D are the controller's period.
 
-Without constraints: if r bits per second exceed m = Σ b/(M d), the delay D in a tail-drop queue of
-Q places is bounded. Datagrams leave in their order, so those before the end of a transmission came
-within D. At most Q of them found a free place; of each loop, at most 1 + D/(M d) had to pass. Hence
-D is at most (Q max b + Σ b)/(r − m). If r is even at least e = Σ b/d, a queue that has been busy
-for t got at most 1 + t/d datagrams of each loop, and has sent r t bits: D is at most Σ b/r.
-
-Impairments before the queue delay a datagram by a time between two bounds that differ by J. It
-enters the queue in the order of its transmission, and after a time between these bounds, too. So
-what enters within t was transmitted within t + J. Then D is at most (Q max b + Σ b + m J)/(r − m),
-or (Σ b + e J)/r. If they may send datagrams twice, each counts twice in the second bound.
-
-A loop has slots of a static schedule for itself. Let W(n) be the longest time until n of them have
-begun; a round has c of them and takes T. The n-th datagram since none waited leaves within W(n) of
-the first, and was transmitted at least (n - 1) d - J after it. So D is at most the largest
-W(n) - (n - 1) d + J. If T <= c d, only n up to c count, since W(n + c) = W(n) + T. If datagrams may
-be sent twice, n - 1 is halved and rounded down.
-Without constraints, and if T <= c M d, there is another bound. A datagram that finds its queue full
-must pass. Of these, since the last datagram that found a place, the n-th leaves within W(Q + n) of
-that one, and (n - 1) M d - J lie between. So D is at most the largest W(Q + n) - (n - 1) M d + J.
+From d, M, the queue and what is before it follow bounds of the delay in a tail-drop queue and in
+the slots of a static schedule (docs/derivations.md, "The delay on a link"). J is by how much the
+delays before it can differ, and W(n) the longest time until n of a loop's slots have begun.
 
 The delay in the network is at most the sum L of the bounds of its impairments. A datagram that is
 held back for the guarantee leaves with an earlier one of its loop, which leaves within L of its own

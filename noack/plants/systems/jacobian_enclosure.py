@@ -216,10 +216,7 @@ def _power_of_number(value: "arb", power: float) -> "arb":
         return value.sqrt()
     if power % 1:
         return (value.log() * power).exp()
-    found = _ball(1.0)
-    for _ in range(int(power)):
-        found *= value
-    return found
+    return value ** int(power)
 
 
 @dataclass(frozen=True)

@@ -52,8 +52,8 @@ class IntervalMatrix(NamedTuple):
         radius = self.radius + other.radius + 2 * _UNIT * np.abs(middle)
         return IntervalMatrix(middle, radius * _ENLARGED + _UNDERFLOW)
 
-    def scaled(self, exponent: int) -> "IntervalMatrix":
-        """Return the matrices times 2^exponent."""
+    def scaled(self, exponent: int | NDArray[np.int64]) -> "IntervalMatrix":
+        """Return the matrices times 2^exponent, which may differ from entry to entry."""
         return IntervalMatrix(
             np.ldexp(self.middle, exponent), np.ldexp(self.radius, exponent) + _UNDERFLOW
         )

@@ -145,7 +145,8 @@ class Stability(NamedTuple):
     upper: float
     """No pattern grows by more than this factor per longest interval, in the long run."""
     pattern: tuple[bool, ...]
-    """Whether each update is delivered, in a pattern that repeats; it begins with a delivery."""
+    """Whether each update is delivered, in a pattern that repeats from the first update on; mostly
+    it begins with a delivery."""
     intervals_s: tuple[float, ...]
     """The time from each update of the pattern to the next one."""
     vertices: int
@@ -231,6 +232,9 @@ class LossMargin:
         self._times = EventTimes(self.shortest_ns // unit_ns, self.longest_ns // unit_ns)
         times = loop_times(resolved, unit_ns)
         self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
+        # A controller that knows x(0) gets its first update after a period.
+        knows_start = resolved.network.initial_sync == "known_state"
+        self._first_slot = int(knows_start) % self.loop.times.slots
         self.maps = cache(self.loop.map)
         """The loop's maps by slot and number of lost updates."""
 
@@ -281,7 +285,14 @@ class LossMargin:
             effort=effort,
         )
         path = [bursts[number] for number in radius.cycle]
+        # In another slot than the first update's the pattern may grow less.
+        slots = [burst.slot for burst in path]
+        first = slots.index(self._first_slot) if self._first_slot in slots else 0
+        path = path[first:] + path[:first]
         pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
+        if path and self._times == EVERY_STEP:
+            first = (self._first_slot - path[0].slot) % self.loop.times.slots
+            pattern = pattern[first:] + pattern[:first]
         intervals_s = (
             steps * self._unit_ns / NS_PER_S
             for burst in path

@@ -352,4 +352,4 @@ def norms_above(matrices: IntervalMatrix) -> Vector:
     size, missed = (matrix.magnitude.sum(axis=2).max(axis=1) for matrix in (square, defect))
     with np.errstate(divide="ignore", invalid="ignore"):
         bounds = np.sqrt(size / (1 - missed)) * _ENLARGED
-    return np.where(missed < 0.5, bounds, np.inf)
+    return np.where((missed < 0.5) & ~np.isnan(bounds), bounds, np.inf)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix
+from noack.core.linear_systems import Matrix, balancing_exponents
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 
 _ITERATIONS = 60
@@ -75,6 +75,22 @@ class SwitchedSystem:
             matrix = exactly(forms[edge.target]) @ edge.matrix @ undone
             edges.append(edge._replace(matrix=matrix))
         return SwitchedSystem(tuple(edges))
+
+    def in_similar_units(self) -> "SwitchedSystem":
+        """Return the system with its states times powers of two, the same at every node.
+
+        Otherwise inputs in other units than the states' could leave it undecided.
+        """
+        if len(set(self.dimensions.values())) > 1:
+            return self
+        sizes = np.max([np.abs(edge.matrix.middle) for edge in self.edges], axis=0)
+        if not np.isfinite(sizes).all():
+            return self
+        exponents = balancing_exponents(sizes)
+        shifts = exponents[:, None] - exponents
+        return SwitchedSystem(
+            tuple(edge._replace(matrix=edge.matrix.scaled(shifts)) for edge in self.edges)
+        )
 
     def balanced(self) -> "SwitchedSystem":
         """Return the system in the coordinates of :meth:`balancing`, or else itself."""
@@ -152,8 +168,9 @@ def spectral_radius_bounds(product: IntervalMatrix) -> tuple[float, float]:
     basis = np.ascontiguousarray(np.where(values.imag >= 0, vectors.real, vectors.imag))
     undone = inverse(basis)
     if undone is not None:
-        turned = undone @ product @ exactly(basis)
-        bounds += [_power_bounds(turned), _normal_bounds(turned, values)]
+        with np.errstate(over="ignore", invalid="ignore"):  # the basis may be nearly singular
+            turned = undone @ product @ exactly(basis)
+            bounds += [_power_bounds(turned), _normal_bounds(turned, values)]
     lower, upper = zip(*bounds, strict=True)
     return max(lower), min(upper)
 

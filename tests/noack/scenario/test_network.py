@@ -231,6 +231,37 @@ def longest_delay_s(scenario: Scenario, loops: int, seed: int, together: bool) -
     return longest_ns * 1e-9
 
 
+RATE_BPS = BITS / 0.05
+"""Of one loop that transmits every 50 ms."""
+CORRUPT = {"kind": "corrupt", "probability": 1.0}
+DELAYS_NS = [150_000_000, 100_000_000, 50_000_000, 0]
+REPLAY = {"kind": "replay", "sent_ns": [0, 1, 2, 3], "delays_ns": DELAYS_NS}
+TIGHT: list[tuple[list[dict[str, Any]], int, float, float]] = [
+    # Four datagrams reach the queue at once. Then: what finds it full must pass.
+    ([REPLAY, {"kind": "rate", "rate_bps": RATE_BPS}], 1, 0.15 + 0.2, 0.2),
+    ([{"kind": "rate", "rate_bps": 0.7 * RATE_BPS, "queue": 2}, CORRUPT], 19,
+     3 * 0.05 / 0.65, 0.157),
+    # The same in slots, which are taken by datagrams that are lost later; two copies.
+    ([{"kind": "schedule", "order": [1, 0], "slot_s": 0.05, "queue": 1}, CORRUPT], 1, 0.2, 0.12),
+    ([{"kind": "duplicate", "probability": 1.0}, {"kind": "schedule", "order": [1],
+      "slot_s": 0.025}], 1, 0.05, 0.04),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("stages", "mansd", "bound_s", "reached_s"), TIGHT)
+def test_the_bound_of_the_delay_is_in_closed_form_and_nearly_reached(
+    content: dict[str, Any], stages: list[dict[str, Any]], mansd: int, bound_s: float,
+    reached_s: float,
+) -> None:  # fmt: skip
+    loops = {"name": "a", "count": 1, "trigger": PERIODIC}
+    stages = [one | {"rate_bps": round(one["rate_bps"])} if "rate_bps" in one else one
+              for one in stages]  # fmt: skip
+    given = scenario_of(content, 1000, 1, loops, impairments=stages, mansd=mansd)
+    assert update_delay(given).largest_s == pytest.approx(bound_s, rel=1e-3)
+    longest_s = max(longest_delay_s(given, 1, seed, together=False) for seed in range(8))
+    assert reached_s <= longest_s <= bound_s * 1.001
+
+
 def _is_alone_valid(one: Impairment) -> bool:
     """Whether it needs no file, and no loss rate of several stages together."""
     return not names_file(one) and not keeps_loss(one)

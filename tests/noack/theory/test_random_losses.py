@@ -8,7 +8,7 @@ import pytest
 
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
-from noack.impairments.markov_chain import Array
+from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.random_losses.mean_square_growth import mean_square_growth
@@ -154,3 +154,31 @@ def test_almost_all_runs_of_random_loops_grow_at_most_by_the_bound(process: Loss
         exceeded += np.log(sure_growth(delivered, lost, fewer)) < grown.mean() - 6 * error
     assert np.median(slack) < 0.04
     assert exceeded
+
+
+def test_growth_does_not_depend_on_units_and_holds_for_fast_modes() -> None:
+    """States in units that differ by 2^60, and maps with eigenvalues from 1e-9 to 1."""
+    rng = np.random.default_rng(5)
+    units, chain = np.ldexp(1.0, [0, 30, -30]), unlimited(independent(0.3))
+    for fastest in (1.0, 1e-9):
+        M0, M1 = (fastest * rng.normal(size=(3, 3)) + 0.5 * np.eye(3)[0] for _ in range(2))
+        turned = [units[:, None] * one / units for one in (M0, M1)]
+        for found, expected in (
+            (mean_square_growth([(turned[0], turned[1])], chain),
+             mean_square_growth([(M0, M1)], chain)),
+            (sure_growth(turned[0], turned[1], chain), sure_growth(M0, M1, chain)),
+        ):  # fmt: skip
+            assert found == pytest.approx(expected, rel=1e-5)
+    with pytest.raises(NotPredictableError, match="beyond 1e308"):
+        mean_square_growth([(np.eye(2), np.full((2, 2), np.inf))], chain)
+
+
+def test_a_spectral_radius_that_was_computed_too_small_is_not_accepted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    maps, chain = [(0.5 * np.eye(2), np.diag([1.4, 0.3]))], unlimited(BURSTY)
+    assert mean_square_growth(maps, chain) > 0
+    values = np.linalg.eigvals
+    monkeypatch.setattr(np.linalg, "eigvals", lambda matrix: 0.999 * values(matrix))
+    with pytest.raises(NotPredictableError, match="bounded numerically"):
+        mean_square_growth(maps, chain)
