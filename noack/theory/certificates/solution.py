@@ -31,6 +31,7 @@ from noack.theory.bounds.terms import (
 from noack.theory.bounds.trigger_bounds import LONGEST_S
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 from noack.theory.certificates.invariant_ellipsoids import is_reset_flow, sharpened_constants
+from noack.theory.certificates.scheduled_flow import is_scheduled_flow, scheduled_constants
 
 _SETTLED = 1e-3
 _ATTEMPTS = 200
@@ -164,6 +165,9 @@ def sharpened(problem: Problem) -> Search[Constants]:
     if problem.longest and is_plain and is_reset_flow(part, conditions):
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
             return sharpened_constants(constants, part, conditions)
+    if problem.longest and is_plain and is_scheduled_flow(part, conditions):
+        with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
+            return scheduled_constants(constants, part, conditions)
     return constants
 
 
