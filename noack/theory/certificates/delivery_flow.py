@@ -1,4 +1,4 @@
-"""The flow between two deliveries: what x and e_c can be, if inputs are neither delayed nor held.
+"""The flow between two deliveries: what x and e_c can be until the next one.
 
 From one delivery to the next no update reaches the controller. So z = (x, e_c) follows a linear
 system without an input, from (ξ, 0) with the state ξ at the delivery:
@@ -14,7 +14,12 @@ induction at all times: the set ‖Λx‖ ≤ 1 is invariant.
 
 All matrices are in coordinates in which W is the identity. Between two nodes of the grid the bounds
 are those of :mod:`noack.theory.bounds.enclosure`, with s the left node. From the last node T on, x
-+ e_c = e^{Hτ} ξ has decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D.
++ e_c = e^{Hτ} ξ has decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D and
+‖Λx‖ ≤ 1.
+
+**Delayed and held inputs.** This is so if inputs are neither delayed nor held. Otherwise z begins
+with an e_c that is not 0, and the age of inputs drives it; :class:`Disturbed` bounds both. What
+they change is added to the bounds; the flow is followed until it is a share of D.
 
 **After lost events.** Without the flow, each missing event adds its ‖e_s‖_W in full, as if all had
 one direction. But until the next delivery everything follows from z at one time. Let an event be

@@ -4,7 +4,8 @@ The bounds are the solution of the inequalities of :mod:`noack.theory.certificat
 The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
 assumed δ gives a time of at least δ, it holds by induction over the events; the largest such δ is
 used. Under the paper's conditions the constants are sharpened by the flow between two deliveries
-(:mod:`noack.theory.certificates.invariant_ellipsoids`).
+(:mod:`noack.theory.certificates.invariant_ellipsoids`), and those of a schedule by the flow between
+updates (:mod:`noack.theory.certificates.scheduled_flow`).
 """
 
 import contextlib
