@@ -1,5 +1,7 @@
 """Certificates of random loops: no bound is exceeded, and those of broken copies are."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,3 +50,14 @@ def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() ->
     worst = CONTINUOUS.simulate(system, np.random.default_rng(1)).worst
     bounds = constants_of(sharp, system.beta)
     assert {name for name, bound in bounds.items() if worst[name] < 0.6 * bound} == set()
+
+
+def test_the_flow_between_updates_makes_the_bounds_of_a_schedule_smaller() -> None:
+    system = dominated_by_errors(np.ones((4, 2)), far=True)
+    system = replace(system, step_s=0.004, delay_steps=1, hold_steps=1)
+    sharp, plain = system.certify(), system.certify(structured=False)
+    assert sharp.state < 0.6 * plain.state
+    assert sharp.delta < plain.delta
+    assert sharp.inter_event_s is not None
+    assert plain.inter_event_s is not None
+    assert sharp.inter_event_s >= plain.inter_event_s
