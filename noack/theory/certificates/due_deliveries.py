@@ -18,6 +18,7 @@ cells of time are enclosed (:mod:`noack.theory.bounds.enclosure`).
 """
 
 import contextlib
+import itertools
 import math
 from collections.abc import Iterator
 from functools import cached_property
@@ -28,12 +29,7 @@ from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
 from noack.theory.bounds.contraction import Stack
-from noack.theory.bounds.enclosure import (
-    KernelBounds,
-    NotDecayingError,
-    Outputs,
-    response_until,
-)
+from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, Outputs, response_until
 from noack.theory.bounds.gains import Output, PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.bounds.trigger_bounds import ErrorGrowth
@@ -42,9 +38,11 @@ _ROUNDING = 1 + 1e-9
 _MOST_GAPS, _MOST_CELLS, _MOST_TIMES = 256, 640, 6000
 _CELL = 0.04
 """Length of a cell, in time constants of the flow."""
+_PIECES = 4
+"""In so many pieces of a gap the ages of the input are averaged."""
 _AGES = 4
 """Cells into which ages of an input from 0 to σ are divided."""
-_SHIFTS = (0.95, 0.9, 0.8, 0.5, 0.0)
+_SHIFTS, _LEAST, _THETAS = (0.9, 0.7, 0.4), 1e-6, 2.0 ** np.arange(0, 7)
 """Decay rates of Λ that are tried, as shares of that of the scaled A + BK."""
 _AT_ONCE, _CENTRED = 64, 3
 _ERROR, _INPUT = "e_c in W", "e_c in K"
@@ -110,6 +108,9 @@ class _Norm(NamedTuple):
     """J of the next event, with the age of the input."""
     late_aged: Matrix
     """The part of J of the next event that a w of 1 in each cell causes."""
+    pulse: Vector
+    """‖Λξ‖ after a gap, and J of the next event, for J = 1."""
+    late_pulse: Vector
     theta: float
     """θ"""
     gain: float
@@ -217,35 +218,73 @@ class _Loop:
     def norm(self, shape: Matrix) -> _Norm:
         """Return what one gap makes of ‖Λξ‖ ≤ 1."""
         inverse = np.asarray(np.linalg.inv(shape))
-        bends = self._age_bends(shape, inverse)
+        bends, curved = self._age_bends(shape, inverse)
         ages = _of_cells(_norms(self.aged @ inverse).max(axis=1)) + bends
         ages = ages * _ROUNDING
-        moved, lost = np.split(self.flows[self.ends] @ inverse, 2, axis=1)
+        lost = self.flows[self.ends, self.n :] @ inverse
         nodes, bend = self.late
         late = _norms(nodes @ lost[:, None]).max(axis=1)
         late = late + bend * _norms(self.plant.error.weight @ lost)
         late_aged = self.at_ends(self.late_areas)
         late = late * _ROUNDING + late_aged @ ages
         aged = self.at_ends(self._response.through(np.hstack([shape, 0 * shape])).area)
-        stretch = _norms(shape @ moved) * _ROUNDING + aged @ ages
+        stretch = self._stretch(shape, inverse) + aged @ curved
         pulse, late_pulse = (one[:, : self.late_cells].sum(axis=1) for one in (aged, late_aged))
-        theta = gain = math.inf
-        if (late_pulse < 1).all():
-            theta = float((pulse / (1 - late_pulse)).max()) * _ROUNDING
-            gain = float((stretch + theta * late).max())
-        return _Norm(shape, bends, ages, stretch, aged, late, late_aged, theta, gain)
+        least = float((pulse / (1 - late_pulse).clip(min=1e-9)).max()) * _ROUNDING or _LEAST
+        thetas = least * _THETAS[:, None]
+        gains = np.maximum(stretch + thetas * late, pulse / thetas + late_pulse).max(axis=1)
+        best = int(gains.argmin())
+        return _Norm(
+            shape, bends, ages, stretch, aged, late, late_aged, pulse, late_pulse,
+            float(thetas[best, 0]), float(gains[best]),
+        )  # fmt: skip
 
-    def _age_bends(self, shape: Matrix, inverse: Matrix) -> Vector:
+    def _stretch(self, shape: Matrix, inverse: Matrix) -> Vector:
+        """Bound ‖Λξ‖ after each gap with ages to first order, (gaps,).
+
+        w = −τ KHe^{Hr}ξ. In a few pieces of a gap, Ψ(g − r) KHe^{Hr} is replaced by its mean; then
+        only the mean of τ counts, and a norm is largest for means of ±σ.
+        """
+        s, G, F, n = self.conditions.hold_s, self.scaled_H, self.F, self.n
+        moved = shape @ self.flows[self.ends, :n] @ inverse
+        if s == 0 or not self.H.any():
+            return _norms(moved) * _ROUNDING
+        pushed = self.BK @ self.H
+        row = np.hstack([shape, 0 * shape])
+        Y = F @ F @ pushed - 2 * F @ pushed @ G + pushed @ G @ G
+        bend = response_until(F, Y @ inverse, self.until_s, self.cells).through(row).sup_on_grid()
+        models = response_until(G, inverse, self.until_s, self.cells).through(shape).sup_on_grid()
+        sag = self.cell_s**2 / 8 * float(bend) * float(models)
+        left, right = row @ self._powers(F) @ pushed, self._powers(G) @ inverse
+        signs = np.array(list(itertools.product((-s, s), repeat=_PIECES)))
+        found = []
+        for end, map_ in zip(self.ends.tolist(), moved, strict=True):
+            at = left[end::-1] @ right[: end + 1]
+            rest, means = 0.0, np.zeros((_PIECES, n, n))
+            for number, piece in enumerate(np.array_split(np.arange(end), _PIECES)):
+                if len(piece):
+                    nodes = at[piece[0] : piece[-1] + 2]
+                    mean = nodes.mean(axis=0)
+                    away = _of_cells(np.linalg.norm(nodes - mean, axis=(1, 2))) + sag
+                    rest += s * self.cell_s * float(away.sum())
+                    means[number] = mean * self.cell_s * len(piece)
+            ends = map_ + np.einsum("sp,pij->sij", signs, means)
+            found.append((float(_norms(ends).max()) + rest) * _ROUNDING)
+        return np.array(found)
+
+    def _age_bends(self, shape: Matrix, inverse: Matrix) -> tuple[Vector, Vector]:
+        """Bound, over each cell, how far ‖w‖ may lie above its nodes, and from the first order."""
         s, H, G = self.conditions.hold_s, self.H, self.scaled_H
         if s == 0:
-            return np.zeros(self.cells)
+            return np.zeros(self.cells), np.zeros(self.cells)
         outputs = Outputs({"τ": self.R @ H @ H, "r": self.R @ H @ G @ G})
         kernels = response_until(G, inverse, self.until_s, self.cells).through_each(outputs)
-        bends = (s / _AGES) ** 2 / 8 * kernels["τ"].highest
-        bends = bends + self.cell_s**2 / 8 * s * kernels["r"].highest
         # e^{−Hτ} commutes with e^{Hr}.
-        grown = [response_until(one, inverse, s).through(shape).sup_on_grid() for one in (H, -H)]
-        return np.asarray(max(map(float, grown)) * bends)
+        both = [response_until(one, inverse, s).through(shape).sup_on_grid() for one in (H, -H)]
+        second = max(map(float, both)) * kernels["τ"].highest
+        turned = max(map(float, both)) * kernels["r"].highest
+        bends = (s / _AGES) ** 2 / 8 * second + self.cell_s**2 / 8 * s * turned
+        return np.asarray(bends), np.asarray(s**2 / 2 * second)
 
 
 def _norms(matrices: Stack) -> Stack:
@@ -263,9 +302,12 @@ class _Run:
 
     def __init__(self, loop: _Loop) -> None:
         self._loop, n = loop, loop.n
-        self._norm = min(map(loop.norm, _shapes(loop.plant)), key=lambda norm: norm.gain)
-        if not self._norm.gain < 1:
-            gain = self._norm.gain
+        gain = math.inf
+        for shape in _shapes(loop.plant):
+            self._norm = loop.norm(shape)
+            if (gain := min(gain, self._norm.gain)) < 1:
+                break
+        else:
             raise NoCertificateError(f"in a norm the loop grows from delivery to delivery: "
                                      f"{gain:.3g}, not below 1", gain)  # fmt: skip
         self._x0 = loop.plant.start[:, 0]
@@ -307,50 +349,44 @@ class _Run:
 
     def _sizes(self) -> Vector:
         """Return the bounds of all outputs, (outputs,)."""
-        loop, norm = self._loop, self._norm
-        counts, ends = loop.gaps.counts, loop.ends
-        pulse = norm.aged[:, : loop.late_cells].sum(axis=1)
-        late_pulse = norm.late_aged[:, : loop.late_cells].sum(axis=1)
-        most = int(counts[-1])
-        highest, children, J_at, V_at = np.zeros(0), dict[int, _Balls](), {}, {}
-        pending: list[tuple[Vector, float, float, Vector]] = []
-        for k in range(_MOST_TIMES):
-            if k == 0:
-                highest, children[0] = self._start()
-                J_at[0], V_at[0] = 0.0, float(np.linalg.norm(norm.shape @ self._x0))
-                continue
-            parents = [(k - int(count), g) for g, count in enumerate(counts)]
-            known = [children[s].of(g) for s, g in parents if s in children]
-            children.pop(k - most, None)
+        norm, counts = self._norm, self._loop.gaps.counts.tolist()
+        highest, first = self._start()
+        children, balls, unseen = {0: first}, dict[int, _Ball](), list[_Ball]()
+        for k in range(1, _MOST_TIMES):
+            known = [children[k - n].of(g) for g, n in enumerate(counts) if k - n in children]
+            children.pop(k - counts[-1], None)
             if not known:
                 continue
-            c, rho = _enclosing(norm.shape, *map(np.array, list(zip(*known, strict=True))[:2]))
-            J = max(one[2] for one in known)
-            ages = self._ages_of(c[None])[0]
-            J_at[k] = J
-            V_at[k] = float(np.linalg.norm(norm.shape @ c)) + rho + norm.theta * J
-            pending.append((c, rho, J, ages))
-            moved = loop.flows[ends] @ c
-            children[k] = _Balls(
-                moved[:, : loop.n],
-                norm.stretch * rho + pulse * J + norm.aged @ ages,
-                loop.late_sizes(moved[:, loop.n :]) + norm.late * rho + late_pulse * J
-                + norm.late_aged @ ages,
-            )  # fmt: skip
-            if len(pending) >= _AT_ONCE or k == _MOST_TIMES - 1:
-                highest = np.maximum(highest, self._seen(pending))
-                pending.clear()
-                window = [s for s in range(k - most + 1, k + 1) if s in V_at]
-                tail = self._tail(max(V_at[s] for s in window), max(J_at[s] for s in window))
-                if (tail <= highest).all() or k == _MOST_TIMES - 1:
-                    return np.asarray(np.maximum(tail, highest) * _ROUNDING)
-        raise AssertionError  # the last time returns
+            ball = balls[k] = _enclosing(norm.shape, known)
+            unseen.append(ball)
+            children[k] = self._after(ball)
+            if len(unseen) == _AT_ONCE or k == _MOST_TIMES - 1:
+                highest = np.maximum(highest, self._seen(unseen))
+                unseen.clear()
+                tail = self._tail([balls[s] for s in range(k - counts[-1], k + 1) if s in balls])
+                if (tail <= highest).all():
+                    break
+        return np.asarray(np.maximum(tail, highest) * _ROUNDING)
 
-    def _tail(self, size: float, late: float) -> Vector:
-        """Bound all outputs after ‖Λξ‖ + θJ and J have been at most these for a longest gap."""
+    def _after(self, ball: "_Ball") -> "_Balls":
+        """Return what follows from a ball after each gap."""
+        loop, norm = self._loop, self._norm
+        moved, ages = loop.flows[loop.ends] @ ball.c, self._ages_of(ball.c[None])[0]
+        late = loop.late_sizes(moved[:, loop.n :]) + norm.late_aged @ ages
+        rho, J = ball.corners
+        rho, J = (
+            norm.stretch[:, None] * rho + norm.pulse[:, None] * J + (norm.aged @ ages)[:, None],
+            norm.late[:, None] * rho + norm.late_pulse[:, None] * J + late[:, None],
+        )
+        both = (rho + norm.theta * J).max(axis=1)
+        return _Balls(moved[:, : loop.n], rho.max(axis=1), J.max(axis=1), both, norm.theta)
+
+    def _tail(self, balls: "list[_Ball]") -> Vector:
+        """Bound all outputs from now on, given the balls within a longest gap."""
         norm, loop = self._norm, self._loop
-        late_pulse = float(norm.late_aged[:, : loop.late_cells].sum(axis=1).max())
-        J = max(late, float(norm.late.max()) * size / (1 - late_pulse))
+        size = max(float(np.linalg.norm(norm.shape @ ball.c)) + ball.both for ball in balls)
+        J = float(norm.late.max()) * size / (1 - float(norm.late_pulse.max()))
+        J = min(max(J, *(ball.J for ball in balls)), size / norm.theta)
         seen = self._of_ball + self._ages_seen * norm.ages + loop.driven @ norm.ages
         return np.asarray((seen * size + self._of_late * J).max(axis=1))
 
@@ -361,21 +397,22 @@ class _Run:
         weighted = np.linalg.norm(points @ self._norm.shape.T, axis=-1)
         return np.asarray((sizes + self._norm.age_bends * weighted[:, None]) * _ROUNDING)
 
-    def _seen(self, balls: list[tuple[Vector, float, float, Vector]]) -> Vector:
-        """Bound all outputs from events with these c, ρ, J, and ‖w‖ from the age of c."""
+    def _seen(self, balls: "list[_Ball]") -> Vector:
+        """Bound all outputs from events with these balls until the next delivery."""
         loop, norm = self._loop, self._norm
-        points, rho, J, ages = (np.array(values) for values in zip(*balls, strict=True))
+        points = np.array([ball.c for ball in balls])
+        corners = np.array([ball.corners for ball in balls])[..., None]
         nodes = np.einsum("ran,kn->kra", loop.flows, points)
-        ages = ages + norm.ages * rho[:, None]
+        ages = self._ages_of(points)
         sizes = np.linalg.norm(points @ norm.shape.T, axis=-1)
         highest = []
         for number, C in enumerate(loop.outputs.values()):
+            seen, pushed = self._ages_seen[number], loop.driven[number]
+            of_ball = self._of_ball[number] + seen * norm.ages + pushed @ norm.ages
+            corner = (of_ball * corners[:, 0] + self._of_late[number] * corners[:, 1]).max(axis=1)
             cells = _of_cells(np.linalg.norm(nodes @ C.T, axis=-1))
-            cells = (
-                cells + self._sags[number] * sizes[:, None] + self._of_ball[number] * rho[:, None]
-            )
-            cells = cells + ages @ loop.driven[number].T + self._of_late[number] * J[:, None]
-            highest.append((cells + self._ages_seen[number] * ages).max())
+            cells = cells + self._sags[number] * sizes[:, None] + corner
+            highest.append((cells + ages @ pushed.T + seen * ages).max())
         return np.array(highest)
 
     def _start(self) -> tuple[Vector, "_Balls"]:
@@ -419,9 +456,9 @@ class _Run:
         )
         J = np.maximum(loop.late_sizes(moved[:, n:]), loop.late_sizes((moved + ends)[:, n:]))
         J = J + max(late) + weighted + norm.late_aged @ ages
-        return np.array(highest), _Balls(
-            moved[:, :n] + ends[:, :n] / 2, half * _ROUNDING + bent + norm.aged @ ages, J
-        )
+        rho = half * _ROUNDING + bent + norm.aged @ ages
+        both = rho + norm.theta * J
+        return np.array(highest), _Balls(moved[:, :n] + ends[:, :n] / 2, rho, J, both, norm.theta)
 
     def _carried(self, C: Matrix, Y: Matrix, cells: int) -> float:
         """Bound ‖C e^{Fr} Y e^{Hs} x(0)‖ over cells of r, and s up to T."""
@@ -437,27 +474,50 @@ class _Run:
         return (largest + T**2 / 8 * float(bent) * float(whole)) * _ROUNDING
 
 
+class _Ball(NamedTuple):
+    """‖Λ(ξ − c)‖ ≤ ρ, J, and ρ + θJ at a delivered event, at most."""
+
+    c: Vector
+    rho: float
+    J: float
+    both: float
+    theta: float
+
+    @property
+    def corners(self) -> Matrix:
+        """ρ and J where linear functions of both, that do not fall, are largest, (2, corners)."""
+        rho, J = min(self.rho, self.both), min(self.J, self.both / self.theta)
+        others = min(J, (self.both - rho) / self.theta), min(rho, self.both - self.theta * J)
+        return np.array([[rho, others[1]], [others[0], J]]).clip(min=0.0) * _ROUNDING
+
+
 class _Balls(NamedTuple):
-    """c, ρ and J a time after a delivered event, for each gap."""
+    """The balls a time after a delivered event, for each gap."""
 
     c: Matrix
     rho: Vector
     J: Vector
+    both: Vector
+    theta: float
 
-    def of(self, gap: int) -> tuple[Vector, float, float]:
-        """Return those of a gap."""
-        return self.c[gap], float(self.rho[gap]), float(self.J[gap])
+    def of(self, gap: int) -> _Ball:
+        """Return that of a gap."""
+        rho, J, both = float(self.rho[gap]), float(self.J[gap]), float(self.both[gap])
+        return _Ball(self.c[gap], rho, J, both, self.theta)
 
 
-def _enclosing(shape: Matrix, c: Matrix, rho: Vector) -> tuple[Vector, float]:
-    """Return a small ball around balls, in the norm ‖Λξ‖."""
+def _enclosing(shape: Matrix, balls: list[_Ball]) -> _Ball:
+    """Return a small ball around balls."""
+    c = np.array([ball.c for ball in balls])
+    rho, J, both = (np.array(values) for values in list(zip(*balls, strict=True))[1:4])
     middle, rounding = c.mean(axis=0), 1e-12 * float(np.linalg.norm(c @ shape.T, axis=-1).max())
     for number in range(1, _CENTRED + 1):
-        away = np.linalg.norm((c - middle) @ shape.T, axis=-1) + rho
-        furthest = int(away.argmax())
+        furthest = int((np.linalg.norm((c - middle) @ shape.T, axis=-1) + both).argmax())
         middle = middle + (c[furthest] - middle) / (number + 2)
-    away = np.linalg.norm((c - middle) @ shape.T, axis=-1) + rho
-    return middle, float(away.max()) * _ROUNDING + rounding
+    away = np.linalg.norm((c - middle) @ shape.T, axis=-1) + rounding
+    sizes = (float((away + one).max()) * _ROUNDING for one in (rho, both))
+    most, most_of_both = sizes
+    return _Ball(middle, most, float(J.max()), most_of_both, balls[0].theta)
 
 
 def _shapes(plant: PlantGains) -> Iterator[Matrix]:
@@ -467,9 +527,11 @@ def _shapes(plant: PlantGains) -> Iterator[Matrix]:
     decay_per_s, identity = -spectral_abscissa(plant.closed_loop), np.eye(len(plant.A))
     if decay_per_s <= 0:
         raise NotDecayingError(f"a mode of the loop grows at {-decay_per_s:.3g} /s")
-    for share in _SHIFTS:
+    rate = plant.error.split_K[1] @ plant.error.H
+    seen = rate.T @ rate + _LEAST * np.linalg.norm(rate) ** 2 * identity
+    for share, right in itertools.product(_SHIFTS, (seen, identity)):
         shifted = plant.closed_loop + share * decay_per_s * identity
-        form = solve_continuous_lyapunov(shifted.T, -identity)
+        form = solve_continuous_lyapunov(shifted.T, -right)
         with contextlib.suppress(np.linalg.LinAlgError):
             yield np.linalg.cholesky(0.5 * (form + form.T)).T
 
