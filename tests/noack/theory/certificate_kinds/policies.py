@@ -397,7 +397,7 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
     ),
     "lyapunov, no start without an input": (
         "lyapunov", without("start_s"), {
-            **LATE, "delay_steps": 0, "hold_steps": 2, "mismatch": 0.0,
+            **LATE, "delay_steps": 2, "hold_steps": 0, "mismatch": 0.0, "known_start": False,
         },
     ),
     "relative, no share": ("relative", with_trigger(NoShares), {**FAR, "mansd": 0}),
