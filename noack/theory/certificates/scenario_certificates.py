@@ -26,6 +26,7 @@ from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
 from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate
+from noack.theory.certificates.due_deliveries import constants_between_deliveries
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 MOST_S = 10.0
@@ -38,6 +39,8 @@ _STEPS = 6
 Points = Sequence[tuple[float, float]]
 """Logarithms of loop gains, and of their times."""
 _SLOWER = 0.9
+_TIMED_RATES = (0.4, 0.1)
+"""Rates that are tried where events are due, as shares of the decay rate of A + BK."""
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
 Phases = tuple[Constants, Constants | None, Constants | None]
@@ -218,14 +221,51 @@ class CertificateScope:
             NoCertificateError: there is no certificate.
             NotDecayingError: a mode of the loop decays too slowly.
         """
+        timed = self._between_deliveries(conditions) if longest else None
+        if timed is not None and self._trigger.comparison is None:
+            return [(timed, None, None)]
         try:
             if self.is_simple:
                 first, late = yield from self._phases(conditions, longest=longest)
-                return [(first, late, None)]
-            pairs = yield from self._disturbed_phases(conditions, longest=longest)
-            return [(first, None, rest) for first, rest in pairs]
-        except (OverflowError, np.linalg.LinAlgError):
+                found: list[Phases] = [(first, late, None)]
+            else:
+                pairs = yield from self._disturbed_phases(conditions, longest=longest)
+                found = [(first, None, rest) for first, rest in pairs]
+        except (
+            NoCertificateError,
+            NotDecayingError,
+            OverflowError,
+            np.linalg.LinAlgError,
+        ) as error:
+            timed = timed or self._between_deliveries(conditions)
+            if timed is not None:
+                return [(timed, None, None)]
+            if isinstance(error, NoCertificateError | NotDecayingError):
+                raise
             raise NoCertificateError(_TOO_LARGE) from None
+        if timed is None:
+            return found
+        apart_s = max(timed.inter_event_s or 0.0, found[0][0].inter_event_s or 0.0)
+        return [(timed._replace(inter_event_s=apart_s), None, None), *found]
+
+    def _between_deliveries(self, conditions: NetworkConditions) -> Constants | None:
+        """Return constants that follow from the times of deliveries alone, if they exist."""
+        trigger, loop = self._trigger, self._loop
+        if not trigger.has_due_time or not self._resolved.coverage.is_undisturbed:
+            return None
+        if self._start_error or self._start.shape[1] != 1 or self._resolved.observer is not None:
+            return None
+        decay = self._decay["A + BK"]
+        for share in _TIMED_RATES if decay > 0 else ():
+            rate = share * decay
+            plant = self._plant_at(error_gains(loop, rate), self._start, rate)
+            if not plant.is_one_plant:
+                return None
+            with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
+                tested = trigger.tested(conditions)
+                bound = trigger.bound(tested, 0.0, None)
+                return constants_between_deliveries(plant, tested, bound, trigger.beta or 1.0)
+        return None
 
     def _phases(
         self, conditions: NetworkConditions, *, longest: bool
