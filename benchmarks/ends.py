@@ -161,25 +161,37 @@ def rows_of(ends: Mapping[float, End]) -> Iterator[Row]:
         return Row(name, length_s / max(more_s, 1e-9), "×", goal=goal, note=note)
 
     yield Row(f"peak memory, end of {longest_s:g} s", long.peak_mib, "MiB", goal=Goal("<=", 300))
-    yield Row("the same, against a short run", long.peak_mib, "MiB",
-              Peer(f"end of {shortest_s:g} s", short.peak_mib))  # fmt: skip
-    yield Row(f"end of {longest_s:g} s", long.wall_s, "s")
-    yield speed("speed of the end, as a multiple of real time", long.wall_s - short.wall_s,
-                note="of the additional length, replay beside the rest")  # fmt: skip
-    yield speed("the same, by CPU time of all processes", long.cpu_s - short.cpu_s, Goal(">=", 200))
-    yield speed(
-        "of it, the replay", long.phases_s[REPLAY] - short.phases_s[REPLAY], Goal(">=", 2000)
+    yield Row(
+        "the same, against a short run",
+        long.peak_mib,
+        "MiB",
+        Peer(f"end of {shortest_s:g} s", short.peak_mib),
     )
+    yield Row(f"end of {longest_s:g} s", long.wall_s, "s")
+    yield speed(
+        "speed of the end, as a multiple of real time",
+        long.wall_s - short.wall_s,
+        note="of the additional length, replay beside the rest",
+    )
+    yield speed("the same, by CPU time of all processes", long.cpu_s - short.cpu_s, Goal(">=", 200))
+    yield speed("of it, the replay", long.phases_s[REPLAY] - short.phases_s[REPLAY], Goal(">=", 2000))
     for phase, took_s in long.phases_s.items():
         hour_s = 3600 * (took_s - short.phases_s.get(phase, 0.0)) / length_s
         yield Row(f"phase: {phase}, per hour of the run", hour_s, "s")
 
 
 @benchmark(
-    "long_run", "The end of a long run",
-    {"--long-run": {"type": float, "nargs": "+", "metavar": "SECONDS",
-                    "help": "long_run: lengths of the runs (default: 120 600)"}},
-)  # fmt: skip
+    "long_run",
+    "The end of a long run",
+    {
+        "--long-run": {
+            "type": float,
+            "nargs": "+",
+            "metavar": "SECONDS",
+            "help": "long_run: lengths of the runs (default: 120 600)",
+        }
+    },
+)
 def long_run(options: argparse.Namespace) -> Iterator[Row]:
     """Complete runs of several lengths, as by ``noack summary``.
 

@@ -229,11 +229,14 @@ def libraries_mib(count: int) -> float:
 
 
 @benchmark(
-    "fleet", "Many loops on one network",
-    {"--fleet-s": {"type": float, "default": 60.0, "help": "length of the runs, seconds"},
-     "--fleet-loops": {"type": int, "default": 1000, "help": "loops at 50 Hz"},
-     "--fleet-dir": {"type": Path, "help": "where the runs are kept meanwhile"}},
-)  # fmt: skip
+    "fleet",
+    "Many loops on one network",
+    {
+        "--fleet-s": {"type": float, "default": 60.0, "help": "length of the runs, seconds"},
+        "--fleet-loops": {"type": int, "default": 1000, "help": "loops at 50 Hz"},
+        "--fleet-dir": {"type": Path, "help": "where the runs are kept meanwhile"},
+    },
+)
 def fleet(options: argparse.Namespace) -> Iterator[Row]:
     """Measure many loops through one bottleneck, live, beside one loop at the same rate.
 
@@ -289,9 +292,7 @@ def cpu_s(command: Sequence[str]) -> float:
 def startup_rows(rounds: Rounds) -> Iterator[Row]:
     """Yield the rows of the start of a run."""
     note = "upper bound: includes a progress line's way through the recorder"
-    yield rounds.row(
-        "noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6), note=note
-    )
+    yield rounds.row("noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6), note=note)
     yield rounds.row("the same, against a bare import", "s", "first_s", OURS, IMPORTS)
     yield rounds.row("of it, from launch to time 0, as the run says", "s", "launch_s", OURS)
 
@@ -326,9 +327,12 @@ def startup(options: argparse.Namespace) -> Iterator[Row]:
         rounds.add(IMPORTS, {"first_s": imported_s("numpy, scipy.linalg, pydantic, zenoh")})
     yield from startup_rows(rounds)
     yield compared(
-        "noack certify lane_following, with all limits", "CPU s", lambda: cpu_s(_CERTIFY),
-        ("Python that imports python-control", lambda: cpu_s(_IMPORT_CONTROL)), Goal("<", 1),
-    )  # fmt: skip
+        "noack certify lane_following, with all limits",
+        "CPU s",
+        lambda: cpu_s(_CERTIFY),
+        ("Python that imports python-control", lambda: cpu_s(_IMPORT_CONTROL)),
+        Goal("<", 1),
+    )
     say("20 loops")
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         begun_s = time.monotonic()
@@ -369,11 +373,16 @@ def size(options: argparse.Namespace) -> Iterator[Row]:
     default = set(re.findall(r"^([A-Za-z0-9_.-]+)==", lock, re.M))
     python = lines(*(f"{folder}/*.py" for folder in PROGRAM))
     yield Row("installed without extras", installed_bytes(default) / 1e6, "MB")
-    yield Row("of it, numba and llvmlite", installed_bytes(default & {"numba", "llvmlite"}) / 1e6,
-              "MB", goal=_NOTHING)  # fmt: skip
+    yield Row(
+        "of it, numba and llvmlite",
+        installed_bytes(default & {"numba", "llvmlite"}) / 1e6,
+        "MB",
+        goal=_NOTHING,
+    )
     yield Row("Python outside tests", python, "lines", goal=Goal("<=", 75_000))
-    yield Row("the same, with benchmarks", python + lines("benchmarks/*.py"), "lines",
-              goal=Goal("<=", 64_000))  # fmt: skip
+    yield Row(
+        "the same, with benchmarks", python + lines("benchmarks/*.py"), "lines", goal=Goal("<=", 64_000)
+    )
     yield Row("C", lines("native/*.c", "native/*.h"), "lines", goal=Goal("<=", 5_000))
 
 
@@ -389,14 +398,16 @@ def clone(options: argparse.Namespace) -> Iterator[Row]:
         subprocess.run(["git", "clone", "-q", str(ROOT), str(target)], check=True)
         begun_s = time.monotonic()
         done = subprocess.run(
-            ["make", "demo"], cwd=target, capture_output=True, text=True, check=False,
-            timeout=_CLONE_PATIENCE_S, env=os.environ | {"VIRTUAL_ENV": ""},
-        )  # fmt: skip
+            ["make", "demo"],
+            cwd=target,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=_CLONE_PATIENCE_S,
+            env=os.environ | {"VIRTUAL_ENV": ""},
+        )
         spent_s = time.monotonic() - begun_s
     if done.returncode:
-        raise MeasurementError(
-            f"make demo: {(done.stderr.strip() or 'no message').splitlines()[-1]}"
-        )
+        raise MeasurementError(f"make demo: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
     compiler = "gcc present" if shutil.which("cc") else "no C compiler"
-    yield Row(f"make demo from a clean clone to its verdict, {compiler}", spent_s, "s",
-              goal=Goal("<=", 60))  # fmt: skip
+    yield Row(f"make demo from a clean clone to its verdict, {compiler}", spent_s, "s", goal=Goal("<=", 60))

@@ -18,13 +18,7 @@ from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
-from noack.protocol.record_tables import (
-    NETEM_PACKET,
-    NETEM_RELEASE,
-    NETEM_SETTING,
-    PACKET_HEAD_BYTES,
-    Fate,
-)
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
@@ -135,9 +129,7 @@ class Channel:
             assert question == core.NOACK_ROWS_FULL
             self._taken = self.take_rows()
 
-    def send(
-        self, flow: int, number: int, size_bytes: int, now_ns: int
-    ) -> tuple[list[Leaving], int]:
+    def send(self, flow: int, number: int, size_bytes: int, now_ns: int) -> tuple[list[Leaving], int]:
         """Take a packet of a flow; return what leaves at once, and the number of its copies.
 
         What is due must have left (:meth:`release`). Of a lost packet there are 0 copies.
@@ -250,9 +242,7 @@ def channel_of(
             )
         )
     schedule = None if network else ChangeSchedule(resolved, lambda one: one.network.link)
-    return Channel(
-        links, loops=loops, first_number=start.first_number, schedule=schedule, network=network
-    )
+    return Channel(links, loops=loops, first_number=start.first_number, schedule=schedule, network=network)
 
 
 def alone(network: Scenario) -> Scenario:

@@ -76,8 +76,10 @@ def terminal_table(
     """
     shown = Table(
         title=escape(table.caption) if table.caption else None,
-        box=SIMPLE_HEAD if dense else HEAVY_HEAD, collapse_padding=dense, pad_edge=not dense,
-    )  # fmt: skip
+        box=SIMPLE_HEAD if dense else HEAVY_HEAD,
+        collapse_padding=dense,
+        pad_edge=not dense,
+    )
     for i, heading in enumerate(table.headings):
         words = " ".join([heading, *(row[i] for row in table.rows)]).split()
         least = max(map(len, words)) if dense else None

@@ -307,10 +307,7 @@ class NetworkRows:
     def of_loops(self, table: str, numbers: Sequence[int]) -> Iterator[list[Rows]]:
         """Yield the next rows of each of some loops, in order; the table is read once."""
         every = [[places[number] for places in self._places.values()] for number in numbers]
-        mine = [
-            np.sort(np.concatenate([*map(np.take, self._inputs.values(), places)]))
-            for places in every
-        ]
+        mine = [np.sort(np.concatenate([*map(np.take, self._inputs.values(), places)])) for places in every]
         first = 0
         for rows in self._source.batches(table):
             found = []
@@ -323,9 +320,7 @@ class NetworkRows:
             yield found
             first += len(rows)
 
-    def _numbered_before(
-        self, numbers: NDArray[np.int64], mine: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
+    def _numbered_before(self, numbers: NDArray[np.int64], mine: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return how many inputs of other loops precede those of a loop, in their generation.
 
         ``mine`` has all numbers of the loop, ascending. Rows that are missing count as the loop's.

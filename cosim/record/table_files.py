@@ -65,8 +65,7 @@ class StoredTables(RecordSource):
     def __init__(self, folder: Path, types: Mapping[str, RowType], most_rows: int) -> None:
         super().__init__(types)
         self._files = {
-            table: TableFile(folder / f"{table}.parquet", dtype, most_rows)
-            for table, dtype in types.items()
+            table: TableFile(folder / f"{table}.parquet", dtype, most_rows) for table, dtype in types.items()
         }
         self._newest: dict[str, dict[int, Rows]] = {}
         """The groups of several loops that were read last, by table and place."""
@@ -145,9 +144,7 @@ class StoredTables(RecordSource):
         """Return the highest number of an input in a table; −1 without rows."""
         highest = [group.highest_input for group in self._files[table].groups]
         known = [number for number in highest if number is not None]
-        return (
-            max(known, default=-1) if len(known) == len(highest) else super().highest_input(table)
-        )
+        return max(known, default=-1) if len(known) == len(highest) else super().highest_input(table)
 
 
 class _Group(NamedTuple):
@@ -198,9 +195,7 @@ class TableFile:
                 raise CallerError(f"{path}: column {name} has holes")
         self.groups = [_group(group, places) for group in groups]
 
-    def batches(
-        self, dtype: RowType | None = None, groups: Iterable[int] | None = None
-    ) -> Iterator[Rows]:
+    def batches(self, dtype: RowType | None = None, groups: Iterable[int] | None = None) -> Iterator[Rows]:
         """Yield the rows of each group, or of some, as rows of a type that has fewer columns."""
         with self._open() as file:
             for group in range(len(self.groups)) if groups is None else groups:
@@ -256,8 +251,7 @@ class TableFile:
 
 def _group(group: Any, places: Mapping[str, int]) -> _Group:
     loops, inputs = (
-        group.column(places[name]).statistics if name in places else None
-        for name in (LOOP, "input")
+        group.column(places[name]).statistics if name in places else None for name in (LOOP, "input")
     )
     highest = int(inputs.max) if inputs is not None and inputs.has_min_max else None
     if loops is None or not loops.has_min_max:
@@ -360,9 +354,7 @@ def _values(path: Path, name: str, column: Any, field: np.dtype[Any]) -> NDArray
     if not len(column):
         return np.zeros(0, field)
     chunk = column.chunk(0)
-    return np.frombuffer(
-        memoryview(chunk.buffers()[1]), field, len(chunk), chunk.offset * field.itemsize
-    )
+    return np.frombuffer(memoryview(chunk.buffers()[1]), field, len(chunk), chunk.offset * field.itemsize)
 
 
 def _columns(dtype: RowType) -> Iterator[tuple[str, pa.DataType]]:

@@ -24,14 +24,7 @@ from noack.core.random_streams import uniform_pair
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.loss_guarantee import LossRule
 from noack.impairments.markov_chain import Chain, Pattern, chance_chain
-from noack.impairments.words import (
-    CORRELATION,
-    OWN_TIME_S,
-    PERCENT,
-    Quantity,
-    brief_percent,
-    time_text,
-)
+from noack.impairments.words import CORRELATION, OWN_TIME_S, PERCENT, Quantity, brief_percent, time_text
 from noack.settings.section import Correlation, Probability, ScenarioSection
 from noack.settings.user_files import NamedFile
 

@@ -20,9 +20,7 @@ from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.section import Positive, Row, Rows, require_length, require_shape
 from noack.settings.user_files import FileSettings, UserCode, real_vector, unchanged
 
-Indices = Annotated[
-    tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, max_length=MAX_DIMENSION)
-]
+Indices = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 _OBSERVATION = "observation"
 _MUJOCO = ("data.qpos", "data.qvel")
 _ALIKE = 1e-6

@@ -54,9 +54,7 @@ _HEAD = struct.Struct("<qq")
 _GREETING = f"noack node {core.NOACK_NODE_VERSION} {ffi.sizeof('noack_node_settings')}"
 
 
-def run_program(
-    process: RunProcess, machines: LoopMachines, settings: ProgramControllerSettings
-) -> None:
+def run_program(process: RunProcess, machines: LoopMachines, settings: ProgramControllerSettings) -> None:
     """Join the run, let a program drive its controller to the horizon, and report.
 
     Raises:
@@ -92,9 +90,7 @@ class NodeDriver(LiveDriver):
         with its:
             self._program = self._started(unchanged(settings, "controller"), settings.runner, its)
 
-    def _started(
-        self, path: Path, runner: Sequence[str], its: socket.socket
-    ) -> "subprocess.Popen[bytes]":
+    def _started(self, path: Path, runner: Sequence[str], its: socket.socket) -> "subprocess.Popen[bytes]":
         prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
         try:
             return subprocess.Popen(
@@ -189,8 +185,7 @@ class NodeDriver(LiveDriver):
         )
         settings = ffi.new("noack_node_settings *", numbers)
         return bytes(ffi.buffer(settings)) + b"".join(
-            bytes(ffi.buffer(array, 8 * size)) if array else bytes(8 * size)
-            for array, size in arrays
+            bytes(ffi.buffer(array, 8 * size)) if array else bytes(8 * size) for array, size in arrays
         )
 
     def drive(self, until_ns: int, sink: RecordSink) -> None:

@@ -109,9 +109,7 @@ def update_delay(scenario: Scenario) -> DelayBound:
         CallerError: as :func:`link_loads`.
     """
     delays, largest_s = _largest_delays(_stages(scenario)[0])
-    own_s = {
-        f"network.impairments.{place}": max(one) for place, one in enumerate(delays) if any(one)
-    }
+    own_s = {f"network.impairments.{place}": max(one) for place, one in enumerate(delays) if any(one)}
     certified_s = scenario.certificate.network_delay_s
     if certified_s is None:
         certified_s = scenario.network.link.longest_delay_s
@@ -158,9 +156,7 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
             )
             at_most_bps, at_least_bps = (_share(window) * bps for bps in needed_bps)
             key = f"{path}.impairments.{place}"
-            load = LinkLoad(
-                begin, key, flow, window, one.rate_bps, at_most_bps, at_least_bps, delay_s
-            )
+            load = LinkLoad(begin, key, flow, window, one.rate_bps, at_most_bps, at_least_bps, delay_s)
             if before is None or load._replace(begin=before.begin) != before:
                 found.append(load)
             before = load
@@ -236,9 +232,7 @@ def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], float]
     return found, largest_s
 
 
-def _slot_delays_s(
-    one: Schedule, stages: Sequence[_Stage], spread_s: float, *, copied: bool
-) -> list[float]:
+def _slot_delays_s(one: Schedule, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> list[float]:
     """Return the bounds for the slots of each loop; see :func:`_queue_delay_s`."""
     least_s = [
         min(stage.loops[entry].least_s for stage in stages)
@@ -302,9 +296,7 @@ def require_slots(scenario: Scenario) -> None:
             missing = set(range(1, loops + 1)) - set(one.order) if isinstance(one, Schedule) else ()
             if isinstance(one, Schedule) and (missing or max(one.order) > loops):
                 wrong = (
-                    f"loop {min(missing)} has no slot"
-                    if missing
-                    else f"a slot is for loop {max(one.order)}"
+                    f"loop {min(missing)} has no slot" if missing else f"a slot is for loop {max(one.order)}"
                 )
                 raise CallerError(
                     f"{path}.impairments.{place}.order: {wrong}; the run has the loops "

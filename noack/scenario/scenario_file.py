@@ -35,9 +35,7 @@ MOST_RECORDED_BYTES = 2**28
 """Largest size of a run's scenario file, which includes the losses and delays read from files."""
 
 
-def load(
-    path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.MOST_BYTES
-) -> Scenario:
+def load(path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.MOST_BYTES) -> Scenario:
     """Read and validate a scenario file.
 
     Args:
@@ -133,9 +131,7 @@ def _loop_tables(path: Path, named: str) -> Table:
         raise CallerError(f"{named}: that file has loops itself; name a file of one loop")
     whole = with_matrices(content, path.parent, str(path))
     file = toml_file.validated(parts_model(frozenset(PARTS), others=True), whole, str(path))
-    tables = {
-        where: located(table, path.parent, f"{path}: {where}") for where, table in file_tables(file)
-    }
+    tables = {where: located(table, path.parent, f"{path}: {where}") for where, table in file_tables(file)}
     parts = set(PARTS)
     return with_tables(file, tables).model_dump(mode="json", exclude_none=True, include=parts)
 
@@ -172,9 +168,7 @@ def _of_another_kind(lines: str, path: Path, key: str, value: str) -> str:
     if kind not in ("kind", "model", "policy") or not unknown:
         return lines
     missing = re.findall(rf"^{start}(\w+): missing.*", lines, re.MULTILINE)
-    others = re.sub(
-        rf"^{start}\w+(: missing| = .*: unknown key; ).*\n?", "", lines, flags=re.MULTILINE
-    )
+    others = re.sub(rf"^{start}\w+(: missing| = .*: unknown key; ).*\n?", "", lines, flags=re.MULTILINE)
     needed = "".join(f", {one}=..." for one in missing)
     line = (
         f"--set {table}.{kind} = {value}: the file's {', '.join(unknown)} are of another {kind}; "

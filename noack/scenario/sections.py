@@ -127,9 +127,7 @@ class ModelSection(ScenarioSection):
         known = parameters_of(name)
         for key in self.parameters:
             if key not in known:
-                raise ValueError(
-                    f"parameters.{key}: {name} has no such parameter; it has {', '.join(known)}"
-                )
+                raise ValueError(f"parameters.{key}: {name} has no such parameter; it has {', '.join(known)}")
         if not all(np.isfinite(matrix).all() for matrix in self.named[:3]):
             raise ValueError("parameters: these give matrices with infinite entries")
 
@@ -217,9 +215,7 @@ class MeasurementSection(ScenarioSection):
 
     def selects_all(self, n: int) -> bool:
         """Whether C is the identity."""
-        return self.C is None or (
-            np.shape(self.C) == (n, n) and bool((np.array(self.C) == np.eye(n)).all())
-        )
+        return self.C is None or (np.shape(self.C) == (n, n) and bool((np.array(self.C) == np.eye(n)).all()))
 
     @property
     def is_noisy(self) -> bool:
@@ -306,14 +302,10 @@ class PlantSection(ScenarioSection):
             if self.draw != "given" and matrix is not None:
                 raise ValueError(f'{key}: matrices are for draw = "given", not "{self.draw}"')
         if self.draw != "nominal" and not isinstance(self.system, LinearSettings):
-            raise ValueError(
-                f'draw: "{self.draw}" is for linear plants; a {self.system.kind} is what it is'
-            )
+            raise ValueError(f'draw: "{self.draw}" is for linear plants; a {self.system.kind} is what it is')
         box = (self.uncertainty_A or ()) + (self.uncertainty_B or ())
         if self.draw in ("uniform", "vertex") and not box:
-            raise ValueError(
-                f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B'
-            )
+            raise ValueError(f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B')
         return self
 
     def noise_variances(self, n: int, m: int) -> NoiseVariances:

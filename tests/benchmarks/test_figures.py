@@ -5,15 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.guarantees import (
-    COMBINATIONS,
-    REORDERING,
-    Decider,
-    check_row,
-    loop_named,
-    row_of,
-    triggers,
-)
+from benchmarks.guarantees import COMBINATIONS, REORDERING, Decider, check_row, loop_named, row_of, triggers
 from cosim.analysis.adversary import Objective, find_worst
 from noack.scenario.sections import POLICIES
 from tests.oracles.receiver import Limits, outcomes_of, violations
@@ -39,9 +31,7 @@ def test_the_check_counts_windows_and_gaps() -> None:
 def test_every_policy_that_is_a_rule_is_compared() -> None:
     paper = {"beta": 0.5, "alpha_per_s": 0.25, "floor": 0.0}
     found = triggers(paper, np.eye(2)).values()
-    names = {one["policy"] for one in found} | {
-        one["rule"]["policy"] for one in found if "rule" in one
-    }
+    names = {one["policy"] for one in found} | {one["rule"]["policy"] for one in found if "rule" in one}
     assert names == {name for name, made in POLICIES.items() if made.example(2) is not None}
 
 

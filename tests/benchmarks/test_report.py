@@ -6,25 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.__main__ import (
-    BEGIN,
-    END,
-    OF_GOALS,
-    all_benchmarks,
-    rows_of_figures,
-    run,
-    write_docs,
-)
-from benchmarks.report import (
-    Benchmark,
-    Goal,
-    MeasurementError,
-    Peer,
-    Rounds,
-    Row,
-    compared,
-    per_cpu_s,
-)
+from benchmarks.__main__ import BEGIN, END, OF_GOALS, all_benchmarks, rows_of_figures, run, write_docs
+from benchmarks.report import Benchmark, Goal, MeasurementError, Peer, Rounds, Row, compared, per_cpu_s
 
 HALF = Goal("<=", 0.5)
 
@@ -93,9 +76,7 @@ def test_a_row_has_the_medians_of_the_rounds_or_the_median_of_their_ratios() -> 
     assert (row.value, row.peer) == (3.0, Peer("theirs", 8.0))
     assert row.ratio == 0.5  # not 3 / 8
     ours, theirs = iter([1.0, 30.0, 3.0]), iter([2.0, 60.0, 8.0])
-    again = compared(
-        "cost", "µs", lambda: next(ours), ("theirs", lambda: next(theirs)), HALF, rounds=3
-    )
+    again = compared("cost", "µs", lambda: next(ours), ("theirs", lambda: next(theirs)), HALF, rounds=3)
     assert again == row
     assert compared("a", "/s", per_cpu_s(1, lambda: None), Peer("known", 2.0)).ratio is not None
 

@@ -88,9 +88,7 @@ def judged(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Tren
         (lambda t: noise(t) + 0.4 * t, 24 * HOUR_S, "grows"),
     ],
 )
-def test_the_trend_of_memory(
-    kib_of_s: Callable[[float], float], length_s: float, verdict: str
-) -> None:
+def test_the_trend_of_memory(kib_of_s: Callable[[float], float], length_s: float, verdict: str) -> None:
     assert judged(kib_of_s, length_s).verdict == verdict
 
 

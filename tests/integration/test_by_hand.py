@@ -119,9 +119,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def visible_in_processes(
-    recording: live.Running, processes: list[subprocess.Popen[str]]
-) -> dict[str, bytes]:
+def visible_in_processes(recording: live.Running, processes: list[subprocess.Popen[str]]) -> dict[str, bytes]:
     """Return command lines, environments and names of the processes."""
     launcher = psutil.Process(recording.process.pid)
     pids = [launcher.pid, *(child.pid for child in launcher.children(recursive=True))]

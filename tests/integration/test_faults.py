@@ -105,9 +105,7 @@ def test_a_full_and_then_closed_pipe_does_not_disturb_the_run(tmp_path: Path) ->
     """The launcher is blocked until the reader of its progress closes the pipe."""
     reading, writing = os.pipe()
     fcntl.fcntl(writing, F_SETPIPE_SZ, 4096)
-    process = subprocess.Popen(
-        run(tmp_path), stdout=subprocess.DEVNULL, stderr=writing, env=AS_A_TERMINAL
-    )
+    process = subprocess.Popen(run(tmp_path), stdout=subprocess.DEVNULL, stderr=writing, env=AS_A_TERMINAL)
     os.close(writing)
     try:
         rows = tmp_path / "latest" / "spool" / "plant_step.recorder"  # from the start on
@@ -292,9 +290,7 @@ def test_inputs_too_old_for_a_certificate_make_its_claims_void(disturbed: Distur
     record = disturbed.record
     for role in ("plant", "sensor", "controller"):  # netem may have had no packet
         assert disturbed.finished.loop["lateness_us"][role]["max"] > 0.9e6 * PAUSE_S
-    certified = [
-        claim for claim in disturbed.finished.loop["claims"] if "certificate" in claim["source"]
-    ]
+    certified = [claim for claim in disturbed.finished.loop["claims"] if "certificate" in claim["source"]]
     assert certified
     for claim in certified:
         assert claim["verdict"] == "void"

@@ -137,9 +137,7 @@ def test_several_loops_run_on_hosts_with_different_clocks(
         assert (np.abs(known["offset_ns"] - true_ns) <= known["error_ns"]).all()
 
 
-def test_rows_of_a_host_that_was_cut_off_are_collected(
-    start: Start, hosts: TwoHosts, tmp_path: Path
-) -> None:
+def test_rows_of_a_host_that_was_cut_off_are_collected(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:
     """The link goes down in the run; its processes work on and keep their rows and reports."""
     recording = record(start, tmp_path, "10.83.3.1", *live.settings(horizon_s=8.0), impatient=True)
     at_home = [start(0, role) for role in ("plant", "sensor")]

@@ -96,9 +96,7 @@ def test_a_killed_program_ends_the_run_and_its_rows_are_kept(start: Start, tmp_p
     assert running.left_behind() == []
 
 
-def test_a_stopped_program_ends_with_its_process_and_another_goes_on(
-    start: Start, tmp_path: Path
-) -> None:
+def test_a_stopped_program_ends_with_its_process_and_another_goes_on(start: Start, tmp_path: Path) -> None:
     """A program that is stopped does not see the end of its input."""
     options = by(built(tmp_path), speed=2.0, horizon_s=60.0, recovery__rejoin_within_s=60.0)
     running = start(*options)
@@ -125,9 +123,7 @@ def test_a_stopped_program_ends_with_its_process_and_another_goes_on(
         ("echo noack node 7 8", "says 'noack node 7 8'; a node of this version says"),
     ],
 )  # fmt: skip
-def test_what_is_no_node_is_refused_in_one_line(
-    script: str | None, line: str, tmp_path: Path
-) -> None:
+def test_what_is_no_node_is_refused_in_one_line(script: str | None, line: str, tmp_path: Path) -> None:
     program = tmp_path / "node"
     if script is not None:
         program.write_text(f"#!/bin/sh\n{script}\n")

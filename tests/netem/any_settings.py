@@ -84,9 +84,7 @@ def _consistent(settings: dict[str, Any]) -> bool:
 constraints = st.lists(st.one_of([varied(kind) for kind in CONSTRAINTS]), max_size=3).map(tuple)
 
 
-def _settings(
-    impairments: st.SearchStrategy[Impairment], most: int = 5
-) -> st.SearchStrategy[LinkSettings]:
+def _settings(impairments: st.SearchStrategy[Impairment], most: int = 5) -> st.SearchStrategy[LinkSettings]:
     return st.fixed_dictionaries({
         "impairments": st.lists(impairments, max_size=5).filter(_goes_together).map(tuple),
         "mansd": st.none() | st.sampled_from([0, 1, 2, 5]) | st.integers(0, most),

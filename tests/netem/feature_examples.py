@@ -47,9 +47,7 @@ WORDS = f"""
     atmost 0 in 1; atmost 1 in 2; atmost 1 in 3; atmost 2 in 5; atmost 3 in 10; atmost 5 in 7
     recover 1; recover 2; recover 3; recover 7
 """
-_CLAUSES = {
-    clause.word: (kind, clause) for kind in (*IMPAIRMENTS, *CONSTRAINTS) for clause in kind.clauses
-}
+_CLAUSES = {clause.word: (kind, clause) for kind in (*IMPAIRMENTS, *CONSTRAINTS) for clause in kind.clauses}
 
 
 def _read(words: str) -> Any:

@@ -14,13 +14,7 @@ from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, link_na
 from netem.link_state import LinkState
 from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
-from noack.protocol.record_tables import (
-    NETEM_PACKET,
-    NETEM_RELEASE,
-    NETEM_SETTING,
-    PACKET_HEAD_BYTES,
-    Fate,
-)
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
 from tests.machine_parts import Machine
@@ -165,9 +159,7 @@ class Link:
             self._state.start_flow(row, flow)
         return self._state.decide(row, size_bytes, now_ns)
 
-    def _release(
-        self, message: Datagram, release_ns: int, bit: int, *, copy: bool
-    ) -> tuple[Datagram, ...]:
+    def _release(self, message: Datagram, release_ns: int, bit: int, *, copy: bool) -> tuple[Datagram, ...]:
         """Return a datagram that leaves at once, or keep it until it is due."""
         decision = self.decision
         counts = bit < 0 and not (copy and decision.bit < 0)

@@ -156,9 +156,7 @@ def _settings(given: Sequence[str] | None) -> "Table":
     return found
 
 
-def _numbers(
-    option: str, text: str | None, kind: Callable[[str], Number] = float
-) -> list[Number] | None:
+def _numbers(option: str, text: str | None, kind: Callable[[str], Number] = float) -> list[Number] | None:
     if text is None:
         return None
     try:
@@ -167,9 +165,7 @@ def _numbers(
         raise CallerError(f"{option} {text}: give numbers with commas, e.g. -1,-0.5") from None
 
 
-def _show(
-    found: "linear_model.LinearModel | linear_model.LoopGain", out: Path | None, *, json: bool
-) -> None:
+def _show(found: "linear_model.LinearModel | linear_model.LoopGain", out: Path | None, *, json: bool) -> None:
     """Print a result, and write its document, not over that of another plant."""
     if out is not None:
         if out.suffix != ".json":

@@ -203,9 +203,7 @@ def export(
         name = run.loop or chosen.resolve().name
         path = out or Path(f"{name}{export_suffix(file_format)}")
         with cli.status("exporting"):
-            written = export_run(
-                chosen, path, file_format, loop=run.loop, certificates=certificates
-            )
+            written = export_run(chosen, path, file_format, loop=run.loop, certificates=certificates)
     else:
         if run.loop or not certificates:
             option = "--loop" if run.loop else "--no-certificates"
@@ -225,9 +223,7 @@ def _scenario_name(run: cli.LoopOptions) -> str:
 
 
 @cli.command(cli.RUNS, 92, takes="about a second")
-def archive(
-    run: cli.RunOptions, *, out: cli.OutOption = None, json: cli.JsonOption = False
-) -> None:
+def archive(run: cli.RunOptions, *, out: cli.OutOption = None, json: cli.JsonOption = False) -> None:
     """Archive a run: one file with everything that its repetition needs.
 
     `noack reproduce` repeats it.
@@ -307,9 +303,7 @@ def collect(
 
 @cli.command(cli.RUNS, 80, takes="about a second")
 def compare(
-    directories: Annotated[
-        list[Path], Argument(metavar="RUN...", autocompletion=completion.run_directories)
-    ],
+    directories: Annotated[list[Path], Argument(metavar="RUN...", autocompletion=completion.run_directories)],
     *,
     out: Path = cli.DEFAULT_RUNS / "comparison.html",
     width: cli.WidthOption = None,

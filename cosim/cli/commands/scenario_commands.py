@@ -52,10 +52,12 @@ def scenarios(
         return
     shipped = {kind: all_shipped(kind) for kind in KINDS}
     if json:
-        cli.print_json({
-            kind: [file._asdict() | {"path": str(file.path)} for file in some]
-            for kind, some in shipped.items()
-        })  # fmt: skip
+        cli.print_json(
+            {
+                kind: [file._asdict() | {"path": str(file.path)} for file in some]
+                for kind, some in shipped.items()
+            }
+        )
         return
     console = cli.console()
     for kind, some in shipped.items():
@@ -169,9 +171,7 @@ def _dependent_defaults(resolved: "scenario.Scenario") -> Iterator[str]:
     """Yield the keys without a value whose default depends on other keys."""
     watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:
-        yield (
-            f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation"
-        )
+        yield (f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation")
     if resolved.controller.safe_input is None:
         yield "controller.safe_input: 0, the input before the first update"
     if resolved.recovery.rejoin_within_s is None:

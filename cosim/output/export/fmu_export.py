@@ -118,9 +118,7 @@ def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
             "network.actuation: an FMU's channel leads to the controller only; remove this table"
         )
     if not scenario.controller.is_linear:
-        raise CallerError(
-            f'controller.kind = "{kind}": an FMU has the linear law only, kind = "linear"'
-        )
+        raise CallerError(f'controller.kind = "{kind}": an FMU has the linear law only, kind = "linear"')
     (resolved,) = resolved_loops(scenario)
     return [
         write_whole(path.with_name(f"{name}_{role}{SUFFIX}"), _archive(resolved, role))
@@ -215,9 +213,7 @@ class _Image:
         core.noack_wire_tag(wire, len(content), content, tag)
         return bytes(tag) + content
 
-    def add_variable(
-        self, reference: int, numbers: list[int], *, is_real: bool, is_input: bool
-    ) -> None:
+    def add_variable(self, reference: int, numbers: list[int], *, is_real: bool, is_input: bool) -> None:
         """Append the numbers of a variable."""
         at = self._add(ffi.new("double[]" if is_real else "int64_t[]", numbers))
         self.head.values[reference] = (len(numbers), is_real, is_input, at)

@@ -73,9 +73,7 @@ def base_of(campaign: Campaign, path: Path) -> tuple[Path, Table]:
     scenario = path.parent / campaign.scenario
     if not scenario.is_file():
         if scenario.suffix == ".toml" or scenario.exists():
-            raise CallerError(
-                f"{source}: no such file beside the campaign file, and no shipped scenario"
-            )
+            raise CallerError(f"{source}: no such file beside the campaign file, and no shipped scenario")
         try:
             scenario = find_shipped(campaign.scenario, SCENARIOS)
         except CallerError as error:
@@ -153,9 +151,7 @@ def _scaled(entries: object, value: int, source: str) -> list[Table]:
             f"of [[loops]]: {names}"
         )
     total = sum(counts)
-    return [
-        one | {"count": count * value // total} for one, count in zip(entries, counts, strict=True)
-    ]
+    return [one | {"count": count * value // total} for one, count in zip(entries, counts, strict=True)]
 
 
 def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
@@ -202,9 +198,7 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
             raise CallerError('loops: a network that loops share needs time = "sampled"')
         judges = "loops_claims_held" in campaign.measured_metrics
         loops, from_s = in_virtual_time(scenario), metrics.count_from_s
-        work = SharedNetworkWork(
-            loops, campaign.seed, **measured, judges=judges, count_from_s=from_s
-        )
+        work = SharedNetworkWork(loops, campaign.seed, **measured, judges=judges, count_from_s=from_s)
         return work, None
     resolved = resolve(scenario)
     if campaign.time == "sampled":

@@ -103,9 +103,7 @@ def print_rows(console: "Console", found: Reproduction) -> None:
     console.print(verdict, style="bold" if found.as_expected else "bold red", highlight=False)
 
 
-def number(
-    quantity: str, where: str, published: float, computed: float, how: str, *, digits: int
-) -> Row:
+def number(quantity: str, where: str, published: float, computed: float, how: str, *, digits: int) -> Row:
     """Return the row of a number that is published with so many digits after the point."""
     agrees = abs(computed - published) <= 0.5000001 * 10.0**-digits
     texts = f"{published:.{digits}f}", f"{computed:.{digits + 1}f}"
@@ -116,9 +114,7 @@ def stored(name: str) -> dict[str, dict[str, Matrix]]:
     """Return the tables of numbers, published or found, beside the result in NAME.toml."""
     path = Path(__file__).parent / "results" / f"{name}.toml"
     tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    return {
-        key: {one: np.array(two) for one, two in table.items()} for key, table in tables.items()
-    }
+    return {key: {one: np.array(two) for one, two in table.items()} for key, table in tables.items()}
 
 
 def shipped_loop(name: str, settings: Iterable[str] = ()) -> ContinuousLoop:

@@ -291,10 +291,7 @@ class EnclosedMotion:
         if found is None:
             raise NotEnclosedError("x is neither its state nor its state minus a constant")
         rates, shown = (
-            [
-                one if isinstance(one, Enclosed) else Enclosed(_ball(float(one)), constant)
-                for one in part
-            ]
+            [one if isinstance(one, Enclosed) else Enclosed(_ball(float(one)), constant) for one in part]
             for part in found
         )
         for one, own in zip(shown, each[: self.n], strict=True):

@@ -59,13 +59,18 @@ _ALONE = 40.0
 """λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
 _NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
 _AT_ONCE = 16
-_SHARES = np.array([
-    (first, (1 - first) * (1 - last), (1 - first) * last, 0.0)
-    for first in (0.01, 0.03, 0.1, 0.3) for last in (0.1, 0.3, 0.5, 0.7, 0.9)
-] + [
-    (0.0, (1 - of_x) * (1 - last), (1 - of_x) * last, of_x)
-    for of_x in (0.5, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.985) for last in (0.4, 0.55, 0.7)
-])  # fmt: skip
+_SHARES = np.array(
+    [
+        (first, (1 - first) * (1 - last), (1 - first) * last, 0.0)
+        for first in (0.01, 0.03, 0.1, 0.3)
+        for last in (0.1, 0.3, 0.5, 0.7, 0.9)
+    ]
+    + [
+        (0.0, (1 - of_x) * (1 - last), (1 - of_x) * last, of_x)
+        for of_x in (0.5, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.985)
+        for last in (0.4, 0.55, 0.7)
+    ]
+)
 """Of the four conditions that hold after the last node."""
 _WINDOWS = (1 / 6, 1 / 3, 2 / 3, 1.0)
 """T' as shares of the last node."""
@@ -282,9 +287,7 @@ class Reach:
     def _errors(self) -> Vector:
         """The same of e_c."""
         flow = self.starts.flow
-        return (
-            self.by.sizes(flow.of_error) if not self.by.is_none else np.zeros(len(flow.edges_s) - 1)
-        )
+        return self.by.sizes(flow.of_error) if not self.by.is_none else np.zeros(len(flow.edges_s) - 1)
 
     @cached_property
     def _cells(self) -> int:
@@ -385,9 +388,7 @@ class _CellBounds:
         """Return bounds in the Frobenius norm, for every λ, (k, j)."""
         singular = self._singular / limits[:, None]
         sizes = np.sqrt(_semi_axes(singular, logits) ** 2 @ self._squares)
-        return np.asarray(
-            sizes[..., :2].max(axis=2) + self._sags_s2[:, None] * sizes[..., 2:].sum(axis=2)
-        )
+        return np.asarray(sizes[..., :2].max(axis=2) + self._sags_s2[:, None] * sizes[..., 2:].sum(axis=2))
 
     def _tight(self, limits: Vector, cells: NDArray[np.int64], logits: Stack) -> Stack:
         """Return bounds in the spectral norm for some cells, each with its own λ, (k, j)."""
@@ -559,9 +560,7 @@ def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
     return rows
 
 
-def _largest(
-    forms: Stack, Y: Stack, enough: float, *, all_of_them: bool = False
-) -> tuple[Vector, Stack]:
+def _largest(forms: Stack, Y: Stack, enough: float, *, all_of_them: bool = False) -> tuple[Vector, Stack]:
     """Bound ‖Y z‖ for all z with forms of at most 1, (j,), by weights, (j, i).
 
     None below ``enough`` is improved, and only the largest ones unless all of them are wanted.
@@ -570,9 +569,7 @@ def _largest(
     active, best = np.arange(len(forms)), weights.copy()
     for _ in range(_ROUNDS):
         some = forms[active]
-        Z = np.linalg.solve(
-            np.einsum("ji,jiab->jab", weights[active], some), Y[active].swapaxes(1, 2)
-        )
+        Z = np.linalg.solve(np.einsum("ji,jiab->jab", weights[active], some), Y[active].swapaxes(1, 2))
         values, vectors = np.linalg.eigh(Y[active] @ Z)
         sizes = np.sqrt(values[:, -1].clip(min=0.0)) * ROUNDING
         better = sizes < bounds[active]

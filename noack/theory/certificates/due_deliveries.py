@@ -308,8 +308,9 @@ class _Run:
             if (gain := min(gain, self._norm.gain)) < 1:
                 break
         else:
-            raise NoCertificateError(f"in a norm the loop grows from delivery to delivery: "
-                                     f"{gain:.3g}, not below 1", gain)  # fmt: skip
+            raise NoCertificateError(
+                f"in a norm the loop grows from delivery to delivery: {gain:.3g}, not below 1", gain
+            )
         self._x0 = loop.plant.start[:, 0]
         at_rest = np.vstack([np.linalg.inv(self._norm.shape), np.zeros((n, n))])
         followed = response_until(loop.F, at_rest, loop.until_s, loop.cells)
@@ -451,9 +452,7 @@ class _Run:
         moved = nodes[loop.ends]
         bent = T**2 / 8 * self._carried(np.hstack([norm.shape, 0 * norm.shape]), turn, loop.cells)
         half = np.linalg.norm(ends[:, :n] @ norm.shape.T, axis=-1) / 2
-        *late, weighted = (
-            T**2 / 8 * self._carried(C, turn, loop.cells) for C in loop.late_outputs.values()
-        )
+        *late, weighted = (T**2 / 8 * self._carried(C, turn, loop.cells) for C in loop.late_outputs.values())
         J = np.maximum(loop.late_sizes(moved[:, n:]), loop.late_sizes((moved + ends)[:, n:]))
         J = J + max(late) + weighted + norm.late_aged @ ages
         rho = half * _ROUNDING + bent + norm.aged @ ages

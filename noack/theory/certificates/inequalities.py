@@ -41,12 +41,7 @@ from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
 from noack.theory.bounds.terms import Constants, NetworkConditions, Part
-from noack.theory.bounds.trigger_bounds import (
-    COARSE_CELLS,
-    ErrorGrowth,
-    first_passage_s,
-    list_growths,
-)
+from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 from noack.theory.certificates.loss_accumulation import LossAccumulation
 
 _SIGNALS = 6
@@ -190,12 +185,9 @@ class ErrorInequalities:
         self._start_error, start = plant.start_up(conditions.start_s)
         self._beyond = np.maximum(self._start_error, earlier_error)
         self._states = {
-            output: Coefficients(free + start[output], gain)
-            for output, (free, gain) in plant.states.items()
+            output: Coefficients(free + start[output], gain) for output, (free, gain) in plant.states.items()
         }
-        self._growths = [
-            list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every
-        ]
+        self._growths = [list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every]
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
@@ -322,9 +314,7 @@ class ErrorInequalities:
             driven = self._plant.growths(until_s, COARSE_CELLS)[output].totals
         return _columns(0.0, self._error.now_until(until_s)[output], 0.0, *driven)
 
-    def _missing(
-        self, output: Output, events: Counts, spacing_s: Vector, own: ErrorGrowth | None
-    ) -> Matrix:
+    def _missing(self, output: Output, events: Counts, spacing_s: Vector, own: ErrorGrowth | None) -> Matrix:
         """Return the bound of the part of sup‖C e_c‖ from missing events as a row of the signals.
 
         The part of e_s that has grown since the last test is followed from where it entered.
@@ -339,9 +329,7 @@ class ErrorInequalities:
                 driven[place] = np.minimum(driven[place], followed)
         return _columns(0.0, gain, gain, *driven)
 
-    def _solved(
-        self, signals: "_Signals", growing: ErrorGrowth, own: ErrorGrowth | None
-    ) -> Solution:
+    def _solved(self, signals: "_Signals", growing: ErrorGrowth, own: ErrorGrowth | None) -> Solution:
         """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
         errors, beyond, held = signals.errors, self._beyond, self.age_gains
         held_input, _, estimated, *_ = np.eye(_SIGNALS)

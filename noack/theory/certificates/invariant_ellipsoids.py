@@ -62,20 +62,14 @@ def is_reset_flow(part: Part, conditions: NetworkConditions) -> bool:
     Its constants can be sharpened.
     """
     error, plant, bound, estimation = part
-    is_ideal = conditions == NetworkConditions(
-        conditions.dropouts, constraints=conditions.constraints
-    )
+    is_ideal = conditions == NetworkConditions(conditions.dropouts, constraints=conditions.constraints)
     is_plain = bound == TriggerBound(bound.beta, bound.reached, bound.shares, unit=bound.unit)
     is_known = plant.is_one_plant and plant.forcing is None and estimation == MEASURED
     rates_agree = plant.alpha_per_s == error.alpha_per_s
-    return (
-        is_ideal and is_plain and is_known and rates_agree and spectral_abscissa(error.scaled_H) < 0
-    )
+    return is_ideal and is_plain and is_known and rates_agree and spectral_abscissa(error.scaled_H) < 0
 
 
-def sharpened_constants(
-    constants: Constants, part: Part, conditions: NetworkConditions
-) -> Constants:
+def sharpened_constants(constants: Constants, part: Part, conditions: NetworkConditions) -> Constants:
     """Return the constants with the bounds from the flow between deliveries."""
     error, plant, bound, _ = part
     dropouts, unit = conditions.dropouts, bound.beta if bound.unit is None else bound.unit

@@ -192,10 +192,15 @@ class CertificateScope:
         if not self._resolved.network.enforce_mansd:
             kept = kept_probability(self._resolved, conditions.guarantee, unchecked.inter_event_s)
         assumptions = certificate_assumptions(
-            self._resolved, conditions, self._decay, first, void,
+            self._resolved,
+            conditions,
+            self._decay,
+            first,
+            void,
             max((phase.loop_gain for phase in (first, rest) if phase is not None), default=0.0),
-            trigger.text(), kept,
-        )  # fmt: skip
+            trigger.text(),
+            kept,
+        )
         return replace(unchecked, assumptions=tuple(assumptions))
 
     def loop_gain(self, conditions: NetworkConditions) -> float:
@@ -210,9 +215,7 @@ class CertificateScope:
             return math.inf
         return max(phase.loop_gain for phase in constants[0] if phase is not None)
 
-    def _constants(
-        self, conditions: NetworkConditions, *, longest: bool = True
-    ) -> Search[list[Phases]]:
+    def _constants(self, conditions: NetworkConditions, *, longest: bool = True) -> Search[list[Phases]]:
         """Search for the constants of each bound of the run; all of them hold.
 
         ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
@@ -291,13 +294,14 @@ class CertificateScope:
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
         return DisturbedCertificate(
-            self._resolved, self._plant_at, self._trigger, self._start_error,
+            self._resolved,
+            self._plant_at,
+            self._trigger,
+            self._start_error,
             min(self._decay.values()),
-        )  # fmt: skip
+        )
 
-    def _checked(
-        self, first: Constants, other: Constants | None
-    ) -> tuple[Constants, Constants | None]:
+    def _checked(self, first: Constants, other: Constants | None) -> tuple[Constants, Constants | None]:
         """Return the constants.
 
         Raises:
@@ -380,9 +384,11 @@ class CertificateScope:
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
         part = Part(plant.error, plant, self._trigger.bound(conditions, level, reached))
-        return (yield from sharpened(
-            Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
-        ))  # fmt: skip
+        return (
+            yield from sharpened(
+                Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -406,9 +412,13 @@ def _at_floor(first: Constants, share: float) -> Constants:
     times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
     """
     scaled = (
-        "input_error", "start_error", "state", "state_weighted", "mismatch",
+        "input_error",
+        "start_error",
+        "state",
+        "state_weighted",
+        "mismatch",
         "received_input_error",
-    )  # fmt: skip
+    )
     return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
 
 
@@ -428,9 +438,7 @@ class NetworkLimits(NamedTuple):
 
 def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
     """Return the limits for some plants; 0 means that there is no certificate at any time."""
-    return NetworkLimits(
-        *(network_limit(scope, scheduled, what) for what in ("sampling", "delay", "hold"))
-    )
+    return NetworkLimits(*(network_limit(scope, scheduled, what) for what in ("sampling", "delay", "hold")))
 
 
 _CHANGES: dict[str, Callable[[NetworkConditions, float], NetworkConditions]] = {

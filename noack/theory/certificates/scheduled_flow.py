@@ -46,9 +46,7 @@ def is_scheduled_flow(part: Part, conditions: NetworkConditions) -> bool:
     )
 
 
-def scheduled_constants(
-    constants: Constants, part: Part, conditions: NetworkConditions
-) -> Constants:
+def scheduled_constants(constants: Constants, part: Part, conditions: NetworkConditions) -> Constants:
     """Return the constants with the bounds from the flow between updates."""
     flow = _ScheduledFlow(part, conditions, constants.inter_event_s or conditions.spacing_s)
     known = flow.known
@@ -109,13 +107,9 @@ class _ScheduledFlow:
         known.signals[0] = min(known.signals[0], reach.by.held)
         inverse = reach.size * self._part.plant.error.inverse_weight @ reach.starts.inverse
         for name, C in self._part.plant.outputs.items():
-            known.states[name] = min(
-                known.states[name], float(spectral_norm(C @ inverse)) * ROUNDING
-            )
+            known.states[name] = min(known.states[name], float(spectral_norm(C @ inverse)) * ROUNDING)
         gain = reach.starts.flow.gain
-        size = max(
-            reach.sup(np.hstack([0 * gain, gain])), float(spectral_norm(gain)) * reach.by.late
-        )
+        size = max(reach.sup(np.hstack([0 * gain, gain])), float(spectral_norm(gain)) * reach.by.late)
         known.errors[Output.GAIN] = min(known.errors[Output.GAIN], size)
         if self.spacing_s >= self._late_s:  # no event happens before the last update has acted
             size = max(self._after_losses(reach), reach.by.late)
@@ -157,9 +151,7 @@ class _ScheduledFlow:
         plain, level = (1 + np.array(missing)) * known.sensor, self._part.bound.reached
         bend = 0.0 if level is None else bend_of_error(reach, level)
         kernel = error.kernels[Output.WEIGHTED]
-        errors = errors_after_losses(
-            reach, plain, known.sensor, level, self.spacing_s, kernel, bend
-        )
+        errors = errors_after_losses(reach, plain, known.sensor, level, self.spacing_s, kernel, bend)
         _, _, _, input_error, mismatch, _ = known.signals.tolist()
         entered = self._entered(conditions.delay_s, input_error, mismatch)
         return error.stretch(conditions.delay_s) * float(errors[-1]) + entered

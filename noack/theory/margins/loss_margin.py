@@ -18,19 +18,10 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
-from noack.impairments.loss_guarantee import (
-    LongestBurst,
-    LossAutomaton,
-    LossGuarantee,
-    outcome_letters,
-)
+from noack.impairments.loss_guarantee import LongestBurst, LossAutomaton, LossGuarantee, outcome_letters
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
-from noack.theory.margins.joint_spectral_radius import (
-    ACCURACY,
-    MOST_VERTICES,
-    joint_spectral_radius,
-)
+from noack.theory.margins.joint_spectral_radius import ACCURACY, MOST_VERTICES, joint_spectral_radius
 from noack.theory.margins.switched_system import Edge
 from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 from noack.trigger.trigger_rule import NEVER_NS
@@ -71,9 +62,7 @@ class Burst(NamedTuple):
         return intervals
 
 
-def list_bursts(
-    guarantee: LossGuarantee, slots: int = 1, times: EventTimes = EVERY_STEP
-) -> list[Burst]:
+def list_bursts(guarantee: LossGuarantee, slots: int = 1, times: EventTimes = EVERY_STEP) -> list[Burst]:
     """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
 
     Different states of the automaton after which the same is allowed are one node.
@@ -174,9 +163,7 @@ class Stability(NamedTuple):
         """Return the same, with the lower bound of a guarantee whose patterns are among these."""
         if other.lower <= self.lower:
             return self
-        return self._replace(
-            lower=other.lower, pattern=other.pattern, intervals_s=other.intervals_s
-        )
+        return self._replace(lower=other.lower, pattern=other.pattern, intervals_s=other.intervals_s)
 
     @property
     def is_periodic(self) -> bool:
@@ -226,9 +213,7 @@ class LossMargin:
             self.shortest_ns = longest_ns if same else min(self.shortest_ns, longest_ns)
             self.longest_ns = longest_ns
         is_periodic = self.shortest_ns == self.longest_ns
-        self._unit_ns = unit_ns = (
-            self.longest_ns if is_periodic else resolved.timing.measurement_period_ns
-        )
+        self._unit_ns = unit_ns = self.longest_ns if is_periodic else resolved.timing.measurement_period_ns
         self._times = EventTimes(self.shortest_ns // unit_ns, self.longest_ns // unit_ns)
         times = loop_times(resolved, unit_ns)
         self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
@@ -268,9 +253,7 @@ class LossMargin:
             ) from None
         return found._replace(took_s=time.process_time() - begun_s)
 
-    def _bounded(
-        self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float
-    ) -> Stability:
+    def _bounded(self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float) -> Stability:
         edges = [
             Edge(burst.source, burst.target, self.maps(burst.slot, burst.steps - 1), burst.steps)
             for burst in bursts
@@ -294,14 +277,16 @@ class LossMargin:
             first = (self._first_slot - path[0].slot) % self.loop.times.slots
             pattern = pattern[first:] + pattern[:first]
         intervals_s = (
-            steps * self._unit_ns / NS_PER_S
-            for burst in path
-            for steps in burst.intervals(self._times)
+            steps * self._unit_ns / NS_PER_S for burst in path for steps in burst.intervals(self._times)
         )
         return Stability(
-            radius.lower**self._times.longest, radius.upper**self._times.longest,
-            tuple(pattern), tuple(intervals_s), radius.vertices, radius.needed,
-        )  # fmt: skip
+            radius.lower**self._times.longest,
+            radius.upper**self._times.longest,
+            tuple(pattern),
+            tuple(intervals_s),
+            radius.vertices,
+            radius.needed,
+        )
 
     def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
         """Return coarser bounds, which decide whether all patterns are stable."""

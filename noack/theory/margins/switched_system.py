@@ -88,9 +88,7 @@ class SwitchedSystem:
             return self
         exponents = balancing_exponents(sizes)
         shifts = exponents[:, None] - exponents
-        return SwitchedSystem(
-            tuple(edge._replace(matrix=edge.matrix.scaled(shifts)) for edge in self.edges)
-        )
+        return SwitchedSystem(tuple(edge._replace(matrix=edge.matrix.scaled(shifts)) for edge in self.edges))
 
     def balanced(self) -> "SwitchedSystem":
         """Return the system in the coordinates of :meth:`balancing`, or else itself."""
@@ -118,8 +116,7 @@ class SwitchedSystem:
             }
         try:
             return {
-                node: np.asarray(np.linalg.cholesky(form).T, dtype=np.float64)
-                for node, form in forms.items()
+                node: np.asarray(np.linalg.cholesky(form).T, dtype=np.float64) for node, form in forms.items()
             }
         except np.linalg.LinAlgError:
             return identity
@@ -253,9 +250,7 @@ def find_cycle(system: SwitchedSystem, most_edges: int, beam: int) -> Cycle:
             # A product cannot grow faster than its norm.
             if path.norm <= (growth * (1 + 1e-12)) ** path.duration:
                 continue
-            path_growth = float(np.abs(np.linalg.eigvals(path.product)).max()) ** (
-                1 / path.duration
-            )
+            path_growth = float(np.abs(np.linalg.eigvals(path.product)).max()) ** (1 / path.duration)
             if path_growth > growth * (1 + 1e-12):
                 best, growth = path.edges, path_growth
         scale = growth or 1.0
@@ -290,9 +285,7 @@ def only_cycle(system: SwitchedSystem) -> tuple[int, ...] | None:
 def _joined(path: _Path, step: _Path) -> _Path:
     product = step.product @ path.product
     duration = path.duration + step.duration
-    return _Path(
-        path.edges + step.edges, path.source, step.target, duration, product, _size(product)
-    )
+    return _Path(path.edges + step.edges, path.source, step.target, duration, product, _size(product))
 
 
 def _size(matrix: Matrix) -> float:

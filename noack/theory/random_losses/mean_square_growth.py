@@ -106,9 +106,7 @@ def bounded_radius(operator: "csc_array[np.float64]", size: int) -> float:
     raise NotPredictableError("the second moments could not be bounded numerically")
 
 
-def second_moments(
-    delivered: Matrix, lost: Matrix, outcomes: OutcomeChain
-) -> "csc_array[np.float64]":
+def second_moments(delivered: Matrix, lost: Matrix, outcomes: OutcomeChain) -> "csc_array[np.float64]":
     """Return the operator of one period on the stacked upper triangles of X_j.
 
     Raises:
@@ -158,9 +156,7 @@ def _is_below(operator: "csc_array[np.float64]", bound: float, size: int) -> boo
     entries = operator.shape[0]
     identity = triangles(np.tile(np.eye(size), (2 * entries // (size * (size + 1)), 1, 1)))
     solution = resolved_by(operator, bound, identity)
-    forms, images = (
-        from_triangles(part, size) for part in (solution, np.asarray(operator @ solution))
-    )
+    forms, images = (from_triangles(part, size) for part in (solution, np.asarray(operator @ solution)))
     longest = int(np.diff(operator.tocsr().indptr).max())
     sizes = np.abs(solution)
     carried = float((abs(operator) @ sizes + bound * sizes).max())

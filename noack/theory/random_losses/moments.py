@@ -142,9 +142,14 @@ class _Inequalities:
     """The inequalities; every signal is bounded by a row: multiples of a and π, and a constant."""
 
     def __init__(
-        self, error: ErrorGains, plant: PlantGains, conditions: NetworkConditions, beta: float,
-        probability: float, order: int,
-    ) -> None:  # fmt: skip
+        self,
+        error: ErrorGains,
+        plant: PlantGains,
+        conditions: NetworkConditions,
+        beta: float,
+        probability: float,
+        order: int,
+    ) -> None:
         if not error.scaled_H.any():
             raise NotDecayingError("a hold does not decay")
         self._error, self._plant, self._conditions = error, plant, conditions
@@ -165,9 +170,7 @@ class _Inequalities:
         best = Moments(self._order, rate_per_s, *(np.inf,) * 5)
         values = np.array([*(_FIRST * self._beta,) * 2, 1.0])
         for _ in range(_ROUNDS):
-            controller = {
-                output: self._controller_error(output, values) for output in self._missing
-            }
+            controller = {output: self._controller_error(output, values) for output in self._missing}
             rows = self._rows(controller)
             solution = solve_inequalities(rows[:, :2], rows[:, 2])
             values = np.append(solution.bound, 1.0)
@@ -198,9 +201,7 @@ class _Inequalities:
 
     def _driven(self, gains: Iterable[Stack]) -> Vector:
         """Return the row of what E x and B p do with these gains."""
-        return sum(
-            (gain * row for gain, row in zip(gains, self._signals, strict=False)), np.zeros(3)
-        )
+        return sum((gain * row for gain, row in zip(gains, self._signals, strict=False)), np.zeros(3))
 
     def _state(self, output: Output) -> Vector:
         free, gain = self._plant.states[output]
@@ -233,9 +234,7 @@ class _Inequalities:
             row = missing.burst(self._probability, self._order, float(whole))
             if overshoot > 0:
                 ratio = np.sqrt(whole / overshoot)
-                row = row + share / (1 - share) / 2 * (
-                    ratio * missing.overshoot + missing.whole / ratio
-                )
+                row = row + share / (1 - share) / 2 * (ratio * missing.overshoot + missing.whole / ratio)
             lost.append(row)
         best = min(lost, key=lambda row: float(row @ values))
         return np.asarray(missing.present + missing.recent + best)

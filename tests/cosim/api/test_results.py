@@ -50,9 +50,7 @@ def test_the_estimates_are_those_of_the_draws(found: noack.CampaignResult) -> No
 def test_the_page_the_summary_and_the_figures_are_there(found: noack.CampaignResult) -> None:
     assert found.report().is_file()
     written = json.loads((found.folder / "summary.json").read_text())
-    assert [one["axes"] for one in written["points"]] == [
-        one["axes"] for one in found.summary["points"]
-    ]
+    assert [one["axes"] for one in written["points"]] == [one["axes"] for one in found.summary["points"]]
     assert found.plot().axes
     assert "0.8" in repr(found)
     assert "<table>" in found._repr_html_()
@@ -103,8 +101,6 @@ def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:
         ("model_predictive", {}, "u is not K x_c; no certificate covers this"),
     ],
 )
-def test_a_missing_certificate_gives_one_line(
-    name: str, options: dict[str, Any], message: str
-) -> None:
+def test_a_missing_certificate_gives_one_line(name: str, options: dict[str, Any], message: str) -> None:
     with pytest.raises(noack.NoackError, match=message):
         noack.certify(name, **options)

@@ -26,9 +26,7 @@ def scenarios(*words: str) -> Result:
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_a_shipped_scenario_runs_from_the_command_line_and_in_the_library(
-    name: str, tmp_path: Path
-) -> None:
+def test_a_shipped_scenario_runs_from_the_command_line_and_in_the_library(name: str, tmp_path: Path) -> None:
     scenario = noack.load(name, {"horizon_s": 0.2})
     try:
         resolved_loops(scenario)

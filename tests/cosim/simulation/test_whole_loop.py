@@ -165,9 +165,7 @@ def check_identity(record: RunRecord) -> int:
     for now_ns in np.unique(
         np.concatenate([rows["now_ns"] for rows in (measured, deliveries, steps)])
     ).tolist():
-        row, delivery, step = (
-            rows[rows["now_ns"] <= now_ns][-1:] for rows in (measured, deliveries, steps)
-        )
+        row, delivery, step = (rows[rows["now_ns"] <= now_ns][-1:] for rows in (measured, deliveries, steps))
         last = max([*step, *delivery], key=lambda one: one["input"], default=None)
         if last is None or not (len(row) and (settings.known_state or len(delivery))):
             continue  # no common start of the two models yet
@@ -176,9 +174,7 @@ def check_identity(record: RunRecord) -> int:
         x_s = propagation(now_ns - int(row["t_ns"][0])) @ x_s
         x_c = propagation(now_ns - int(last["model_t_ns"])) @ last["x_c"]
         missed = [
-            propagation(now_ns - then_ns) @ e_s
-            for then_ns, e_s in jumps[received + 1 :]
-            if then_ns <= now_ns
+            propagation(now_ns - then_ns) @ e_s for then_ns, e_s in jumps[received + 1 :] if then_ns <= now_ns
         ]
         # Each side takes some hundred propagations, with relative errors of about 1e-15.
         expected = np.sum([0 * x_s, *missed], axis=0)

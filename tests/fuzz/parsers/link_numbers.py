@@ -135,8 +135,7 @@ def _allocate(link: Any, tables: dict[str, Words]) -> dict[str, Any]:
             setattr(link, name, getattr(link, name) % 64)
     sizes = {name: max(_length(link, name), 0) for name in tables}
     kept: dict[str, Any] = {
-        name: _resized(words, sizes[name] * ffi.sizeof(_kind(name)) // 8)
-        for name, words in tables.items()
+        name: _resized(words, sizes[name] * ffi.sizeof(_kind(name)) // 8) for name, words in tables.items()
     }
     rows, stages = max(link.rows, 0), sizes["stages"]
     kept |= {

@@ -51,9 +51,7 @@ def passes(link: Link) -> bool:
 
 
 @pytest.mark.parametrize(("forward", "reverse", "most"), CASES)
-def test_the_bound_on_tries_holds_from_any_question_on(
-    forward: str, reverse: str, most: int
-) -> None:
+def test_the_bound_on_tries_holds_from_any_question_on(forward: str, reverse: str, most: int) -> None:
     expected = list(islice(answered(forward, reverse), 3000))
     bursts = [len(list(burst)) for got, burst in groupby(expected) if not got]
     assert max(bursts) == most - 1

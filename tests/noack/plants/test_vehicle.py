@@ -30,9 +30,7 @@ def parameters(car: str) -> Any:
 
 
 def linearised(chosen: VehicleSettings) -> tuple[np.ndarray, np.ndarray]:
-    found = linearise(
-        lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
-    )
+    found = linearise(lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s)
     return found.A, found.B
 
 
@@ -51,9 +49,7 @@ def test_the_linearised_single_track_model_is_the_textbooks(car: str) -> None:
 
 
 @pytest.mark.parametrize(("model", "library"), [("kinematic", "ks"), ("single_track", "st")])
-def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
-    model: str, library: str
-) -> None:
+def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(model: str, library: str) -> None:
     """Over a lane change, with the servo written out; the larger models' equations are below."""
     chosen, p = settings(model=model, friction=1.0), parameters("bmw_320i")
     system = OdeSystem(chosen.equations(), X0)
@@ -80,9 +76,7 @@ def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
     ({"model": "kinematic", "parameters": "truck", "speed_m_per_s": 30.0},
      r"maximum speed of a truck is 22\.22 m/s"),
 ])  # fmt: skip
-def test_settings_that_the_library_does_not_support_are_refused(
-    given: dict[str, Any], expected: str
-) -> None:
+def test_settings_that_the_library_does_not_support_are_refused(given: dict[str, Any], expected: str) -> None:
     with pytest.raises((ValueError, CallerError), match=expected):
         OdeSystem(settings(**given).equations(), np.zeros(4))
 

@@ -95,17 +95,13 @@ def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None
         (b" \n", "is empty; a trace has a 1 for each lost packet"),
     ],
 )
-def test_a_mistake_in_a_trace_gets_one_line(
-    content: bytes | None, says: str, tmp_path: Path
-) -> None:
+def test_a_mistake_in_a_trace_gets_one_line(content: bytes | None, says: str, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / "t").write_bytes(content)
     settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="t")),))
     with pytest.raises(CallerError) as caught:
         read_files(settings, tmp_path, "l.toml: link.0.reverse")
-    assert str(caught.value).startswith(
-        f'l.toml: link.0.reverse.impairments.0.loss.file = "t": {says}'
-    )
+    assert str(caught.value).startswith(f'l.toml: link.0.reverse.impairments.0.loss.file = "t": {says}')
 
 
 def test_a_mistake_in_a_delay_file_gives_the_approved_line(tmp_path: Path) -> None:

@@ -81,9 +81,7 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
         )
 
 
-def held_loop(
-    resolved: Scenario, pattern: Sequence[bool], intervals_s: Sequence[float] = ()
-) -> Matrix:
+def held_loop(resolved: Scenario, pattern: Sequence[bool], intervals_s: Sequence[float] = ()) -> Matrix:
     """The map of (x, x_c, u) over a pattern, with the controller's ticks half a step later.
 
     It is computed step by step, without :mod:`noack.theory`. By default the updates are 0.1 s
@@ -118,9 +116,7 @@ def admissible(guarantee: LossGuarantee, pattern: Sequence[bool]) -> bool:
 
 @pytest.mark.parametrize("guarantee", GUARANTEES, ids=lambda one: one.meaning)
 def test_no_pattern_grows_faster_than_the_upper_bound(guarantee: LossGuarantee) -> None:
-    resolved = scenario(
-        "unstable_pendulum", "mode=zoh", "plant.rate_hz=100", "controller.rate_hz=100"
-    )
+    resolved = scenario("unstable_pendulum", "mode=zoh", "plant.rate_hz=100", "controller.rate_hz=100")
     found = LossMargin(resolved).stability(guarantee)
     fastest = 0.0
     for length in range(1, 8):
@@ -169,9 +165,7 @@ def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
     loop, margin, guarantee = loop_of(resolved), LossMargin(resolved), GUARANTEES[0]
     expected = margin.stability(guarantee)
     for unit in (2.0**40, 1e-12):
-        margin.loop = TimeTriggeredLoop(
-            loop.A, loop.B * unit, loop.K / unit, loop.H, margin.loop.times
-        )
+        margin.loop = TimeTriggeredLoop(loop.A, loop.B * unit, loop.K / unit, loop.H, margin.loop.times)
         margin.maps = margin.loop.map  # type: ignore[assignment]
         found = margin.stability(guarantee)
         assert found.pattern == expected.pattern

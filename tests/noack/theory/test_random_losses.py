@@ -30,9 +30,7 @@ def scalar(rate: float, gain: float, mismatch: float) -> PlantGains:
 
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("p", [0.1, 0.5, 0.9])
-def test_in_a_contracting_norm_the_moment_at_events_is_the_geometric_series(
-    p: float, order: int
-) -> None:
+def test_in_a_contracting_norm_the_moment_at_events_is_the_geometric_series(p: float, order: int) -> None:
     error = scalar(2.0, 3.0, 0.0).error
     found = moment_at_events(error, independent(p), 0.0, order)
     assert found == pytest.approx(1 / (1 - p ** (1 / order)), rel=1e-6)
@@ -53,8 +51,7 @@ def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand
         x = 1.0 + gain * e_c / (rate + mismatch)
         whole = (mismatch * x + gain * e_c) / rate
         burst = [
-            np.minimum(beta, (beta ** (r - 1) * powers * whole) ** (1 / r)).sum()
-            for r in range(order, 3)
+            np.minimum(beta, (beta ** (r - 1) * powers * whole) ** (1 / r)).sum() for r in range(order, 3)
         ]
         e_c = beta + min(p ** (1 / order) * whole, *burst)
     assert found.controller_error == pytest.approx(e_c, rel=0.02)

@@ -158,9 +158,7 @@ def events(record: RunRecord) -> list[int]:
 
 
 @pytest.mark.parametrize("protocol", ["none", "ack"])
-def test_a_send_on_delta_class_gives_the_same_run_as_the_policy(
-    tmp_path: Path, protocol: str
-) -> None:
+def test_a_send_on_delta_class_gives_the_same_run_as_the_policy(tmp_path: Path, protocol: str) -> None:
     own = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
     network = own.network.model_copy(update={"protocol": protocol})
     own = own.model_copy(update={"network": network})

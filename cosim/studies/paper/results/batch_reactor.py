@@ -77,8 +77,7 @@ RESULT = PublishedResult(
     notes=(
         "intervals: the same five numbers occur; no state waits longer, as after 5 periods the "
         "trigger's condition holds for every state",
-        "intervals after one of 1 period: ETCetera computes a set that may be too large, so fewer "
-        "may occur",
+        "intervals after one of 1 period: ETCetera computes a set that may be too large, so fewer may occur",
         "states whose interval is 2 periods: of the states of the runs, the published inequalities "
         "hold for as many as wait 2 periods, and they are the same states",
     ),

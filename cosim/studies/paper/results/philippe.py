@@ -46,7 +46,5 @@ RESULT = PublishedResult(
     "with constrained switching sequences, Automatica 72, 2016; value: github.com/blegat/"
     "SwitchOnSafety.jl",
     rows=_rows,
-    notes=(
-        "not available: the paper's text; the value is from a test of that library, PEDJ16s4.jl",
-    ),
+    notes=("not available: the paper's text; the value is from a test of that library, PEDJ16s4.jl",),
 )

@@ -4,13 +4,7 @@ import numpy as np
 from scipy.integrate import quad
 
 from cosim.simulation.continuous import ContinuousLoop
-from cosim.studies.paper.published_result import (
-    PublishedResult,
-    Row,
-    directions,
-    run_all,
-    shipped_loop,
-)
+from cosim.studies.paper.published_result import PublishedResult, Row, directions, run_all, shipped_loop
 
 _WHERE = "Corollary IV.1"
 _HOW = "shortest inter-event time of exact runs of 2 s; τ is the corollary's integral"

@@ -203,9 +203,7 @@ def test_what_cannot_be_searched_is_refused(scenario: dict[str, Any], message: s
     ],
     ids=["disturbance", "noise", "observer"],
 )
-def test_no_signs_are_worse_than_those_found(
-    sections: dict[str, Any], objective: Objective
-) -> None:
+def test_no_signs_are_worse_than_those_found(sections: dict[str, Any], objective: Objective) -> None:
     """Events every 0.15 s, whatever is measured: so the worst signs are those of the responses."""
     periodic = {"policy": "periodic", "period_s": 0.15}
     resolved = scenario_of(periodic, horizon_s=0.35, network={"mansd": 0}, **sections)

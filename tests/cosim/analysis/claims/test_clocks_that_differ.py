@@ -58,9 +58,7 @@ class OtherClock:
 
 def simulated(scenario: Scenario, clocks: dict[str, tuple[int, int]]) -> RunRecord:
     """Simulate with the offset in ns and the drift in ppb of the clock of each role."""
-    wraps = {
-        role: partial(OtherClock, offset_ns=at, drift_ppb=by) for role, (at, by) in clocks.items()
-    }
+    wraps = {role: partial(OtherClock, offset_ns=at, drift_ppb=by) for role, (at, by) in clocks.items()}
     return shuttled(scenario, wraps=wraps)
 
 

@@ -300,9 +300,7 @@ def test_a_scenario_that_an_fmu_cannot_have_is_one_line(
     assert not [*tmp_path.iterdir()]
 
 
-def test_the_command_takes_scenarios_and_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_takes_scenarios_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A scenario gives the same bytes in each process: there is no address in them."""
     monkeypatch.chdir(tmp_path)
     scenario = noack.load("double_integrator", {"network.mansd": 2})

@@ -138,9 +138,7 @@ def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
     assert "transmissions" in rows[0]
 
 
-def test_the_page_is_one_file_and_escapes_user_text(
-    write: Write, plan: dict[str, Any], full: Store
-) -> None:
+def test_the_page_is_one_file_and_escapes_user_text(write: Write, plan: dict[str, Any], full: Store) -> None:
     plan["axes"][1]["title"] = HOSTILE
     path = write(plan, description=HOSTILE)
     campaign = load(path)
@@ -279,9 +277,7 @@ def test_differences_are_taken_draw_by_draw() -> None:
 
 def at_most(j: int, count: int, share: float) -> float:
     """P(Bin(count, share) ≤ j), term by term."""
-    return math.fsum(
-        math.comb(count, i) * share**i * (1 - share) ** (count - i) for i in range(j + 1)
-    )
+    return math.fsum(math.comb(count, i) * share**i * (1 - share) ** (count - i) for i in range(j + 1))
 
 
 @pytest.mark.parametrize(("count", "quantile"), [(100, 0.5), (200, 0.9), (400, 0.95)])

@@ -171,9 +171,7 @@ def test_the_regulator_solves_the_riccati_equation(name: str) -> None:
 @pytest.mark.parametrize("poles", [[-1, -2, -3, -4], [-2 + 1j, -2 - 1j, -3 + 2j, -3 - 2j]])
 def test_poles_are_placed(poles: list[complex]) -> None:
     found = noack.gain("cart_pole", poles=poles)
-    np.testing.assert_allclose(
-        np.sort_complex(found.eigenvalues), np.sort_complex(poles), atol=1e-5
-    )
+    np.testing.assert_allclose(np.sort_complex(found.eigenvalues), np.sort_complex(poles), atol=1e-5)
 
 
 def test_the_double_integrators_gain_is_the_textbooks() -> None:

@@ -155,9 +155,7 @@ CONTINUOUS = Kind(
 _certified = certified_by(System.certify)
 
 
-def _broken_schedule(
-    mistake: Callable[[], AbstractContextManager[Any]], system: System
-) -> Bounds | None:
+def _broken_schedule(mistake: Callable[[], AbstractContextManager[Any]], system: System) -> Bounds | None:
     with mistake():
         return _certified(system)
 

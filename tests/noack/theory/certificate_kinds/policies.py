@@ -207,9 +207,7 @@ def _lyapunov(system: System, rng: Rng) -> PolicyCase:
     steps = int(rng.integers(1, 4)) * system.sample_steps
     rule = {"policy": "lyapunov", "rate_per_s": 0.3}
     settings = {"policy": "deadline", "rule": rule, "interval_s": steps * system.step_s}
-    return settings, AtLatest(
-        steps, Growing(float(rng.choice([0.9, 2.0, 100.0])), system.sample_steps)
-    )
+    return settings, AtLatest(steps, Growing(float(rng.choice([0.9, 2.0, 100.0])), system.sample_steps))
 
 
 def _self_triggered(system: System, rng: Rng) -> PolicyCase:
@@ -253,9 +251,7 @@ def policy_case(
     return scenario_with(system, settings, push, rate_hz=rate_hz), rule, system
 
 
-def scenario_with(
-    system: System, trigger: dict[str, Any], push: float = 0.0, **plant: float
-) -> Scenario:
+def scenario_with(system: System, trigger: dict[str, Any], push: float = 0.0, **plant: float) -> Scenario:
     """The system's matrices with a trigger; the rates have no effect where conditions are given."""
     mode = "model" if system.H.any() else "zoh"
     model: Matrix = system.H - system.B @ system.K if mode == "model" else system.A
@@ -277,9 +273,7 @@ def scenario_with(
     return resolve(validate(content, "test"))
 
 
-def policy_shares(
-    trace: Trace, certificate: ScenarioCertificate, system: System
-) -> dict[str, float]:
+def policy_shares(trace: Trace, certificate: ScenarioCertificate, system: System) -> dict[str, float]:
     """The largest share of each bound that any run reached."""
     t_s = times_s(system)
     slack = _RELATIVE_ROUNDING * trace.state_weighted
