@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from cosim.simulation.exact_simulation import ExactSimulation, run_with_events
 from noack.core import core_library
 from noack.core.core_library import core, ffi, load_core
+from noack.core.errors import CallerError
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.batch.exact import random_population, random_setting
@@ -130,7 +131,11 @@ def test_random_machines(
 @given(roles, sizes(64), st.integers(0, 2**16), st.sampled_from([1.0, 1e308]), inputs)
 def test_large_machines(role: str, of: Sizes, seed: int, scale: float, given_inputs: list[Any]) -> None:
     with np.errstate(all="ignore"):
-        drive(machines_of(role, [(of, seed)], scale), given_inputs)
+        try:
+            machines = machines_of(role, [(of, seed)], scale)
+        except CallerError:  # rounding: so large a closed loop need not be found stable
+            reject()
+        drive(machines, given_inputs)
 
 
 @settings(max_examples=80)
