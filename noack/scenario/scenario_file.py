@@ -171,7 +171,7 @@ def _of_another_kind(lines: str, path: Path, key: str, value: str) -> str:
     others = re.sub(rf"^{start}\w+(: missing| = .*: unknown key; ).*\n?", "", lines, flags=re.MULTILINE)
     needed = "".join(f", {one}=..." for one in missing)
     line = (
-        f"--set {table}.{kind} = {value}: {', '.join(unknown)} in the file belongs to another {kind}; "
+        f"--set {table}.{kind} = {value}: the file has {', '.join(unknown)} of another {kind}; "
         f"set the table: --set '{table}={{{kind}=\"{value}\"{needed}}}'"
     )
     return "\n".join([line, *others.splitlines()])

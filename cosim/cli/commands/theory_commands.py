@@ -22,7 +22,7 @@ with lazy_modules():
     from noack.theory.certificates import scenario_certificates
 
 
-@cli.command(cli.THEORY, 10, takes="about two seconds")
+@cli.command(cli.THEORY, 10, takes="about two seconds; half a minute where events are due after many tests")
 def certify(
     given: cli.ScenarioOptions,
     *,

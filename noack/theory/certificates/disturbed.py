@@ -236,7 +236,7 @@ def choose_rate(solved: Callable[[float], Search[Some]], decay_per_s: float, sta
 
     Raises: what ``solved`` raises at the smallest rate.
     """
-    size, candidates = float(np.linalg.norm(start)) or 1.0, list[tuple[float, Some]]()
+    candidates = list[tuple[float, Some]]()
     for share in _RATES:
         rate_per_s = share * decay_per_s
         try:
@@ -245,5 +245,11 @@ def choose_rate(solved: Callable[[float], Search[Some]], decay_per_s: float, sta
             if not candidates:
                 raise
             break  # larger rates have larger gains
-        candidates.append((math.log(max(10 * constants[0].state / size, 1.0)) / rate_per_s, constants))
+        candidates.append((tenth_s(constants[0], start), constants))
     return min(candidates, key=lambda timed: timed[0])[1]
+
+
+def tenth_s(constants: Constants, start: Matrix) -> float:
+    """Return when the bound of ‖x‖ falls to ‖x(0)‖/10."""
+    size = float(np.linalg.norm(start)) or 1.0
+    return math.log(max(10 * constants.state / size, 1.0)) / constants.rate_per_s

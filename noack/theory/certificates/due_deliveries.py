@@ -78,19 +78,6 @@ class Gaps(NamedTuple):
         return cls(step_s, np.array(sorted(counts)))
 
 
-def constants_between_deliveries(
-    plant: PlantGains, conditions: NetworkConditions, bound: TriggerBound, unit: float
-) -> Constants:
-    """Return the constants of an undisturbed plant that follow from times of deliveries alone.
-
-    ``unit`` is that of Δ and β̃.
-
-    Raises:
-        NoCertificateError: the times are not covered, or the loop does not contract.
-    """
-    return _Run(_Loop(plant, conditions, Gaps.of(conditions, bound))).constants(bound, unit)
-
-
 class _Norm(NamedTuple):
     """What one gap makes of ‖Λξ‖ ≤ 1: arrays of (gaps,), (cells,) or (gaps, cells)."""
 
@@ -270,7 +257,9 @@ class _Loop:
                     means[number] = mean * self.cell_s * len(piece)
             ends = map_ + np.einsum("sp,pij->sij", signs, means)
             found.append((float(_norms(ends).max()) + rest) * _ROUNDING)
-        return np.array(found)
+            if found[-1] >= 1:  # of no use: the other gaps do not matter
+                break
+        return np.array(found + found[-1:] * (len(moved) - len(found)))
 
     def _age_bends(self, shape: Matrix, inverse: Matrix) -> tuple[Vector, Vector]:
         """Bound, over each cell, how far ‖w‖ may lie above its nodes, and from the first order."""
@@ -292,16 +281,28 @@ def _norms(matrices: Stack) -> Stack:
     return np.asarray(np.linalg.norm(matrices, 2, axis=(-2, -1)))
 
 
+def _lengths(vectors: Matrix) -> Vector:
+    """Return ‖·‖ of vectors, (k, n)."""
+    return np.asarray(np.sqrt(np.einsum("kn,kn->k", vectors, vectors)))
+
+
 def _of_cells(values: Stack) -> Stack:
     """Return the larger of the values at both ends of each cell."""
     return np.asarray(np.maximum(values[..., :-1], values[..., 1:]))
 
 
-class _Run:
-    """A loop from its x(0) on."""
+class Deliveries:
+    """What x can be at the deliveries of an undisturbed plant's loop, from its x(0) on.
 
-    def __init__(self, loop: _Loop) -> None:
-        self._loop, n = loop, loop.n
+    Raises:
+        NoCertificateError: the times between deliveries are not covered, or the loop grows from one
+            to the next.
+    """
+
+    def __init__(self, plant: PlantGains, conditions: NetworkConditions, bound: TriggerBound) -> None:
+        self._bound = bound
+        self._loop = loop = _Loop(plant, conditions, Gaps.of(conditions, bound))
+        n = loop.n
         gain = math.inf
         for shape in _shapes(loop.plant):
             self._norm = loop.norm(shape)
@@ -325,9 +326,14 @@ class _Run:
         self._ages_seen = np.zeros_like(self._of_ball)
         self._ages_seen[[*C].index(_INPUT)] = 1.0
 
-    def constants(self, bound: TriggerBound, unit: float) -> Constants:
-        """Return the constants; see :func:`constants_between_deliveries`."""
-        plant, conditions = self._loop.plant, self._loop.conditions
+    @property
+    def gain(self) -> float:
+        """By what the norm of x grows from one delivery to the next, at most; below 1."""
+        return self._norm.gain
+
+    def constants(self, unit: float) -> Constants:
+        """Return the constants; ``unit`` is that of Δ and β̃."""
+        plant, conditions, bound = self._loop.plant, self._loop.conditions, self._bound
         size = dict(zip(self._loop.outputs, self._sizes().tolist(), strict=True))
         start_error = float(plant.start_up(conditions.start_s)[0])
         pushed, moved, _ = ErrorGrowth(plant, bound.due_s, TriggerBound(0.0, None)).driven
@@ -344,30 +350,52 @@ class _Run:
             state_weighted=size[Output.WEIGHTED],
             mismatch=size[Output.MISMATCH],
             inter_event_s=apart_s,
-            loop_gain=self._norm.gain,
+            loop_gain=0.0,
             received_input_error=size[_INPUT],
         )
 
     def _sizes(self) -> Vector:
         """Return the bounds of all outputs, (outputs,)."""
-        norm, counts = self._norm, self._loop.gaps.counts.tolist()
+        counts, places = self._loop.gaps.counts, int(self._loop.gaps.counts[-1]) + 1
         highest, first = self._start()
-        children, balls, unseen = {0: first}, dict[int, _Ball](), list[_Ball]()
+        # What follows from the balls of the last times, by their time modulo the longest gap + 1.
+        after = [np.zeros((places, *part.shape)) for part in first]
+        known, gaps = np.zeros(places, dtype=bool), np.arange(len(counts))
+        self._keep(after, known, 0, first)
+        balls, unseen = dict[int, _Ball](), list[_Ball]()
         for k in range(1, _MOST_TIMES):
-            known = [children[k - n].of(g) for g, n in enumerate(counts) if k - n in children]
-            children.pop(k - counts[-1], None)
-            if not known:
+            known[k % places] = False
+            before = (k - counts) % places
+            here = known[before]
+            if not here.any():
                 continue
-            ball = balls[k] = _enclosing(norm.shape, known)
+            ball = balls[k] = self._enclosing(*(part[before[here], gaps[here]] for part in after))
             unseen.append(ball)
-            children[k] = self._after(ball)
+            self._keep(after, known, k, self._after(ball))
             if len(unseen) == _AT_ONCE or k == _MOST_TIMES - 1:
                 highest = np.maximum(highest, self._seen(unseen))
                 unseen.clear()
-                tail = self._tail([balls[s] for s in range(k - counts[-1], k + 1) if s in balls])
+                tail = self._tail([balls[s] for s in range(k - places + 1, k + 1) if s in balls])
                 if (tail <= highest).all():
                     break
         return np.asarray(np.maximum(tail, highest) * _ROUNDING)
+
+    @staticmethod
+    def _keep(after: list[Stack], known: NDArray[np.bool_], k: int, balls: "_Balls") -> None:
+        for kept, part in zip(after, balls, strict=True):
+            kept[k % len(known)] = part
+        known[k % len(known)] = True
+
+    def _enclosing(self, c: Matrix, rho: Vector, J: Vector, both: Vector) -> "_Ball":
+        """Return a small ball around balls."""
+        shape = self._norm.shape
+        middle, rounding = c.mean(axis=0), 1e-12 * float(_lengths(c @ shape.T).max())
+        for number in range(1, _CENTRED + 1):
+            furthest = int((_lengths((c - middle) @ shape.T) + both).argmax())
+            middle = middle + (c[furthest] - middle) / (number + 2)
+        away = _lengths((c - middle) @ shape.T) + rounding
+        most, most_of_both = (float((away + one).max()) * _ROUNDING for one in (rho, both))
+        return _Ball(middle, most, float(J.max()), most_of_both, self._norm.theta)
 
     def _after(self, ball: "_Ball") -> "_Balls":
         """Return what follows from a ball after each gap."""
@@ -380,7 +408,7 @@ class _Run:
             norm.late[:, None] * rho + norm.late_pulse[:, None] * J + late[:, None],
         )
         both = (rho + norm.theta * J).max(axis=1)
-        return _Balls(moved[:, : loop.n], rho.max(axis=1), J.max(axis=1), both, norm.theta)
+        return _Balls(moved[:, : loop.n], rho.max(axis=1), J.max(axis=1), both)
 
     def _tail(self, balls: "list[_Ball]") -> Vector:
         """Bound all outputs from now on, given the balls within a longest gap."""
@@ -457,7 +485,7 @@ class _Run:
         J = J + max(late) + weighted + norm.late_aged @ ages
         rho = half * _ROUNDING + bent + norm.aged @ ages
         both = rho + norm.theta * J
-        return np.array(highest), _Balls(moved[:, :n] + ends[:, :n] / 2, rho, J, both, norm.theta)
+        return np.array(highest), _Balls(moved[:, :n] + ends[:, :n] / 2, rho, J, both)
 
     def _carried(self, C: Matrix, Y: Matrix, cells: int) -> float:
         """Bound ‖C e^{Fr} Y e^{Hs} x(0)‖ over cells of r, and s up to T."""
@@ -497,26 +525,6 @@ class _Balls(NamedTuple):
     rho: Vector
     J: Vector
     both: Vector
-    theta: float
-
-    def of(self, gap: int) -> _Ball:
-        """Return that of a gap."""
-        rho, J, both = float(self.rho[gap]), float(self.J[gap]), float(self.both[gap])
-        return _Ball(self.c[gap], rho, J, both, self.theta)
-
-
-def _enclosing(shape: Matrix, balls: list[_Ball]) -> _Ball:
-    """Return a small ball around balls."""
-    c = np.array([ball.c for ball in balls])
-    rho, J, both = (np.array(values) for values in list(zip(*balls, strict=True))[1:4])
-    middle, rounding = c.mean(axis=0), 1e-12 * float(np.linalg.norm(c @ shape.T, axis=-1).max())
-    for number in range(1, _CENTRED + 1):
-        furthest = int((np.linalg.norm((c - middle) @ shape.T, axis=-1) + both).argmax())
-        middle = middle + (c[furthest] - middle) / (number + 2)
-    away = np.linalg.norm((c - middle) @ shape.T, axis=-1) + rounding
-    sizes = (float((away + one).max()) * _ROUNDING for one in (rho, both))
-    most, most_of_both = sizes
-    return _Ball(middle, most, float(J.max()), most_of_both, balls[0].theta)
 
 
 def _shapes(plant: PlantGains) -> Iterator[Matrix]:

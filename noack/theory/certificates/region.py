@@ -87,7 +87,7 @@ class _Box(CertificateScope):
         Raises: as :meth:`bounded`.
         """
         if not self.is_simple:
-            return (yield from self._constants(conditions, longest=False))
+            return (yield from self._solved(conditions, longest=False))
         trigger = self._trigger
         level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
         tested, reached = trigger.tested(conditions), trigger.floor or None

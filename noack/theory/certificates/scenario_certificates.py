@@ -6,7 +6,7 @@ searches for the largest sampling period, delay and age of inputs for which a ce
 
 import contextlib
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -25,8 +25,8 @@ from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
-from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate
-from noack.theory.certificates.due_deliveries import constants_between_deliveries
+from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate, tenth_s
+from noack.theory.certificates.due_deliveries import Deliveries
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 MOST_S = 10.0
@@ -39,7 +39,7 @@ _STEPS = 6
 Points = Sequence[tuple[float, float]]
 """Logarithms of loop gains, and of their times."""
 _SLOWER = 0.9
-_TIMED_RATES = (0.4, 0.1)
+_TIMED_RATES = (0.7, 0.4, 0.1)
 """Rates that are tried where events are due, as shares of the decay rate of A + BK."""
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
@@ -207,68 +207,72 @@ class CertificateScope:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
         # Whether inputs of an earlier run are covered depends on the constants.
         try:
-            search = self._constants(conditions, longest=self._start_error > 0)
+            search = self._solved(conditions, longest=self._start_error > 0)
             constants = completed_alone(search)
         except NoCertificateError as error:
-            return max(error.loop_gain, 1.0)
+            gain = max(error.loop_gain, 1.0)
         except NotDecayingError:
-            return math.inf
-        return max(phase.loop_gain for phase in constants[0] if phase is not None)
+            gain = math.inf
+        else:
+            return max(phase.loop_gain for phase in constants[0] if phase is not None)
+        # The slowest rate asks for least.
+        return next((one.gain for one in self._deliveries(conditions, _TIMED_RATES[-1:])), gain)
 
-    def _constants(self, conditions: NetworkConditions, *, longest: bool = True) -> Search[list[Phases]]:
+    def _constants(self, conditions: NetworkConditions) -> Search[list[Phases]]:
         """Search for the constants of each bound of the run; all of them hold.
-
-        ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
 
         Raises:
             NoCertificateError: there is no certificate.
             NotDecayingError: a mode of the loop decays too slowly.
         """
-        timed = self._between_deliveries(conditions) if longest else None
-        if timed is not None and self._trigger.comparison is None:
-            return [(timed, None, None)]
+        timed = self._timed(conditions)
+        try:
+            found = yield from self._solved(conditions, longest=True)
+        except (NoCertificateError, NotDecayingError):
+            if timed is None:
+                raise
+            found = []
+        if timed is None:
+            return found
+        apart_s = max(one.inter_event_s or 0.0 for one in (timed, *(first for first, _, _ in found)))
+        useful = [phases for phases in found if not _is_within(timed, phases[0])]
+        return [(timed._replace(inter_event_s=apart_s), None, None), *useful]
+
+    def _solved(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
+        """Search for the constants that solve the inequalities.
+
+        ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
+        """
         try:
             if self.is_simple:
                 first, late = yield from self._phases(conditions, longest=longest)
-                found: list[Phases] = [(first, late, None)]
-            else:
-                pairs = yield from self._disturbed_phases(conditions, longest=longest)
-                found = [(first, None, rest) for first, rest in pairs]
-        except (
-            NoCertificateError,
-            NotDecayingError,
-            OverflowError,
-            np.linalg.LinAlgError,
-        ) as error:
-            timed = timed or self._between_deliveries(conditions)
-            if timed is not None:
-                return [(timed, None, None)]
-            if isinstance(error, NoCertificateError | NotDecayingError):
-                raise
+                return [(first, late, None)]
+            pairs = yield from self._disturbed_phases(conditions, longest=longest)
+            return [(first, None, rest) for first, rest in pairs]
+        except (OverflowError, np.linalg.LinAlgError):
             raise NoCertificateError(_TOO_LARGE) from None
-        if timed is None:
-            return found
-        apart_s = max(timed.inter_event_s or 0.0, found[0][0].inter_event_s or 0.0)
-        return [(timed._replace(inter_event_s=apart_s), None, None), *found]
 
-    def _between_deliveries(self, conditions: NetworkConditions) -> Constants | None:
+    def _timed(self, conditions: NetworkConditions) -> Constants | None:
         """Return constants that follow from the times of deliveries alone, if they exist."""
+        found = [one.constants(self._trigger.beta or 1.0) for one in self._deliveries(conditions)]
+        return min(found, key=lambda one: tenth_s(one, self._start), default=None)
+
+    def _deliveries(
+        self, conditions: NetworkConditions, shares: Sequence[float] = _TIMED_RATES
+    ) -> Iterator[Deliveries]:
+        """Yield what is known of the deliveries where events are due, for each rate that is tried."""
         trigger, loop = self._trigger, self._loop
         if not trigger.has_due_time or not self._resolved.coverage.is_undisturbed:
-            return None
+            return
         if self._start_error or self._start.shape[1] != 1 or self._resolved.observer is not None:
-            return None
-        decay = self._decay["A + BK"]
-        for share in _TIMED_RATES if decay > 0 else ():
-            rate = share * decay
+            return
+        tested = trigger.tested(conditions)
+        for share in shares if self._decay["A + BK"] > 0 else ():
+            rate = share * self._decay["A + BK"]
             plant = self._plant_at(error_gains(loop, rate), self._start, rate)
-            if not plant.is_one_plant:
-                return None
-            with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
-                tested = trigger.tested(conditions)
-                bound = trigger.bound(tested, 0.0, None)
-                return constants_between_deliveries(plant, tested, bound, trigger.beta or 1.0)
-        return None
+            if plant.is_one_plant:
+                with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
+                    yield Deliveries(plant, tested, trigger.bound(tested, 0.0, None))
 
     def _phases(
         self, conditions: NetworkConditions, *, longest: bool
@@ -420,6 +424,22 @@ def _at_floor(first: Constants, share: float) -> Constants:
         "received_input_error",
     )
     return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
+
+
+def _is_within(ours: Constants, others: Constants) -> bool:
+    """Return whether no bound of the others is below ours at any time."""
+    names = (
+        "delta",
+        "overshoot",
+        "input_error",
+        "state",
+        "state_weighted",
+        "mismatch",
+        "received_input_error",
+    )
+    return ours.rate_per_s >= others.rate_per_s and all(
+        getattr(ours, name) <= getattr(others, name) for name in names
+    )
 
 
 def _is_finite(constants: Constants) -> bool:
