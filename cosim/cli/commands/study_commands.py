@@ -116,7 +116,10 @@ def paper(
         return ExitStatus.OK
     if name is not None:
         if out is not None or draws is not None:
-            raise CallerError("--out, --draws: are for the page of Section V; this has --tables")
+            raise CallerError(
+                f"--out, --draws: are for `noack paper` without a name; the table of {name} is written "
+                "by --tables FILE"
+            )
         with cli.status("computing"):
             found = paper_results.reproduce(name)
         cli.show(json, found.document, published_result.print_rows, found)

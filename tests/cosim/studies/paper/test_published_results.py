@@ -38,7 +38,7 @@ def test_a_value_that_differs_fails_the_command(monkeypatch: pytest.MonkeyPatch)
     [
         (["selivanow"], "no published result of this name; did you mean selivanov_fridman?"),
         (["umsonst"], f"no published result of this name; there are {', '.join(NAMES)}"),
-        (["tabuada", "--draws", "3"], "--out, --draws: are for the page of Section V"),
+        (["tabuada", "--draws", "3"], "--out, --draws: are for `noack paper` without a name"),
     ],
 )
 def test_a_mistake_is_one_line(words: list[str], says: str) -> None:
