@@ -14,14 +14,15 @@ from typer.testing import CliRunner, Result
 
 import noack
 from cosim.cli import app
-from cosim.measurement.certificate_time import DELAY, certificate_time
 from cosim.measurement.chain_fits import ChainRates
 from cosim.measurement.loss_bursts import histogram
 from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables, trace_csv
 from cosim.measurement.network_measurement import (
+    DELAY,
     Measurement,
     MeasurementOptions,
     autocorrelation,
+    certificate_time,
     normal_scores,
 )
 from cosim.measurement.trace_sources import SourceOptions, read_source, updates_trace

@@ -10,8 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from cosim.analysis.adversary import Objective, conditions_of, find_worst
-from cosim.analysis.adversary.loop_flows import SampledFlow, run_of
-from cosim.analysis.adversary.objective import Pattern
+from cosim.analysis.adversary.loop_flows import Pattern, SampledFlow, run_of
 from cosim.analysis.adversary.worst_run import bounds_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.sampled_loop import SampledLoop, Scales

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
+from cosim.studies.design.design_page import DesignOutcome
 from cosim.studies.design.event_design import Certified, EventSearch, design_for_network, event_outcome
 from cosim.studies.design.loop_growth import PatternGraph
-from cosim.studies.design.network_page import DesignOutcome
 from cosim.studies.design.network_search import Candidate, NetworkSearch, Reached, Wish, periodic_outcome
 from noack.impairments.loss_guarantee import LossesInWindow, LossGuarantee, LossHistory
 from noack.scenario.resolution import loop_of, resolve
