@@ -4,6 +4,7 @@ By default, each run tries the same few examples; ``--hypothesis-profile search`
 new examples per test.
 """
 
+import copy
 import os
 import signal
 import sys
@@ -98,14 +99,17 @@ def usual_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+CONTENT: dict[str, Any] = {
+    "name": "small",
+    "horizon_s": 1.0,
+    "model": {"name": "double_integrator"},
+    "plant": {"initial_state": [1.0, 0.0]},
+    "trigger": {"beta": 0.5, "alpha_per_s": 0.25},
+    "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
+}
+
+
 @pytest.fixture
 def content() -> dict[str, Any]:
     """A minimal valid scenario of the double integrator, as parsed TOML."""
-    return {
-        "name": "small",
-        "horizon_s": 1.0,
-        "model": {"name": "double_integrator"},
-        "plant": {"initial_state": [1.0, 0.0]},
-        "trigger": {"beta": 0.5, "alpha_per_s": 0.25},
-        "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
-    }
+    return copy.deepcopy(CONTENT)
