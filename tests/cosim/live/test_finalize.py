@@ -222,7 +222,7 @@ def many_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run of more loops than are prepared at once, without a summary."""
     monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
     monkeypatch.setattr(end_helpers, "cores", lambda: 2)
-    scenario = load(find_shipped("shared_bottleneck", "scenarios"), ["horizon_s=1"])
+    scenario = load(find_shipped("shared_bottleneck", "scenarios"), ["horizon_s=0.2"])
     assert scenario.loops is not None
     loops = (scenario.loops[0].model_copy(update={"count": 17}),)
     return simulate_run(scenario.model_copy(update={"loops": loops}), tmp_path).run_dir
