@@ -88,6 +88,12 @@ def runs_of_other_workers_are_unknown(
 
 
 @pytest.fixture
+def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finalise runs without a report, whose figures take longer than everything else."""
+    monkeypatch.setattr("cosim.live.finalize._write_report", lambda *_: None)
+
+
+@pytest.fixture
 def usual_signals() -> Iterator[None]:
     """Let signals do what they usually do, also in a process that was started to ignore them."""
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}

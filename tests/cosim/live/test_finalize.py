@@ -43,6 +43,8 @@ from noack.scenario.scenario_file import dumps, load
 from tests.cosim.record.changed_records import changed
 from tests.cosim.summaries import alone
 
+pytestmark = pytest.mark.usefixtures("no_report")
+
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -55,11 +57,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / REPORTS_FILE).write_text(json.dumps(reports))
     write_run(alone(record), folder)
     return folder
-
-
-@pytest.fixture(autouse=True)
-def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cosim.live.finalize, "_write_report", lambda *_: None)
 
 
 @pytest.fixture

@@ -122,6 +122,7 @@ def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: s
     assert path.read_bytes().startswith(b"RRF")
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     own = "A = [[0.0, 1.0], [50.0, 0.0]], B = [[0.0], [1.0]]"
     wild = f'{{ name = "wild", phase = 0.75, plant = {{ draw = "given", {own} }} }}'

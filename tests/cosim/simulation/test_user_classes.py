@@ -246,7 +246,7 @@ def test_a_failed_plant_stops_moving_and_the_run_is_recorded(
     path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, parameters)
     build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
     ending = simulate_run(load(path), tmp_path / "runs")
-    outcome = finalize(ending)
+    outcome = finalize(ending, report=False, view=False)
     assert outcome.status == 1
     assert outcome.reason == expected
     record = load_record(ending.run_dir)
