@@ -27,6 +27,7 @@ from noack.scenario.scenario_file import load
 from tests.approved import compare_lines, lines_of_error
 from tests.command_line import invoke
 from tests.plant_server.fmus.build import build
+from tests.shipped import resolved
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 EXAMPLES = ("saturated_lqr", "model_predictive")
@@ -116,7 +117,7 @@ def run_of(tmp_path: Path, **methods: str) -> RunRecord:
         f"controller.file={tmp_path / 'law.py'}", "controller.name=Law", "controller.parameters={}",
         "controller.safe_input=[0.25]", "horizon_s=2.0",
     ]  # fmt: skip
-    return simulate(resolve(load(SCENARIOS / "saturated_lqr.toml", settings)))
+    return simulate(resolved("saturated_lqr", *settings))
 
 
 @pytest.mark.parametrize(

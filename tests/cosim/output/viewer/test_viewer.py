@@ -34,14 +34,12 @@ from cosim.output.viewer.pictures.picture import TIMELINE, Frames
 from cosim.output.viewer.recording import APPLICATION_ID, LoopView, RecordingFile, ViewError
 from cosim.output.viewer.run_recording import RunRecording
 from cosim.record.align import AlignedRun
-from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
 from tests.cosim.output.test_texts import compare
 from tests.cosim.summaries import summary_of
 from tests.integration.conftest import noack_command, wait_for
+from tests.shipped import resolved
 
 Floats = NDArray[np.float64]
 
@@ -56,8 +54,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def new_view(path: Path, live: LiveView | None = None, horizon_s: float = 20.0) -> RunRecording:
-    given = load(find_shipped("lane_following", "scenarios"), [f"horizon_s={horizon_s}"])
-    scenario = resolve(given)
+    scenario = resolved("lane_following", f"horizon_s={horizon_s}")
     return RunRecording(scenario, path, 1, {0: scenario}, live=live)
 
 
@@ -396,7 +393,7 @@ T_NS = 4_244_000_000
 
 
 def summary_at(at_s: float | None) -> str:
-    scenario = resolve(load(find_shipped("double_integrator", "scenarios"), ["horizon_s=0.1"]))
+    scenario = resolved("double_integrator", "horizon_s=0.1")
     return summary_of(simulate(scenario), sup_e_c_at_s=at_s).model_dump_json()
 
 

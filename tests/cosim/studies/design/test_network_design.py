@@ -22,7 +22,6 @@ from cosim.studies.design.network_search import Candidate, NetworkSearch, Reache
 from noack.impairments.loss_guarantee import LossesInWindow, LossGuarantee, LossHistory
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load
 from noack.settings.section import rows_of
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify_box
@@ -30,14 +29,11 @@ from noack.theory.margins.loss_margin import LossMargin, list_bursts
 from tests.approved import compare_lines
 from tests.command_line import invoke
 from tests.noack.theory.test_loss_margin import held_loop
+from tests.shipped import shipped
 
 ROOT = Path(__file__).parents[4]
 LINEAR = 'plant.system={kind="linear"}'
 PERIOD_S = 0.25
-
-
-def shipped(name: str, *settings: str) -> Scenario:
-    return load(ROOT / "scenarios" / f"{name}.toml", settings)
 
 
 class Found(NamedTuple):
