@@ -268,10 +268,15 @@ def expectations_of(run_dir: Path, block: range) -> Sequence[Expectations]:
 
 
 def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:
-    certificates: Sequence[Sequence[ScenarioCertificate] | None] = [None] * len(scenarios)
+    """Return what to expect of some loops; equal loops share it."""
+    keys = [one.model_dump_json(exclude={"name", "seeds"}) for one in scenarios]
+    distinct = dict(zip(keys, scenarios, strict=True))
+    certificates: Sequence[Sequence[ScenarioCertificate] | None] = [None] * len(distinct)
     with suppress(Exception):
-        certificates = certificates_together(scenarios)
-    return [*map(Expectations, map(assumptions, scenarios), certificates)]
+        certificates = certificates_together([*distinct.values()])
+    found = [*map(Expectations, map(assumptions, distinct.values()), certificates)]
+    shared = dict(zip(distinct, found, strict=True))
+    return [shared[key] for key in keys]
 
 
 class ReplayBeside:
