@@ -189,23 +189,21 @@ class ClaimEvaluation(RunEvidence):
         """Return every claim with its verdict, in the run's time."""
         if not self.facts.any_in_common:
             return []
+        void = partial(void_claim, since_s=self.part.from_s, until_s=_end_s(self.part))
         if self.record.scenario.protocol.acknowledges:
             what = "x_c − x_s is the sum of the missed jumps"
-            return [self._void_claim(what, "(I1)", _ACKNOWLEDGED)]
+            return [void(what, "(I1)", why=_ACKNOWLEDGED)]
         found: list[Claim] = []
         for certificate in (None, *self.certificates):
             if certificate is not None and certificate.constants is None:
                 what = f"a certificate for {certificate.scope}"
-                found.append(self._void_claim(what, certificate.source, certificate.void or ""))
+                found.append(void(what, certificate.source, why=certificate.void or ""))
             found += [
                 instance.check.result()
                 for instance in self._checked
                 if instance.certificate is certificate and instance.check.is_claimed
             ]
         return found
-
-    def _void_claim(self, what: str, source: str, why: str) -> Claim:
-        return void_claim(what, source, self.part.from_s, why, _end_s(self.part))
 
     @cached_property
     def _checked(self) -> list[_Instance]:
