@@ -17,7 +17,7 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 359
+MOST_MODULES = 425
 LINES = {
     "noack/scenario": 3915,
     "noack/controllers": 270,
@@ -30,7 +30,7 @@ LINES = {
     "noack/protocol": 1235,
     "noack/runtime": 5400,
     "noack/settings": 585,
-    "noack/theory": 10605,
+    "noack/theory": 10670,
     "noack/traces": 1320,
     "noack/trigger": 1070,
     "netem": 6500,
@@ -51,7 +51,7 @@ LINES = {
     "controller_node": 415,
     "benchmarks": 4715,
     "native": 10740,
-    "tests": 45780,
+    "tests": 45815,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
