@@ -431,7 +431,7 @@ class ContinuousSummary(NamedTuple):
 def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
     """Return the run's numbers."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
-    diverged = _divergence(run, samples, resolved)
+    diverged = divergence_of(run, samples, resolved)
     arrived = np.flatnonzero(run.delivered)
     drop_runs = np.diff(arrived, prepend=-1, append=len(run.delivered)) - 1
     return ContinuousSummary(
@@ -456,7 +456,8 @@ def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
     )
 
 
-def _divergence(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Divergence | None:
+def divergence_of(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Divergence | None:
+    """Return the divergence of a run, from samples at evenly spaced times."""
     if run.diverged_at_s is not None:
         return Divergence(run.diverged_at_s, f"diverged at {run.diverged_at_s:g} s")
     return divergence([(samples.t_s, samples.x)], len(samples.t_s), [resolved])
