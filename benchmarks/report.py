@@ -18,8 +18,6 @@ from rich.table import Table
 
 BUSY_SHARE, STEAL_SHARE = 0.1, 0.01
 """Figures are doubtful if other programs, or the hypervisor, used this share of all cores."""
-_SET_CHILD_SUBREAPER = 36
-"""Of prctl(2): orphans among this process's descendants become its children."""
 _COMPARISONS = {"<=": operator.le, "<": operator.lt, ">=": operator.ge, "==": operator.eq}
 median = statistics.median
 
@@ -146,8 +144,8 @@ class Load:
     """The machine's load by other programs since the object's construction."""
 
     def __init__(self) -> None:
-        # Nobody waits for the processes of a browser when it ends; here they remain countable.
-        ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        # Nobody waits for the processes of a browser that has ended; here they remain countable.
+        ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER: it adopts orphans
         self._before = self._read()
 
     def rows(self) -> list[Row]:
