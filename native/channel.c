@@ -53,6 +53,13 @@ static int is_behind(const noack_channel *channel, int64_t direction, int64_t re
     return 0;
 }
 
+/* Begin to send what can begin until now_ns in a queue that chooses when the link is free. */
+static void serve(noack_channel *channel, int64_t direction, int64_t now_ns) {
+    noack_heap_entry entry;
+    while (begin_sending(channel->links[direction], channel->waiting, now_ns, &entry))
+        heap_push(channel->heap, &channel->heap_count, entry);
+}
+
 /* Let a datagram, or its copy, leave now, or keep it until it is due. */
 static void release(
     noack_channel *channel, const noack_datagram *datagram, const noack_decision *decision,
@@ -75,10 +82,13 @@ static void release(
         copy_datagram(&channel->leaving[channel->leaving_count++], &kept->datagram);
         return;
     }
-    noack_heap_entry entry = {
-        release_ns, departure_order(direction, channel->put), channel->free_place};
+    int64_t place = channel->free_place, order = departure_order(direction, channel->put);
     channel->free_place = kept->next;
-    heap_push(channel->heap, &channel->heap_count, entry);
+    if (decision->waits)
+        wait_for_link(channel->links[direction], channel->waiting, place, order, decision);
+    else
+        heap_push(
+            channel->heap, &channel->heap_count, (noack_heap_entry){release_ns, order, place});
 }
 
 int64_t noack_channel_handle(
@@ -92,7 +102,7 @@ int64_t noack_channel_handle(
         return NOACK_ASK_CHANGE;
     if (channel->packet_count == channel->row_places)
         return NOACK_ROWS_FULL;
-    if (channel->heap_count + 2 > channel->places)
+    if (channel->free_place < 0 || channel->delayed[channel->free_place].next < 0)
         return NOACK_ASK_PLACES;
     if (asks && !channel->answered) {
         copy_datagram(&channel->asked, datagram);
@@ -101,6 +111,7 @@ int64_t noack_channel_handle(
     }
     channel->answered = 0;
     channel->reached_ns = now_ns;
+    serve(channel, direction, now_ns);
     if (asks)
         link_repeat(link, row, datagram->size_bytes, now_ns, &channel->outcome, &decision);
     else
@@ -112,6 +123,7 @@ int64_t noack_channel_handle(
         release(channel, datagram, &decision, 0);
     if (decision.copy_ns != NOACK_NEVER_NS)
         release(channel, datagram, &decision, 1);
+    serve(channel, direction, now_ns);
     return NOACK_DONE;
 }
 
@@ -134,10 +146,12 @@ int64_t noack_channel_release(noack_channel *channel, int64_t now_ns) {
     copy_datagram(&channel->leaving[channel->leaving_count++], &leaving->datagram);
     leaving->next = channel->free_place;
     channel->free_place = due.slot;
+    serve(channel, leaving->datagram.flow / channel->loops, due.release_ns);
     return NOACK_DONE;
 }
 
-void noack_channel_latest(const noack_channel *channel, int64_t direction, int64_t *latest_ns) {
+void noack_channel_latest(noack_channel *channel, int64_t direction, int64_t *latest_ns) {
+    serve(channel, direction, INT64_MAX);
     for (int64_t i = 0; i < channel->heap_count; i++) {
         const noack_datagram *one = &channel->delayed[channel->heap[i].slot].datagram;
         int64_t row = one->flow % channel->loops;

@@ -49,7 +49,8 @@ typedef void stage_function(packet *packet, const noack_stage *stage, noack_stag
    depend on other stages. */
 stage_function apply_bernoulli, apply_four_state, apply_gilbert_elliott, apply_periodic,
     apply_scripted, apply_worst_case, apply_tail_drop, apply_blackout, apply_corrupt, apply_delay,
-    apply_duplicate, apply_opportunities, apply_reorder, apply_replay, apply_schedule;
+    apply_duplicate, apply_earliest_deadline, apply_opportunities, apply_priority, apply_reorder,
+    apply_replay, apply_schedule;
 
 /* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. */
 static inline void refuse(noack_decision *decision, int64_t fate) {
@@ -125,6 +126,20 @@ int64_t departure_order(int64_t direction, int64_t put);
 void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
 /* Remove the first entry. */
 void heap_pop(noack_heap_entry *heap, int64_t *count);
+
+/* waiting.c: the number of a packet's flow in the table of a stage. */
+int64_t flow_number(const packet *packet, const noack_stage *stage);
+/* Let a packet enter the queue of its stage; the packets with the smallest key + time leave first,
+   of which those with the same leave in order of arrival. */
+void enter_queue(packet *packet, int64_t key, int is_time);
+/* Let a stored datagram, of whose link the decision is, wait until the link is free. */
+void wait_for_link(
+    noack_link *link, noack_waiting *waiting, int64_t place, int64_t order,
+    const noack_decision *decision);
+/* If a link is free at now_ns or before, and a datagram waits: begin to send the first one; set its
+   place and departure, and return 1. */
+int begin_sending(
+    noack_link *link, noack_waiting *waiting, int64_t now_ns, noack_heap_entry *entry);
 
 /* Copy what a message has: it may have few entries. */
 static inline void copy_message(noack_message *to, const noack_message *from) {

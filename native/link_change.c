@@ -1,7 +1,8 @@
 /* A change of settings: transfers a link's state to one with other settings.
 
    A stage keeps its state if the new settings have a stage of the same kind and random stream; a
-   queue keeps its state under another discipline, too. Flows, counters and packets in flight do not
+   queue keeps its state under another discipline, too, unless one of them chooses when the link is
+   free. Flows, counters and packets in flight do not
    change, except that the count of the longest loss burst starts again, since another guarantee may
    apply. */
 #include <string.h>
@@ -104,7 +105,7 @@ static int is_same_guarantee(const noack_link *a, const noack_link *b) {
 }
 
 /* Transfer the release times that the guarantee needs. If the guarantee differs (or there is none
-   any more), later packets leave only after the packets that are in flight at the change. */
+   any more), or a queue chose when the link was free, later packets leave only after the packets that are in flight at the change. */
 static void change_releases(
     const noack_link *before, const noack_link *after, int64_t row, int64_t latest_ns) {
     noack_flow *flow = &after->flows[row];
@@ -117,7 +118,7 @@ static void change_releases(
             for (int64_t number = max_of(flow->packets - kept, 0); number < flow->packets; number++)
                 times_ns[number & mask] = older_ns[number & (before->recent_width - 1)];
         }
-        if (!is_same_guarantee(before, after))
+        if (!is_same_guarantee(before, after) || before->scheduler >= 0 || after->scheduler >= 0)
             flow->first_release_ns = max_of(flow->first_release_ns, latest_ns);
     } else if (after->mansd >= 0) {
         int64_t delivered = flow->packets - 1 - flow->consecutive_losses;

@@ -191,9 +191,10 @@ def _transmissions(record: RunRecord) -> _Transmissions:
 def _delays_s(record: RunRecord) -> Vector:
     """The times of the effectively delivered updates in the network."""
     packets = record.columns(
-        NETEM_PACKET, "now_ns", "release_ns", "flow", "fate",
+        NETEM_PACKET, "sequence", "now_ns", "release_ns", "flow", "fate",
         where=lambda rows: (rows["flow"] == UPDATES) & effective(rows["fate"]),
     )  # fmt: skip
+    packets = record.with_departures(packets)
     return np.asarray((packets["release_ns"] - packets["now_ns"]) / NS_PER_S)
 
 

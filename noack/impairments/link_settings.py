@@ -15,7 +15,9 @@ from noack.core.core_library import core
 from noack.impairments.constraints import AnyConstraint, find_longest_burst, require_consistent
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
 from noack.settings.section import ScenarioSection
 
 NEVER_NS: int = core.NOACK_NEVER_NS
@@ -60,6 +62,7 @@ class LinkSettings(ScenarioSection):
     def _check(self) -> Self:
         require_consistent(self.mansd, self.constraints)
         require_scores(self.impairments)
+        require_order(self.impairments)
         return self
 
 
@@ -76,6 +79,26 @@ def require_scores(impairments: Iterable[AnyImpairment], loss: LossModel | None 
             raise ValueError(
                 f"impairments.{number}.loss_correlation: needs a loss before it, "
                 "by model bernoulli or gilbert_elliott"
+            )
+
+
+def require_order(impairments: Sequence[AnyImpairment]) -> None:
+    """Check that a queue which chooses when the link is free keeps the order within each flow.
+
+    Raises:
+        ValueError: another impairment could change it; the message begins with the key.
+    """
+    places = [k for k, one in enumerate(impairments) if isinstance(one, Rate) and one.scheduler]
+    for number, other in enumerate(impairments):
+        if not places or number == places[0]:
+            continue
+        varies = other.reorders(True, False)[1] or other.copies or not other.is_bounded
+        varies = varies or (other.delays and not isinstance(other, Delay))
+        if varies or (number > places[0] and not other.delays and not other.flips_bits):
+            raise ValueError(
+                f"impairments.{number}: {other.kind} cannot stand "
+                f"{'before' if number < places[0] else 'after'} a rate that chooses what it sends; "
+                "only losses can before it, and constant delays and corruption anywhere"
             )
 
 

@@ -26,12 +26,15 @@ Without constraints, and if T <= c M d, there is another bound. A datagram that 
 must pass. Of these, since the last datagram that found a place, the n-th leaves within W(Q + n) of
 that one, and (n - 1) M d - J lie between. So D is at most the largest W(Q + n) - (n - 1) M d + J.
 
+A rate that chooses what it sends has a bound for each loop: noack/scenario/response_times.py.
+
 The delay in the network is at most the sum L of the bounds of its impairments. A datagram that is
 held back for the guarantee leaves with an earlier one of its loop, which leaves within L of its own
 transmission: so L bounds this delay, too. A live run adds the lateness of its processes.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -39,12 +42,14 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.disciplines.tail_drop import TailDrop
+from noack.impairments.feature import Scheduler
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.scenario.resolution import policy_of, resolve
+from noack.scenario.response_times import Sender, response_ns
 from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
 from noack.scenario.scenario_checks import with_settings
 from noack.scenario.sections import DirectionSection
@@ -158,8 +163,8 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
         return found
     delays, _ = _largest_delays(stages)
     for place, one in enumerate(stages[0].direction.impairments):
+        key = f"{path}.impairments.{place}"
         if isinstance(one, Schedule):
-            key = f"{path}.impairments.{place}"
             found += _slot_loads(one, stages, (key, flow), delays[place])
         if not isinstance(one, Rate | Opportunities):
             continue
@@ -173,14 +178,23 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
                 sum(b / loop.largest_s for b, loop in zip(bits, loops, strict=True)),
             )
             at_most_bps, at_least_bps = (_share(window) * bps for bps in needed_bps)
-            key = f"{path}.impairments.{place}"
             load = LinkLoad(
                 begin, key, flow, window, one.rate_bps, at_most_bps, at_least_bps, delay_s
             )
             if before is None or load._replace(begin=before.begin) != before:
-                found.append(load)
+                found += _loop_loads(load, delays[place])
             before = load
     return found
+
+
+def _loop_loads(load: LinkLoad, delays_s: Sequence[float]) -> Iterator[LinkLoad]:
+    """Yield the load; if each loop has a bound, for the first loop with each bound."""
+    if len(delays_s) == 1:
+        yield load
+        return
+    firsts = {delay_s: loop for loop, delay_s in reversed([*enumerate(delays_s)])}
+    for delay_s, loop in sorted(firsts.items(), key=lambda item: item[1]):
+        yield load._replace(begin=f"{load.begin}loop {loop + 1}, ", delay_bound_s=_known([delay_s]))
 
 
 def _known(delays_s: Sequence[float]) -> float | None:
@@ -233,7 +247,8 @@ def _share(window: LossWindow) -> float:
 def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], float]:
     """Return the bounds of the delay in each impairment, and the bound in all of them, in seconds.
 
-    A schedule has a bound for each loop, another impairment one for all; infinite: there is none.
+    A schedule, and a rate that chooses what it sends, have a bound for each loop; another
+    impairment has one for all; infinite: there is none.
     """
     least_s = largest_s = 0.0
     found, copied = list[list[float]](), False
@@ -241,6 +256,9 @@ def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], float]
         spread_s = largest_s - least_s
         if isinstance(one, Schedule):
             found.append(_slot_delays_s(one, stages, spread_s, copied=copied))
+            largest_s += max(found[-1])
+        elif isinstance(one, Rate) and one.scheduler is not None:
+            found.append(_chosen_delays_s(one, one.scheduler, stages))
             largest_s += max(found[-1])
         elif isinstance(one, Rate):
             found.append([_queue_delay_s(one, stages, spread_s, copied=copied)])
@@ -279,6 +297,36 @@ def _slot_delays_s(
             bounds.append(max(t_ns - n * least_ns / share for n, t_ns in enumerate(waits_ns)))
         found.append(min(bounds) / NS_PER_S + spread_s)
     return found
+
+
+def _chosen_delays_s(one: Rate, chooses: Scheduler, stages: Sequence[_Stage]) -> list[float]:
+    """Return the bounds for each loop of a rate that chooses what it sends.
+
+    A change of the direction's settings makes the order of what waits final, so there is no bound.
+    """
+    sections = range(len(stages[0].loops))
+    loops = [entry for entry in sections for _ in range(stages[0].loops[entry].loops)]
+    if any(stage.direction.link != stages[0].direction.link for stage in stages):
+        return [math.inf] * len(loops)
+    least_ns = [
+        round(min(stage.loops[entry].least_s for stage in stages) * NS_PER_S) for entry in sections
+    ]
+    sent_ns = [
+        max(-(-int(one.line_bits(demand.payload_bytes)) * NS_PER_S // one.rate_bps), 1)
+        for demand in stages[0].loops
+    ]
+    found: dict[tuple[int, int], float] = {}
+    for loop, entry in enumerate(loops):
+        kind = entry, chooses.number(loop)
+        if kind not in found:
+            own = Sender(least_ns[entry], sent_ns[entry])
+            others = Counter(
+                Sender(least_ns[other], sent_ns[other], chooses.yields_ns(loop, number))
+                for number, other in enumerate(loops)
+                if number != loop
+            )
+            found[kind] = response_ns(own, others) / NS_PER_S
+    return [found[entry, chooses.number(loop)] for loop, entry in enumerate(loops)]
 
 
 def _queue_delay_s(one: Rate, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> float:

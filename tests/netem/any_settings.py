@@ -12,7 +12,7 @@ from noack.impairments.feature import Feature, Impairment
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.kinds.delay import SHAPES
 from noack.impairments.kinds.reorder import Reorder
-from noack.impairments.link_settings import LinkSettings, require_scores
+from noack.impairments.link_settings import LinkSettings, require_order, require_scores
 from tests.netem.feature_examples import EXAMPLES, IMPAIRED, keeps_loss, names_file
 
 _TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).filter(
@@ -65,9 +65,10 @@ def varied(draw: st.DrawFn, feature: type[Feature]) -> Any:
 
 
 def _goes_together(chain: list[Impairment]) -> bool:
-    """Whether each delay with a loss correlation comes after a loss."""
+    """Whether each delay with a loss correlation comes after a loss, and so on."""
     try:
         require_scores(chain)
+        require_order(chain)
     except ValueError:
         return False
     return True
