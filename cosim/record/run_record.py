@@ -46,7 +46,6 @@ from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
 from noack.core.process_limits import cores
-from noack.impairments.kinds.rate import Rate
 from noack.protocol.machine_interface import RESTART
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
@@ -157,9 +156,8 @@ class RunRecord:
         In a queue that chooses what it sends, this is not known at their arrival. A packet that has
         not left gets the time of the last departure, if that is later. Copies keep their times.
         """
-        flows = self.scenario.network.flows
-        links = [self.scenario.network.link_of(flow).impairments for flow in flows]
-        if not any(isinstance(one, Rate) and one.scheduler for link in links for one in link):
+        network = self.scenario.network
+        if not any(network.link_of(flow).chooses for flow in network.flows):
             return packets
         left = self.columns(
             NETEM_RELEASE, "sequence", "flow", "copy", "t_ns",

@@ -54,6 +54,11 @@ class LinkSettings(ScenarioSection):
         return all(impairment.is_bounded for impairment in self.impairments)
 
     @property
+    def chooses(self) -> bool:
+        """Whether the queue of a rate chooses what it sends when the link is free."""
+        return any(isinstance(one, Rate) and one.scheduler for one in self.impairments)
+
+    @property
     def longest_burst(self) -> int | None:
         """Maximum number of consecutive losses that the guarantee allows; None: no maximum."""
         return find_longest_burst(self.mansd, self.constraints)

@@ -14,6 +14,7 @@ import numpy as np
 
 from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, link_name
 from netem.link_state import LinkState
+from noack.core.core_library import core
 from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
 from noack.impairments.disciplines.priority import Priority
 from noack.impairments.kinds.rate import Rate
@@ -214,6 +215,7 @@ class Link:
             self._waiting.append(
                 _Waiting(key, leaving.number, decision.arrival_ns, decision.after_ns, leaving)
             )
+            self._state.core.queues[self._state.core.scheduler].waits = len(self._waiting)
             return ()
         # Overdue datagrams leave first, even if ``on_timer`` has not been called for them yet.
         overdue = bool(self._in_flight) and self._in_flight[0].release_ns <= release_ns
@@ -233,8 +235,12 @@ class Link:
             begin = (
                 self._free if int(self._free) >= first.arrival_ns else Fraction(first.arrival_ns)
             )
-            bits = int(rate.line_bits(len(first.leaving.datagram.data)))
+            size_bytes = len(first.leaving.datagram.data)
+            bits = int(rate.line_bits(size_bytes))
             self._free = begin + Fraction(bits * 10**9, rate.rate_bps)
+            link = self._state.core  # it knows how many wait, and until when the link is busy
+            link.queues[link.scheduler].waits = len(self._waiting)
+            assert core.noack_queue_serve(link, link.scheduler, size_bytes) == int(self._free)
             leaves_ns = max(int(self._free) + first.after_ns, first.leaving.release_ns)
             heapq.heappush(self._in_flight, first.leaving._replace(release_ns=leaves_ns))
 
