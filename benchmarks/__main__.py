@@ -28,9 +28,7 @@ from benchmarks.report import BENCHMARKS, Benchmark, Load, MeasurementError, Row
 
 GOALS = "goals"
 BEGIN, END = "<!-- goals: written by `python -m benchmarks goals --docs` -->", "<!-- goals: end -->"
-_HEAD = (
-    "| figure | value | alternative in the same run | ratio | goal | holds |\n" + "|---" * 6 + "|"
-)
+_HEAD = "| figure | value | alternative in the same run | ratio | goal | holds |\n" + "|---" * 6 + "|"
 
 
 class Figure(NamedTuple):
@@ -118,9 +116,7 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
     return 1 if failures else 0
 
 
-def _measured(
-    benchmark: Benchmark, options: argparse.Namespace, console: Console
-) -> tuple[list[Row], bool]:
+def _measured(benchmark: Benchmark, options: argparse.Namespace, console: Console) -> tuple[list[Row], bool]:
     """Run a benchmark and print its table; return its rows, and whether it failed."""
     print(f"{benchmark.name}:", file=sys.stderr)
     load, begun_s, failed = Load(), time.monotonic(), False

@@ -29,12 +29,7 @@ from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
 from noack.protocol.machine_interface import GENERATION
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    CONTROLLER_STEP,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-)
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario_file import load
@@ -131,9 +126,7 @@ _RESTARTS = ("horizon_s=9", "recovery.rejoin_within_s=30")
 IMPORT = "Python that imports as much"
 
 
-def faulted(
-    role: str, fault: Callable[[psutil.Process], object]
-) -> tuple[FaultedRun[float], float]:
+def faulted(role: str, fault: Callable[[psutil.Process], object]) -> tuple[FaultedRun[float], float]:
     """Run with a fault of a process; return the run, and the fault's end in time of the run.
 
     Raises:
@@ -191,11 +184,13 @@ def killed_rows(role: str) -> Iterator[Row]:
         rounds.add(IMPORT, dict.fromkeys(("acted_s", "updated_s"), imported_s(MODULES[role])))
     row = partial(rounds.row, ours=role)
     yield row(f"{role} killed: until another acts in its place", "s", "acted_s", peer=IMPORT)
+    yield row(f"{role} killed: until the controller has an update again", "s", "updated_s", peer=IMPORT)
     yield row(
-        f"{role} killed: until the controller has an update again", "s", "updated_s", peer=IMPORT
+        f"{role} killed: age of its last recorded row",
+        "ms",
+        "unwritten_ms",
+        note="rows are handed over every 50 ms",
     )
-    yield row(f"{role} killed: age of its last recorded row", "ms", "unwritten_ms",
-              note="rows are handed over every 50 ms")  # fmt: skip
 
 
 @benchmark("recovery", "A run whose processes die or stop")
@@ -212,9 +207,13 @@ def recovery(options: argparse.Namespace) -> Iterator[Row]:
     steps = run.record[PLANT_STEP]["sequence"]
     if run.back_s is None or len(steps) != steps[-1] + 1:
         raise MeasurementError("recorder: it was not restarted, or rows are missing")
-    yield Row("recorder killed: until another records", run.back_s - at_s, "s",
-              Peer(IMPORT, imported_s(MODULES["recorder"])),
-              note="nothing is missing from the record")  # fmt: skip
+    yield Row(
+        "recorder killed: until another records",
+        run.back_s - at_s,
+        "s",
+        Peer(IMPORT, imported_s(MODULES["recorder"])),
+        note="nothing is missing from the record",
+    )
     for role in ("plant", "sensor", "netem", "controller", "recorder"):
         runs = [faulted(role, stop) for _ in range(ROUNDS)]
         late_ms = median(1e3 * run_recovery_s(run.record, end_s) for run, end_s in runs)
@@ -245,10 +244,13 @@ CASES = (
     Case("limit, all, no real-time", LOOP_ROLES, 0, asked=False),
 )
 _FIGURES = {
-    "the flood": "datagrams/s", "measurements missed": "", "the loop's datagrams lost": "",
-    "lateness before, p99": "µs", "lateness during, p99": "µs",
+    "the flood": "datagrams/s",
+    "measurements missed": "",
+    "the loop's datagrams lost": "",
+    "lateness before, p99": "µs",
+    "lateness during, p99": "µs",
     "last late step after the end": "ms",
-}  # fmt: skip
+}
 """The figures of a flood with their units."""
 
 
@@ -269,9 +271,13 @@ def figures_of(run: FaultedRun[Flood]) -> Figures:
     sent = record[PLANT_STEP]["sequence"] // record.scenario.plant.measure_every
     missed = np.setdiff1d(sent, record[SENSOR_MEASUREMENT]["sequence"]).size
     values = (
-        flood.rate_hz, missed, run.summary["unintended_losses"], float(max(before)),
-        float(max(during)), 1e3 * run_recovery_s(record, end_s),
-    )  # fmt: skip
+        flood.rate_hz,
+        missed,
+        run.summary["unintended_losses"],
+        float(max(before)),
+        float(max(during)),
+        1e3 * run_recovery_s(record, end_s),
+    )
     return dict(zip(_FIGURES, values, strict=True))
 
 

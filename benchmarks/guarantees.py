@@ -36,8 +36,12 @@ COMBINATIONS: Mapping[str, Limits] = {
     "mansd 4 recover 3": Limits(((4, 5),), 3),
     "mansd 2 atmost 3 in 10 recover 2": Limits(((2, 3), (3, 10)), 2),
 }
-EXPECTED = ("loss 50% mansd 4", "loss 30% keep mansd 2", "loss 20% keep atmost 3 in 10 recover 2",
-            "loss 20% 50% keep mansd 3 atmost 3 in 10 corrupt 5%")  # fmt: skip
+EXPECTED = (
+    "loss 50% mansd 4",
+    "loss 30% keep mansd 2",
+    "loss 20% keep atmost 3 in 10 recover 2",
+    "loss 20% 50% keep mansd 3 atmost 3 in 10 corrupt 5%",
+)
 COST_ROUNDS = 30
 _COSTED = 200_000
 CAP = 3
@@ -136,12 +140,15 @@ def guarantee(options: argparse.Namespace) -> Iterator[Row]:
         for words in COMBINATIONS:
             cap = f"mansd {settings_of(words).longest_burst}"
             if words != cap:
-                ours, plain = (
-                    Decider(f"{before} {one} limit 1000000").cost() for one in (words, cap)
+                ours, plain = (Decider(f"{before} {one} limit 1000000").cost() for one in (words, cap))
+                yield compared(
+                    f"{before} {words}: decision",
+                    "ns",
+                    ours,
+                    (f"{before} {cap}", plain),
+                    Goal("<=", 1.3),
+                    rounds=COST_ROUNDS,
                 )
-                yield compared(f"{before} {words}: decision", "ns", ours,
-                               (f"{before} {cap}", plain), Goal("<=", 1.3),
-                               rounds=COST_ROUNDS)  # fmt: skip
     yield from network_rows()
     for words, limits in COMBINATIONS.items():
         for before in ("loss 50%", f"loss 30% {REORDERING}"):
@@ -178,17 +185,21 @@ def triggers(paper: Mapping[str, Any], weight: Matrix) -> dict[str, dict[str, An
         {"policy": "quadratic", "Q": Q.tolist(), "epsilon": delta**2, "period_s": _PERIOD_S} | W,
         {"policy": "send_on_area", "delta_s": delta * _PERIOD_S} | W,
         {"policy": "periodic", "period_s": _PERIOD_S} | W,
-        {"policy": "self_triggered", "growth_per_s": 1.0, "mismatch_per_s": 1.0,
-         "shortest_s": _PERIOD_S, "longest_s": _DEADLINE_S} | paper | W,
+        {
+            "policy": "self_triggered",
+            "growth_per_s": 1.0,
+            "mismatch_per_s": 1.0,
+            "shortest_s": _PERIOD_S,
+            "longest_s": _DEADLINE_S,
+        }
+        | paper
+        | W,
         deadline | {"rule": absolute},
         {"policy": "dwell", "interval_s": _PERIOD_S, "rule": absolute},
         deadline | {"rule": {"policy": "lyapunov", "rate_per_s": 0.2} | W},
         deadline | {"rule": dynamic | W},
-    ]  # fmt: skip
-    return {
-        one["policy"] + (f"({one['rule']['policy']})" if "rule" in one else ""): one
-        for one in found
-    }
+    ]
+    return {one["policy"] + (f"({one['rule']['policy']})" if "rule" in one else ""): one for one in found}
 
 
 def loop_named(name: str, horizon_s: float, norm: str) -> Scenario:
@@ -230,13 +241,15 @@ def row_of(name: str, worst: Worst) -> Row:
 
 
 @benchmark(
-    "tightness", "The adversary against the certificates",
-    {"--loop": {"action": "append", "choices": LOOPS, "help": "tightness: only this loop"},
-     "--policy": {"action": "append", "help": "tightness: only this policy"},
-     "--search-s": {"type": float, "default": 5.0, "help": "tightness: horizon in s"},
-     "--norm": {"choices": ("chosen", "identity"), "default": "chosen",
-                "help": "tightness: the norm"}},
-)  # fmt: skip
+    "tightness",
+    "The adversary against the certificates",
+    {
+        "--loop": {"action": "append", "choices": LOOPS, "help": "tightness: only this loop"},
+        "--policy": {"action": "append", "help": "tightness: only this policy"},
+        "--search-s": {"type": float, "default": 5.0, "help": "tightness: horizon in s"},
+        "--norm": {"choices": ("chosen", "identity"), "default": "chosen", "help": "tightness: the norm"},
+    },
+)
 def tightness(options: argparse.Namespace) -> Iterator[Row]:
     """Search the largest share of each certificate's bounds that the worst losses use, by policy.
 

@@ -197,12 +197,14 @@ def run_client(options: Exchange) -> None:
                     if found is not None:
                         errors_ns.append(found.error_ns)
     figures = {
-        "checks": checks, "outside": outside, "restarts": restarts, "turns": turns,
-        "exchanges": offset.exchanges, "cpu_us": cpu_ns / 1e3 / max(turns, 1),
-    }  # fmt: skip
-    print(
-        json.dumps(figures | _quantiles("error", errors_ns) | _quantiles("estimate", estimates_ns))
-    )
+        "checks": checks,
+        "outside": outside,
+        "restarts": restarts,
+        "turns": turns,
+        "exchanges": offset.exchanges,
+        "cpu_us": cpu_ns / 1e3 / max(turns, 1),
+    }
+    print(json.dumps(figures | _quantiles("error", errors_ns) | _quantiles("estimate", estimates_ns)))
 
 
 def _quantiles(name: str, values_ns: Sequence[int]) -> dict[str, float]:
@@ -250,18 +252,32 @@ CLOCKS = [(ahead_s, drift_ppb) for ahead_s in (1, -1) for drift_ppb in (100_000,
 
 
 def measured(
-    hosts: TwoHosts, ahead_s: int, drift_ppb: int, case: Case, *, bare: bool = False,
-    seconds: float = SECONDS, realtime: bool = True, ip: int = 4,
-) -> Figures:  # fmt: skip
+    hosts: TwoHosts,
+    ahead_s: int,
+    drift_ppb: int,
+    case: Case,
+    *,
+    bare: bool = False,
+    seconds: float = SECONDS,
+    realtime: bool = True,
+    ip: int = 4,
+) -> Figures:
     """Run a reference and a client on two hosts; return the client's figures.
 
     Raises:
         MeasurementError: one of them failed.
     """
-    own = Exchange(
-        hosts.addresses[0][ip == 6], bare, realtime, ahead_ns=-ahead_s * 10**9,
-        drift_ppb=drift_ppb, seconds=seconds,
-    )._asdict() | case.settings  # fmt: skip
+    own = (
+        Exchange(
+            hosts.addresses[0][ip == 6],
+            bare,
+            realtime,
+            ahead_ns=-ahead_s * 10**9,
+            drift_ppb=drift_ppb,
+            seconds=seconds,
+        )._asdict()
+        | case.settings
+    )
 
     def command(end: str, port: int = 0) -> list[str]:
         program = (sys.executable, "-m", "benchmarks.hosts", end, json.dumps(own | {"port": port}))
@@ -275,9 +291,7 @@ def measured(
         port = reference.stdout.readline().strip()
         if not port:
             raise MeasurementError("the reference did not start")
-        client = subprocess.run(
-            command("client", int(port)), capture_output=True, text=True, check=False
-        )
+        client = subprocess.run(command("client", int(port)), capture_output=True, text=True, check=False)
         reference.communicate()
     if client.returncode:
         raise MeasurementError(f"the client failed: {client.stderr.strip().splitlines()[-1:]}")
@@ -302,9 +316,7 @@ def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
             say(case.name)
             found.add(OURS, measured(hosts, *CLOCKS[0], case))
     cases = [(MAIN, rounds), *others]
-    checks, outside = (
-        sum(sum(one.of(OURS, name)) for _, one in cases) for name in ("checks", "outside")
-    )
+    checks, outside = (sum(sum(one.of(OURS, name)) for _, one in cases) for name in ("checks", "outside"))
     yield Row("checks of the bound against the true offset", checks, "", goal=Goal(">=", 1e5))
     yield Row("true offset outside the bound", outside, "", goal=Goal("==", 0))
     for case, found in cases:
@@ -324,9 +336,15 @@ ROUNDS = 3
 ACROSS, ON_LOOPBACK = "noack across a veth link", "noack on loopback"
 _PATIENCE_S = 120.0
 _SETTINGS = (
-    *FREE_PORTS, "--set", "horizon_s=10", "--set", "trigger.beta=1e-9",
-    "--set", 'network.loss={model="lossless"}', "--no-report",
-)  # fmt: skip
+    *FREE_PORTS,
+    "--set",
+    "horizon_s=10",
+    "--set",
+    "trigger.beta=1e-9",
+    "--set",
+    'network.loss={model="lossless"}',
+    "--no-report",
+)
 
 
 def run_by_hand(hosts: TwoHosts | None) -> dict[str, Any]:

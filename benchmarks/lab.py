@@ -128,8 +128,15 @@ def _strokes_ms(page: Page, prepared: str, x: float, y: float, width: float) -> 
     page.js(prepared)
 
     def mouse(kind: str, share: float) -> None:
-        page.call("Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y, button="left",
-                  buttons=1, clickCount=1)  # fmt: skip
+        page.call(
+            "Input.dispatchMouseEvent",
+            type=kind,
+            x=x + share * width,
+            y=y,
+            button="left",
+            buttons=1,
+            clickCount=1,
+        )
 
     mouse("mousePressed", 0.5)
     time.sleep(1)  # the curve of this place is drawn
@@ -187,8 +194,7 @@ def stroke(options: argparse.Namespace) -> Iterator[Row]:
             place = page.js(_BOX)
             median_ms = median(_strokes_ms(page, _NOTE_STROKES, *place))
             alone_ms = median(_strokes_ms(page, _DRAW_ALONE, *place))
-        yield Row(f"moved slider to painted curve, {name}", median_ms, "ms",
-                  goal=Goal("<=", goal_ms))  # fmt: skip
+        yield Row(f"moved slider to painted curve, {name}", median_ms, "ms", goal=Goal("<=", goal_ms))
         yield Row(f"moved mouse to a curve of the browser alone, {name}", alone_ms, "ms")
 
 

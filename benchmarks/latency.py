@@ -142,9 +142,7 @@ def quantile_of(histogram: Mapping[int, int], share: float) -> float:
     return bins[int(np.searchsorted(seen, share * seen[-1]))] + 0.5
 
 
-def cyclictest(
-    seconds: int = ROUND_S, priority: int = PRIORITY, core: int | None = None
-) -> Figures | str:
+def cyclictest(seconds: int = ROUND_S, priority: int = PRIORITY, core: int | None = None) -> Figures | str:
     """Return the lateness in a round of cyclictest, p50, p99 and max in µs; or why there is none.
 
     Args:
@@ -217,10 +215,11 @@ def lateness_rows(rounds: Mapping[bool, Rounds]) -> list[Row]:
     return [
         asked.row(name.format("p50"), "µs", "p50", LOOP, KERNEL),
         asked.row(name.format("p99"), "µs", "p99", LOOP, KERNEL, Goal("<=", 1.5)),
-        Row(name.format("max"), max(ours), "µs", Peer(KERNEL, max(kernel, default=None)),
-            note=note),
+        Row(name.format("max"), max(ours), "µs", Peer(KERNEL, max(kernel, default=None)), note=note),
         *(
             rounds[asked].row(f"tick lateness p99, {settings}", "µs", "p99", LOOP, kind)
-            for asked, settings in _ASKED.items() for kind in LOOPS if kind != LOOP
+            for asked, settings in _ASKED.items()
+            for kind in LOOPS
+            if kind != LOOP
         ),
-    ]  # fmt: skip
+    ]

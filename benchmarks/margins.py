@@ -79,9 +79,7 @@ def random_loop(seed: int) -> RandomLoop:
     burst = int(rng.integers(1, 8))
     rules: list[LossRule] = [LongestBurst(burst)]
     if which % 2:
-        rules.append(
-            LossesInWindow(int(rng.integers(1, burst + 2)), burst + int(rng.integers(2, 6)))
-        )
+        rules.append(LossesInWindow(int(rng.integers(1, burst + 2)), burst + int(rng.integers(2, 6))))
     if which >= 2:
         rules.append(DeliveriesBetweenBursts(int(rng.integers(2, 4))))
     guarantee = LossGuarantee(tuple(rules))

@@ -98,9 +98,13 @@ def execute(command: Sequence[str]) -> Finished:
     with tempfile.TemporaryFile("w+") as stdout:
         begun_s = time.monotonic()
         with subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=subprocess.PIPE,
-            text=True, env=os.environ | PLAIN_TERMINAL,
-        ) as process:  # fmt: skip
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=stdout,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | PLAIN_TERMINAL,
+        ) as process:
             assert process.stderr is not None
             lines = [Line(time.monotonic(), text.rstrip()) for text in process.stderr]
         stdout.seek(0)
@@ -173,8 +177,13 @@ class Sample(NamedTuple):
             memory, cpu = process.memory_full_info(), process.cpu_times()
             kib = (memory.rss, getattr(memory, "pss", memory.uss), memory.uss)
             sockets = len(process.net_connections("all"))
-            return cls(*(one / 1024 for one in kib), process.num_fds(), sockets,
-                       process.num_threads(), cpu.user + cpu.system)  # fmt: skip
+            return cls(
+                *(one / 1024 for one in kib),
+                process.num_fds(),
+                sockets,
+                process.num_threads(),
+                cpu.user + cpu.system,
+            )
 
 
 class Processes:
@@ -193,6 +202,15 @@ class Processes:
             with contextlib.suppress(psutil.Error):
                 found[role] = Sample.of(process)
         return found
+
+    def are_alive(self, roles: Sequence[str]) -> bool:
+        """Whether a process of these roles, once seen by :meth:`sample`, has not ended."""
+        ended = (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+        for role in roles:
+            with contextlib.suppress(KeyError, psutil.Error):
+                if self._known[role].status() not in ended:
+                    return True
+        return False
 
     def left_behind(self, patience_s: float) -> list[str]:
         """Return the roles of processes that are alive although the run is over."""
@@ -297,8 +315,7 @@ def two_hosts() -> Iterator[TwoHosts]:
         for name in names:
             _run(["ip", "netns", "add", name])
             _run(["ip", "-n", name, "link", "set", "lo", "up"])
-        _run(["ip", "-n", names[0], "link", "add", "line", "type", "veth", "peer", "line",
-              "netns", names[1]])  # fmt: skip
+        _run(["ip", "-n", names[0], "link", "add", "line", "type", "veth", "peer", "line", "netns", names[1]])
         for name, (four, six) in zip(names, hosts.addresses, strict=True):
             _run(["ip", "-n", name, "address", "add", f"{four}/24", "dev", "line"])
             _run(["ip", "-n", name, "address", "add", f"{six}/64", "dev", "line", "nodad"])

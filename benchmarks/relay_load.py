@@ -141,9 +141,7 @@ class Ends:
         self.out.close()
         self.sink.close()
 
-    def burst(
-        self, relay: int, count: int, slack: int = 0, addresses: Addresses | None = None
-    ) -> Burst:
+    def burst(self, relay: int, count: int, slack: int = 0, addresses: Addresses | None = None) -> Burst:
         """Stop the relay, fill its receive buffer, continue it, and wait until the buffer is empty.
 
         Args:
@@ -170,8 +168,7 @@ class Ends:
     def ping(self, count: int) -> Nanoseconds:
         """Return the one-way delays of datagrams sent one by one, ns; -1 for a missing one."""
         delays_ns = np.empty(count, np.int64)
-        self._call("ping", self.sink.fileno(), self._first(count), count, DATAGRAM_BYTES,
-                   _numbers(delays_ns))  # fmt: skip
+        self._call("ping", self.sink.fileno(), self._first(count), count, DATAGRAM_BYTES, _numbers(delays_ns))
         return delays_ns
 
     def pace(self, count: int, period_ns: int) -> Nanoseconds:
@@ -179,9 +176,7 @@ class Ends:
         departures_ns, arrivals_ns = np.empty(count, np.int64), np.full(count, -1, np.int64)
         first = self._first(count)
         self._call("pace", first, count, DATAGRAM_BYTES, period_ns, _numbers(departures_ns))
-        self._load.load_collect(
-            self.sink.fileno(), first, count, _PATIENCE_NS, _numbers(arrivals_ns)
-        )
+        self._load.load_collect(self.sink.fileno(), first, count, _PATIENCE_NS, _numbers(arrivals_ns))
         return np.where(arrivals_ns < 0, -1, arrivals_ns - departures_ns)
 
     def soak(self, state: Any, groups: int, group: int, period_ns: int) -> None:
@@ -236,9 +231,7 @@ def socat() -> Kind | str:
     )
 
 
-def our_relay(
-    name: str, words: str, *flags: str, reverse: bool = False, lossy: bool = True
-) -> Kind:
+def our_relay(name: str, words: str, *flags: str, reverse: bool = False, lossy: bool = True) -> Kind:
     """Return ``python -m netem`` with impairments in tc's words, maybe with a reverse direction."""
     one_way = [] if reverse else ["--one-way"]
 

@@ -42,17 +42,7 @@ from benchmarks.relay_load import (
     socat,
     sources,
 )
-from benchmarks.report import (
-    Figures,
-    Goal,
-    MeasurementError,
-    Peer,
-    Rounds,
-    Row,
-    benchmark,
-    median,
-    say,
-)
+from benchmarks.report import Figures, Goal, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from netem.relay_links import LinkSpec
 from netem.shell.devices import open_devices
 from noack.impairments.link_settings import LinkSettings
@@ -118,8 +108,12 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
     and returns them. (To wait for a socket by epoll costs when sending, too.)
     """
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
-        kinds = [c_relay(tools), c_relay(tools, "paths"), our_relay(PLAIN, WORDS),
-                 our_relay(REVERSE, WORDS, reverse=True)]  # fmt: skip
+        kinds = [
+            c_relay(tools),
+            c_relay(tools, "paths"),
+            our_relay(PLAIN, WORDS),
+            our_relay(REVERSE, WORDS, reverse=True),
+        ]
         with Sides([(kind.name, kind) for kind in kinds], tools) as sides:
             one, many = sources(1), sources(FLOWS)
 
@@ -273,10 +267,17 @@ def _seconds(text: str) -> int:
 
 
 @benchmark(
-    "relay_soak", "Our relay under a steady load",
-    {"--soak-s": {"type": _seconds, "default": 20, "metavar": "S",
-                  "help": "length of relay_soak (%(default)s)"}},
-)  # fmt: skip
+    "relay_soak",
+    "Our relay under a steady load",
+    {
+        "--soak-s": {
+            "type": _seconds,
+            "default": 20,
+            "metavar": "S",
+            "help": "length of relay_soak (%(default)s)",
+        }
+    },
+)
 def steady_load(options: argparse.Namespace) -> Iterator[Row]:
     """Load our relay with half its maximum rate: no unintended loss, constant memory.
 
@@ -369,9 +370,7 @@ def _bare(command: str, forwarder: Path) -> str:
 def _in_shell(name: str, command: str) -> str:
     script = f"TO=${{NOACK_OUTSIDE:-$MAHIMAHI_BASE}}; {command}"
     words = [*_SHELLS[name], "sh", "-c", script]
-    return subprocess.run(
-        words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ).stdout
+    return subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True).stdout
 
 
 def _shell_figures(run: _Run) -> dict[str, float] | str:
@@ -402,9 +401,7 @@ def shell(_options: argparse.Namespace) -> Iterator[Row]:
                 if shutil.which(words[0]) is None:
                     rounds.add(name, f"there is no {words[0]}")
                 else:
-                    rounds.add(
-                        name, _shell_figures(lambda command, one=name: _in_shell(one, command))
-                    )
+                    rounds.add(name, _shell_figures(lambda command, one=name: _in_shell(one, command)))
     for peer in (_BARE_FORWARDER, _LOSS, _DELAY):
         goal = Goal(">=", 0.9) if peer == _BARE_FORWARDER else None
         yield rounds.row("TCP", "Mbit/s", "mbit", _SHELL, peer, goal, paired=True)

@@ -87,19 +87,26 @@ class Row:
         """The row of a table: figure, value, alternative, its value, ratio, goal, verdict."""
         goal = "" if self.goal is None else str(self.goal)
         return (
-            self.name, with_unit(self.value, self.unit), self.peer.name if self.peer else "",
+            self.name,
+            with_unit(self.value, self.unit),
+            self.peer.name if self.peer else "",
             with_unit(self.peer.value, self.unit) if self.peer else "",
-            "" if self.ratio is None else number_text(self.ratio), goal,
+            "" if self.ratio is None else number_text(self.ratio),
+            goal,
             {True: "yes", False: "no", None: "?" if goal else ""}[self.holds],
-        )  # fmt: skip
+        )
 
     def as_json(self) -> dict[str, object]:
         """Return the row as ``--json`` writes it."""
         row = {
-            "name": self.name, "value": self.value, "unit": self.unit,
-            "peer": self.peer and self.peer._asdict(), "ratio": self.ratio,
-            "goal": self.goal and str(self.goal), "holds": self.holds,
-        }  # fmt: skip
+            "name": self.name,
+            "value": self.value,
+            "unit": self.unit,
+            "peer": self.peer and self.peer._asdict(),
+            "ratio": self.ratio,
+            "goal": self.goal and str(self.goal),
+            "holds": self.holds,
+        }
         return row | ({"note": self.notes} if self.notes else {})
 
 
@@ -206,10 +213,15 @@ class Rounds:
         if paired and not reasons:
             ratios = [one / other for one, other in zip(value, alternative, strict=True)]
         return Row(
-            name, median(value) if value else None, unit,
+            name,
+            median(value) if value else None,
+            unit,
             None if peer is None else Peer(peer, median(alternative) if alternative else None),
-            goal, note, "; ".join(reasons) or None, median(ratios) if ratios else None,
-        )  # fmt: skip
+            goal,
+            note,
+            "; ".join(reasons) or None,
+            median(ratios) if ratios else None,
+        )
 
 
 Side = Callable[[], float]
@@ -217,10 +229,16 @@ Side = Callable[[], float]
 
 
 def compared(
-    name: str, unit: str, ours: Side, peer: tuple[str, Side] | Peer | None = None,
-    goal: Goal | None = None, *, note: str | None = None, unjudged: str | None = None,
+    name: str,
+    unit: str,
+    ours: Side,
+    peer: tuple[str, Side] | Peer | None = None,
+    goal: Goal | None = None,
+    *,
+    note: str | None = None,
+    unjudged: str | None = None,
     rounds: int = 5,
-) -> Row:  # fmt: skip
+) -> Row:
     """Measure our side and the alternative in turn; the ratio is the median of the rounds' ratios.
 
     The alternative may also be a known figure.

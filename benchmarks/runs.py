@@ -74,7 +74,11 @@ _KIBI = 1024
 _POLL_S = 2.0
 _SINGLE_S = 60.0
 _FLAT_MIB = 32.0
-_STEP_US, _MEMORY_MIB, _END_SHARE = Goal("<=", 5), Goal("<=", 80), Goal("<=", 0.1)
+_LOOK_S = 0.1
+_MEMORY_MIB, _END_SHARE = Goal("<=", 80), Goal("<=", 0.1)
+_STEP_US = {50.0: Goal("<=", 5)}
+"""By the rate of the loops, Hz. Not of 20 loops at 500 Hz, of which a step is due every 100 µs:
+steps that share a wake-up would be later than :data:`_LATE_MS`."""
 _LATE_MS = {50.0: Goal("<=", 1.0), 500.0: Goal("<=", 0.3)}
 """By the rate of the loops, Hz."""
 _LIBRARIES = "import numpy, zenoh; print(); input()"
@@ -147,15 +151,17 @@ def _follow(
     """Return memory and CPU time of a run's processes from its start, when a path exists."""
     processes = Processes(process.pid)
     memory, cpu_s = defaultdict[str, list[float]](list), defaultdict[str, list[float]](list)
-    ended_s = time.monotonic()
+    ended_s = sampled_s = time.monotonic()
     while process.poll() is None:
-        if started.exists():
+        if time.monotonic() >= sampled_s + _POLL_S and started.exists():
+            sampled_s = time.monotonic()
             for role, one in processes.sample().items():
                 memory[role].append(one.uss_kib / _KIBI)
                 if role in LOOP_ROLES:
                     cpu_s[role].append(one.cpu_s)
-                    ended_s = time.monotonic()
-        time.sleep(_POLL_S)
+        if processes.are_alive(LOOP_ROLES):
+            ended_s = time.monotonic()
+        time.sleep(_LOOK_S)
     used_s = {role: total_s[-1] - total_s[0] for role, total_s in cpu_s.items()}
     return memory, used_s, time.monotonic() - ended_s
 
@@ -181,7 +187,7 @@ def figures(load: Load, found: Measured, single_us: float) -> list[Row]:
         ),
         Row("loops and network not replayed bit for bit", 1 + len(loops) - equal, "",
             goal=_NOTHING),
-        Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US,
+        Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US.get(load.rate_hz),
             note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in found.cpu_s.items())),
         Row("the same", step_us, "µs", Peer("one loop alone", single_us)),
         Row("growth of memory in the second half, worst process", growth, "MiB",
@@ -223,11 +229,14 @@ def libraries_mib(count: int) -> float:
 
 
 @benchmark(
-    "fleet", "Many loops on one network",
-    {"--fleet-s": {"type": float, "default": 60.0, "help": "length of the runs, seconds"},
-     "--fleet-loops": {"type": int, "default": 1000, "help": "loops at 50 Hz"},
-     "--fleet-dir": {"type": Path, "help": "where the runs are kept meanwhile"}},
-)  # fmt: skip
+    "fleet",
+    "Many loops on one network",
+    {
+        "--fleet-s": {"type": float, "default": 60.0, "help": "length of the runs, seconds"},
+        "--fleet-loops": {"type": int, "default": 1000, "help": "loops at 50 Hz"},
+        "--fleet-dir": {"type": Path, "help": "where the runs are kept meanwhile"},
+    },
+)
 def fleet(options: argparse.Namespace) -> Iterator[Row]:
     """Measure many loops through one bottleneck, live, beside one loop at the same rate.
 
@@ -283,9 +292,7 @@ def cpu_s(command: Sequence[str]) -> float:
 def startup_rows(rounds: Rounds) -> Iterator[Row]:
     """Yield the rows of the start of a run."""
     note = "upper bound: includes a progress line's way through the recorder"
-    yield rounds.row(
-        "noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6), note=note
-    )
+    yield rounds.row("noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6), note=note)
     yield rounds.row("the same, against a bare import", "s", "first_s", OURS, IMPORTS)
     yield rounds.row("of it, from launch to time 0, as the run says", "s", "launch_s", OURS)
 
@@ -320,9 +327,12 @@ def startup(options: argparse.Namespace) -> Iterator[Row]:
         rounds.add(IMPORTS, {"first_s": imported_s("numpy, scipy.linalg, pydantic, zenoh")})
     yield from startup_rows(rounds)
     yield compared(
-        "noack certify lane_following, with all limits", "CPU s", lambda: cpu_s(_CERTIFY),
-        ("Python that imports python-control", lambda: cpu_s(_IMPORT_CONTROL)), Goal("<", 1),
-    )  # fmt: skip
+        "noack certify lane_following, with all limits",
+        "CPU s",
+        lambda: cpu_s(_CERTIFY),
+        ("Python that imports python-control", lambda: cpu_s(_IMPORT_CONTROL)),
+        Goal("<", 1),
+    )
     say("20 loops")
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         begun_s = time.monotonic()
@@ -363,11 +373,16 @@ def size(options: argparse.Namespace) -> Iterator[Row]:
     default = set(re.findall(r"^([A-Za-z0-9_.-]+)==", lock, re.M))
     python = lines(*(f"{folder}/*.py" for folder in PROGRAM))
     yield Row("installed without extras", installed_bytes(default) / 1e6, "MB")
-    yield Row("of it, numba and llvmlite", installed_bytes(default & {"numba", "llvmlite"}) / 1e6,
-              "MB", goal=_NOTHING)  # fmt: skip
+    yield Row(
+        "of it, numba and llvmlite",
+        installed_bytes(default & {"numba", "llvmlite"}) / 1e6,
+        "MB",
+        goal=_NOTHING,
+    )
     yield Row("Python outside tests", python, "lines", goal=Goal("<=", 75_000))
-    yield Row("the same, with benchmarks", python + lines("benchmarks/*.py"), "lines",
-              goal=Goal("<=", 64_000))  # fmt: skip
+    yield Row(
+        "the same, with benchmarks", python + lines("benchmarks/*.py"), "lines", goal=Goal("<=", 64_000)
+    )
     yield Row("C", lines("native/*.c", "native/*.h"), "lines", goal=Goal("<=", 5_000))
 
 
@@ -383,14 +398,16 @@ def clone(options: argparse.Namespace) -> Iterator[Row]:
         subprocess.run(["git", "clone", "-q", str(ROOT), str(target)], check=True)
         begun_s = time.monotonic()
         done = subprocess.run(
-            ["make", "demo"], cwd=target, capture_output=True, text=True, check=False,
-            timeout=_CLONE_PATIENCE_S, env=os.environ | {"VIRTUAL_ENV": ""},
-        )  # fmt: skip
+            ["make", "demo"],
+            cwd=target,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=_CLONE_PATIENCE_S,
+            env=os.environ | {"VIRTUAL_ENV": ""},
+        )
         spent_s = time.monotonic() - begun_s
     if done.returncode:
-        raise MeasurementError(
-            f"make demo: {(done.stderr.strip() or 'no message').splitlines()[-1]}"
-        )
+        raise MeasurementError(f"make demo: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
     compiler = "gcc present" if shutil.which("cc") else "no C compiler"
-    yield Row(f"make demo from a clean clone to its verdict, {compiler}", spent_s, "s",
-              goal=Goal("<=", 60))  # fmt: skip
+    yield Row(f"make demo from a clean clone to its verdict, {compiler}", spent_s, "s", goal=Goal("<=", 60))

@@ -39,13 +39,7 @@ from cosim.analysis.replay import replay
 from cosim.cli import find_scenario
 from cosim.shipped_files import find_shipped
 from cosim.simulation.continuous import continuous_loop_of, network_fates, simulate_continuous
-from cosim.simulation.exact_simulation import (
-    Population,
-    Setting,
-    run_batch,
-    run_with_events,
-    setting_of,
-)
+from cosim.simulation.exact_simulation import Population, Setting, run_batch, run_with_events, setting_of
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign import campaign_file
@@ -70,9 +64,12 @@ from plant_server.plant import plants_of
 
 
 def integrated(
-    setting: Setting, draw: Population, delivered: NDArray[np.bool_], method: str,
+    setting: Setting,
+    draw: Population,
+    delivered: NDArray[np.bool_],
+    method: str,
     rtol: float = 1e-8,
-) -> list[float]:  # fmt: skip
+) -> list[float]:
     """Return event times by ``solve_ivp`` of plant and both models, from crossing to crossing."""
     A, B, x = draw.A[0], draw.B[0], draw.x0[0]
     n, trigger = len(x), setting.trigger
@@ -88,9 +85,14 @@ def integrated(
     t_s, z, found = 0.0, np.concatenate([x, x, x]), [0.0]
     while True:
         solution = solve_ivp(
-            lambda _, z: field @ z, (t_s, setting.horizon_s), z,
-            method=method, events=excess, rtol=rtol, atol=1e-2 * rtol,
-        )  # fmt: skip
+            lambda _, z: field @ z,
+            (t_s, setting.horizon_s),
+            z,
+            method=method,
+            events=excess,
+            rtol=rtol,
+            atol=1e-2 * rtol,
+        )
         if not len(solution.t_events[0]):
             return found
         t_s, z = float(solution.t_events[0][0]), solution.y_events[0][0].copy()
@@ -101,15 +103,24 @@ def integrated(
 
 
 def beside_scipy(
-    name: str, unit: str, ours: Side, peer: tuple[str, Side], error_s: float, agreement_s: float,
+    name: str,
+    unit: str,
+    ours: Side,
+    peer: tuple[str, Side],
+    error_s: float,
+    agreement_s: float,
     goal: Goal | None,
-) -> Row:  # fmt: skip
+) -> Row:
     """Compare a simulator with the integrator, whose event times differ by at most ``error_s``."""
     return compared(
-        name, unit, ours, (f"solve_ivp, {peer[0]}", peer[1]), goal,
+        name,
+        unit,
+        ours,
+        (f"solve_ivp, {peer[0]}", peer[1]),
+        goal,
         note=f"event times differ by {error_s:.1g} s from those of {peer[0]}",
         unjudged=None if error_s <= agreement_s else "the two do not agree",
-    )  # fmt: skip
+    )
 
 
 def apart_s(found: Vector, expected: list[float]) -> float:
@@ -138,10 +149,14 @@ def continuous_row(scenario: Scenario) -> Row:
         return integrated(setting, draw, np.array(fates), "DOP853", rtol)
 
     return beside_scipy(
-        f"{horizon_s:g} s in continuous time", "ms", cpu_ms(ours),
-        (f"DOP853, rtol {rtol:g}", cpu_ms(theirs)), apart_s(ours(), theirs()), 1e-8,
+        f"{horizon_s:g} s in continuous time",
+        "ms",
+        cpu_ms(ours),
+        (f"DOP853, rtol {rtol:g}", cpu_ms(theirs)),
+        apart_s(ours(), theirs()),
+        1e-8,
         Goal("<=", 0.1),
-    )  # fmt: skip
+    )
 
 
 def many_loops(scenario: Scenario) -> Scenario:
@@ -184,19 +199,25 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
         goal=Goal(">=", 3000),
     )
     yield compared(
-        f"sampled runs of {horizon_s:g} s on one core", "/s",
-        per_cpu_s(_SAMPLED_RUNS, lambda: sampled_runs(loop)), earlier, Goal(">=", 100),
+        f"sampled runs of {horizon_s:g} s on one core",
+        "/s",
+        per_cpu_s(_SAMPLED_RUNS, lambda: sampled_runs(loop)),
+        earlier,
+        Goal(">=", 100),
         note="the alternative was measured with that version, not in this run",
-    )  # fmt: skip
+    )
     draws = per_cpu_s(4, lambda: work.run(range(4)))
     yield compared("draws of a campaign in sampled time", "runs/s", draws)
     record = simulate(lane.model_copy(update={"horizon_s": _REPLAYED_S}))
     replayed = replay(record)
     yield compared(
-        f"replay of {_REPLAYED_S:g} s, {replayed.inputs:,} inputs", "× real time",
-        per_cpu_s(_REPLAYED_S, lambda: replay(record)), goal=Goal(">=", 2000), rounds=3,
+        f"replay of {_REPLAYED_S:g} s, {replayed.inputs:,} inputs",
+        "× real time",
+        per_cpu_s(_REPLAYED_S, lambda: replay(record)),
+        goal=Goal(">=", 2000),
+        rounds=3,
         unjudged=None if replayed.bit_exact else "the replay is not bit-exact",
-    )  # fmt: skip
+    )
     yield compared("certificate", "ms", cpu_ms(lambda: certify(lane, conditions)))
 
 
@@ -322,8 +343,7 @@ def plant_rows(name: str, scenario: Scenario, found: Sequence[tuple[float, ...]]
     p50, p99 = np.quantile(np.array(found), (0.5, 0.99), axis=0).tolist()
     yield Row(f"{name}: p50", p50[0], "µs/step", Peer("linear plant", p50[1]))
     yield Row(f"{name}: p99", p99[0], "µs/step", Peer("linear plant", p99[1]))
-    yield Row(f"{name}: p99, of {period_us / 1e3:g} ms", 100 * p99[0] / period_us, "%",
-              goal=Goal("<", 20.0))  # fmt: skip
+    yield Row(f"{name}: p99, of {period_us / 1e3:g} ms", 100 * p99[0] / period_us, "%", goal=Goal("<", 20.0))
 
 
 @benchmark("plants", "Cost per step of the plants")
@@ -367,9 +387,7 @@ def whole_campaign(draws: int) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder:
         command = [*NOACK, "campaign", CAMPAIGN, "--json", "--draws", str(draws), "--out", folder]
         begun_s = time.perf_counter()
-        process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-        )
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
         def follow() -> None:
             nonlocal peak_mib
@@ -394,12 +412,17 @@ def whole_campaign(draws: int) -> tuple[float, float]:
 
 
 @benchmark(
-    "campaign", "A million runs",
-    {"--campaign-draws": {
-        "type": int, "default": 100_000, "metavar": "N",
-        "help": "draws of the whole campaign at each of its grid points (100000: a million runs)",
-    }},
-)  # fmt: skip
+    "campaign",
+    "A million runs",
+    {
+        "--campaign-draws": {
+            "type": int,
+            "default": 100_000,
+            "metavar": "N",
+            "help": "draws of the whole campaign at each of its grid points (100000: a million runs)",
+        }
+    },
+)
 def campaign(options: argparse.Namespace) -> Iterator[Row]:
     """Measure the speed-up of a shipped campaign by a second worker, then a million runs.
 
@@ -408,9 +431,13 @@ def campaign(options: argparse.Namespace) -> Iterator[Row]:
     page.
     """
     yield compared(
-        f"{CAMPAIGN}, two workers", "runs/s", lambda: runs_per_s(2),
-        ("one worker", lambda: runs_per_s(1)), Goal(">=", 1.8), rounds=3,
-    )  # fmt: skip
+        f"{CAMPAIGN}, two workers",
+        "runs/s",
+        lambda: runs_per_s(2),
+        ("one worker", lambda: runs_per_s(1)),
+        Goal(">=", 1.8),
+        rounds=3,
+    )
     path, draws = find_shipped(CAMPAIGN, "campaigns"), options.campaign_draws
     runs = f"{len(grid(campaign_file.load(path), path)) * draws:,} runs"
     say(runs)

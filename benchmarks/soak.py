@@ -41,26 +41,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from benchmarks.programs import (
-    FREE_PORTS,
-    LAUNCHER,
-    NOACK,
-    PLAIN_TERMINAL,
-    PROGRESS,
-    Processes,
-    Sample,
-)
+from benchmarks.programs import FREE_PORTS, LAUNCHER, NOACK, PLAIN_TERMINAL, PROGRESS, Processes, Sample
 from benchmarks.report import MeasurementError, say
 from cosim.output import palette
-from cosim.output.figure_description import (
-    Axis,
-    FigureDescription,
-    Line,
-    Panel,
-    Row,
-    Spans,
-    time_axis,
-)
+from cosim.output.figure_description import Axis, FigureDescription, Line, Panel, Row, Spans, time_axis
 from cosim.output.figure_files import save_figure
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SUMMARY_FILE
@@ -121,9 +105,7 @@ def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend
     windows = np.minimum((judged[:, 0] - begin_s) / judged_s * WINDOWS, WINDOWS - 1).astype(int)
     medians = [_low_median(judged[windows == window]) for window in np.unique(windows)]
     shares = (
-        float(samples[np.abs(samples[:, 0] - share * length_s).argmin(), 1])
-        if len(samples)
-        else math.nan
+        float(samples[np.abs(samples[:, 0] - share * length_s).argmin(), 1]) if len(samples) else math.nan
         for share in (0.1, 0.5, 1.0)
     )
     if judged_s < LEAST_S or len(medians) < LEAST_WINDOWS:
@@ -147,11 +129,7 @@ def _low_median(values: Values) -> Values:
 
 def constant(at_s: Sequence[float], counts: Sequence[int], length_s: float) -> tuple[int, int]:
     """Return minimum and maximum of a count after the warm-up, ignoring single outliers."""
-    judged = [
-        count
-        for at, count in zip(at_s, counts, strict=True)
-        if warm_up_s(length_s) <= at <= length_s
-    ]
+    judged = [count for at, count in zip(at_s, counts, strict=True) if warm_up_s(length_s) <= at <= length_s]
     lasting = [a for a, b in pairwise(judged) if a == b] or judged
     return (min(lasting), max(lasting)) if lasting else (0, 0)
 
@@ -270,9 +248,7 @@ class Result:
         }
 
 
-def soak(
-    path: Path, settings: Sequence[str], runs: Path, report: Callable[[str], None] = say
-) -> Result:
+def soak(path: Path, settings: Sequence[str], runs: Path, report: Callable[[str], None] = say) -> Result:
     """Soak a scenario.
 
     Args:
@@ -293,10 +269,13 @@ def soak(
         (folder / "stdout.json").open("w") as stdout,
         log.open("w") as stderr,
         subprocess.Popen(
-            [*command, *FREE_PORTS, *changes], stdin=subprocess.DEVNULL, stdout=stdout,
-            stderr=stderr, env=os.environ | PLAIN_TERMINAL,
+            [*command, *FREE_PORTS, *changes],
+            stdin=subprocess.DEVNULL,
+            stdout=stdout,
+            stderr=stderr,
+            env=os.environ | PLAIN_TERMINAL,
         ) as run,
-    ):  # fmt: skip
+    ):
         processes = Processes(run.pid)
         try:
             deadline_s, latest = time.monotonic() + _START_PATIENCE_S, folder / LATEST
@@ -314,9 +293,13 @@ def soak(
 
 class _Soak:
     def __init__(
-        self, run: "subprocess.Popen[bytes]", run_dir: Path, processes: Processes, log: TextIO,
+        self,
+        run: "subprocess.Popen[bytes]",
+        run_dir: Path,
+        processes: Processes,
+        log: TextIO,
         report: Callable[[str], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._run, self._run_dir, self._processes, self._log = run, run_dir, processes, log
         self._report = report
         self._scenario = load(run_dir / SCENARIO_FILE)
@@ -343,9 +326,16 @@ class _Soak:
             else:
                 self._faults.append(f"{role}: was never seen")
         result = Result(
-            self._scenario.name, self._run_dir, reached_s - began_s, ended_s - reached_s, peaks,
-            disk_bytes, watched, summary, self._faults,
-        )  # fmt: skip
+            self._scenario.name,
+            self._run_dir,
+            reached_s - began_s,
+            ended_s - reached_s,
+            peaks,
+            disk_bytes,
+            watched,
+            summary,
+            self._faults,
+        )
         text = json.dumps(result.as_json(), indent=2, default=float)
         (self._run_dir / RESULT_FILE).write_text(text + "\n", encoding="utf-8")
         if watched:
@@ -430,9 +420,7 @@ def size_bytes(folder: Path) -> int:
     return total
 
 
-def ended_badly(
-    summary: Mapping[str, Any], status: int, delivered_out_of_order: int = 0
-) -> Iterator[str]:
+def ended_badly(summary: Mapping[str, Any], status: int, delivered_out_of_order: int = 0) -> Iterator[str]:
     """Yield descriptions of the faults in a run's summary.
 
     Args:
@@ -471,9 +459,7 @@ def memory_figure(result: Result) -> FigureDescription:
         margin = 0.05 * (high - low)
         title = f"{result.name}: private memory since the warm-up (grey); 1 MiB is allowed"
         colour = palette.PROCESSES.get(role, palette.SERIES[5 if role == RECORDER else 4])
-        warm = Spans(
-            begin=np.zeros(1), end=np.array([warm_s]), colour=(128, 128, 128), opacity=0.14
-        )
+        warm = Spans(begin=np.zeros(1), end=np.array([warm_s]), colour=(128, 128, 128), opacity=0.14)
         panel = Panel(
             title="" if i else title,
             items=[warm, Line(x=at_s, y=kib, colour=colour)],
@@ -491,12 +477,17 @@ def print_result(console: Console, result: Result) -> None:
         memory = watched.memory
         ends = (watched.ends(count) for count in COUNTS)
         kib = (memory.at_10_kib, memory.at_50_kib, memory.at_100_kib)
-        rows.append((
-            role, *(f"{one / 1024:.1f} MiB" for one in kib), f"{memory.growth_kib:+.0f} KiB",
-            f"{memory.slope_kib_per_h:+.0f} KiB",
-            *(str(most) if least == most else f"{least}–{most}" for least, most in ends),
-            f"{100 * watched.cpu_share:.0f} %", memory.verdict,
-        ))  # fmt: skip
+        rows.append(
+            (
+                role,
+                *(f"{one / 1024:.1f} MiB" for one in kib),
+                f"{memory.growth_kib:+.0f} KiB",
+                f"{memory.slope_kib_per_h:+.0f} KiB",
+                *(str(most) if least == most else f"{least}–{most}" for least, most in ends),
+                f"{100 * watched.cpu_share:.0f} %",
+                memory.verdict,
+            )
+        )
     headings = ("process", "10 %", "50 %", "100 %", "growth", "per hour", *COUNTS, "CPU", "verdict")
     table = ResultTable("soak", f"{result.name}: private memory", headings, rows)
     styles = {"flat": "green", "": "bold red"}
@@ -510,8 +501,7 @@ def print_result(console: Console, result: Result) -> None:
     peaks = ", ".join(f"{role} {kib / 1024:,.0f}" for role, kib in result.end_peak_kib.items())
     for line in (
         f"longest loss burst: {result.loop.get('longest_loss_burst')}",
-        f"replayed at the end: {replay.get('inputs') or 0:,} inputs, bit exact: "
-        f"{replay.get('bit_exact')}",
+        f"replayed at the end: {replay.get('inputs') or 0:,} inputs, bit exact: {replay.get('bit_exact')}",
         f"lateness, p50/p99/max in µs (reported, not judged): {late or 'unknown'}",
         f"wall time: {result.wall_s:.0f} s of loop, {result.end_s:.0f} s for its end "
         f"(at most, in MiB: {peaks or 'unknown'}); {result.disk_bytes / 2**20:.0f} MiB on the disk",

@@ -21,21 +21,19 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, Role, alike_loops, set_machine, take_changes
 from noack.protocol.machine_interface import BEGINNING, FAILED, External, Notice, Start
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    CONTROLLER_SETTING,
-    CONTROLLER_STEP,
-    RecordShape,
-)
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ChangeSchedule
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 
 CONTROLLER = Role(
-    "controller", "noack_controller", Flow.UPDATE, (CONTROLLER_STEP, CONTROLLER_DELIVERY, None),
+    "controller",
+    "noack_controller",
+    Flow.UPDATE,
+    (CONTROLLER_STEP, CONTROLLER_DELIVERY, None),
     CONTROLLER_SETTING,
-)  # fmt: skip
+)
 Setpoint = tuple[Vector, Vector]
 """x_r and u_r, shapes (n,) and (m,)."""
 
@@ -212,27 +210,41 @@ class Controller:
         self._memory = memory
         step = max(-(-(start.from_ns - self.first_ns) // period_ns), 0)
         set_machine(
-            controller.machine, n=n, m=m, entries=n, flow=Flow.UPDATE,
-            first_number=start.first_number, period_ns=period_ns, first_ns=self.first_ns,
-            horizon_ns=self.horizon_ns, step=step,
-        )  # fmt: skip
+            controller.machine,
+            n=n,
+            m=m,
+            entries=n,
+            flow=Flow.UPDATE,
+            first_number=start.first_number,
+            period_ns=period_ns,
+            first_ns=self.first_ns,
+            horizon_ns=self.horizon_ns,
+            step=step,
+        )
         steps_ns = (period_ns, self.first_ns, period_ns - self.first_ns)
         transitions = memory.transitions(self.H, steps_ns)
         memory.set_model(controller.model, transitions, (), self._points)
         linear = isinstance(self.law, LinearFeedback)
-        memory.fill(controller, {
-            "K": self.law.K if isinstance(self.law, LinearFeedback) else np.zeros((m, n)),
-            "safe_input": np.zeros(m) if self.safe_input is None else self.safe_input,
-            "is_user": not linear, "acknowledges": self.acknowledges,
-            "predictions": self.predictions, "carries_model": self.predictive,
-            "x_c": np.zeros(n) if self.x0 is None else self.x0,
-            # A model without a state starts at the first tick, which is recorded.
-            "model_ns": self.first_ns + step * period_ns if start.is_restart else 0,
-            "knows_state": self.x0 is not None,
-            # After a restart the updates before it are unknown.
-            "newest": core.NOACK_UNKNOWN_SEQUENCE if start.is_restart else core.NOACK_NO_SEQUENCE,
-            "x": np.zeros(n), "u": np.zeros(m), "scratch": np.zeros(3 * n + m),
-        })  # fmt: skip
+        memory.fill(
+            controller,
+            {
+                "K": self.law.K if isinstance(self.law, LinearFeedback) else np.zeros((m, n)),
+                "safe_input": np.zeros(m) if self.safe_input is None else self.safe_input,
+                "is_user": not linear,
+                "acknowledges": self.acknowledges,
+                "predictions": self.predictions,
+                "carries_model": self.predictive,
+                "x_c": np.zeros(n) if self.x0 is None else self.x0,
+                # A model without a state starts at the first tick, which is recorded.
+                "model_ns": self.first_ns + step * period_ns if start.is_restart else 0,
+                "knows_state": self.x0 is not None,
+                # After a restart the updates before it are unknown.
+                "newest": core.NOACK_UNKNOWN_SEQUENCE if start.is_restart else core.NOACK_NO_SEQUENCE,
+                "x": np.zeros(n),
+                "u": np.zeros(m),
+                "scratch": np.zeros(3 * n + m),
+            },
+        )
         self._set_point(controller, self.setpoint)
 
     def redraw(self, controller: CData, memory: CoreMemory) -> None:
@@ -271,9 +283,7 @@ class Controller:
         """Raise ValueError: the core's controller writes no notes."""
         raise ValueError("a controller writes no notes")
 
-    def _call(
-        self, controller: CData, method: Callable[[ControlLaw], Vector | None]
-    ) -> Sequence[Notice]:
+    def _call(self, controller: CData, method: Callable[[ControlLaw], Vector | None]) -> Sequence[Notice]:
         """Call the control law; after its first failure, the input is the safe input."""
         m = controller.machine.m
         safe = np.zeros(m) if self.safe_input is None else self.safe_input

@@ -70,9 +70,7 @@ def shipped_names(folder: str) -> list[str]:
 def all_shipped(folder: str) -> list[ShippedFile]:
     """Return the scenarios or campaigns that come with noack, by name."""
     paths = (_path_of(name, folder) for name in shipped_names(folder))
-    return [
-        ShippedFile(path.stem, str(toml_file.read(path)["description"]), path) for path in paths
-    ]
+    return [ShippedFile(path.stem, str(toml_file.read(path)["description"]), path) for path in paths]
 
 
 def text_of(name: str) -> str:
@@ -88,9 +86,7 @@ def text_of(name: str) -> str:
             text = "".join(line for line in lines if not line.startswith(_SCHEMA))
             return _FILE.sub(rf'file = "{path.absolute().parent}/\1"', text)
     names = [known for folder in KINDS for known in shipped_names(folder)]
-    raise CallerError(
-        f"{shortened(name)}: not a shipped file; {did_you_mean(name, names) or _LIST}"
-    )
+    raise CallerError(f"{shortened(name)}: not a shipped file; {did_you_mean(name, names) or _LIST}")
 
 
 def _path_of(name: str, folder: str) -> Path:

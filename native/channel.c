@@ -53,13 +53,6 @@ static int is_behind(const noack_channel *channel, int64_t direction, int64_t re
     return 0;
 }
 
-/* Begin to send what can begin until now_ns in a queue that chooses when the link is free. */
-static void serve(noack_channel *channel, int64_t direction, int64_t now_ns) {
-    noack_heap_entry entry;
-    while (begin_sending(channel->links[direction], channel->waiting, now_ns, &entry))
-        heap_push(channel->heap, &channel->heap_count, entry);
-}
-
 /* Let a datagram, or its copy, leave now, or keep it until it is due. */
 static void release(
     noack_channel *channel, const noack_datagram *datagram, const noack_decision *decision,
@@ -77,7 +70,7 @@ static void release(
     if (bit >= 0 && bit < 8 * NOACK_HEAD_BYTES)
         kept->datagram.head[bit / 8] ^= (uint8_t)(1 << (bit % 8));
     channel->put++;
-    if (!kept->delayed && !is_behind(channel, direction, release_ns)) {
+    if (!decision->waits && !kept->delayed && !is_behind(channel, direction, release_ns)) {
         leave(channel, kept);
         copy_datagram(&channel->leaving[channel->leaving_count++], &kept->datagram);
         return;
@@ -85,7 +78,9 @@ static void release(
     int64_t place = channel->free_place, order = departure_order(direction, channel->put);
     channel->free_place = kept->next;
     if (decision->waits)
-        wait_for_link(channel->links[direction], channel->waiting, place, order, decision);
+        wait_for_link(
+            channel->links[direction], datagram->flow % channel->loops, channel->waiting, place,
+            order, decision);
     else
         heap_push(
             channel->heap, &channel->heap_count, (noack_heap_entry){release_ns, order, place});
@@ -111,7 +106,7 @@ int64_t noack_channel_handle(
     }
     channel->answered = 0;
     channel->reached_ns = now_ns;
-    serve(channel, direction, now_ns);
+    serve(link, channel->waiting, now_ns, channel->heap, &channel->heap_count);
     if (asks)
         link_repeat(link, row, datagram->size_bytes, now_ns, &channel->outcome, &decision);
     else
@@ -123,7 +118,7 @@ int64_t noack_channel_handle(
         release(channel, datagram, &decision, 0);
     if (decision.copy_ns != NOACK_NEVER_NS)
         release(channel, datagram, &decision, 1);
-    serve(channel, direction, now_ns);
+    serve(link, channel->waiting, now_ns, channel->heap, &channel->heap_count);
     return NOACK_DONE;
 }
 
@@ -146,12 +141,16 @@ int64_t noack_channel_release(noack_channel *channel, int64_t now_ns) {
     copy_datagram(&channel->leaving[channel->leaving_count++], &leaving->datagram);
     leaving->next = channel->free_place;
     channel->free_place = due.slot;
-    serve(channel, leaving->datagram.flow / channel->loops, due.release_ns);
+    serve(
+        channel->links[leaving->datagram.flow / channel->loops], channel->waiting, due.release_ns,
+        channel->heap, &channel->heap_count);
     return NOACK_DONE;
 }
 
 void noack_channel_latest(noack_channel *channel, int64_t direction, int64_t *latest_ns) {
-    serve(channel, direction, INT64_MAX);
+    serve(
+        channel->links[direction], channel->waiting, INT64_MAX, channel->heap,
+        &channel->heap_count);
     for (int64_t i = 0; i < channel->heap_count; i++) {
         const noack_datagram *one = &channel->delayed[channel->heap[i].slot].datagram;
         int64_t row = one->flow % channel->loops;

@@ -156,7 +156,7 @@ void link_repeat(
             APPLY[stage->kind](&own, stage, &memory[own.stage]);
         }
         if (decision->waits)
-            decision->after_ns += decision->release_ns;
+            leave_queue(decision);
         keep_limit(link->limit - link->in_flight, decision);
     }
     noack_settle(link, row, decision);
@@ -187,7 +187,10 @@ static int64_t hold_back(
             decision->copy_ns = max_of(decision->copy_ns, needed_ns);
         link->counters.held_back++;
     }
-    decision->makes_stale = make_stale(link, row, decision->packet, needed_ns);
+    if (link->scheduler < 0)
+        decision->makes_stale = make_stale(link, row, decision->packet, needed_ns);
+    else if (!decision->waits)
+        link->flows[row].first_release_ns = needed_ns; /* of what waits, see waiting.c */
     return needed_ns;
 }
 

@@ -1,8 +1,7 @@
 /* A change of settings: transfers a link's state to one with other settings.
 
    A stage keeps its state if the new settings have a stage of the same kind and random stream; a
-   queue keeps its state under another discipline, too, unless one of them chooses when the link is
-   free. Flows, counters and packets in flight do not
+   queue keeps its state under another discipline, too. Flows, counters and packets in flight do not
    change, except that the count of the longest loss burst starts again, since another guarantee may
    apply. */
 #include <string.h>
@@ -10,7 +9,7 @@
 #include "core.h"
 
 static int is_bottleneck(const noack_stage *stage) {
-    return stage->kind == NOACK_CODEL || stage->kind == NOACK_TAIL_DROP;
+    return stage->kind == NOACK_CODEL || stage->kind == NOACK_TAIL_DROP || is_scheduler(stage);
 }
 
 /* The place of the stage with this random stream and the same kind, or also a bottleneck; -1: none.
@@ -105,7 +104,8 @@ static int is_same_guarantee(const noack_link *a, const noack_link *b) {
 }
 
 /* Transfer the release times that the guarantee needs. If the guarantee differs (or there is none
-   any more), or a queue chose when the link was free, later packets leave only after the packets that are in flight at the change. */
+   any more), or a queue chooses before or after the change, later packets leave only after the
+   packets that are in flight at the change. */
 static void change_releases(
     const noack_link *before, const noack_link *after, int64_t row, int64_t latest_ns) {
     noack_flow *flow = &after->flows[row];

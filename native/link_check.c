@@ -54,10 +54,6 @@ static const char *check_scheduler(const noack_link *link, const noack_stage *st
     return check_bottleneck(stage);
 }
 
-static int is_scheduler(const noack_stage *stage) {
-    return stage->kind == NOACK_PRIORITY || stage->kind == NOACK_EARLIEST_DEADLINE;
-}
-
 static const char *check_opportunities(const noack_link *link, const noack_stage *stage) {
     const noack_opportunities *own = &stage->opportunities;
     if (!in_range(own->begin, own->end, link->integer_count) || own->begin == own->end)

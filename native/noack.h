@@ -192,7 +192,9 @@ typedef struct { /* a link's state of a flow */
     int64_t forced_first;       /* 1: the first packet is still to come, and must be delivered */
     int64_t packets;            /* packets that have arrived */
     int64_t consecutive_losses; /* up to the last packet */
-    int64_t first_release_ns;   /* departure time of the first packet, if it had to be delivered */
+    int64_t first_release_ns;   /* no packet leaves before: departure time of the first one, if it had
+                                   to be delivered; in a queue that chooses, of the last one; of the
+                                   last one in flight at a change */
     double score;               /* normal score of the link's state for the last packet */
     int64_t newest;             /* greatest number among the packets that have left intact */
     int64_t since;              /* number of the first packet under the present settings */
@@ -211,8 +213,8 @@ typedef struct { /* a stage's state that all flows share; departure times lie in
     int64_t used, left_bytes;  /* opportunities: which of those at busy_until_ns, from 1; its rest */
     int64_t total_bytes;       /* all bytes that were put into the queue */
     int64_t phase, step;       /* Gilbert-Elliott, common to all flows: state, and number of its step */
-    int64_t waiting, waits; /* what waits until the link is free: its first place + 1, 0 for none;
-                               its number */
+    int64_t waiting, waits;    /* packets that wait until the link is free: the place + 1 of the first
+                                  one, 0: none; how many */
 } noack_queue;
 
 typedef struct {
@@ -291,7 +293,8 @@ int64_t noack_link_leave(
 int64_t noack_link_touch(const noack_link *link, int64_t row);
 
 /* Transfer the state of a link to one with other settings, which has as many rows and shares the
-   array of flows. Nothing waits in a queue. latest_ns: (rows,) last departure time of the packets in flight; -1: none. */
+   array of flows. Nothing waits in a queue that chooses. latest_ns: (rows,) last departure time of
+   the packets in flight; -1: none. */
 void noack_link_change(const noack_link *before, noack_link *after, const int64_t *latest_ns);
 
 /* Begin the flow of row 0 again, with other keys, (stage_count, 2): another run of a batch. */
@@ -875,7 +878,7 @@ typedef struct { /* an entry of the heap of delayed datagrams */
 } noack_heap_entry;
 
 typedef struct { /* a stored datagram that waits until the link is free; see native/waiting.c */
-    int64_t key, order, size_bytes, after_ns, earliest_ns;
+    int64_t key, order, row, size_bytes, after_ns, earliest_ns;
     int64_t left, right; /* the heap: places + 1; 0: none */
 } noack_waiting;
 

@@ -1,17 +1,21 @@
 /* A bottleneck that chooses, whenever its link is free, which of the waiting packets it sends next:
    that with the smallest key. So a departure depends on later arrivals.
 
-   The decision for a packet is made at its arrival all the same: whether it is lost, and the earliest
-   time at which it can leave. What is not lost waits in a heap (a skew heap: Sleator and Tarjan,
-   1986), whose nodes the relay or the channel has, one for each place of a stored datagram. The
-   packet that is being sent has left the heap; its departure is known. At its departure, and at each
-   arrival, what could begin until then begins (begin_sending). This is soon enough: what begins at a
-   time depends on earlier arrivals only, and while packets wait, one that is being sent has still to
-   leave, so there will be a departure.
+   Whether a packet is lost is decided at its arrival all the same, and so is the earliest time at
+   which it can leave. What is not lost waits in a heap (a skew heap: Sleator and Tarjan, 1986),
+   whose nodes the relay or the channel has, one for each place of a stored datagram. The packet
+   that is being sent has left the heap; its departure is known. At its departure, and at each
+   arrival, what could begin until then begins (serve). This is soon enough: what begins at a time
+   depends on earlier arrivals only; and no packet leaves before it has been sent, so that while
+   packets wait, there will be a departure. (If a clock ran backward, so that there is none, the
+   next one begins at once.) Constant delays before and after the queue have the same effect, and
+   are added to the departure.
 
-   The key of a flow's packets does not decrease, so they leave in order of arrival. Hence their
-   earliest times, which do not decrease either, stand for their departures in the guarantee. Constant
-   delays before and after the queue have the same effect, and are added to the departure. */
+   The guarantee needs none of these times, only an order: a flow's packets leave in the order of
+   their arrival. Their keys do not decrease, so they begin in this order, and none is given a
+   departure before that of an earlier one (first_release_ns, the last departure of the flow). So no
+   packet is ever stale, whatever the other stages do: the losses are those that are decided at the
+   arrivals, which noack_must_pass allows, and no packet needs to be held back for others. */
 #include "core.h"
 
 static int is_before(const noack_waiting *a, const noack_waiting *b) {
@@ -60,13 +64,22 @@ void enter_queue(packet *packet, int64_t key, int is_time) {
     decision->release_ns += begin_ns + 1 - decision->arrival_ns;
 }
 
+void leave_queue(noack_decision *decision) {
+    int64_t least_ns = -decision->after_ns;
+    decision->release_ns = max_of(decision->release_ns, least_ns);
+    decision->after_ns = decision->release_ns - least_ns;
+    if (decision->copy_ns != NOACK_NEVER_NS)
+        decision->copy_ns = max_of(decision->copy_ns, least_ns);
+}
+
 void wait_for_link(
-    noack_link *link, noack_waiting *waiting, int64_t place, int64_t order,
+    noack_link *link, int64_t row, noack_waiting *waiting, int64_t place, int64_t order,
     const noack_decision *decision) {
     noack_queue *queue = &link->queues[link->scheduler];
     waiting[place] = (noack_waiting){
         .key = decision->key,
         .order = order,
+        .row = row,
         .size_bytes = decision->size_bytes,
         .after_ns = decision->after_ns,
         .earliest_ns = decision->release_ns,
@@ -75,19 +88,22 @@ void wait_for_link(
     queue->waits++;
 }
 
-int begin_sending(
-    noack_link *link, noack_waiting *waiting, int64_t now_ns, noack_heap_entry *entry) {
+void serve(
+    noack_link *link, noack_waiting *waiting, int64_t now_ns, noack_heap_entry *heap,
+    int64_t *count) {
     if (link->scheduler < 0)
-        return 0;
+        return;
     noack_queue *queue = &link->queues[link->scheduler];
-    if (queue->waiting == 0 || queue->busy_until_ns > now_ns)
-        return 0;
-    int64_t place = queue->waiting - 1;
-    const noack_waiting *next = &waiting[place];
-    queue->waiting = merge(waiting, next->left, next->right);
-    queue->waits--;
-    int64_t end_ns = noack_queue_serve(link, link->scheduler, next->size_bytes);
-    int64_t release_ns = max_of(end_ns + next->after_ns, next->earliest_ns);
-    *entry = (noack_heap_entry){release_ns, next->order, place};
-    return 1;
+    while (queue->waiting != 0
+           && (queue->busy_until_ns <= now_ns || link->in_flight == queue->waits)) {
+        int64_t place = queue->waiting - 1;
+        const noack_waiting *next = &waiting[place];
+        noack_flow *flow = &link->flows[next->row];
+        queue->waiting = merge(waiting, next->left, next->right);
+        queue->waits--;
+        int64_t end_ns = noack_queue_serve(link, link->scheduler, next->size_bytes);
+        int64_t leaves_ns = max_of(end_ns + next->after_ns, next->earliest_ns);
+        flow->first_release_ns = max_of(flow->first_release_ns, leaves_ns);
+        heap_push(heap, count, (noack_heap_entry){flow->first_release_ns, next->order, place});
+    }
 }

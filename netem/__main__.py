@@ -57,9 +57,13 @@ def run_network(run: RunProcess) -> None:
             for flow in run.scenario.network.flows
         ]
         channel = NetworkChannel(
-            endpoint, ways, network=network, clock=run.clock, spin_ns=run.spin_ns,
+            endpoint,
+            ways,
+            network=network,
+            clock=run.clock,
+            spin_ns=run.spin_ns,
             loops=len(run.phases_ns),
-        )  # fmt: skip
+        )
         run.run(network, channel, network)
 
 

@@ -107,10 +107,13 @@ class PcapngSection:
             self._start_ns = self._start_ns or int(events["t_ns"][0])
             self._end_ns = int(events["t_ns"][-1])
         size = core.noack_capture_blocks(
-            rows, events.size, pointer_to(data, "uint8_t *"),
-            pointer_to(self._missing, "int64_t *"), pointer_to(self._written, "int64_t *"),
+            rows,
+            events.size,
+            pointer_to(data, "uint8_t *"),
+            pointer_to(self._missing, "int64_t *"),
+            pointer_to(self._written, "int64_t *"),
             pointer_to(self._out, "uint8_t *"),
-        )  # fmt: skip
+        )
         return self._out.data[:size]
 
     def miss(self, events: NDArray[np.int64]) -> None:
@@ -129,9 +132,7 @@ class PcapngSection:
                 (_RECEIVED, struct.pack("<q", written + missing)),
                 (_DROPPED, struct.pack("<q", missing)),
             )
-            for index, (written, missing) in enumerate(
-                zip(self._written, self._all_missing, strict=True)
-            )
+            for index, (written, missing) in enumerate(zip(self._written, self._all_missing, strict=True))
         )
 
 

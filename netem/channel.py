@@ -18,13 +18,7 @@ from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
-from noack.protocol.record_tables import (
-    NETEM_PACKET,
-    NETEM_RELEASE,
-    NETEM_SETTING,
-    PACKET_HEAD_BYTES,
-    Fate,
-)
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
@@ -136,9 +130,7 @@ class Channel:
             assert question == core.NOACK_ROWS_FULL
             self._taken = self.take_rows()
 
-    def send(
-        self, flow: int, number: int, size_bytes: int, now_ns: int
-    ) -> tuple[list[Leaving], int]:
+    def send(self, flow: int, number: int, size_bytes: int, now_ns: int) -> tuple[list[Leaving], int]:
         """Take a packet of a flow; return what leaves at once, and the number of its copies.
 
         What is due must have left (:meth:`release`). Of a lost packet there are 0 copies.
@@ -255,9 +247,7 @@ def channel_of(
             )
         )
     schedule = None if network else ChangeSchedule(resolved, lambda one: one.network.link)
-    return Channel(
-        links, loops=loops, first_number=start.first_number, schedule=schedule, network=network
-    )
+    return Channel(links, loops=loops, first_number=start.first_number, schedule=schedule, network=network)
 
 
 def alone(network: Scenario) -> Scenario:
@@ -268,7 +258,10 @@ def alone(network: Scenario) -> Scenario:
     """
     for name, given in (("changes", network.changes), ("loops", network.loops)):
         if given:
-            raise CallerError(f"network: the scenario has {name}; the channel needs one without")
+            raise CallerError(
+                f"network: the scenario has {name}; outside a run of noack a network serves one "
+                f"loop and does not change: remove {name}"
+            )
     if network.network.protocol != "none":
         raise CallerError('network: nothing is acknowledged here; set protocol = "none"')
     return network

@@ -58,8 +58,7 @@ class LinkWarnings:
             return False
         self._full = clients > 0  # the end of one makes place
         self._report(
-            f"no file descriptors are left for more than {clients} clients; raise the limit "
-            "(ulimit -n)"
+            f"no file descriptors are left for more than {clients} clients; raise the limit (ulimit -n)"
         )
         return True
 

@@ -6,6 +6,7 @@
 import argparse
 import difflib
 import json
+import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -104,9 +105,13 @@ class _Formatter(argparse.HelpFormatter):
             more = " " * column if column else left + (4 * " " if left else "")
             command = line.startswith("  noack") and not column
             wrapped = textwrap.wrap(
-                line, width - 2 * command, initial_indent=indent, subsequent_indent=indent + more,
-                break_long_words=False, break_on_hyphens=False,
-            )  # fmt: skip
+                line,
+                width - 2 * command,
+                initial_indent=indent,
+                subsequent_indent=indent + more,
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
             lines += [(" \\\n" if command else "\n").join(wrapped)]
         return "\n".join(lines)
 
@@ -170,9 +175,7 @@ def shell_parser() -> Parser:
 
 def _add_words(group: argparse._ArgumentGroup, here: str, there: str) -> None:
     group.add_argument("words", nargs="*", metavar="WORDS", help=f"impairments, {here} to {there}")
-    group.add_argument(
-        "--reverse", metavar="WORDS", nargs="+", help=f"impairments, {there} to {here} (none)"
-    )
+    group.add_argument("--reverse", metavar="WORDS", nargs="+", help=f"impairments, {there} to {here} (none)")
     group.add_argument("--both", action="store_true", help="the words apply in both directions")
     what = "client that sends" if here == "clients" else "flow that has"
     group.add_argument("--idle", metavar="TIME", help=f"remove a {what} nothing for TIME (60s)")
@@ -187,9 +190,7 @@ def shell_spec(options: argparse.Namespace) -> LinkSpec:
     """
     forward, reverse, seed = _directions(options)
     forward, reverse = (read_files(one, Path()) for one in (forward, reverse))
-    return LinkSpec(
-        LINK_NAME, _NOWHERE, _NOWHERE, forward, reverse, seed, idle_s=_idle_s(options.idle)
-    )
+    return LinkSpec(LINK_NAME, _NOWHERE, _NOWHERE, forward, reverse, seed, idle_s=_idle_s(options.idle))
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
@@ -199,7 +200,9 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
         CallerError: a word begins with dashes, or --session is combined with other options.
     """
     require_no_dashes(arguments)
-    options = parser.parse_intermixed_args(arguments)
+    # With a space before it, argparse takes -1,2 for a word, not for an option.
+    words = [f" {one}" if re.match(r"-[0-9.]", one) else one for one in arguments]
+    options = parser.parse_intermixed_args(words)
     if any(argument.partition("=")[0] == "--session" for argument in arguments):
         raise CallerError(
             "--session joins a run and allows only --json beside it; words and all other options "
@@ -289,9 +292,7 @@ _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 """Minimum and maximum columns for words."""
 
 
-def explain(
-    specs: Sequence[LinkSpec], written: Sequence[LinkSpec], *, as_json: bool, as_file: bool
-) -> None:
+def explain(specs: Sequence[LinkSpec], written: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
     """Print the effect of links' settings on standard output, as tables or as JSON.
 
     Args:
@@ -303,12 +304,15 @@ def explain(
     if as_json:
         links = [
             {
-                "name": spec.name, "listen": address_text(spec.listen),
-                "to": address_text(spec.to), "seed": spec.seed, "forward": _document(spec.forward),
+                "name": spec.name,
+                "listen": address_text(spec.listen),
+                "to": address_text(spec.to),
+                "seed": spec.seed,
+                "forward": _document(spec.forward),
                 "reverse": _document(spec.reverse) if spec.return_path else None,
             }
             for spec in specs
-        ]  # fmt: skip
+        ]
         print(json.dumps({"links": links}, indent=2))
         return
     console = Console(highlight=False)
@@ -373,9 +377,7 @@ def _print_link(console: Console, spec: LinkSpec, named: LinkSpec) -> None:
         console.print(Text("reverse: not relayed; the server's answers are discarded", "bold"))
 
 
-def _print_direction(
-    console: Console, title: str, settings: LinkSettings, named: LinkSettings
-) -> None:
+def _print_direction(console: Console, title: str, settings: LinkSettings, named: LinkSettings) -> None:
     if settings == LinkSettings():
         console.print(Text(f"{title}: no impairment", "bold"))
         return
@@ -421,10 +423,13 @@ def _print_tc(console: Console, tc: TcCommand) -> None:
         return
     console.print(Text("nearest command of tc, for a network device:"))
     command = textwrap.wrap(
-        f"tc qdisc add dev DEVICE root netem {tc.words}", max(console.width - 2, _NARROW_WIDTH),
-        initial_indent="  ", subsequent_indent="      ",
-        break_long_words=False, break_on_hyphens=False,
-    )  # fmt: skip
+        f"tc qdisc add dev DEVICE root netem {tc.words}",
+        max(console.width - 2, _NARROW_WIDTH),
+        initial_indent="  ",
+        subsequent_indent="      ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
     console.print(Text(" \\\n".join(command)), soft_wrap=True)
     if lacks:
         console.print(Text(f"tc lacks: {lacks}"))

@@ -113,14 +113,12 @@ class FateRecorder:
 
     wants_data = False
 
-    def __init__(
-        self, path: Path, specs: Sequence[LinkSpec], max_waiting: int = _MAX_WAITING
-    ) -> None:
+    def __init__(self, path: Path, specs: Sequence[LinkSpec], max_waiting: int = _MAX_WAITING) -> None:
         for spec in specs:
             if spec.forward.chooses or spec.reverse.chooses:
                 raise CallerError(
-                    f"--record-fates {path}: link {spec.name} has a rate that chooses what it "
-                    "sends: no delay is known at the arrival; capture the packets instead"
+                    f"--record-fates {path}: link {spec.name} has a rate that chooses what it sends: "
+                    "no delay is known at the arrival; capture the packets instead"
                 )
         self._path = path
         self._specs = specs
@@ -149,9 +147,7 @@ class FateRecorder:
             finally:
                 os.close(descriptor)
         except (OSError, ValueError) as error:
-            raise CallerError(
-                f"--record-fates {path}: cannot be written ({_reason(error)})"
-            ) from None
+            raise CallerError(f"--record-fates {path}: cannot be written ({_reason(error)})") from None
         self._thread = threading.Thread(target=self._run, name="fates", daemon=True)
 
     def __enter__(self) -> Self:
@@ -309,8 +305,7 @@ def _is_kept(settings: "_Direction", rows: Mapping[str, NDArray[np.int64]]) -> b
     order = np.lexsort((rows["packet"], rows["flow"]))
     flows, lost = rows["flow"][order].tolist(), (losses > 0)[order].tolist()
     return not any(
-        histories.setdefault(flow, LossHistory(rules)).add(one)
-        for flow, one in zip(flows, lost, strict=True)
+        histories.setdefault(flow, LossHistory(rules)).add(one) for flow, one in zip(flows, lost, strict=True)
     )
 
 
@@ -347,9 +342,7 @@ def _read(path: Path) -> tuple[pa.Table, Mapping[str, "_Link"]]:
 
 
 def _missing(path: Path, count: int | str) -> CallerError:
-    return CallerError(
-        f"{path}: {count} events are missing; an incomplete trace cannot be replayed"
-    )
+    return CallerError(f"{path}: {count} events are missing; an incomplete trace cannot be replayed")
 
 
 class _Direction(BaseModel):

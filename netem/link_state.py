@@ -102,9 +102,7 @@ class LinkState:
         core.noack_link_decide(self.core, row, size_bytes, now_ns, self.decision)
         return self.decision
 
-    def decide_many(
-        self, rows: Integers, sizes_bytes: Integers, arrivals_ns: Integers
-    ) -> NDArray[np.void]:
+    def decide_many(self, rows: Integers, sizes_bytes: Integers, arrivals_ns: Integers) -> NDArray[np.void]:
         """Return the decisions for k packets in order of arrival, (k,) of ``noack_decision``.
 
         Args:
@@ -161,21 +159,24 @@ class LinkState:
             places += stage.queue_places
         rules = [one.rule for one in settings.constraints]
         windows = [(one.limit, one.window) for one in rules if isinstance(one, LossesInWindow)]
-        link = ffi.new("noack_link *", {
-            "stages": stages, "stage_count": len(named),
-            "recorded_flows": len(self._decisions_begin) - 1,
-            "recovery": max(
-                (one.deliveries for one in rules if isinstance(one, DeliveriesBetweenBursts)),
-                default=0,
-            ),
-            "mansd": -1 if settings.longest_burst is None else settings.longest_burst,
-            "limit": settings.limit,
-            "tracks": tracks or any(one.delays for one in settings.impairments),
-            "rows": rows, "departure_places": places,
-            "scheduler": next(
-                (place for place, (stage, *_) in enumerate(named) if stage.schedules), -1
-            ),
-        })  # fmt: skip
+        link = ffi.new(
+            "noack_link *",
+            {
+                "stages": stages,
+                "stage_count": len(named),
+                "recorded_flows": len(self._decisions_begin) - 1,
+                "recovery": max(
+                    (one.deliveries for one in rules if isinstance(one, DeliveriesBetweenBursts)),
+                    default=0,
+                ),
+                "mansd": -1 if settings.longest_burst is None else settings.longest_burst,
+                "limit": settings.limit,
+                "tracks": tracks or any(one.delays for one in settings.impairments),
+                "rows": rows,
+                "departure_places": places,
+                "scheduler": next((place for place, (stage, *_) in enumerate(named) if stage.schedules), -1),
+            },
+        )
         link.recent_width = 1 << link.mansd.bit_length() if link.tracks and link.mansd >= 0 else 1
         link.loss_width = 1
         if windows or link.recovery:

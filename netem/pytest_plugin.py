@@ -82,8 +82,7 @@ def pytest_runtest_makereport(
     report = yield
     if report.failed and (links := item.stash.get(_LINKS, [])):
         again = (
-            "the same losses again: pytest "
-            f"{_OPTION} {item.config.stash[_COMMON]} {shlex.quote(item.nodeid)}"
+            f"the same losses again: pytest {_OPTION} {item.config.stash[_COMMON]} {shlex.quote(item.nodeid)}"
         )
         text = "\n".join([*map(str, links), again])
         add = getattr(report.longrepr, "addsection", None)  # shown whatever --show-capture is

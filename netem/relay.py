@@ -77,17 +77,18 @@ class Relay:
         self._memory.core.spin_ns = spin_ns
         self._directions = [
             RelayDirection(
-                getattr(spec, side), spec.seed, (spec.name, side),
-                self._memory.directions[2 * number + reverse], spec.decisions.get(side, ()),
+                getattr(spec, side),
+                spec.seed,
+                (spec.name, side),
+                self._memory.directions[2 * number + reverse],
+                spec.decisions.get(side, ()),
             )
             for number, spec in enumerate(self.specs)
             for reverse, side in enumerate(DIRECTIONS)
-        ]  # fmt: skip
+        ]
         for number in range(len(self.specs)):
             self._listen(number)
-        self._clients = ClientTable(
-            self._open_links, self._warnings, self._directions, self._memory
-        )
+        self._clients = ClientTable(self._open_links, self._warnings, self._directions, self._memory)
         for number in range(len(self._directions)):
             self._stamp_arrivals(number)
 
@@ -238,11 +239,13 @@ class Relay:
         busiest = rows[np.argsort(-packets, kind="stable")[:_REPORTED_FLOWS]].tolist()
         return [
             FlowReport(
-                int(clients["number"][row]), self._clients.text(row), int(flow["packets"]),
+                int(clients["number"][row]),
+                self._clients.text(row),
+                int(flow["packets"]),
                 int(flow["longest_loss_burst"]),
             )
             for row, flow in zip(busiest, flows[clients["place"][busiest]], strict=True)
-        ]  # fmt: skip
+        ]
 
     def _listen(self, number: int) -> None:
         link = self._open_links[number]

@@ -304,9 +304,7 @@ def stamp_arrivals(endpoint: Endpoint) -> None:
 def let_wait(endpoint: Endpoint) -> int:
     """Let receiving from a socket wait; return how long, in ns."""
     endpoint.setblocking(True)
-    endpoint.setsockopt(
-        socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, RECEIVE_WAIT_NS // 1000)
-    )
+    endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, RECEIVE_WAIT_NS // 1000))
     return RECEIVE_WAIT_NS
 
 
@@ -451,8 +449,7 @@ def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:
             server = socket_name(spec.to, f"link {spec.name}: to")
             if spec.to[1] == 0:
                 raise CallerError(
-                    f"link {spec.name}: to {text_of(spec.to)}: nobody can be at port 0; give the "
-                    "server's"
+                    f"link {spec.name}: to {text_of(spec.to)}: nobody can be at port 0; give the server's"
                 )
             endpoint = undo.enter_context(listen(spec, own_name))
             path = None if spec.return_path else undo.enter_context(one_way_path(server))

@@ -36,9 +36,7 @@ class RelayMemory:
         row_count: number of rows of the record that are kept for each table; 0: no record.
     """
 
-    def __init__(
-        self, links: int, segment: bool = False, taps: int = 0, row_count: int = 0
-    ) -> None:
+    def __init__(self, links: int, segment: bool = False, taps: int = 0, row_count: int = 0) -> None:
         self.first_path = 2 * links
         self._chunks: list[Bytes] = []
         self._epoll = select.epoll()
@@ -201,9 +199,7 @@ class RelayDirection(LinkState):
         decisions: Decisions = (),
         restarted: bool = False,
     ) -> None:
-        super().__init__(
-            settings, seed, *name, decisions=decisions, rows=_ROWS, restarted=restarted
-        )
+        super().__init__(settings, seed, *name, decisions=decisions, rows=_ROWS, restarted=restarted)
         self.row = row
         row.link = self.core
         self._set_keeps()

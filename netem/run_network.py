@@ -16,12 +16,7 @@ from noack.core.clock import RunClock
 from noack.core.core_library import Rows, core
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Notice, Record, Start
-from noack.protocol.record_tables import (
-    NETEM_PACKET,
-    NETEM_RELEASE,
-    NETEM_SETTING,
-    PACKET_HEAD_BYTES,
-)
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES
 from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.real_time_loop import RecordSink, RowSink
@@ -65,9 +60,12 @@ class RunNetwork:
         for number, (settings, name) in enumerate(links):
             first, names = at_start(settings, name, start)
             direction = RelayDirection(
-                first, resolved.seeds.loss, names, self._memory.directions[number],
+                first,
+                resolved.seeds.loss,
+                names,
+                self._memory.directions[number],
                 restarted=start.is_restart,
-            )  # fmt: skip
+            )
             for loop in range(self._loops):
                 direction.start_flow(loop, number * self._loops + loop)
             self._directions.append(direction)
@@ -125,9 +123,7 @@ class RunNetwork:
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Accept a change; see :meth:`netem.channel.Channel.announce`."""
-        outputs = self._schedule.announce(
-            NETEM_SETTING, change, self._relay.inputs, now_ns, self._reached_ns
-        )
+        outputs = self._schedule.announce(NETEM_SETTING, change, self._relay.inputs, now_ns, self._reached_ns)
         self._relay.inputs += 1
         self._set_change_time()
         return outputs
@@ -141,9 +137,7 @@ class RunNetwork:
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Record]:
         """Process a datagram as if it had been received now; return its rows."""
         place = self._memory.first_path if message.flow >= self._loops else 0
-        core.noack_relay_add_datagram(
-            self._relay, place, self._sensor, message.data, len(message.data)
-        )
+        core.noack_relay_add_datagram(self._relay, place, self._sensor, message.data, len(message.data))
         return self.on_timer(now_ns)
 
     def on_timer(self, now_ns: int) -> Sequence[Record]:
@@ -276,9 +270,7 @@ class NetworkChannel(CountingSocket):
         for source, direction in self._directions.items():
             received = network.received[direction] - self._passed_on[direction]
             self.count_received(source, received)
-        rejected = {
-            "source": self._foreign + network.refused, "loop": self._of_no_loop + network.of_no_loop
-        }  # fmt: skip
+        rejected = {"source": self._foreign + network.refused, "loop": self._of_no_loop + network.of_no_loop}
         return super().report() | {
             "sent": network.sent,
             "send_errors": errors_by_text(network.send_errors),

@@ -77,9 +77,7 @@ def add_recording_options(parser: argparse.ArgumentParser, *, shell: bool = Fals
         metavar="FILE.pcapng",
         help="capture all datagrams, with their fates as comments; - for standard output",
     )
-    group.add_argument(
-        "--record-fates", metavar="FILE.parquet", type=Path, help="record packet fates"
-    )
+    group.add_argument("--record-fates", metavar="FILE.parquet", type=Path, help="record packet fates")
     group.add_argument(
         "--replay-fates",
         metavar="FILE.parquet",
@@ -163,9 +161,7 @@ def relay(
             side = stack.enter_context(attached(opened, options))
             running = nullcontext(lambda: False) if program is None else program.running(signals)
             has_ended = stack.enter_context(running)
-        for setting, answer in stack.enter_context(
-            realtime(options.realtime, _FIFO_PRIORITY)
-        ).items():
+        for setting, answer in stack.enter_context(realtime(options.realtime, _FIFO_PRIORITY)).items():
             if answer.startswith("refused"):
                 say(f"{setting} {answer}")
         takes_output = options.view or (options.stats is not None and options.stats_file is None)
@@ -245,8 +241,7 @@ def _report_ready(opened: Relay, *, print_it: bool, as_json: bool) -> None:
     line = f"ready: listening on {', '.join(listen.values())}"
     if as_json:
         links = [
-            {"name": spec.name, "listen": listen[spec.name], "to": text_of(spec.to)}
-            for spec in opened.specs
+            {"name": spec.name, "listen": listen[spec.name], "to": text_of(spec.to)} for spec in opened.specs
         ]
         line = json.dumps({"ready": links})
     if print_it and sys.stdout is not None:
@@ -269,18 +264,19 @@ def _add_watching_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         help="print statistics as JSON lines every SECONDS",
     )
-    group.add_argument(
-        "--stats-file", metavar="FILE", type=Path, help="write these lines to FILE instead"
-    )
+    group.add_argument("--stats-file", metavar="FILE", type=Path, help="write these lines to FILE instead")
     group.add_argument(
         OPTION,
         metavar="[HOST]:PORT",
         help="serve the statistics for Prometheus (OpenMetrics); the loopback without a HOST",
     )
     group.add_argument(
-        "--log-format", choices=[*LogFormat], type=LogFormat, default=LogFormat.TEXT,
+        "--log-format",
+        choices=[*LogFormat],
+        type=LogFormat,
+        default=LogFormat.TEXT,
         help="format of standard error: text, or JSON Lines for log collectors (text)",
-    )  # fmt: skip
+    )
     group.add_argument("--view", action="store_true", help="show live statistics in this terminal")
 
 

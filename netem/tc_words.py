@@ -11,14 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self, TypeVar
 
-from pydantic import (
-    BeforeValidator,
-    Field,
-    FiniteFloat,
-    TypeAdapter,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 
 from netem.relay_links import LinkSpec
 from noack.core.errors import CallerError, shortened
@@ -189,8 +182,11 @@ def _check_place(
             reader.wrong("nothing before it delays a packet; it goes after delay or rate")
         if isinstance(before[-1], Reorder):
             how = "reorder PERCENT gap N"
-            reader.wrong(f"there is a reorder before it; write {how}" if bare_gap else
-                         f"there is a reorder, or a gap, before it; write {how}")  # fmt: skip
+            reader.wrong(
+                f"there is a reorder before it; write {how}"
+                if bare_gap
+                else f"there is a reorder, or a gap, before it; write {how}"
+            )
 
 
 _FIXED_ORDER = ("duplicate", "loss", "corrupt", "delay", "reorder", "rate")
@@ -256,9 +252,7 @@ def _settings(value: object) -> LinkSettings:
         raise ValueError(str(error)) from None
 
 
-Side = Annotated[
-    LinkSettings, BeforeValidator(_settings, json_schema_input_type=str | LinkSettings)
-]
+Side = Annotated[LinkSettings, BeforeValidator(_settings, json_schema_input_type=str | LinkSettings)]
 
 
 class LinkTable(ScenarioSection):
@@ -335,8 +329,7 @@ def load_links(path: Path, *, read: bool = True) -> tuple[LinkSpec, ...]:
     """
     links = toml_file.validated(LinksFile, toml_file.read(path, LinksFile), str(path)).link
     specs = tuple(
-        link.spec(path.parent, f"{path}: link.{number}", read=read)
-        for number, link in enumerate(links)
+        link.spec(path.parent, f"{path}: link.{number}", read=read) for number, link in enumerate(links)
     )
     listening: dict[object, str] = {}
     for number, spec in enumerate(specs):

@@ -57,9 +57,7 @@ class Disturbance:
         widths: their entries, m and n; 0 where there is no disturbance.
     """
 
-    def __init__(
-        self, at_input: list[Signal], at_state: list[Signal], widths: tuple[int, int]
-    ) -> None:
+    def __init__(self, at_input: list[Signal], at_state: list[Signal], widths: tuple[int, int]) -> None:
         self._parts, self.widths = (at_input, at_state), widths
 
     def values(self, steps: range) -> tuple[Matrix, Matrix]:
@@ -116,18 +114,21 @@ class Watchdog:
 
     def fill(self, plant: CData, memory: CoreMemory, period_ns: int) -> None:
         """Fill the watchdog of a ``noack_plant`` with this step."""
-        memory.fill(plant, {
-            "watchdog": _POLICIES[self.policy], "timeout_ns": self.timeout_ns,
-            "notice_ns": max(self.notice_ns, self.timeout_ns),
-            "carries_model": self.is_predictive, "K": self.K,
-        })  # fmt: skip
+        memory.fill(
+            plant,
+            {
+                "watchdog": _POLICIES[self.policy],
+                "timeout_ns": self.timeout_ns,
+                "notice_ns": max(self.notice_ns, self.timeout_ns),
+                "carries_model": self.is_predictive,
+                "K": self.K,
+            },
+        )
         if self.H is not None:
             memory.set_model(plant.fallback, memory.transitions(self.H, (period_ns,)))
 
 
-def too_old(
-    t_ns: NDArray[np.int64], newest_ns: NDArray[np.int64], timeout_ns: int
-) -> NDArray[np.bool_]:
+def too_old(t_ns: NDArray[np.int64], newest_ns: NDArray[np.int64], timeout_ns: int) -> NDArray[np.bool_]:
     """Whether actuations of the times ``newest_ns`` are too old at ``t_ns``."""
     return t_ns - newest_ns > timeout_ns
 
@@ -189,10 +190,14 @@ class Plant:
         """The sizes of the rows."""
         d, w = (0, 0) if self.disturbance is None else self.disturbance.widths
         return RecordShape(
-            len(self.system.x), self.inputs, predictive=self.watchdog.is_predictive,
-            predictions=self.predictions, internal=len(self.system.z),
-            disturbed_input=d > 0, disturbed_state=w > 0,
-        )  # fmt: skip
+            len(self.system.x),
+            self.inputs,
+            predictive=self.watchdog.is_predictive,
+            predictions=self.predictions,
+            internal=len(self.system.z),
+            disturbed_input=d > 0,
+            disturbed_state=w > 0,
+        )
 
     @property
     def external(self) -> External | None:
@@ -203,10 +208,14 @@ class Plant:
         """Fill a ``noack_plant`` at time 0."""
         n, m, shape = len(self.system.x), self.inputs, self.shape
         set_machine(
-            plant.machine, n=n, m=m, flow=Flow.ACTUATION,
+            plant.machine,
+            n=n,
+            m=m,
+            flow=Flow.ACTUATION,
             entries=m * self.predictions + n * self.watchdog.is_predictive,
-            period_ns=self.period_ns, horizon_ns=self.horizon_ns,
-        )  # fmt: skip
+            period_ns=self.period_ns,
+            horizon_ns=self.horizon_ns,
+        )
         sources, shown = m + n * shape.disturbed_state, self.measure_every * self.reports_inputs
         C = None if self.measuring is None else self.measuring.C
         memory.fill(plant, {
@@ -221,9 +230,14 @@ class Plant:
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip
         if isinstance(self.system, LinearSystem):
-            memory.fill(plant, {
-                "system": core.NOACK_LINEAR, "Ad": np.zeros((n, n)), "Bd": np.zeros((n, sources)),
-            })  # fmt: skip
+            memory.fill(
+                plant,
+                {
+                    "system": core.NOACK_LINEAR,
+                    "Ad": np.zeros((n, n)),
+                    "Bd": np.zeros((n, sources)),
+                },
+            )
         self.redraw(plant, memory)
         self.watchdog.fill(plant, memory, self.period_ns)
         widths = (0, 0) if self.disturbance is None else self.disturbance.widths

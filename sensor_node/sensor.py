@@ -40,9 +40,12 @@ from noack.scenario.scenario import Scenario
 from noack.trigger.trigger_rule import CodedPolicy, EventTrigger, Policy, fill_rule, rule_rows
 
 SENSOR = Role(
-    "sensor", "noack_sensor", Flow.MEASUREMENT,
-    (None, SENSOR_MEASUREMENT, SENSOR_ACKNOWLEDGEMENT), SENSOR_SETTING,
-)  # fmt: skip
+    "sensor",
+    "noack_sensor",
+    Flow.MEASUREMENT,
+    (None, SENSOR_MEASUREMENT, SENSOR_ACKNOWLEDGEMENT),
+    SENSOR_SETTING,
+)
 _SENT_PLACES = 64
 _ANY_TIME_NS = 2**60  # the latest horizon of a machine
 
@@ -142,19 +145,26 @@ class Sensor:
         """The sizes of the rows."""
         observed = (0, 0) if self.observer is None else (self.observer.p, self.observer.reported)
         return RecordShape(
-            len(self.H), self.inputs, acknowledged=self.timeout_ns is not None,
-            outputs=observed[0], inputs_reported=observed[1],
-        )  # fmt: skip
+            len(self.H),
+            self.inputs,
+            acknowledged=self.timeout_ns is not None,
+            outputs=observed[0],
+            inputs_reported=observed[1],
+        )
 
     def fill(self, sensor: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_sensor`` at its start."""
         n, own, steps_ns = len(self.H), self.observer, (self.period_ns or 0,)
         self._memory = memory
         set_machine(
-            sensor.machine, n=n, m=self.inputs, flow=Flow.MEASUREMENT,
-            entries=n if own is None else own.p + own.reported, first_number=self.first_number,
+            sensor.machine,
+            n=n,
+            m=self.inputs,
+            flow=Flow.MEASUREMENT,
+            entries=n if own is None else own.p + own.reported,
+            first_number=self.first_number,
             horizon_ns=self.horizon_ns,
-        )  # fmt: skip
+        )
         memory.set_model(sensor.model, memory.transitions(self.H, steps_ns), (), self._points)
         start = np.zeros(n) if self.x0 is None else self.x0
         memory.fill(sensor, {
@@ -235,9 +245,13 @@ class Sensor:
         n = sensor.machine.n
         reals_at(sensor.event_x, n)[:] = x
         core.noack_trigger_start(
-            ffi.addressof(sensor.rule), ffi.addressof(sensor.trigger), n, t_ns, sensor.event_x,
+            ffi.addressof(sensor.rule),
+            ffi.addressof(sensor.trigger),
+            n,
+            t_ns,
+            sensor.event_x,
             sensor.scratch,
-        )  # fmt: skip
+        )
 
     def _from_setpoint(self, t_ns: int, x: Vector) -> Vector:
         """Return x − x_r at a time, (n,), which a trigger compares with."""
@@ -255,18 +269,20 @@ class Sensor:
         sensor.scratch = memory.zeros(5 * n + rule_rows(policy))
         if sensor.trigger.event_ns >= 0:
             core.noack_trigger_condition(
-                ffi.addressof(sensor.rule), ffi.addressof(sensor.trigger), n,
-                sensor.trigger.event_ns, sensor.event_x, sensor.scratch,
-            )  # fmt: skip
+                ffi.addressof(sensor.rule),
+                ffi.addressof(sensor.trigger),
+                n,
+                sensor.trigger.event_ns,
+                sensor.event_x,
+                sensor.scratch,
+            )
 
     def _set_point(self, sensor: CData, since_ns: int, setpoint: Vector | None) -> None:
         """Move x_r from ``since_ns`` on."""
         if not np.array_equal(_or_zero(self._points[-1]), _or_zero(setpoint)):
             self._points.append(setpoint)
             self._since_ns.append(since_ns)
-            self._memory.set_model(
-                sensor.model, sensor.model.transitions, self._since_ns, self._points
-            )
+            self._memory.set_model(sensor.model, sensor.model.transitions, self._since_ns, self._points)
 
     def _make_room(self, sensor: CData, places: int) -> None:
         """Provide room for updates that wait for their acknowledgement."""
@@ -345,6 +361,11 @@ def observer_of(resolved: Scenario, *, restarted: bool) -> Observer | None:
     if settings.initial_estimate is not None:
         x = np.array(settings.initial_estimate)
     return Observer(
-        settings, assumed_model(resolved), x, resolved.message_sizes.inputs_reported,
-        resolved.timing.plant_period_ns, knows_start, restarted,
-    )  # fmt: skip
+        settings,
+        assumed_model(resolved),
+        x,
+        resolved.message_sizes.inputs_reported,
+        resolved.timing.plant_period_ns,
+        knows_start,
+        restarted,
+    )

@@ -21,8 +21,12 @@ from hypothesis.internal.conjecture import providers
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-FIRST = ("tests/integration/", "tests/native/", "tests/cosim/lab/")
-"""Of these folders some files take minutes, and a worker runs whole files."""
+FIRST = (
+    "tests/test_doc_programs.py", "tests/integration/", "tests/cosim/lab/", "tests/native/",
+    "tests/cosim/simulation/test_whole_loop.py", "tests/test_docs.py", "tests/other_system/",
+    "tests/noack/theory/test_certificate_kinds.py", "tests/attacks/", "tests/cosim/studies/",
+)  # fmt: skip
+"""What takes longest, in this order: a worker runs whole files, and none should end alone."""
 
 settings.register_profile(
     "noack",
@@ -42,8 +46,11 @@ settings.load_profile("noack")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    # With several workers, what waits or takes minutes begins first.
-    items.sort(key=lambda item: not item.nodeid.startswith(FIRST))
+    def place(item: pytest.Item) -> int:
+        found = (place for place, begin in enumerate(FIRST) if item.nodeid.startswith(begin))
+        return next(found, len(FIRST))
+
+    items.sort(key=place)
     if settings().derandomize:
         # Hypothesis would also try constants of the loaded modules, which depend on the tests that
         # this worker has run before.

@@ -45,8 +45,8 @@ def fill(folder: Path) -> Path:
             subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
     result = subprocess.run(
         [
-            sys.executable, "-m", "cosim.cli", "run", "lane_following", "--json",
-            "--set", "ports={}", "--set", "horizon_s=2",
+            sys.executable, "-m", "cosim.cli", "simulate", "lane_following", "--json",
+            "--set", "horizon_s=2", "--no-report",
         ],
         cwd=folder, capture_output=True, text=True, check=False, timeout=250,
     )  # fmt: skip

@@ -37,11 +37,11 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 SHORTER = {
-    "simulate": ("--no-report", "--set", "horizon_s=4"),
+    "simulate": ("--no-report", "--set", "horizon_s=1"),
     "demo": ("--no-report",),
     "run": ("--no-report",),
     "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
-    "design": ("--draws", "100"),
+    "design": ("--draws", "80"),
     "capacity": ("--draws", "1", "--loops", "11", "--set", "horizon_s=1"),
     "margin": ("--no-period",),
     "doctor": ("--seconds", "0.1"),
@@ -55,9 +55,7 @@ def shorter(words: list[str]) -> list[str]:
 
 
 @pytest.mark.parametrize("command", sorted(set(commands())))
-def test_every_command_works(
-    command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *words = shlex.split(command.partition(" > ")[0])
     if program == "make":
         assert target_exists(command)
@@ -162,9 +160,7 @@ def numbers(line: str) -> list[float]:
 
 def alike(line: str, other: str) -> bool:
     """Whether two output lines agree to 2 %, or both differ from zero by rounding only."""
-    return shape(line) == shape(other) and numbers(line) == pytest.approx(
-        numbers(other), rel=0.02, abs=1e-12
-    )
+    return shape(line) == shape(other) and numbers(line) == pytest.approx(numbers(other), rel=0.02, abs=1e-12)
 
 
 @pytest.fixture
@@ -216,9 +212,7 @@ def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> N
             process.send_signal(signal.SIGINT)
             _, stderr = process.communicate(timeout=120)
     assert process.returncode == 130, stderr
-    assert [shape(line) for line in change.shown] == [
-        shape(line) for line in done.stdout.splitlines()
-    ]
+    assert [shape(line) for line in change.shown] == [shape(line) for line in done.stdout.splitlines()]
     summary = json.loads((folder / "runs/latest/summary.json").read_text())
     (recorded,) = summary["changes"]
     assert recorded["settings"] == {"network.loss.probability": 0.9}

@@ -9,16 +9,7 @@ from noack.scenario.sections import POLICIES
 from noack.settings.section import Table
 from noack.trigger.mixed import mixed_rule as given_mixed_rule
 from noack.trigger.policy_settings import ModelMatrices
-from noack.trigger.trigger_rule import (
-    NEVER_NS,
-    QuadraticForm,
-    TriggerRule,
-    empty_map,
-    error_form,
-    quadratic_form,
-    require_rule,
-    state_map,
-)
+from noack.trigger.trigger_rule import NEVER_NS, TriggerRule, error_form, quadratic_form, require_rule
 
 EXAMPLES: dict[str, Table] = {
     name: example.model_dump(mode="json", exclude_none=True)
@@ -79,13 +70,10 @@ TABLES: dict[str, Table] = {
 """Tables of all policies that are rules, and of combinations; one of several values is drawn."""
 
 
-def drawn(
-    table: Table, rng: np.random.Generator, n: int = 2, weight: Matrix | None = None
-) -> Table:
+def drawn(table: Table, rng: np.random.Generator, n: int = 2, weight: Matrix | None = None) -> Table:
     """A table for n states; "quadratic" gets a random matrix."""
     found = {
-        key: rng.choice(value).item() if isinstance(value, tuple) else value
-        for key, value in table.items()
+        key: rng.choice(value).item() if isinstance(value, tuple) else value for key, value in table.items()
     }
     if "rule" in found:
         return found | {"rule": drawn(found["rule"], rng, n, weight)}
@@ -101,9 +89,7 @@ def rule_from(table: Table, model: ModelMatrices) -> TriggerRule:
     return require_rule(settings.trigger_policy(model))
 
 
-def random_rule(
-    name: str, rng: np.random.Generator, n: int, weight: Matrix | None = None
-) -> TriggerRule:
+def random_rule(name: str, rng: np.random.Generator, n: int, weight: Matrix | None = None) -> TriggerRule:
     """A rule of a table, with the matrices of a random model of n states."""
     BK = 3 * rng.uniform(-1, 1, (n, n))
     closed = 0.3 * rng.uniform(-1, 1, (n, n)) - np.eye(n)
@@ -127,9 +113,7 @@ def area_rule(delta_s: float, weight: Matrix | None = None, n: int = 2) -> Trigg
     return absolute_rule(delta_s, weight, n)._replace(integrates=True)
 
 
-def mixed_rule(
-    sigma: float, epsilon: float = 0.0, weight: Matrix | None = None, n: int = 2
-) -> TriggerRule:
+def mixed_rule(sigma: float, epsilon: float = 0.0, weight: Matrix | None = None, n: int = 2) -> TriggerRule:
     return given_mixed_rule(n if weight is None else len(weight), sigma, epsilon, weight)
 
 
@@ -142,9 +126,3 @@ def quadratic_rule(
         quadratic_form(Q), floor=float(np.sqrt(epsilon)), grid_ns=period_ns, longest_ns=longest_ns,
         weight=weight,
     )  # fmt: skip
-
-
-def lyapunov_rule(factor: Matrix, rate_per_s: float, weight: Matrix | None = None) -> TriggerRule:
-    n = len(factor)
-    form = QuadraticForm(state_map(n, factor), empty_map(n))
-    return TriggerRule(form, rate_per_s=rate_per_s / 2, from_event=True, weight=weight)

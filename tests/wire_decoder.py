@@ -49,11 +49,7 @@ class Decoder:
             assert self._wire.seal is not None
             content = self._wire.seal.open(datagram, wire_format.HEADER_BYTES)
             if content is not None:
-                readable = (
-                    datagram[: wire_format.HEADER_BYTES]
-                    + content
-                    + datagram[-wire_format.TAG_BYTES :]
-                )
+                readable = datagram[: wire_format.HEADER_BYTES] + content + datagram[-wire_format.TAG_BYTES :]
                 found = self._examine(readable, from_peer, opened=True)
         message = self._message
         core.noack_wire_count(self._reception, found, message)

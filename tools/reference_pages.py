@@ -45,9 +45,7 @@ def _command(name: str, command: Any, parent: Any) -> str:
     lines += ["```text", usage.replace("{", "").replace("}", ""), "```", ""]
     if rows:
         lines += ["| | |", "|---|---|"]
-        lines += [
-            f"| `{_cell(what)}` | {_cell(meaning).replace('<', '&lt;')} |" for what, meaning in rows
-        ]
+        lines += [f"| `{_cell(what)}` | {_cell(meaning).replace('<', '&lt;')} |" for what, meaning in rows]
     if command.epilog:
         lines += ["", "```text", _examples(command.epilog), "```"]
     return "\n".join([*lines, ""])

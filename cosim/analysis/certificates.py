@@ -27,12 +27,7 @@ from noack.theory.certificates.conditions import (
     void_at_setpoint,
 )
 from noack.theory.certificates.region import RegionScope
-from noack.theory.certificates.scenario_certificates import (
-    NetworkLimits,
-    box,
-    network_limits,
-    own_plant,
-)
+from noack.theory.certificates.scenario_certificates import NetworkLimits, box, network_limits, own_plant
 from noack.theory.certificates.weight import choose_weight
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
@@ -97,6 +92,7 @@ class Certificates:
         given: Matrix | None = None,
         nonlinear: Scenario | None = None,
     ) -> None:
+        self._given_arguments = (scenario, late_periods, weight, given, nonlinear)
         scenario.coverage.require_constant()
         scenario.coverage.require_certifiable()
         self.setpoint, void = scenario.controller.setpoint, void_at_setpoint(scenario)
@@ -113,13 +109,15 @@ class Certificates:
             if REGION not in void_at_setpoint(nonlinear) and nonlinear.coverage.can_be_certified:
                 self._scopes.append(RegionScope(nonlinear))
         self._certificates = [
-            (under, scope.certificate(of))
-            for under, of in conditions.items()
-            for scope in self._scopes
+            (under, scope.certificate(of)) for under, of in conditions.items() for scope in self._scopes
         ]
         self._given = np.eye(loop_of(scenario).n) if given is None else given
         self.theorem_2 = _theorem_2(scenario, self.paper)
         self.unlimited, self.unpredictable = self._unlimited()
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle what they are computed from; it is computed again."""
+        return Certificates, self._given_arguments
 
     def __iter__(self) -> Iterator[tuple[str, ScenarioCertificate]]:
         return iter(self._certificates)
@@ -272,17 +270,18 @@ def with_weight(
     if which == "chosen":
         try:
             weight = choose_weight(
-                loop_of(resolved), trigger.beta, trigger.alpha_per_s,
-                nominal_conditions(resolved, late_periods), progress,
-            )  # fmt: skip
+                loop_of(resolved),
+                trigger.beta,
+                trigger.alpha_per_s,
+                nominal_conditions(resolved, late_periods),
+                progress,
+            )
         except NotDecayingError as error:
             raise CallerError(f"weight chosen: {error}") from None
         except np.linalg.LinAlgError as error:  # extremely stiff models
             raise CallerError(f"weight chosen: {one_line(error)}") from None
     rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
-    return resolved.model_copy(
-        update={"trigger": trigger.model_copy(update={"weight": rows})}
-    ), weight
+    return resolved.model_copy(update={"trigger": trigger.model_copy(update={"weight": rows})}), weight
 
 
 def with_linear_plant(resolved: Scenario) -> Scenario:
@@ -341,9 +340,12 @@ def in_chosen_norm(
 
 
 _PERSISTENT = {
-    "‖e_c‖": "delta", "‖e_s‖": "overshoot", "‖u − Kx‖": "input_error", "‖x‖": "state",
+    "‖e_c‖": "delta",
+    "‖e_s‖": "overshoot",
+    "‖u − Kx‖": "input_error",
+    "‖x‖": "state",
     "‖x̂ − x‖": "estimation_error",
-}  # fmt: skip
+}
 """Rows of the bounds that are added under disturbances, noise or an observer."""
 
 

@@ -174,15 +174,11 @@ def _latched(actuations: NDArray[np.int64], ticks: _Ticks) -> _Ticks:
     """Return the origin of the input held from each step on; −1 before the first."""
     known = bool(actuations.max(initial=NO_SEQUENCE) < len(ticks.newest))
     _require(known, "the controller's record ends before the plant's")
-    by_sequence = _Ticks(
-        np.append(ticks.model_ns, NO_ACTUATION), np.append(ticks.newest, NO_SEQUENCE)
-    )
+    by_sequence = _Ticks(np.append(ticks.model_ns, NO_ACTUATION), np.append(ticks.newest, NO_SEQUENCE))
     return _Ticks(by_sequence.model_ns[actuations], by_sequence.newest[actuations])
 
 
-def _delays(
-    accepted: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]
-) -> Callable[[int], int]:
+def _delays(accepted: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]) -> Callable[[int], int]:
     """Return the recorded delays; for events that the run did not have, their median."""
     usable = [int(delays[event]) for event in accepted if event < len(delays) and acted[event]]
     usual = int(np.median(usable)) if usable else 0
@@ -353,13 +349,14 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     split_s = _SPLIT_PERIODS * scenario.plant.measure_every * period_s
     stages = (
         FidelityStage(
-            name, _difference(effect), _share(effect, whole), len(after_s),
+            name,
+            _difference(effect),
+            _share(effect, whole),
+            len(after_s),
             *_event_changes(before_s, after_s, split_s),
         )
-        for name, effect, (before_s, after_s) in zip(
-            _STAGES, effects, pairwise(events_s), strict=True
-        )
-    )  # fmt: skip
+        for name, effect, (before_s, after_s) in zip(_STAGES, effects, pairwise(events_s), strict=True)
+    )
     largest_s, first_different = _event_changes(ideal.event_s, live.event_s, split_s)
     return Fidelity(
         scenario=scenario.name,
@@ -399,9 +396,12 @@ def _ideal(
 ) -> ContinuousRun:
     try:
         ideal = simulate_continuous(
-            system, horizon_s=horizon_s, delivered=live.schedule.delivered,
-            known_start=known_start, max_events=max_events,
-        )  # fmt: skip
+            system,
+            horizon_s=horizon_s,
+            delivered=live.schedule.delivered,
+            known_start=known_start,
+            max_events=max_events,
+        )
     except TooManyEventsError:
         raise IncomparableError(
             f"the ideal loop has more than {max_events} events, which accumulate"
@@ -431,9 +431,7 @@ def _share(part: Matrix, whole: Matrix) -> float:
     return float((part * whole).sum()) / energy if energy else 0.0
 
 
-def _event_changes(
-    first_s: Vector, second_s: Vector, tolerance_s: float
-) -> tuple[float | None, int | None]:
+def _event_changes(first_s: Vector, second_s: Vector, tolerance_s: float) -> tuple[float | None, int | None]:
     """Return the largest time difference of events of equal number, and the first other event.
 
     The latter is further apart than the tolerance, or only one of the two runs has it.

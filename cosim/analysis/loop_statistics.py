@@ -109,9 +109,7 @@ def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64
     """
     events = record.events()
     deliveries = record.columns(CONTROLLER_DELIVERY, "sequence", "now_ns")
-    _, at_sensor, at_controller = np.intersect1d(
-        events["event"], deliveries["sequence"], return_indices=True
-    )
+    _, at_sensor, at_controller = np.intersect1d(events["event"], deliveries["sequence"], return_indices=True)
     passed_ns = deliveries["now_ns"][at_controller] - events["now_ns"][at_sensor]
     return events["t_ns"][at_sensor], passed_ns / (1e3 * record.scenario.speed)
 
@@ -191,19 +189,12 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
     }
     for flow in record.scenario.network.flows[1:]:
         name, answers = flow.name.lower(), packet_outcomes(record, flow)
-        sent, arrived = (
-            record.columns(table, "sequence")["sequence"] for table in _SENT_RECEIVED[flow]
-        )
+        sent, arrived = (record.columns(table, "sequence")["sequence"] for table in _SENT_RECEIVED[flow])
         legs.pop(name, None)
         legs[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
-        legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
-            _left_until(answers, last_ns), arrived
-        )
+        legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(_left_until(answers, last_ns), arrived)
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
-    return {
-        leg: max(one.count(complete=complete) - _not_finite(record, leg), 0)
-        for leg, one in legs.items()
-    }
+    return {leg: max(one.count(complete=complete) - _not_finite(record, leg), 0) for leg, one in legs.items()}
 
 
 def _not_finite(record: RunRecord, leg: str) -> int:
@@ -464,9 +455,7 @@ class SignalStatistics:
             "sup_e_c_norm": self._sup_e_c,
             "sup_e_c_at_s": self._sup_e_c_at_s,
             "identity_residual_max": self._residual,
-            "identity_residual_relative": None
-            if self._residual is None
-            else self._residual / scale,
+            "identity_residual_relative": None if self._residual is None else self._residual / scale,
         }
 
     def estimation(self) -> EstimationPart | None:

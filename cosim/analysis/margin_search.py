@@ -5,11 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from cosim.analysis.guarantee_comparison import (
-    GuaranteeComparison,
-    compare_guarantees,
-    read_guarantee,
-)
+from cosim.analysis.guarantee_comparison import GuaranteeComparison, compare_guarantees, read_guarantee
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import duration
@@ -82,9 +78,7 @@ class PeriodLimit(NamedTuple):
         """The limit in words."""
         apart = "updates at most" if self.is_longest else "an update every"
         if self.found is None:
-            return (
-                f"stable for every pattern with {apart} {self.stable_s:g} s, the longest examined"
-            )
+            return f"stable for every pattern with {apart} {self.stable_s:g} s, the longest examined"
         longer = f"{apart} {self.unstable_s:g} s: undecided, {undecided_text(self.found, 1.0)}"
         if self.found.verdict == "destabilised":
             longer = f"{apart} {self.unstable_s:g} s: this pattern destabilises: {self.found.text}"
@@ -181,9 +175,7 @@ class MarginResult:
         period = None
         if self.period is not None:
             period = self.period._asdict() | {"text": self.period.text}
-            period["found"] = (
-                None if self.period.found is None else stability_document(self.period.found)
-            )
+            period["found"] = None if self.period.found is None else stability_document(self.period.found)
         found = self.without_guarantee
         return vars(self) | {
             "verdict": self.verdict,
@@ -276,9 +268,7 @@ def _without_guarantee(resolved: Scenario, progress: MarginProgress) -> RandomGr
         return f"not known: {error}"
 
 
-def find_longest_period(
-    resolved: Scenario, progress: MarginProgress = lambda text: None
-) -> PeriodLimit:
+def find_longest_period(resolved: Scenario, progress: MarginProgress = lambda text: None) -> PeriodLimit:
     """Find a stable period and an unstable one that is one measurement longer.
 
     From the scenario's period on, periods are doubled or halved until one is stable and one is not;

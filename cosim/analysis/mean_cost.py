@@ -79,9 +79,7 @@ class MeanCost:
         return f"{text}; stationary: {found.stationary.cost_per_s:.6g} /s"
 
 
-def find_mean_cost(
-    resolved: Scenario, Q: Matrix | None = None, R: Matrix | None = None
-) -> MeanCost:
+def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None = None) -> MeanCost:
     """Return the mean of the cost ∫ xᵀQx + uᵀRu dt.
 
     Args:
@@ -132,9 +130,7 @@ def _under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarantee) -
     if stationary is not None:
         means, at = stationary[1], np.diag(stationary[0].moments.sum(axis=0))
         roots = np.sqrt(np.maximum(np.concatenate([means[:-1], at[:n]]), 0.0)).tolist()
-        found = Stationary(
-            tuple(roots[:n]), tuple(roots[-n:]), tuple(roots[n:-n]), float(means[-1])
-        )
+        found = Stationary(tuple(roots[:n]), tuple(roots[-n:]), tuple(roots[n:-n]), float(means[-1]))
     with np.errstate(over="ignore"):
         _, until = moments.until(start, resolved.timing.horizon_ns)
     transient = moments.transient(start)

@@ -81,9 +81,7 @@ def _deadlines(lateness_us: Sequence[Mapping[str, LatenessPart]]) -> dict[str, D
         role: DeadlinesPart(
             steps=sum(one[role].steps for one in lateness_us),
             late_steps=sum(one[role].late_steps for one in lateness_us),
-            max_us=max(
-                (one[role].max or 0.0 for one in lateness_us if one[role].steps), default=None
-            ),
+            max_us=max((one[role].max or 0.0 for one in lateness_us if one[role].steps), default=None),
         )
         for role in lateness_us[0]
     }
@@ -122,16 +120,12 @@ def _network_part(
         drops_by_cause=dict(sum((Counter(one.drops_by_cause) for one in loops), Counter())),
         longest_loss_burst=max(one.longest_loss_burst for one in loops),
         rate_bps=None if slowest is None else slowest.rate_bps,
-        utilisation=(
-            None if slowest is None else _utilisation(packets, slowest, stages, reached_ns)
-        ),
+        utilisation=(None if slowest is None else _utilisation(packets, slowest, stages, reached_ns)),
         in_flight=in_flight(packets, network.scenario.timing.horizon_ns, reached_ns),
     )
 
 
-def _utilisation(
-    packets: Rows, bottleneck: Rate, stages: Sequence[Impairment], until_ns: int
-) -> float:
+def _utilisation(packets: Rows, bottleneck: Rate, stages: Sequence[Impairment], until_ns: int) -> float:
     """Return the share of a bottleneck's rate that was used until a time."""
     copied = any(isinstance(one, Duplicate) for one in stages[: stages.index(bottleneck)])
     left = [packets[name] for name in (("release_ns", "copy_ns") if copied else ("release_ns",))]

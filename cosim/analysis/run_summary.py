@@ -86,9 +86,7 @@ def outcome_of_loop(outcome: Outcome, loop: str | None) -> Outcome:
         raise no_such_loop(loop, names)
     summary = outcome.summary.of_loop(loop)
     status = ExitStatus(summary.exit.status)
-    return Outcome(
-        outcome.run_dir, status, summary.exit.reason, summary, loop if len(names) > 1 else None
-    )
+    return Outcome(outcome.run_dir, status, summary.exit.reason, summary, loop if len(names) > 1 else None)
 
 
 @np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same
@@ -135,9 +133,7 @@ def summarise(
         },
         lateness_us={role: lateness(record, role) for role in LOOP_ROLES if live},
         latency_us=latency(record) if live else None,
-        realtime={
-            role: report.get("realtime") or {} for role, report in record.reports.items() if live
-        },
+        realtime={role: report.get("realtime") or {} for role, report in record.reports.items() if live},
         watchdog=watchdog_actions(record),
         estimation=signals.estimation(),
         disturbances=disturbances(record),
@@ -191,9 +187,14 @@ def _transmissions(record: RunRecord) -> _Transmissions:
 def _delays_s(record: RunRecord) -> Vector:
     """The times of the effectively delivered updates in the network."""
     packets = record.columns(
-        NETEM_PACKET, "sequence", "now_ns", "release_ns", "flow", "fate",
+        NETEM_PACKET,
+        "sequence",
+        "now_ns",
+        "release_ns",
+        "flow",
+        "fate",
         where=lambda rows: (rows["flow"] == UPDATES) & effective(rows["fate"]),
-    )  # fmt: skip
+    )
     packets = record.with_departures(packets)
     return np.asarray((packets["release_ns"] - packets["now_ns"]) / NS_PER_S)
 
@@ -204,9 +205,7 @@ def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
     return dict(sum((Counter(one.get("rejected") or {}) for one in both), Counter()))
 
 
-def _why_failed(
-    record: RunRecord, missing: Mapping[str, int], diverged: Divergence | None
-) -> str | None:
+def _why_failed(record: RunRecord, missing: Mapping[str, int], diverged: Divergence | None) -> str | None:
     """Return why a run that ended at its horizon failed; None if it did not fail."""
     if diverged is not None:
         return diverged.text
@@ -255,16 +254,20 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
         notices = [n for n in record.notices if (n["process"], n["level"]) == (role, RESTART)]
         if role == RECORDER:  # the recorder has no rows
             found += [
-                RestartPart(process=role, generation=number, last_s=None,
-                            first_s=notice["t_ns"] * 1e-9, what=notice["text"])
+                RestartPart(
+                    process=role,
+                    generation=number,
+                    last_s=None,
+                    first_s=notice["t_ns"] * 1e-9,
+                    what=notice["text"],
+                )
                 for number, notice in enumerate(notices, 1)
-            ]  # fmt: skip
+            ]
             continue
         if not notices and len(record.begun_lives(role)) == 1:
             continue
         active_s = {
-            life.generation: (_seconds(life.first_ns), _seconds(life.last_ns))
-            for life in record.lives(role)
+            life.generation: (_seconds(life.first_ns), _seconds(life.last_ns)) for life in record.lives(role)
         }
         # Each restart has one notice. It is lost only if the process ended soon after, so the
         # notices belong to the last generations.
@@ -274,9 +277,7 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
             first_s, until_s = active_s.get(number, (None, last_s))
             what = reported[number]["text"] if number in reported else None
             found.append(
-                RestartPart(
-                    process=role, generation=number, last_s=last_s, first_s=first_s, what=what
-                )
+                RestartPart(process=role, generation=number, last_s=last_s, first_s=first_s, what=what)
             )
             last_s = until_s
     return sorted(found, key=lambda one: one.first_s or one.last_s or math.inf)
@@ -321,9 +322,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
             else:
                 is_fixed = plant.system.has_own_step
                 step_ns = resolved.timing.plant_period_ns if is_fixed else STEP_NS
-                found = linearise(
-                    system_at, n, m, settling_s=plant.system.settling_s, step_ns=step_ns
-                )
+                found = linearise(system_at, n, m, settling_s=plant.system.settling_s, step_ns=step_ns)
                 A, B = found.A, found.B
     except NoackError:  # a user's plant: its code fails, or it does not accept this x(0)
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)

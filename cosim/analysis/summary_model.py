@@ -450,9 +450,7 @@ class RunSummary(SummaryPart):
             if loop.name == name:
                 only = {"loops": [loop], "exit": loop.exit, "changes": loop.changes}
                 scenario = self.scenario if len(self.loops) == 1 else name
-                return self.model_copy(
-                    update=only | {"scenario": scenario, "reached_s": loop.reached_s}
-                )
+                return self.model_copy(update=only | {"scenario": scenario, "reached_s": loop.reached_s})
         raise KeyError(name)
 
     def to_json(self) -> dict[str, object]:

@@ -143,9 +143,7 @@ def decimate_all(t: Reals, values: Reals, columns: int) -> Indices:
     return np.unique(np.concatenate(kept))
 
 
-def _where_first(
-    extreme: Reals, y: Reals, column: Indices, first: Indices, last: Indices
-) -> Indices:
+def _where_first(extreme: Reals, y: Reals, column: Indices, first: Indices, last: Indices) -> Indices:
     """Return the index of each column's first value that equals its extreme."""
     equal = np.flatnonzero(y == np.repeat(extreme, last - first + 1))
     _, which = np.unique(column[equal], return_index=True)

@@ -57,8 +57,7 @@ def __getattr__(name: str) -> object:
     elif name == "LossyChannel":
         if find_spec("gymnasium") is None:
             raise _CallerError(
-                "noack.LossyChannel needs a package that is not installed; "
-                "pip install 'noack[gymnasium]'"
+                "noack.LossyChannel needs a package that is not installed; pip install 'noack[gymnasium]'"
             )
         module = "cosim.api.lossy_channel"
     else:

@@ -152,8 +152,11 @@ class Explorer:
 
     def __repr__(self) -> str:
         found = self.certificate
-        rows = [("scenario", self.scenario.name), *self.run.numbers,
-                ("certificate", f"{found.verdict}: {found.reason}")]  # fmt: skip
+        rows = [
+            ("scenario", self.scenario.name),
+            *self.run.numbers,
+            ("certificate", f"{found.verdict}: {found.reason}"),
+        ]
         return as_text([*rows, *([("warning", self.warning)] if self.warning else [])])
 
     def _ipython_display_(self) -> None:

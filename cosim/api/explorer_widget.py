@@ -45,9 +45,11 @@ class ExplorerWidget:
         self._later: asyncio.Handle | None = None
         names = results.run.state_names
         self._state = widgets.Dropdown(
-            options=[(name, i) for i, name in enumerate(names)], value=len(names) - 1,
-            description="drawn state", style={"description_width": "initial"},
-        )  # fmt: skip
+            options=[(name, i) for i, name in enumerate(names)],
+            value=len(names) - 1,
+            description="drawn state",
+            style={"description_width": "initial"},
+        )
         self._state.observe(lambda _: self._draw(), "value")
         self._controls = widgets.VBox()
         self._message = widgets.HTML()
@@ -56,8 +58,10 @@ class ExplorerWidget:
         margin = widgets.Button(description="compute the margin", tooltip="takes some seconds")
         margin.on_click(lambda _: self._compute_rest([MARGIN]))
         side = widgets.VBox([self._controls, self._state], layout=_SIDE)
-        figure = widgets.VBox([self._message, self._image, self._facts, margin],
-                              layout=widgets.Layout(flex="1 1 420px", min_width="0"))  # fmt: skip
+        figure = widgets.VBox(
+            [self._message, self._image, self._facts, margin],
+            layout=widgets.Layout(flex="1 1 420px", min_width="0"),
+        )
         self.whole = widgets.HBox([side, figure], layout=widgets.Layout(flex_flow="row wrap"))
         self.show()
         results.listeners.append(self.show)
@@ -130,9 +134,10 @@ class ExplorerWidget:
 
     def _choice(self, choice: Choice) -> widgets.Widget:
         made = widgets.Dropdown(
-            options=[(text, value) for value, text in choice.options.items()], value=choice.value,
+            options=[(text, value) for value, text in choice.options.items()],
+            value=choice.value,
             layout=_WIDE,
-        )  # fmt: skip
+        )
         made.observe(
             lambda change: self._change(lambda draft: chosen(draft, choice.key, change["new"])),
             "value",

@@ -132,9 +132,7 @@ class LossyChannel(
         if seed is not None:
             self._seed, self._episode = seed, 0
         flows = self._network.flows
-        links = [
-            LinkState(self._network.link_of(flow), self._seed, link_name(flow)) for flow in flows
-        ]
+        links = [LinkState(self._network.link_of(flow), self._seed, link_name(flow)) for flow in flows]
         self._channel = Channel(links)
         for direction, link in enumerate(links):
             link.start_flow(0, len(links) * self._episode + direction)
@@ -147,9 +145,7 @@ class LossyChannel(
             network["action"] = self._actions.info(0)
         return deepcopy(observation), {**info, "network": network}
 
-    def step(
-        self, action: ActType
-    ) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, UserCode]]:
+    def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, UserCode]]:
         """Make a step with the newest action that has arrived; return the newest observation."""
         if self._episode < 0:
             raise gymnasium.error.ResetNeeded("LossyChannel: call reset before step")
@@ -169,9 +165,7 @@ class LossyChannel(
         """Send a packet now, after what is due has arrived."""
         receiver.steps[receiver.sent] = self._step, deepcopy(value)
         self._take(self._channel.release(self._now_ns))
-        left, copies = self._channel.send(
-            direction, receiver.sent, receiver.size_bytes, self._now_ns
-        )
+        left, copies = self._channel.send(direction, receiver.sent, receiver.size_bytes, self._now_ns)
         if not copies:
             del receiver.steps[receiver.sent]
         receiver.sent += 1
@@ -191,11 +185,13 @@ class LossyChannel(
 def _loaded(network: Source | ReadTable) -> Scenario:
     if isinstance(network, Mapping):
         base = toml_file.read(find_shipped("double_integrator", "scenarios"), Scenario)
-        return load({**base, "network": dict(network), "seeds": {}})
+        try:
+            return load({**base, "network": dict(network), "seeds": {}})
+        except CallerError as error:
+            lines = str(error).replace("scenario: ", "").splitlines()
+            raise CallerError(f"LossyChannel: {'; '.join(lines)}") from None
     if not isinstance(network, Scenario | str | PathLike):
-        raise CallerError(
-            f"network: {network!r}; give a table as {{'mansd': 3, 'loss': ...}}, or a scenario"
-        )
+        raise CallerError(f"network: {network!r}; give a table as {{'mansd': 3, 'loss': ...}}, or a scenario")
     return load(network)
 
 

@@ -16,7 +16,7 @@ from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import RECORD, REPORT_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
-from noack.scenario import resolution
+from noack.scenario import link_load, resolution
 from noack.scenario.scenario import Scenario
 
 with lazy_modules():
@@ -109,9 +109,7 @@ class Run:
         return {name: self._of(name) for name in self._run.names if self._loop in (None, name)}
 
     def _of(self, loop: str) -> "Run":
-        return Run(
-            self.directory, lambda: run_summary.outcome_of_loop(self._outcome, loop), loop=loop
-        )
+        return Run(self.directory, lambda: run_summary.outcome_of_loop(self._outcome, loop), loop=loop)
 
     @property
     def scenario(self) -> Scenario:
@@ -244,9 +242,7 @@ class Run:
             NoackError: the path has another ending, or a file cannot be written.
         """
         self.summary  # noqa: B018  # of a temporary run, it is computed now
-        return exports.export_run(
-            self.directory, Path(path), loop=self._loop, certificates=certificates
-        )
+        return exports.export_run(self.directory, Path(path), loop=self._loop, certificates=certificates)
 
     def archive(self, path: Folder) -> Path:
         """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.
@@ -279,9 +275,7 @@ class Run:
 
     def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
-        return network_figures.page_figures(
-            self._run, lambda: self.summary, self._loop, bounded=bounded
-        )
+        return network_figures.page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
 
     @cached_property
     def _outcome(self) -> "run_summary.Outcome":
@@ -323,12 +317,10 @@ def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
     Raises:
         NoackError: the scenario is wrong, or the run directory cannot be written.
     """
-    loaded = load(scenario)
+    link_load.require_slots(loaded := load(scenario))
     with _folder(runs) as (folder, temporary):
         ending, view = simulated_run.simulate_run(loaded, folder), temporary is None
-        made = Run(
-            ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary
-        )
+        made = Run(ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary)
     if temporary is None:
         made.summary  # noqa: B018  # writes it into the run directory
     return made
@@ -350,11 +342,9 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
         NoackError: the scenario is wrong; the run could not start, e.g. because a port is in use;
             or the caller is not the main thread, which receives the signals.
     """
-    loaded = load(scenario)
+    link_load.require_slots(loaded := load(scenario))
     if threading.current_thread() is not threading.main_thread():
-        raise CallerError(
-            "noack.run: a live run is started by the main thread, which signals go to"
-        )
+        raise CallerError("noack.run: a live run is started by the main thread, which signals go to")
     with _folder(runs) as (folder, temporary):
         console = progress_display.PipeSafeConsole(stderr=True, quiet=not progress)
         with progress_display.progress_line(console, loaded) as watcher:
@@ -380,9 +370,7 @@ def open_run(directory: Folder = "runs/latest") -> Run:
     return Run(outcome.run_dir, lambda: outcome)
 
 
-def reproduce(
-    path: Folder, *, run_code: bool = False, long: bool = False
-) -> "run_archive.Repetition":
+def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "run_archive.Repetition":
     """Repeat an archived run, and compare it bit for bit.
 
     Args:
@@ -419,9 +407,7 @@ def compare(*runs: Run | Folder) -> "run_comparison.RunComparison":
     for one in runs:
         if isinstance(one, Run):
             one.summary  # noqa: B018  # a temporary run computes it at the first access
-    return run_comparison.compare_runs(
-        [one.directory if isinstance(one, Run) else Path(one) for one in runs]
-    )
+    return run_comparison.compare_runs([one.directory if isinstance(one, Run) else Path(one) for one in runs])
 
 
 @contextmanager

@@ -10,14 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.shipped_files import find_shipped
-from cosim.studies.new_loop import (
-    ALPHA_SHARE,
-    BETA_SHARE,
-    LOSS_PROBABILITY,
-    MANSD,
-    SETTLED,
-    rounded,
-)
+from cosim.studies.new_loop import ALPHA_SHARE, BETA_SHARE, LOSS_PROBABILITY, MANSD, SETTLED, rounded
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 from noack.scenario import toml_file
@@ -143,14 +136,11 @@ def _completed(content: Table, settings: ReadTable | None, path: Path) -> Scenar
     """Apply settings, validate, and read the named files, relative to ``path``."""
     if not isinstance(settings, Mapping | None):
         raise CallerError(
-            f"settings: {settings!r} is no table; give values by key, "
-            '{"network.loss.probability": 0.8}'
+            f'settings: {settings!r} is no table; give values by key, {{"network.loss.probability": 0.8}}'
         )
     for key, value in (settings or {}).items():
         if not isinstance(key, str):
-            raise CallerError(
-                f'settings: {key!r} is not a key; a key is a text such as "trigger.beta"'
-            )
+            raise CallerError(f'settings: {key!r} is not a key; a key is a text such as "trigger.beta"')
         if value is None:
             remove(content, key)
         else:

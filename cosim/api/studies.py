@@ -152,9 +152,7 @@ class Measurement(NetworkMeasurement):
         """
         measurement_outputs.write_page(self, None, Path(path))
 
-    def write_network(
-        self, path: str | PathLike[str], form: Literal["trace", "model"] = "trace"
-    ) -> None:
+    def write_network(self, path: str | PathLike[str], form: Literal["trace", "model"] = "trace") -> None:
         """Write a ``[network]`` section that reproduces the network (``.toml``).
 
         Raises:
@@ -195,9 +193,7 @@ def measure(
 class CampaignResult:
     """A finished campaign; :func:`noack.campaign` returns it."""
 
-    def __init__(
-        self, finished: "campaign_report.FinishedCampaign", temporary: Path | None = None
-    ) -> None:
+    def __init__(self, finished: "campaign_report.FinishedCampaign", temporary: Path | None = None) -> None:
         self._finished = finished
         if temporary is not None:
             weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True)
@@ -240,11 +236,16 @@ class CampaignResult:
             ``smaller`` than at the reference. Without ``compare`` in the campaign it is empty.
         """
         rows = [
-            {**one.point.labels, "metric": str(metric), **found.estimate._asdict(),
-             "larger": found.larger, "smaller": found.smaller}
+            {
+                **one.point.labels,
+                "metric": str(metric),
+                **found.estimate._asdict(),
+                "larger": found.larger,
+                "smaller": found.smaller,
+            }
             for one in self._finished.summary.compared
             for metric, found in one.differences.items()
-        ]  # fmt: skip
+        ]
         return _table(rows)
 
     def draws(self, **axes: object) -> "pa.Table":
@@ -266,8 +267,7 @@ class CampaignResult:
 
                 return pa.table({str(name): values for name, values in metrics.items()})
         known = "; ".join(
-            f"{axis.name} is one of {', '.join(axis.labels)}"
-            for axis in self._finished.summary.campaign.axes
+            f"{axis.name} is one of {', '.join(axis.labels)}" for axis in self._finished.summary.campaign.axes
         )
         raise CallerError(f"no such grid point: {known}")
 
@@ -351,11 +351,10 @@ def campaign(
     temporary = None if folder is not None else Path(tempfile.mkdtemp(prefix="noack-"))
     start = partial(campaign_workers.local, workers or cores())
     try:
+        bar, where = _runs_bar() if progress else None, Path(folder or temporary or "")
         finished = campaign_report.finish_campaign(
-            plan, path, Path(folder or temporary or ""), start, draws=draws,
-            show=lambda text: nullcontext(),
-            bar=_runs_bar() if progress else None,
-        )  # fmt: skip
+            plan, path, where, start, draws=draws, show=lambda text: nullcontext(), bar=bar
+        )
     except BaseException:
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)

@@ -3,6 +3,7 @@
 import inspect
 import io
 import math
+import os
 import pkgutil
 import re
 import sys
@@ -16,16 +17,7 @@ from importlib import import_module
 from itertools import groupby
 from json import dumps
 from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    Concatenate,
-    ParamSpec,
-    TextIO,
-    TypeVar,
-    dataclass_transform,
-)
+from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec, TextIO, TypeVar, dataclass_transform
 
 import typer
 from typer import Argument, Option
@@ -85,9 +77,7 @@ class Program(TyperGroup):
 
     def format_commands(self, ctx: "Context", formatter: "HelpFormatter") -> None:
         """Write the commands, a section for each panel."""
-        by_panel = groupby(
-            self.commands.values(), lambda command: getattr(command, "rich_help_panel", "")
-        )
+        by_panel = groupby(self.commands.values(), lambda command: getattr(command, "rich_help_panel", ""))
         for panel, some in by_panel:
             with formatter.section(panel):
                 formatter.write_dl(
@@ -246,18 +236,20 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # importing rich takes 0.1 s
     # \b keeps the lines of a paragraph as they are.
-    help="\n".join([
-        "A laboratory for event-triggered control over lossy networks without acknowledgements. "
-        "The loop runs as real processes over UDP; the network loses at most M − 1 consecutive "
-        "packets.",
-        "",
-        "\b",
-        *_columns(_TOUR),
-        "",
-        "Each command has --help, with examples at the end. A scenario is a TOML file, or the name "
-        "of a shipped one. `noack --install-completion` installs shell completion.",
-    ]),
-)  # fmt: skip
+    help="\n".join(
+        [
+            "A laboratory for event-triggered control over lossy networks without acknowledgements. "
+            "The loop runs as real processes over UDP; the network loses at most M − 1 consecutive "
+            "packets.",
+            "",
+            "\b",
+            *_columns(_TOUR),
+            "",
+            "Each command has --help, with examples at the end. A scenario is a TOML file, or the name "
+            "of a shipped one. `noack --install-completion` installs shell completion.",
+        ]
+    ),
+)
 
 ScenarioArgument = Annotated[
     str,
@@ -268,13 +260,9 @@ ScenarioArgument = Annotated[
 ]
 RunArgument = Annotated[
     Path | None,
-    Argument(
-        help="Run directory; the last run by default.", autocompletion=completion.run_directories
-    ),
+    Argument(help="Run directory; the last run by default.", autocompletion=completion.run_directories),
 ]
-LoopOption = Annotated[
-    str | None, Option("--loop", metavar="NAME", help="Only the loop of this name.")
-]
+LoopOption = Annotated[str | None, Option("--loop", metavar="NAME", help="Only the loop of this name.")]
 SetOption = Annotated[
     list[str] | None,
     Option(
@@ -296,10 +284,7 @@ class TriggerMode(StrEnum):
 
 TriggerOption = Annotated[
     TriggerMode,
-    Option(
-        help="sampled: test the trigger at each measurement, as in a live run; "
-        "continuous: at all times."
-    ),
+    Option(help="sampled: test the trigger at each measurement, as in a live run; continuous: at all times."),
 ]
 RunsOption = Annotated[Path, Option("--runs", help="Folder of the run directories.")]
 WidthOption = Annotated[
@@ -311,10 +296,23 @@ WidthOption = Annotated[
         "column for pdf, 10 in for svg and png.",
     ),
 ]
+
+
+def _usable_folder(folder: Path | None) -> Path | None:
+    """Refuse a folder in which nothing can be written, before anything is computed."""
+    if folder is not None:
+        place = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+        if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+            reason = "may not be written to" if place.is_dir() else "is not a folder"
+            raise typer.BadParameter(f"{place} {reason}")
+    return folder
+
+
 TablesOption = Annotated[
     Path | None,
     Option(
         "--tables",
+        callback=_usable_folder,
         metavar="FOLDER",
         help="Write the tables into this folder, as LaTeX (booktabs) and as CSV.",
     ),
@@ -322,9 +320,7 @@ TablesOption = Annotated[
 VerboseOption = Annotated[
     bool, Option("--verbose", help="Print all tables: timing, assumptions, each claim.")
 ]
-JsonOption = Annotated[
-    bool, Option("--json", help="Print one JSON document on stdout, and nothing else.")
-]
+JsonOption = Annotated[bool, Option("--json", help="Print one JSON document on stdout, and nothing else.")]
 SeedOption = Annotated[int, Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
 SESSION = Option("--session", help="Session name that the processes of a run share.")
 
@@ -471,9 +467,7 @@ def command(
         def reported(**given: Any) -> None:
             as_json = bool(given.get("json"))
             for name, group in groups.items():
-                given[name] = group(
-                    **{field.name: given.pop(field.name) for field in fields(group)}
-                )
+                given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
             try:
                 with stop_requests_raised():
                     if on_linux:
@@ -536,8 +530,7 @@ def _parameters(
                 _describe_options(base)
                 types |= vars(base).get("__annotations__", {})
         parameters += [
-            option.replace(kind=option.KEYWORD_ONLY, annotation=types[option.name])
-            for option in members
+            option.replace(kind=option.KEYWORD_ONLY, annotation=types[option.name]) for option in members
         ]
     return parameters, groups
 
@@ -591,9 +584,7 @@ def status(what: str) -> "AbstractContextManager[Status]":
     return progress.error_console().status(what)
 
 
-def write_tables(
-    tables: "Iterable[result_tables.ResultTable]", folder: Path | None, *, json: bool
-) -> None:
+def write_tables(tables: "Iterable[result_tables.ResultTable]", folder: Path | None, *, json: bool) -> None:
     """Write the tables of ``--tables``, if it is given; print the paths, unless with ``--json``."""
     if folder is not None:
         paths = result_tables.save_tables(tables, folder)

@@ -18,15 +18,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.runtime.command_line import LogFormat, log_format, print_to_stderr
 
 with lazy_modules():
-    from cosim.live import (
-        finalize,
-        fork_server,
-        launcher,
-        progress,
-        remote_access,
-        run_metrics,
-        run_watcher,
-    )
+    from cosim.live import finalize, fork_server, launcher, progress, remote_access, run_metrics, run_watcher
     from cosim.output import run_verdict
     from cosim.output.viewer import rerun_program
     from cosim.record import run_directory
@@ -127,10 +119,15 @@ def run_processes(
                 if options.metrics is not None:
                     watchers.append(stack.enter_context(_served_metrics(loaded, options.metrics)))
                 ending = launcher.launch(
-                    loaded, options.runs, spawn=spawn or topology.ROLES, session=session,
-                    live=options.live, watcher=run_watcher.joint_watcher(watchers),
-                    server=server, listening=listening,
-                )  # fmt: skip
+                    loaded,
+                    options.runs,
+                    spawn=spawn or topology.ROLES,
+                    session=session,
+                    live=options.live,
+                    watcher=run_watcher.joint_watcher(watchers),
+                    server=server,
+                    listening=listening,
+                )
         except OSError:  # a closed terminal must not end the run
             if ending is None:
                 raise
@@ -161,9 +158,7 @@ def warn_of_violations(loaded: "scenario.Scenario") -> None:
         for found in assumptions.assumptions(resolved):
             is_violated = found.verdict == assumptions.AssumptionStatus.VIOLATED
             if is_violated and found.source == "Theorem 2":
-                print(
-                    f"noack: warning: {whose}violated: {found.what}: {found.why}", file=sys.stderr
-                )
+                print(f"noack: warning: {whose}violated: {found.what}: {found.why}", file=sys.stderr)
 
 
 def warn_of_other_runs() -> None:
@@ -212,9 +207,14 @@ def worker_pool(workers: int | None, scheduler: str | None = None) -> StartWorke
 
 
 def execute_campaign(
-    plan: "campaign_file.Campaign", path: Path, start: StartWorkers, *,
-    folder: Path, draws: int | None = None, figure_files: "FigureFiles | None" = None,
-) -> "campaign_report.FinishedCampaign":  # fmt: skip
+    plan: "campaign_file.Campaign",
+    path: Path,
+    start: StartWorkers,
+    *,
+    folder: Path,
+    draws: int | None = None,
+    figure_files: "FigureFiles | None" = None,
+) -> "campaign_report.FinishedCampaign":
     """Run or continue a campaign; write its page.
 
     Args:
@@ -231,6 +231,12 @@ def execute_campaign(
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
     return campaign_report.finish_campaign(
-        plan, path, folder, lambda: start(say), draws=draws, figure_files=figure_files,
-        show=console.status, bar=progress.runs_bar(console),
-    )  # fmt: skip
+        plan,
+        path,
+        folder,
+        lambda: start(say),
+        draws=draws,
+        figure_files=figure_files,
+        show=console.status,
+        bar=progress.runs_bar(console),
+    )

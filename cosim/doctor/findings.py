@@ -82,8 +82,7 @@ def _check(
     def register(check: Callable[[MachineFacts, RunRequirements], Iterator[Outcome]]) -> None:
         _checks.append(
             lambda machine, wanted: (
-                MachineFinding(what.format(wanted.name), *outcome)
-                for outcome in check(machine, wanted)
+                MachineFinding(what.format(wanted.name), *outcome) for outcome in check(machine, wanted)
             )
         )
 
@@ -245,8 +244,7 @@ def _disk(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
         yield BAD, found, "nothing can be recorded", remedy
         return
     text = (
-        f"{found.folder}: {byte_size(found.free_bytes)} free, writes "
-        f"{byte_size(found.write_bytes_per_s)}/s"
+        f"{found.folder}: {byte_size(found.free_bytes)} free, writes {byte_size(found.write_bytes_per_s)}/s"
     )
     needs = f"{wanted.name} needs {byte_size(found.needed_bytes)} plus its events"
     if found.free_bytes < found.needed_bytes:
@@ -314,9 +312,7 @@ def document(
     }
 
 
-def print_findings(
-    console: Console, wanted: RunRequirements, findings: Sequence[MachineFinding]
-) -> None:
+def print_findings(console: Console, wanted: RunRequirements, findings: Sequence[MachineFinding]) -> None:
     """Print each finding, its meaning for a run, and a remedy."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
@@ -328,9 +324,7 @@ def print_findings(
             text.append(f"\n{finding.means}", "" if finding.verdict is not GOOD else "dim")
         if finding.remedy:
             text.append(f"\n→ {finding.remedy}", "cyan")
-        table.add_row(
-            Text(finding.verdict, _VERDICTS[finding.verdict][0]), Text(finding.what), text
-        )
+        table.add_row(Text(finding.verdict, _VERDICTS[finding.verdict][0]), Text(finding.what), text)
     console.print(table)
     colour, verdict = _VERDICTS[worst(findings)]
     console.print(Text.assemble("this machine, for ", wanted.name, ": ", (verdict, colour)))

@@ -176,9 +176,7 @@ class MachineFacts:
     """Versions of Python and of the libraries that a run depends on."""
 
 
-def measure(
-    resolved: Scenario, wanted: RunRequirements, runs: Path, duration_s: float
-) -> MachineFacts:
+def measure(resolved: Scenario, wanted: RunRequirements, runs: Path, duration_s: float) -> MachineFacts:
     """Measure this machine for a scenario.
 
     Args:
@@ -241,9 +239,12 @@ def _wake_ups(
     command = _probe("wake", wanted.period_ns, duration_s, wanted.fifo_priority, wanted.spin_us)
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, check=True,
+            command,
+            capture_output=True,
+            text=True,
+            check=True,
             timeout=_PATIENCE_S + 10 * duration_s,
-        )  # fmt: skip
+        )
     except (OSError, subprocess.SubprocessError) as error:
         reason = one_line(error)
         return reason, reason, {}

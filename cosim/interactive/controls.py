@@ -124,8 +124,12 @@ class Controls:
         )
 
 
-_GREEK = {"alpha_per_s": "α, decay of the threshold [1/s]", "beta": "β, threshold at the start",
-          "floor": "ε, smallest threshold", "period_s": "period [s]"}  # fmt: skip
+_GREEK = {
+    "alpha_per_s": "α, decay of the threshold [1/s]",
+    "beta": "β, threshold at the start",
+    "floor": "ε, smallest threshold",
+    "period_s": "period [s]",
+}
 
 
 def controls_of(draft: Draft) -> Controls:
@@ -141,12 +145,14 @@ def controls_of(draft: Draft) -> Controls:
         *_guarantee_sliders(scenario),
         *_trigger_sliders(scenario, base),
         *_plant_sliders(scenario, base),
-        Slider("seeds.loss", "random seed of the losses", _seed(scenario.seeds.loss), 0, _SEEDS, 1,
-               whole=True),
-        Slider("seeds.plant", "random seed of the plant", _seed(scenario.seeds.plant), 0, _SEEDS, 1,
-               whole=True),
+        Slider(
+            "seeds.loss", "random seed of the losses", _seed(scenario.seeds.loss), 0, _SEEDS, 1, whole=True
+        ),
+        Slider(
+            "seeds.plant", "random seed of the plant", _seed(scenario.seeds.plant), 0, _SEEDS, 1, whole=True
+        ),
         _decades("horizon_s", "horizon [s]", scenario.horizon_s, base.horizon_s, live=False),
-    )  # fmt: skip
+    )
     return Controls(_choices(scenario), sliders)
 
 
@@ -235,9 +241,15 @@ def _loss_sliders(scenario: Scenario) -> list[Slider]:
 
 def _guarantee_sliders(scenario: Scenario) -> list[Slider]:
     mansd = Slider(
-        "network.mansd", "maximum consecutive losses (M − 1)", scenario.network.mansd, 0,
-        max(_MOST_LOSSES, scenario.network.mansd), 1, whole=True, live=True,
-    )  # fmt: skip
+        "network.mansd",
+        "maximum consecutive losses (M − 1)",
+        scenario.network.mansd,
+        0,
+        max(_MOST_LOSSES, scenario.network.mansd),
+        1,
+        whole=True,
+        live=True,
+    )
     if not _is_window(scenario):
         return [mansd]
     window = scenario.network.constraints[0].model_dump()
@@ -281,9 +293,7 @@ def _limits(section: type[BaseModel], name: str) -> tuple[float, float]:
     schema = section.model_json_schema()
     properties = schema.get("$defs", {}).get(section.__name__, schema)["properties"]
     kinds = properties[name].get("anyOf", [properties[name]])
-    number: Mapping[str, float] = next(
-        (one for one in kinds if one.get("type") in ("number", "integer")), {}
-    )
+    number: Mapping[str, float] = next((one for one in kinds if one.get("type") in ("number", "integer")), {})
     below = _BELOW * number.get("exclusiveMaximum", math.inf)
     return number.get("minimum", -math.inf), min(number.get("maximum", math.inf), below)
 
@@ -303,9 +313,16 @@ def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
         return []
     value = max(found.values())
     return [
-        Slider("plant.uncertainty", "model error, as a multiple of the scenario's uncertainty",
-               round(value, 3), 0.0, max(_MOST_MODEL_ERROR, value), 0.1, scaled=tuple(found)),
-    ]  # fmt: skip
+        Slider(
+            "plant.uncertainty",
+            "model error, as a multiple of the scenario's uncertainty",
+            round(value, 3),
+            0.0,
+            max(_MOST_MODEL_ERROR, value),
+            0.1,
+            scaled=tuple(found),
+        ),
+    ]
 
 
 def _decades(key: str, label: str, value: float, middle: float, *, live: bool = True) -> Slider:
@@ -313,8 +330,9 @@ def _decades(key: str, label: str, value: float, middle: float, *, live: bool = 
     whole = isinstance(value, int)
     low, high = max(middle / _DECADE, 1.0 if whole else 0.0), middle * _DECADE
     step = math.log10(high / low) / _STEPS
-    return Slider(key, label, value, min(low, value), max(high, value), step,
-                  whole=whole, logarithmic=True, live=live)  # fmt: skip
+    return Slider(
+        key, label, value, min(low, value), max(high, value), step, whole=whole, logarithmic=True, live=live
+    )
 
 
 def _words(name: str) -> str:
@@ -475,8 +493,9 @@ def _group(key: str, schema: Schema, help_: str, content: object, default: objec
         optional = [kind for kind, one in kinds.items() if name not in one.get("required", ())]
         usual = default.get(name, optional[0] if len(optional) == 1 else None)
         chosen = content.get(name, usual)
-        fields.append(Field(f"{key}.{name}", name, help_, FieldKind.CHOICE, _text(usual),
-                            tuple(kinds), selects=key))  # fmt: skip
+        fields.append(
+            Field(f"{key}.{name}", name, help_, FieldKind.CHOICE, _text(usual), tuple(kinds), selects=key)
+        )
         schema = kinds.get(chosen, {}) if isinstance(chosen, str) else {}
     for part, described in schema.get("properties", {}).items():
         inner, path = _resolved(described), f"{key}.{part}".removeprefix(".")
@@ -497,9 +516,7 @@ def _kinds(schema: Schema) -> tuple[str, dict[str, Schema]]:
     name = ""
     for reference in schema.get("oneOf", ()):
         one = _resolved(reference)
-        name, described = next(
-            (name, part) for name, part in one["properties"].items() if "const" in part
-        )
+        name, described = next((name, part) for name, part in one["properties"].items() if "const" in part)
         found[described["const"]] = one
     return name, found
 

@@ -93,10 +93,15 @@ def explore_ensemble(scenario: Scenario, draws: int = DRAWS) -> Ensemble:
     sent = rows["transmissions"][used]
     low, middle, high = np.quantile(sent, (LOW, 0.5, HIGH)) if len(sent) else (np.nan,) * 3
     return Ensemble(
-        t_s, tuple(_band(x[:, :, i]) for i in range(x.shape[2])), x_norm, e_c_norm, draws,
-        int((rows["status"] == DIVERGED).sum()), draws - len(used),
+        t_s,
+        tuple(_band(x[:, :, i]) for i in range(x.shape[2])),
+        x_norm,
+        e_c_norm,
+        draws,
+        int((rows["status"] == DIVERGED).sum()),
+        draws - len(used),
         (float(low), float(middle), float(high)),
-    )  # fmt: skip
+    )
 
 
 def _setting(scenario: Scenario) -> Setting:
@@ -124,9 +129,12 @@ def trajectories(
     They are right-continuous: at an event, the state after the reset.
     """
     core = ExactSimulation(
-        setting.H, setting.K, setting.trigger, horizon_s=setting.horizon_s,
+        setting.H,
+        setting.K,
+        setting.trigger,
+        horizon_s=setting.horizon_s,
         known_start=setting.known_start,
-    )  # fmt: skip
+    )
     found = []
     for A, B, x0, own in zip(*population[:3], events, strict=True):
         rest = np.zeros_like(x0)

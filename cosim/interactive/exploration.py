@@ -15,13 +15,7 @@ from cosim.analysis.run_summary import summarise
 from cosim.analysis.value_reduction import decimate_all
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
-from cosim.simulation.continuous import (
-    ContinuousRun,
-    LoopState,
-    TooManyEventsError,
-    run_continuous,
-    summary,
-)
+from cosim.simulation.continuous import ContinuousRun, LoopState, TooManyEventsError, run_continuous, summary
 from cosim.simulation.virtual_time import simulate
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError

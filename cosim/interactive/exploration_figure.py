@@ -262,17 +262,24 @@ class DraftResults:
         if MARGIN in self.known:
             groups["margin"] = [
                 ("margin", self.margin.verdict),
-                *((f"M = {m}: growth of the worst pattern (D delivered, L lost) per event",
-                   f"{growth}, {verdict}") for m, growth, verdict in self.margin.rows),
-            ]  # fmt: skip
+                *(
+                    (
+                        f"M = {m}: growth of the worst pattern (D delivered, L lost) per event",
+                        f"{growth}, {verdict}",
+                    )
+                    for m, growth, verdict in self.margin.rows
+                ),
+            ]
         return groups
 
     def shown(self, state: int) -> Shown:
         """Return what a figure shows of the results that are computed."""
         return Shown(
-            self.run, state, self.ensemble if ENSEMBLE in self.known else None,
+            self.run,
+            state,
+            self.ensemble if ENSEMBLE in self.known else None,
             self.certificate if CERTIFICATE in self.known else None,
-        )  # fmt: skip
+        )
 
     def put(self, name: str, result: object) -> None:
         """Take a result that was computed elsewhere: RUN, CERTIFICATE, ENSEMBLE or MARGIN."""

@@ -125,10 +125,9 @@ def margin_of(scenario: Scenario) -> Margin:
     except CallerError as error:
         return Margin(str(error), (), defined=False)
     rows = tuple(
-        (str(cap.m), f"{number(cap.found.lower, 5)} – {number(cap.found.upper, 5)}",
-         cap.found.verdict)
+        (str(cap.m), f"{number(cap.found.lower, 5)} – {number(cap.found.upper, 5)}", cap.found.verdict)
         for cap in found.caps
-    )  # fmt: skip
+    )
     return Margin(found.verdict, rows, defined=True)
 
 
@@ -136,9 +135,7 @@ def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None
     """Return in words whether a run is unstable, and why nothing is guaranteed; empty if stable."""
     parts = []
     if run.diverged_at_s is not None:
-        parts.append(
-            f"The loop is unstable under these losses: it diverged at {run.diverged_at_s:.3g} s."
-        )
+        parts.append(f"The loop is unstable under these losses: it diverged at {run.diverged_at_s:.3g} s.")
     elif run.x_norm[-1] > run.x_norm[0]:
         first, last = (number(float(run.x_norm[i]), 3) for i in (0, -1))
         parts.append(f"‖x‖ grows from {first} to {last}.")

@@ -75,9 +75,7 @@ def _measured(run: Exploration, until_s: float) -> dict[str, float]:
 
 def _settings(other: Exploration, run: Exploration) -> str:
     """Return which settings differ; matrices by their names only."""
-    before, after = (
-        one.scenario.model_dump(mode="json", exclude_none=True) for one in (other, run)
-    )
+    before, after = (one.scenario.model_dump(mode="json", exclude_none=True) for one in (other, run))
     found = []
     for key, _ in differences(before, after):
         old, new = (leaf(content, key) for content in (before, after))

@@ -20,15 +20,7 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 from pyarrow import csv
 
-from cosim.interactive.controls import (
-    Controls,
-    by_field,
-    chosen,
-    controls_of,
-    dragged,
-    filled,
-    form_of,
-)
+from cosim.interactive.controls import Controls, by_field, chosen, controls_of, dragged, filled, form_of
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.exploration_figure import CERTIFICATE, Shown, exploration_figure
@@ -100,16 +92,23 @@ class _Page:
         with ui.header().classes("items-center gap-3 py-1 lab-head"):
             ui.label("noack lab").classes("text-h6 lab-title").props("role=heading aria-level=1")
             for text, icon, kind in (
-                ("settings", "tune", "drawer"), ("tutorial", "school", "guide"),
-            ):  # fmt: skip
+                ("settings", "tune", "drawer"),
+                ("tutorial", "school", "guide"),
+            ):
                 ui.button(icon=icon).classes(f"lab-{kind}-button").props(
                     f'flat color=white dense aria-label="{text}" title="{text}" '
                     f"aria-expanded=false aria-controls=lab-{kind}"
                 ).on("click", js_handler=f"() => labToggle{kind.capitalize()}()")
-            self._scenarios = ui.select(
-                sorted(self._services.known), value=self._session.draft.base, label="scenario",
-                on_change=self._choose,
-            ).props("dense options-dense dark standout").classes("lab-scenario")  # fmt: skip
+            self._scenarios = (
+                ui.select(
+                    sorted(self._services.known),
+                    value=self._session.draft.base,
+                    label="scenario",
+                    on_change=self._choose,
+                )
+                .props("dense options-dense dark standout")
+                .classes("lab-scenario")
+            )
             ui.space()
             FileMenu(self._services, self._calls, self._session, self._shown)
             ui.button(icon="contrast", on_click=self._toggle).props(
@@ -127,8 +126,9 @@ class _Page:
 
     def _build_bar(self) -> None:
         with ui.element("div").classes("lab-bar"):
-            self._sources = ui.toggle([EXPLORE, LIVE, RECORDED], value=EXPLORE,
-                                      on_change=self._switch).props("no-caps dense")  # fmt: skip
+            self._sources = ui.toggle([EXPLORE, LIVE, RECORDED], value=EXPLORE, on_change=self._switch).props(
+                "no-caps dense"
+            )
             with ui.element("div").classes("lab-of lab-of-live"):
                 self._live = LiveSource(self._services, lambda: self._session.draft, self._replay)
             with ui.element("div").classes("lab-of lab-of-recorded"):
@@ -214,16 +214,19 @@ class _Page:
         pending = {EXPLORE: self._session.pending, RECORDED: self._recorded.note}
         await self._stage.show(
             pending=pending.get(self._source, ""),
-            progress=self._live.progress if live else None, report=name and report_address(name),
+            progress=self._live.progress if live else None,
+            report=name and report_address(name),
             **parts,
-        )  # fmt: skip
+        )
 
     def _drawing(self, shown: Shown | None) -> dict[str, object]:
         """Return what is shown anew while a slider is dragged; ``slider`` is its new value."""
         parts: dict[str, object] = {
-            "source": self._source, "stale": shown is None, "note": self._note(shown),
+            "source": self._source,
+            "stale": shown is None,
+            "note": self._note(shown),
             "verdict": self._verdict(),
-        }  # fmt: skip
+        }
         if shown is not None:
             parts["figure"] = figure_part(exploration_figure(shown))
             reference = self._reference()
@@ -400,9 +403,11 @@ class FileMenu:
                         ui.label(text)
         with ui.dialog() as self._dialog, ui.card():
             ui.label(f"Save in {services.folder}")
-            self._name = ui.input("file name", value="my_loop.toml", validation={
-                "a name like my_loop.toml": lambda text: bool(_NAME.fullmatch(text))
-            }).classes("w-64")  # fmt: skip
+            self._name = ui.input(
+                "file name",
+                value="my_loop.toml",
+                validation={"a name like my_loop.toml": lambda text: bool(_NAME.fullmatch(text))},
+            ).classes("w-64")
             self._replace = ui.checkbox("replace a file of this name")
             with ui.row():
                 ui.button("save", on_click=self._save)
@@ -475,6 +480,5 @@ class Step(NamedTuple):
 
 
 STEPS = [
-    Step(**step)
-    for step in tomllib.loads(_FOLDER.joinpath("tutorial.toml").read_text("utf-8"))["steps"]
+    Step(**step) for step in tomllib.loads(_FOLDER.joinpath("tutorial.toml").read_text("utf-8"))["steps"]
 ]

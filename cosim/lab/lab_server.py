@@ -9,10 +9,12 @@ another secret, which leads to the page for processes of this user only.
 """
 
 import asyncio
+import logging
 import os
 import secrets
 import socket
 import sys
+import traceback
 import webbrowser
 from collections.abc import Callable
 from contextlib import suppress
@@ -31,7 +33,7 @@ from cosim.lab.lab_page import show_page
 from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.lab.run_views import report_page
 from cosim.output.viewer.rerun_program import HOST, OWN_HOST, socket_user
-from noack.core.errors import MachineError, NoackError
+from noack.core.errors import MachineError, NoackError, one_line, printable, shortened
 
 
 @dataclass(frozen=True)
@@ -70,23 +72,47 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
         reports = serve_reports(application, services)
         # Without a history of messages: each redraw is one. A reconnected page loads itself again.
         ui.run_with(
-            application, title="noack lab", favicon="🧪", dark=None, message_history_length=0,
-            show_welcome_message=False, gzip_middleware_factory=None,
+            application,
+            title="noack lab",
+            favicon="🧪",
+            dark=None,
+            message_history_length=0,
+            show_welcome_message=False,
+            gzip_middleware_factory=None,
             reconnect_timeout=_RECONNECT_S,
-        )  # fmt: skip
+        )
         config = uvicorn.Config(
-            AddressGuard(application, secret, opening), log_level="warning", access_log=False,
-            ws_per_message_deflate=False, timeout_graceful_shutdown=2, server_header=False,
-        )  # fmt: skip
+            AddressGuard(application, secret, opening),
+            log_level="warning",
+            access_log=False,
+            ws_per_message_deflate=False,
+            timeout_graceful_shutdown=2,
+            server_header=False,
+        )
 
         def announced() -> None:
             announce(f"{origin}/{secret}/{query}")
             if options.open_browser:
                 webbrowser.open(f"{origin}/{opening if _CAN_CHECK else secret}/{query}")
 
+        for logger in ("engineio.server", "asyncio"):
+            logging.getLogger(logger).addFilter(refused_message)
         server = _Server(config, announced, reports.give_up)
         with listener, suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
             asyncio.run(server.serve(sockets=[listener]))
+
+
+def refused_message(record: logging.LogRecord) -> bool:
+    """Make one line of the traceback of a message that the socket's libraries could not read."""
+    error = record.exc_info[1] if record.exc_info else None
+    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__ if error else None)]
+    in_library = any("/socketio/" in file for file in files)
+    if error is not None and in_library and not any("/cosim/" in file for file in files):
+        reason = shortened(one_line(error))
+        record.msg = "noack lab: a message on the page's socket is refused: %s: %s"
+        record.args = (type(error).__name__, printable(reason))
+        record.exc_info = None
+    return True
 
 
 _CAN_CHECK = sys.platform == "linux"
@@ -138,12 +164,11 @@ _HEADERS = {
     # draws without a graphics card, it would keep this page from handling clicks for seconds.
     "origin-agent-cluster": "?1",
     # The framework compiles its templates in the browser, which needs unsafe-eval.
-    "content-security-policy":
-    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
+    "content-security-policy": "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
     "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
     "connect-src 'self'; worker-src 'self' blob:; frame-src 'self' http://127.0.0.1:* "
     "http://localhost:*; frame-ancestors 'self'; base-uri 'self'; form-action 'self'",
-}  # fmt: skip
+}
 _UNKNOWN = (
     "noack lab: this is not the address of the page. Each start of noack lab has another address:"
     " open the one that its terminal shows. What follows the '?' are the settings; add it there.\n"

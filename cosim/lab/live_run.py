@@ -75,9 +75,12 @@ class LiveRun:
         environment = {key: value for key, value in os.environ.items() if key not in _DISPLAYS}
         self._process = await asyncio.create_subprocess_exec(
             *python_command("-m", "cosim.lab.live_run", folder.absolute(), runs.absolute()),
-            stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
-            stdin=asyncio.subprocess.PIPE, env=environment, start_new_session=True,
-        )  # fmt: skip
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            stdin=asyncio.subprocess.PIPE,
+            env=environment,
+            start_new_session=True,
+        )
         assert self._process.stdin is not None
         self._process.stdin.write(text.encode())
         self._process.stdin.close()  # after the text; a process that has ended needs none
@@ -216,9 +219,12 @@ def main() -> int:
         _say("error", text=str(error))
         return error.exit_status
     _say(
-        "ended", run_dir=str(outcome.run_dir), reason=outcome.reason,
-        ok=outcome.status is ExitStatus.OK, verdict=verdict(outcome.summary),
-    )  # fmt: skip
+        "ended",
+        run_dir=str(outcome.run_dir),
+        reason=outcome.reason,
+        ok=outcome.status is ExitStatus.OK,
+        verdict=verdict(outcome.summary),
+    )
     return outcome.status
 
 

@@ -75,9 +75,7 @@ def recorded_view(directory: Path, loop: str | None) -> RunView:
     one = summary.loops[number]
     found = of_record(record, RECORDED, one.diverged_at_s)
     said = remarks(summary.model_copy(update={"loops": [one]}))
-    return RunView(
-        found, verdict(summary), tuple(remark.text for remark in said), _bounds(record), names
-    )
+    return RunView(found, verdict(summary), tuple(remark.text for remark in said), _bounds(record), names)
 
 
 def _bounds(record: RunRecord) -> Guarantee | None:

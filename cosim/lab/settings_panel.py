@@ -60,17 +60,23 @@ def controls_part(controls: Controls, wrong: set[str], *, live: bool) -> Json:
     """
     return {
         "choices": [
-            {"key": one.key, "label": one.label, "value": one.value,
-             "options": [*one.options.items()]}
+            {"key": one.key, "label": one.label, "value": one.value, "options": [*one.options.items()]}
             for one in controls.choices
         ],
         "sliders": [
-            {"key": one.key, "label": one.label + " · also live" * (live and one.live),
-             "min": one.ends[0], "max": one.ends[1], "step": one.step, "place": one.position,
-             "text": value_text(one.value), "wrong": one.key in wrong}
+            {
+                "key": one.key,
+                "label": one.label + " · also live" * (live and one.live),
+                "min": one.ends[0],
+                "max": one.ends[1],
+                "step": one.step,
+                "place": one.position,
+                "text": value_text(one.value),
+                "wrong": one.key in wrong,
+            }
             for one in controls.sliders
         ],
-    }  # fmt: skip
+    }
 
 
 def value_text(value: float) -> str:
@@ -85,12 +91,19 @@ def form_part(group: Group, draft: Draft, mistakes: dict[str, str]) -> Json:
         "title": group.key.rpartition(".")[2] or "all settings (form)",
         "help": group.help,
         "fields": [
-            {"key": one.key, "label": one.label, "help": one.help, "default": one.default,
-             "options": _options(one), "text": one.text(draft), "error": mistakes.get(one.key, "")}
+            {
+                "key": one.key,
+                "label": one.label,
+                "help": one.help,
+                "default": one.default,
+                "options": _options(one),
+                "text": one.text(draft),
+                "error": mistakes.get(one.key, ""),
+            }
             for one in group.fields
         ],
         "groups": [form_part(one, draft, mistakes) for one in group.groups],
-    }  # fmt: skip
+    }
 
 
 def _options(field: Field) -> list[tuple[str, str]] | None:

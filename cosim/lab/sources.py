@@ -49,15 +49,9 @@ class LiveSource:
         self._live: LiveRun | None = None
         """The run that is shown, with its version and the number of its lines that are shown."""
         self._version = self._lines = 0
-        self._start = ui.button("run live", icon="play_arrow", on_click=self._begin).props(
-            "no-caps dense"
-        )
-        self._stop = ui.button("stop", icon="stop", on_click=self._end).props(
-            "outline no-caps dense"
-        )
-        self._again = ui.button("replay this run", icon="replay", on_click=self._open).props(
-            "no-caps dense"
-        )
+        self._start = ui.button("run live", icon="play_arrow", on_click=self._begin).props("no-caps dense")
+        self._stop = ui.button("stop", icon="stop", on_click=self._end).props("outline no-caps dense")
+        self._again = ui.button("replay this run", icon="replay", on_click=self._open).props("no-caps dense")
         self._stop.disable()
         self._again.set_visibility(False)
 
@@ -194,9 +188,7 @@ class LiveSource:
         self._frame.clear()
         with self._frame:
             ui.link("open the viewer in a tab of its own", address or "", new_tab=True)
-            ui.element("iframe").props(f'src="{address}" title="rerun viewer"').classes(
-                "w-full lab-viewer"
-            )
+            ui.element("iframe").props(f'src="{address}" title="rerun viewer"').classes("w-full lab-viewer")
 
 
 def _words(live: LiveRun) -> str:
@@ -223,16 +215,14 @@ class RecordedSource:
         self._select = ui.select([], label="run", on_change=self._open).classes("w-72")
         self._select.props("dense options-dense")
         self._loop = ui.select([], label="loop", on_change=self._open).props("dense options-dense")
-        ui.button(icon="refresh", on_click=self.refresh).props(
-            'flat dense aria-label="look for new runs"'
-        )
+        ui.button(icon="refresh", on_click=self.refresh).props('flat dense aria-label="look for new runs"')
 
     def build_details(self) -> None:
         """Build what can be asked about a run, below what is said of it."""
         for text, function in (("replay", replayed), ("compare with the ideal loop", compared)):
-            ui.button(text, on_click=partial(self._ask, function)).props(
-                "outline no-caps dense"
-            ).classes("mr-2")
+            ui.button(text, on_click=partial(self._ask, function)).props("outline no-caps dense").classes(
+                "mr-2"
+            )
 
     @property
     def chosen(self) -> str:

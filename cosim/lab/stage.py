@@ -74,8 +74,12 @@ def figure_part(figure: FigureDescription) -> Json:
     values = [column for _, column in columns.values()]
     with np.errstate(over="ignore"):
         numbers = base64.b64encode(np.concatenate(values).astype("<f4").tobytes()).decode()
-    return {"panels": panels, "description": figure.description,
-            "lengths": [*map(len, values)], "numbers": numbers}  # fmt: skip
+    return {
+        "panels": panels,
+        "description": figure.description,
+        "lengths": [*map(len, values)],
+        "numbers": numbers,
+    }
 
 
 def _panel(panel: Panel, height: float, columns: _Columns) -> Json:
@@ -84,18 +88,29 @@ def _panel(panel: Panel, height: float, columns: _Columns) -> Json:
     style = ("kind", "colour", "width", "dash", "opacity", "label")
     low, high = _ends(panel)
     return {
-        "title": panel.title, "height": height, "items": items, "log": panel.y.logarithmic,
-        "low": low, "high": high, "start": panel.x.ends[0] or 0.0, "end": panel.x.ends[1],
-        "numbers": panel.x.numbers, "label": panel.x.label,
+        "title": panel.title,
+        "height": height,
+        "items": items,
+        "log": panel.y.logarithmic,
+        "low": low,
+        "high": high,
+        "start": panel.x.ends[0] or 0.0,
+        "end": panel.x.ends[1],
+        "numbers": panel.x.numbers,
+        "label": panel.x.label,
         "legend": [{key: by_label[name][key] for key in style} for name in panel.labels],
-    }  # fmt: skip
+    }
 
 
 def _item(item: Line | Band | Marks, columns: _Columns) -> Json:
     made: Json = {
-        "colour": f"rgb{item.colour}", "label": item.label, "opacity": item.opacity,
-        "x": columns.add(item.x), "width": 0.0, "dash": (),
-    }  # fmt: skip
+        "colour": f"rgb{item.colour}",
+        "label": item.label,
+        "opacity": item.opacity,
+        "x": columns.add(item.x),
+        "width": 0.0,
+        "dash": (),
+    }
     if isinstance(item, Band):
         low, high = columns.add(item.low), columns.add(item.high)
         return made | {"kind": "band", "y": low, "high": high}

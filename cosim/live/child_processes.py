@@ -121,9 +121,12 @@ def start_over_ssh(role: str, host: Host, invitation: str, log: IO[str]) -> subp
     remote = f"{host.command} {role} --invitation - --runs {shlex.quote(host.runs)}"
     child = subprocess.Popen(
         ["ssh", *_OPTIONS, "--", host.ssh, remote],
-        stdin=subprocess.PIPE, stdout=log, stderr=log, encoding="utf-8",
+        stdin=subprocess.PIPE,
+        stdout=log,
+        stderr=log,
+        encoding="utf-8",
         start_new_session=True,  # the launcher handles Ctrl-C
-    )  # fmt: skip
+    )
     assert child.stdin is not None
     with suppress(BrokenPipeError), child.stdin:
         child.stdin.write(invitation)
@@ -241,9 +244,7 @@ class ChildProcesses:
         known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
         lines, own = self._log_lines(role), f"noack {role}: "
         # Libraries write to the log, too; and on a full disk the log may be empty.
-        logged = next(
-            (line.removeprefix(own) for line in lines[::-1] if line.startswith(own)), None
-        )
+        logged = next((line.removeprefix(own) for line in lines[::-1] if line.startswith(own)), None)
         why = logged or reported(role) or "".join(lines[-1:]) or f"exit status {code}"
         return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}"
 
@@ -360,11 +361,7 @@ class RestartPolicy:
         }
         if self._is_past_horizon() and RECORDER in running:
             failures.pop(RECORDER, None)  # sorting a long record, it may not respond
-        return {
-            role: failure
-            for role, failure in (failures | exited).items()
-            if role not in self._failed
-        }
+        return {role: failure for role, failure in (failures | exited).items() if role not in self._failed}
 
     def _is_past_horizon(self) -> bool:
         return self._coordinator.now_ns() >= self._scenario.timing.horizon_ns

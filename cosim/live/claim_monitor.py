@@ -109,15 +109,11 @@ class ClaimMonitor:
         """Begin a round: give each loop its rows."""
         waiting, self._waiting = self._waiting, {}
         for table, batches in waiting.items():
-            for loop, rows in rows_by_loop(
-                table, np.concatenate(batches), self._phases_ns, self._types
-            ):
+            for loop, rows in rows_by_loop(table, np.concatenate(batches), self._phases_ns, self._types):
                 self._monitors[loop].take(table, rows)
         self._due = [*range(len(self._monitors))]
 
-    def _check(
-        self, loop: int, check: Callable[[AssumptionMonitor], Sequence[AssumptionViolation]]
-    ) -> None:
+    def _check(self, loop: int, check: Callable[[AssumptionMonitor], Sequence[AssumptionViolation]]) -> None:
         for violation in check(self._monitors[loop]):
             t_ns, text = round(violation.t_s * NS_PER_S), violation.text
             if violation.cause in SCHEDULE:

@@ -103,9 +103,7 @@ class Coordinator:
         session, key = self.plane.session, self.plane.key
         self._admissions = session.declare_queryable(key("admit", "*"), FifoChannel(64))
         self._joins = session.declare_queryable(key("join", "*"), FifoChannel(64))
-        self._tokens = session.liveliness().declare_subscriber(
-            key("alive", "*", "*"), RingChannel(256)
-        )
+        self._tokens = session.liveliness().declare_subscriber(key("alive", "*", "*"), RingChannel(256))
         self._ends = session.declare_subscriber(key("ended", "*", "*"), RingChannel(256))
         self._progress = session.declare_subscriber(key("progress"), RingChannel(1))
         self._change_queries = session.declare_queryable(key("runtime_parameters"), FifoChannel(64))
@@ -348,9 +346,7 @@ class Coordinator:
             member.apply(Event.START)
         self.joined[member.instance] = {"process": member.role, "generation": member.generation}
         members = [self._members[role] for role in LOOP_ROLES]
-        addresses = {
-            member.role: member.address for member in members if member.address is not None
-        }
+        addresses = {member.role: member.address for member in members if member.address is not None}
         query, member.query = member.query, None
         assert query is not None
         assert self._clock is not None
@@ -444,9 +440,7 @@ class ChangeRequests:
     def _parameters(self) -> dict[str, Table]:
         return {name: current_parameters(schedule.last) for name, schedule in self._entries.items()}
 
-    def _add(
-        self, change: ParameterChange, requested_ns: int, requested_at: str
-    ) -> ChangeAnnouncement:
+    def _add(self, change: ParameterChange, requested_ns: int, requested_at: str) -> ChangeAnnouncement:
         """Check and store a change; return its announcement.
 
         Raise CallerError if the change is not valid for this run.
@@ -462,9 +456,7 @@ class ChangeRequests:
             settings=dict(change.settings),
             requested_ns=requested_ns,
             requested_at=requested_at,
-            kept_losses=found_probabilities(
-                *(changed_scenario.network.link for changed_scenario in later)
-            ),
+            kept_losses=found_probabilities(*(changed_scenario.network.link for changed_scenario in later)),
         )
         self.announced += (announcement,)
         return announcement

@@ -62,9 +62,7 @@ _LOOPS_AT_ONCE, _LEAST_LOOPS, _ROWS_AT_ONCE = 64, 8, 2**18
 
 
 @np.errstate(all="ignore")
-def finalize(
-    ending: RunEnding, *, report: bool = True, view: bool = True, again: bool = False
-) -> Outcome:
+def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again: bool = False) -> Outcome:
     """Complete the record of a run; write its summary, its report and its recording.
 
     Args:
@@ -228,15 +226,11 @@ def _stored_run(run_dir: Path) -> RecordedRun:
 
 
 @np.errstate(all="ignore")
-def _judged_stored(
-    ending: RunEnding, block: range, known: Sequence[Expectations] | None
-) -> list[_Judged]:
+def _judged_stored(ending: RunEnding, block: range, known: Sequence[Expectations] | None) -> list[_Judged]:
     return _judged_loops(_stored_run(ending.run_dir), ending, None, block, known)
 
 
-def _record_stored(
-    run_dir: Path, summary: RunSummary, over_time: Sequence[LoopOverTime] | None
-) -> None:
+def _record_stored(run_dir: Path, summary: RunSummary, over_time: Sequence[LoopOverTime] | None) -> None:
     _write_recording(_stored_run(run_dir), summary, run_dir, None, over_time)
 
 
@@ -332,9 +326,7 @@ def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:
         "certified_for": _schedule(claims.certified_for),
         "claims": claims.judge(),
         "judged_until_s": claims.judged_until_s,
-        "assumption_violations": list_violations(
-            summary.assumption_violations, claims.violations()
-        ),
+        "assumption_violations": list_violations(summary.assumption_violations, claims.violations()),
         "longest_loss_burst": longest,
     }
 

@@ -39,14 +39,24 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 _COMMON = (
-    "noack.runtime.control_plane", "noack.runtime.join_ticket", "noack.scenario.scenario_file",
-    "noack.scenario.resolution", "noack.core.random_streams", "cosim.record.run_directory",
-)  # fmt: skip
+    "noack.runtime.control_plane",
+    "noack.runtime.join_ticket",
+    "noack.scenario.scenario_file",
+    "noack.scenario.resolution",
+    "noack.core.random_streams",
+    "cosim.record.run_directory",
+)
 """What the processes and the launcher import."""
 _IMPORTS = (
-    *_COMMON, "plant_server.__main__", "sensor_node.__main__", "controller_node.__main__",
-    "netem.__main__", "cosim.live.recorder", "numpy.random", "zenoh",
-)  # fmt: skip
+    *_COMMON,
+    "plant_server.__main__",
+    "sensor_node.__main__",
+    "controller_node.__main__",
+    "netem.__main__",
+    "cosim.live.recorder",
+    "numpy.random",
+    "zenoh",
+)
 QUICK_IMPORTS = {
     "OPENBLAS_NUM_THREADS": "1",  # numpy starts no threads
     "PYDANTIC_DISABLE_PLUGINS": "__all__",  # no search among all installed packages

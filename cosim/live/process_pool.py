@@ -21,7 +21,7 @@ _ENVIRONMENT = dict.fromkeys(
     "PYTHONSAFEPATH": "1",
     "MALLOC_MMAP_THRESHOLD_": _KEPT_BYTES,
     "MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
-}  # fmt: skip
+}
 """One thread each, and no imports from the current folder (:mod:`noack.core.process_limits`). They
 keep freed memory: with new memory for each part of a record, half of the time is page faults."""
 

@@ -39,26 +39,28 @@ def error_console() -> Console:
 
 
 @contextmanager
-def progress_line(
-    console: Console, scenario: Scenario, session: str | None = None
-) -> Iterator[Watcher]:
+def progress_line(console: Console, scenario: Scenario, session: str | None = None) -> Iterator[Watcher]:
     """Show the progress of a run while the context lasts."""
     live = console.is_terminal and not console.is_dumb_terminal
     columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:
         shown = _RunProgress(console, progress, scenario, session)
         yield Watcher(
-            shown.waiting, shown.listening, shown.started, shown.failed, shown.restarted,
-            shown.update, shown.stopping, shown.notice,
-        )  # fmt: skip
+            shown.waiting,
+            shown.listening,
+            shown.started,
+            shown.failed,
+            shown.restarted,
+            shown.update,
+            shown.stopping,
+            shown.notice,
+        )
 
 
 class _RunProgress:
     """What has been shown of a run."""
 
-    def __init__(
-        self, console: Console, progress: Progress, scenario: Scenario, session: str | None
-    ) -> None:
+    def __init__(self, console: Console, progress: Progress, scenario: Scenario, session: str | None) -> None:
         self._console, self._progress, self._scenario = console, progress, scenario
         self._options = "" if session in (None, DEFAULT_SESSION) else f" --session {session}"
         self._task: TaskID | None = None
@@ -75,9 +77,7 @@ class _RunProgress:
         """Say how processes on other hosts join."""
         if how.invitation is None:
             places = (f"{role} on {host.ssh}" for role, host in how.hosts.items())
-            self._print(
-                f"listening on {escape(address)} (TCP); by ssh: {escape(', '.join(places))}"
-            )
+            self._print(f"listening on {escape(address)} (TCP); by ssh: {escape(', '.join(places))}")
             return
         role = how.role or "plant|sensor|netem|controller"
         self._print(

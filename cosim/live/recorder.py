@@ -38,12 +38,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.control_messages import (
-    ChangeAnnouncement,
-    ProcessReport,
-    RunProgress,
-    message_json,
-)
+from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane, header_of
 from noack.runtime.life_cycle import LAUNCHED_AWAY_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess, join_run
@@ -137,9 +132,7 @@ class ProgressReport(RunProgress):
         if len(self.warnings) < _MOST_LINES:
             self.warnings.append(text)
         elif len(self.warnings) == _MOST_LINES:
-            self.warnings.append(
-                "further void claims and diverging loops are in the logs of the loops"
-            )
+            self.warnings.append("further void claims and diverging loops are in the logs of the loops")
 
     @np.errstate(all="ignore")  # a run may diverge
     def count(self, table: str, rows: Rows) -> None:
@@ -340,9 +333,7 @@ class Recorder:
                 self._feed.log(notice.line())
         if self._monitor.stopped is not None and not self._blind_reported:
             self._blind_reported = True
-            self._progress.add_warning(
-                f"claims are checked after the run only: {self._monitor.stopped}"
-            )
+            self._progress.add_warning(f"claims are checked after the run only: {self._monitor.stopped}")
 
     def _publish_progress(self) -> None:
         self._plane.publish("progress", content=message_json(self._progress))
@@ -441,9 +432,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
 
 def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunRecording":
     ticket = process.ticket
-    return run_recording.open_recording(
-        process.scenario, Path(ticket.run_dir), ticket.run_id, live_view
-    )
+    return run_recording.open_recording(process.scenario, Path(ticket.run_dir), ticket.run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:

@@ -28,12 +28,7 @@ from cosim.live.coordinator import AdmissionPass, Coordinator
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of
-from noack.runtime.connections.coordinator_link import (
-    InvitationProof,
-    Protection,
-    forwarding,
-    tls_context,
-)
+from noack.runtime.connections.coordinator_link import InvitationProof, Protection, forwarding, tls_context
 from noack.runtime.control_plane import RUNS, run_name, socket_path
 from noack.runtime.host_clocks.time_exchange import TimeReference, answering
 from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass, own_host
@@ -126,9 +121,7 @@ def _listen(address: Address) -> socket.socket:
 
 
 @contextmanager
-def open_to_hosts(
-    listening: Listening, ticket: Ticket, coordinator: Coordinator
-) -> Iterator[Opened]:
+def open_to_hosts(listening: Listening, ticket: Ticket, coordinator: Coordinator) -> Iterator[Opened]:
     """Listen for processes of other hosts meanwhile, and make their invitation.
 
     Raise CallerError if the address cannot be used.
@@ -138,27 +131,28 @@ def open_to_hosts(
         endpoint = stack.enter_context(_listen(listening.address))
         host, port = endpoint.getsockname()[:2]
         floods = ConnectionFloodWatch()
-        protection = Protection(
-            coordinator_context(keys), InvitationProof(ticket.key), floods.next_interval
-        )
-        stack.enter_context(
-            forwarding(endpoint, lambda: asyncio.open_unix_connection(path), protection)
-        )
+        protection = Protection(coordinator_context(keys), InvitationProof(ticket.key), floods.next_interval)
+        stack.enter_context(forwarding(endpoint, lambda: asyncio.open_unix_connection(path), protection))
         times = TimeReference((host, listening.address[1]), ticket.key)
         stack.callback(times.close)
         stack.enter_context(answering(times))
         until = datetime.datetime.now().astimezone() + datetime.timedelta(seconds=listening.valid_s)
         remote = RemoteAccess(
-            host=host, port=port, coordinator=keys.coordinator.certificate,
-            **keys.joining._asdict(), valid_until=until.isoformat(timespec="seconds"),
-        )  # fmt: skip
+            host=host,
+            port=port,
+            coordinator=keys.coordinator.certificate,
+            **keys.joining._asdict(),
+            valid_until=until.isoformat(timespec="seconds"),
+        )
         shown = new_admission_pass()
         roles = LOOP_ROLES if listening.role is None else (listening.role,)
         coordinator.passes[shown] = AdmissionPass(roles, time.monotonic() + listening.valid_s)
         invited = {
-            "launched": False, "admission_pass": shown, "remote": remote,
+            "launched": False,
+            "admission_pass": shown,
+            "remote": remote,
             "time_reference": times.address,
-        }  # fmt: skip
+        }
         yield Opened((host, port), ticket.model_copy(update=invited), floods.lines)
 
 
@@ -190,9 +184,7 @@ class ConnectionFloodWatch:
             self._ended += total
             self._calm += 1
             if self._calm >= self._needed:
-                self.lines.put(
-                    f"the flood is over: {self._ended} connections without an invitation ended"
-                )
+                self.lines.put(f"the flood is over: {self._ended} connections without an invitation ended")
                 self._ended, self._needed = 0, min(2 * self._needed, _MOST_CALM_S)
 
 
@@ -230,9 +222,7 @@ def _new_key_pair(whose: x509.GeneralName) -> KeyPair:
         .sign(key, hashes.SHA256())
     )
     pem = serialization.Encoding.PEM
-    private = key.private_bytes(
-        pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
+    private = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
     return KeyPair(certificate.public_bytes(pem).decode(), private.decode())
 
 

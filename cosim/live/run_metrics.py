@@ -43,9 +43,12 @@ class RunMetrics:
     def watcher(self) -> Watcher:
         """Return the callbacks of the launcher."""
         return Watcher(
-            waiting=self._wait, started=self._start, failed=self._fail, restarted=self._restart,
+            waiting=self._wait,
+            started=self._start,
+            failed=self._fail,
+            restarted=self._restart,
             progress=self._progress,
-        )  # fmt: skip
+        )
 
     def _wait(self, roles: Sequence[str]) -> None:
         self._waiting = len(roles)
@@ -70,20 +73,15 @@ class RunMetrics:
         for name, text, value in (
             ("horizon_seconds", "simulated time at which the run ends", scenario.horizon_s),
             ("speed", "simulated time per wall time", scenario.speed),
-            ("loss_burst_limit", "most consecutive losses allowed (M - 1)",
-             scenario.network.mansd),
+            ("loss_burst_limit", "most consecutive losses allowed (M - 1)", scenario.network.mansd),
             ("missing_processes", "processes that the start barrier waits for", self._waiting),
-        ):  # fmt: skip
+        ):
             yield GaugeMetricFamily(f"{_PREFIX}_{name}", text, value)
-        restarts = CounterMetricFamily(
-            f"{_PREFIX}_restarts", "restarted processes", labels=["process"]
-        )
+        restarts = CounterMetricFamily(f"{_PREFIX}_restarts", "restarted processes", labels=["process"])
         for role, count in self._restarts.items():
             restarts.add_metric([role], count)
         yield restarts
-        yield CounterMetricFamily(
-            f"{_PREFIX}_failures", "processes that failed", self._failures.total()
-        )
+        yield CounterMetricFamily(f"{_PREFIX}_failures", "processes that failed", self._failures.total())
         if (report := self._report) is not None:
             yield from _of_loop(report)
 

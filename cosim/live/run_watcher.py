@@ -69,9 +69,7 @@ class RunLog:
         return Watcher(started=self._started, progress=self._progress)
 
     def _started(self, run_dir: Path) -> None:
-        log_event(
-            "info", _SOURCE, f"run {run_dir} is prepared", event="run", directory=str(run_dir)
-        )
+        log_event("info", _SOURCE, f"run {run_dir} is prepared", event="run", directory=str(run_dir))
 
     def _progress(self, report: RunProgress) -> None:
         if time.monotonic() < self._due_s:
@@ -84,6 +82,11 @@ class RunLog:
 def log_end(status: int, reason: str, run_dir: Path) -> None:
     """Log how a run ended."""
     log_event(
-        "info" if status == 0 else "error", _SOURCE, f"ended: {reason}",
-        event="end", status=status, reason=reason, directory=str(run_dir),
-    )  # fmt: skip
+        "info" if status == 0 else "error",
+        _SOURCE,
+        f"ended: {reason}",
+        event="end",
+        status=status,
+        reason=reason,
+        directory=str(run_dir),
+    )

@@ -14,15 +14,7 @@ from noack.protocol.machine_interface import GENERATION, Notice, Start
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
-from noack.runtime.spool import (
-    NOTICES,
-    SPOOL,
-    SpoolWriter,
-    lines_in,
-    notice_number,
-    notices_of,
-    read_chunks,
-)
+from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, lines_in, notice_number, notices_of, read_chunks
 from noack.runtime.telemetry import ReceivedRows
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario import Scenario
@@ -51,16 +43,12 @@ class TelemetryStore:
         self._received: defaultdict[tuple[str, str, int], ReceivedRows] = defaultdict(ReceivedRows)
         """By role, table and generation."""
 
-    def add_notices(
-        self, role: str, generation: int, first: int, payload: bytes
-    ) -> list[dict[str, Any]]:
+    def add_notices(self, role: str, generation: int, first: int, payload: bytes) -> list[dict[str, Any]]:
         """Store a batch of lines of the log; return the fields of each.
 
         Raise PeerError if the payload has something else.
         """
-        lines = [
-            parse_message(LogLine, line).fields() | {"process": role} for line in lines_in(payload)
-        ]
+        lines = [parse_message(LogLine, line).fields() | {"process": role} for line in lines_in(payload)]
         self.writer.append(notices_of(role), notice_number(generation, first), payload)
         self._received[role, NOTICES, generation].add(first, first + len(lines))
         return lines

@@ -106,15 +106,21 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
         observed_s=end_ns * 1e-9,
         share=_covered_ns(*union) / whole,
         causes=tuple(
-            VoidShare(one.cause, _covered_ns(one.begin_ns, one.end_ns) / whole,
-                      float(one.begin_ns.min()) * 1e-9, one.worst, one.text)
+            VoidShare(
+                one.cause,
+                _covered_ns(one.begin_ns, one.end_ns) / whole,
+                float(one.begin_ns.min()) * 1e-9,
+                one.worst,
+                one.text,
+            )
             for one in spans
         ),
         kept={
             one.cause: f"kept: {one.text}" if one.worst else "kept"
-            for one in every if not len(one.begin_ns) and not one.cause.endswith(ORDER)
+            for one in every
+            if not len(one.begin_ns) and not one.cause.endswith(ORDER)
         },
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,16 +156,17 @@ def _violations(
         for suffix, these in (("", which), (ORDER, (every > rule.limit) & ~which)):
             values = every if suffix else dropped
             worst = float((every[these] if these.any() else values).max(initial=0))
-            yield _Spans(
-                rule.name + suffix, sent_ns[these], until_ns[these], worst, rule.violation(worst)
-            )
+            yield _Spans(rule.name + suffix, sent_ns[these], until_ns[these], worst, rule.violation(worst))
     delays = trace.received_ns - sent_ns
     beyond = ~found.lost & ~stale & (delays > delay_ns)
     worst = float(delays[~found.lost & ~stale].max(initial=0)) * 1e-9
     yield _Spans(
-        DELAY, sent_ns[beyond] + delay_ns, trace.received_ns[beyond], worst,
+        DELAY,
+        sent_ns[beyond] + delay_ns,
+        trace.received_ns[beyond],
+        worst,
         f"an update was in the network for {worst:.4g} s, {allowed_s:.4g} s allowed",
-    )  # fmt: skip
+    )
 
 
 def _covered_ns(begin_ns: Times, end_ns: Times) -> int:

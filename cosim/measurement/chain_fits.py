@@ -309,10 +309,7 @@ class ChainFits:
             # A slow chain around the observed loss rate, and one as fast as the observed bursts.
             share = min(max((self.lost / self.packets - good) / (bad - good), 1e-3), 0.9)
             starts += [(leave * share / (1 - share), leave, good, bad) for leave in (r / 3, r / 20)]
-        inner = [
-            np.asarray(logit(np.clip(start, [1e-7, 1e-7, 1e-5, 1e-5], 1 - 1e-5)))
-            for start in starts
-        ]
+        inner = [np.asarray(logit(np.clip(start, [1e-7, 1e-7, 1e-5, 1e-5], 1 - 1e-5))) for start in starts]
         likeliest = sorted(inner, key=self._cost)[:_SEARCHES]
         found = [minimise(self._cost, start, _LIMIT) for start in likeliest]
         return min(found, key=lambda one: one.value)
@@ -428,9 +425,12 @@ def _geometric(lengths: NDArray[np.int64]) -> NDArray[np.float64]:
     rest = total - lengths - (count - 1)  # C(S − ℓ, b − 1) is 0 below 0
     with np.errstate(invalid="ignore"):
         log = (
-            np.log(count) + gammaln(total - lengths + 1) - gammaln(rest + 1)
-            - gammaln(total) + gammaln(total - count + 1)
-        )  # fmt: skip
+            np.log(count)
+            + gammaln(total - lengths + 1)
+            - gammaln(rest + 1)
+            - gammaln(total)
+            + gammaln(total - count + 1)
+        )
     return np.where(rest < 0, 0.0, np.exp(np.minimum(log, 0.0)))
 
 
@@ -484,8 +484,12 @@ def fit_outages(
     p_value = None
     if len(durations_s) >= FEWEST_OUTAGES and complete.all():
         tested = goodness_of_fit(
-            expon, durations_s, known_params={"loc": 0.0}, statistic="ad", n_mc_samples=999,
+            expon,
+            durations_s,
+            known_params={"loc": 0.0},
+            statistic="ad",
+            n_mc_samples=999,
             rng=np.random.default_rng(SEED),
-        )  # fmt: skip
+        )
         p_value = float(tested.pvalue)
     return OutageFit(len(durations_s), rate, mean, p_value)

@@ -184,9 +184,12 @@ def minimise(function: Callable[[Reals], float], start: Reals, limit: float) -> 
     if not len(start):
         return Minimum(start, function(start))
     found = minimize(
-        function, start, method="L-BFGS-B", bounds=[(-limit, limit)] * len(start),
+        function,
+        start,
+        method="L-BFGS-B",
+        bounds=[(-limit, limit)] * len(start),
         options={"eps": 1e-5, "ftol": 1e-10, "gtol": 1e-5, "maxiter": 200},
-    )  # fmt: skip
+    )
     return Minimum(np.asarray(found.x), float(found.fun))
 
 
@@ -205,9 +208,7 @@ def profile_interval(
     return low, high
 
 
-def _profile_end(
-    function: Callable[[Reals], float], best: Minimum, place: int, outer: float
-) -> float:
+def _profile_end(function: Callable[[Reals], float], best: Minimum, place: int, outer: float) -> float:
     """Return where the profile has lost what an interval allows, or ``outer``.
 
     The profile at a value is searched for from the minimum at the last step inside the interval.
@@ -283,9 +284,7 @@ def _packet_quantile(bursts: LossBursts, share: float) -> int:
     return bisect_left(range(bursts.longest), True, key=is_enough) + 1
 
 
-def most_losses(
-    bursts: LossBursts, windows: Sequence[int], left_out: Flags | None = None
-) -> dict[int, int]:
+def most_losses(bursts: LossBursts, windows: Sequence[int], left_out: Flags | None = None) -> dict[int, int]:
     """Return the largest number of losses in any K consecutive packets, by K.
 
     Windows that touch a burst that is left out do not count; a K without a window has no entry.

@@ -72,9 +72,7 @@ class OutputRequest:
             require_suffix(self.network, "--write", ".toml")
 
 
-def report(
-    found: Measurement, request: OutputRequest, console: Console | None
-) -> dict[str, object]:
+def report(found: Measurement, request: OutputRequest, console: Console | None) -> dict[str, object]:
     """Write what is requested, print the tables, and return the document of ``--json``.
 
     Raises:
@@ -141,8 +139,7 @@ def _comment(found: Measurement, form: Form) -> str:
     lines = [f"Measured: {printable(found.name)}, {len(found.trace)} packets{late}."]
     if form == "trace":
         lines += [
-            "Each update gets what was recorded at its time. "
-            'With by = "packet", update k gets record k.',
+            'Each update gets what was recorded at its time. With by = "packet", update k gets record k.',
         ]
     else:
         lines += ["A model, fitted per packet: it assumes updates at the trace's rate."]
@@ -193,11 +190,14 @@ def _delay(found: Measurement) -> list[Mapping[str, object]]:
         return [{"kind": "delay", "delay_s": int(delays_ns[0]) * 1e-9}]
     samples_s = np.quantile(delays_ns, np.linspace(0, 1, _SAMPLES)) * 1e-9
     correlation = found.delays.correlation[0] if found.delays.correlation else 0.0
-    return [{
-        "kind": "delay", "distribution": "empirical",
-        "samples_s": np.round(samples_s, 9).tolist(),
-        "correlation": round(min(max(correlation, 0.0), _MOST_CORRELATION), 4),
-    }]  # fmt: skip
+    return [
+        {
+            "kind": "delay",
+            "distribution": "empirical",
+            "samples_s": np.round(samples_s, 9).tolist(),
+            "correlation": round(min(max(correlation, 0.0), _MOST_CORRELATION), 4),
+        }
+    ]
 
 
 _MODELS = {
@@ -217,19 +217,21 @@ _MOST_LISTED = 12
 _MOST_OUTAGES = 5
 
 
-def measurement_tables(
-    found: Measurement, void: CertificateTime | None = None
-) -> Iterator[ResultTable]:
+def measurement_tables(found: Measurement, void: CertificateTime | None = None) -> Iterator[ResultTable]:
     """Yield the tables of a measurement, and that of a scenario's certificate."""
     without = ", without the outages" if found.is_outage.any() else ""
     estimates = ("estimate", "95 % interval")
     heads: tuple[str, ...]
     yield ResultTable("numbers", "losses and delays", KEY_VALUE, [*_numbers(found, without)])
     rows = [
-        (f"{100 * one.share:.6g} %", str(one.bursts), str(one.bursts_confident or "too few bursts"),
-         str(one.packets))
+        (
+            f"{100 * one.share:.6g} %",
+            str(one.bursts),
+            str(one.bursts_confident or "too few bursts"),
+            str(one.packets),
+        )
         for one in found.quantiles
-    ]  # fmt: skip
+    ]
     heads = ("share", "of the bursts", "with 95 % confidence", "of the packets")
     yield ResultTable("m", f"M: at most M − 1 consecutive losses{without}", heads, rows)
     if found.windows:
@@ -252,9 +254,7 @@ def measurement_tables(
         yield ResultTable("certificate", what, heads, [*_void_rows(void)])
 
 
-def print_measurement(
-    console: Console, found: Measurement, void: CertificateTime | None = None
-) -> None:
+def print_measurement(console: Console, found: Measurement, void: CertificateTime | None = None) -> None:
     """Print the tables and the remarks."""
     console.print(found.name, markup=False, highlight=False, soft_wrap=True)
     for table in measurement_tables(found, void):
@@ -395,8 +395,7 @@ def measurement_figures(found: Measurement) -> Iterator[FigureDescription]:
     yield one_panel("bursts", _histogram(found), _HEIGHT_IN).captioned(
         "Number of loss bursts by length. A burst is a number of consecutive effective "
         "losses: packets that were lost, out of order, or later than the deadline.",
-        f"Bars: {len(found.bursts.length)} loss bursts, the longest of "
-        f"{found.bursts.longest} packets.",
+        f"Bars: {len(found.bursts.length)} loss bursts, the longest of {found.bursts.longest} packets.",
     )
     yield one_panel("delays", _delays(found), _HEIGHT_IN).captioned(
         "Delay of each received packet, at its sending time; crosses at the top: lost "
@@ -430,9 +429,7 @@ def _histogram(found: Measurement) -> Panel:
         ("outages", found.bursts.only(outages), _OUTAGES),
     ):
         counts = np.histogram(bursts.length, edges)[0].astype(np.float64)
-        items.append(
-            Bars(edges=edges - 0.5, heights=counts, label=label, colour=colour, opacity=0.85)
-        )
+        items.append(Bars(edges=edges - 0.5, heights=counts, label=label, colour=colour, opacity=0.85))
     return Panel(
         title="Loss bursts",
         items=items,
@@ -450,9 +447,16 @@ def _delays(found: Measurement) -> Panel:
     items: list[Item] = [
         Line(x=sent_s, y=values, colour=_DELAYS, width=0.8, marker=".", size=2.5),
         Spans(begin=begin_s, end=begin_s + duration_s, colour=_OUTAGES),
-        Marks(x=sent_s[lost], y=np.zeros(int(lost.sum())), marker="x", size=3.5, colour=_LOST,
-              at_top=True, reduced=False),
-    ]  # fmt: skip
+        Marks(
+            x=sent_s[lost],
+            y=np.zeros(int(lost.sum())),
+            marker="x",
+            size=3.5,
+            colour=_LOST,
+            at_top=True,
+            reduced=False,
+        ),
+    ]
     if found.options.deadline_s is not None:
         items.append(Rule(at=found.options.deadline_s, colour=_LIMIT))
     return Panel(
@@ -503,5 +507,11 @@ def _windows(found: Measurement) -> Panel:
 
 
 def _curve(x: Sequence[float], y: Sequence[float], label: str, colour: palette.Colour) -> Line:
-    return Line(x=np.asarray(x, np.float64), y=np.asarray(y, np.float64), label=label,
-                colour=colour, marker=".", size=4)  # fmt: skip
+    return Line(
+        x=np.asarray(x, np.float64),
+        y=np.asarray(y, np.float64),
+        label=label,
+        colour=colour,
+        marker=".",
+        size=4,
+    )

@@ -250,10 +250,7 @@ class Measurement:
             found.append("a loss burst is cut by the beginning or end of the trace")
         if self.is_outage.any():
             found.append("outages are reported as such: M and the loss models do not include them")
-            if (
-                self.options.outage_s is None
-                and self.models["gilbert_elliott"].test.verdict == "rejected"
-            ):
+            if self.options.outage_s is None and self.models["gilbert_elliott"].test.verdict == "rejected":
                 found.append(
                     "the fitted chain is itself rejected by its test: what counts as an outage "
                     "depends on it; --outage TIME sets the limit by hand"
@@ -284,9 +281,7 @@ class Measurement:
                 for window, (every, usual) in self.windows.items()
             },
             "delay_s": {str(share): value for share, value in self.delays.quantiles_s.items()},
-            "delay_correlation": dict(
-                zip(map(str, self.delays.lags), self.delays.correlation, strict=True)
-            ),
+            "delay_correlation": dict(zip(map(str, self.delays.lags), self.delays.correlation, strict=True)),
             "interval_level": LEVEL,
             "models": {name: one.to_json() for name, one in self.models.items()},
             "chosen_model": self.chosen.fit.model if self.models else None,

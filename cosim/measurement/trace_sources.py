@@ -35,13 +35,7 @@ from noack.protocol.record_tables import CONTROLLER_DELIVERY, Fate
 from noack.settings.user_files import NamedFile
 from noack.traces.capture_packets import is_capture
 from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
-from noack.traces.packet_trace import (
-    LOST_NS,
-    MAX_PACKETS,
-    PacketTrace,
-    TraceRecordError,
-    packet_trace,
-)
+from noack.traces.packet_trace import LOST_NS, MAX_PACKETS, PacketTrace, TraceRecordError, packet_trace
 from noack.traces.trace_formats import read_trace
 
 if TYPE_CHECKING:
@@ -75,9 +69,7 @@ FILE_OPTIONS = {
 """Options of the command line, by field of :class:`SourceOptions`."""
 
 
-def refuse_unused(
-    options: "DataclassInstance", names: Mapping[str, str], what: str, *used: str
-) -> None:
+def refuse_unused(options: "DataclassInstance", names: Mapping[str, str], what: str, *used: str) -> None:
     """Raise CallerError for an option that differs from its default, but has no effect.
 
     Args:
@@ -173,9 +165,7 @@ def read_fate_file(path: Path, number: int) -> PacketTrace:
         chosen, packets = counts.most_common(number)[-1]
         if packets > MAX_PACKETS:
             raise CallerError(f"{path}: the flow has more than {MAX_PACKETS} packets")
-        is_chosen = reduce(
-            and_, (pc.field(name) == value for name, value in zip(_FLOW, chosen, strict=True))
-        )
+        is_chosen = reduce(and_, (pc.field(name) == value for name, value in zip(_FLOW, chosen, strict=True)))
         batches = (pa.Table.from_batches([one]) for one in file.iter_batches(columns=[*_COLUMNS]))
         table = pa.concat_tables([batch.filter(is_chosen) for batch in batches])
     rows = {name: np.asarray(table[name].to_numpy()) for name in _COLUMNS[len(_FLOW) :]}
@@ -189,9 +179,7 @@ def read_fate_file(path: Path, number: int) -> PacketTrace:
     return trace.noted(f"flow {number}: {link} {direction}, flow {flow}, {packets} packets{others}")
 
 
-def _received(
-    path: Path, rows: dict[str, NDArray[np.int64]]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _received(path: Path, rows: dict[str, NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the times of the first intact delivery, and which packets have none."""
     times = (rows[name] for name in ("delay_ns", "copy_delay_ns", "arrival_ns"))
     if max(int(np.abs(time_ns).max(initial=0)) for time_ns in times) > _LATEST_NS:

@@ -25,16 +25,19 @@ from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
 from noack.theory.random_losses.moments import UnlimitedLosses
 
 
-def print_certificates(
-    console: Console, found: Certificates, chosen: Certificates | None = None
-) -> None:
+def print_certificates(console: Console, found: Certificates, chosen: Certificates | None = None) -> None:
     """Print the tables, and what is certified in a norm that noack chose instead."""
     constants, *limits = certificate_tables(found)
     if found.nonlinear is not None:
+        region = found.schedule_region
+        if region is None or region.constants is None:
+            why = "" if region is None else f": {region.void}"
+            own = f". The plant itself has no certificate from its x(0){why}"
+        else:
+            own = ", except under “region”: that is certified for the plant itself"
         console.print(
             f"[yellow]the plant is not linear[/] ({escape(found.nonlinear)}): what follows is "
-            "certified for the linear plant ẋ = Âx + B̂u in its place, except under “region”: that "
-            "is certified for the plant itself"
+            f"certified for the linear plant ẋ = Âx + B̂u in its place{escape(own)}"
         )
     console.print(terminal_table(constants))
     _print_notes(console, found)
@@ -80,8 +83,10 @@ def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> Non
     rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in weight)
     console.print(
         f"for the scenario file, below [trigger]:\nweight = [\n{rows},\n]",
-        markup=False, highlight=False, soft_wrap=True,
-    )  # fmt: skip
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _in_words(found: Certificates) -> Iterator[str]:
@@ -172,9 +177,7 @@ def _print_notes(console: Console, found: Certificates) -> None:
         )
     for under, certificate in found:
         if certificate.void:
-            console.print(
-                f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}"
-            )
+            console.print(f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}")
         if certificate.region is not None:
             loop, region = loop_of(found.scenario), certificate.region
             limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
@@ -182,12 +185,7 @@ def _print_notes(console: Console, found: Certificates) -> None:
             console.print(f"[green]region[/] ({under}): {escape(text)}", highlight=False)
     policy = found.scenario.trigger.policy
     exists = found.schedule.constants is not None  # else another norm is tried
-    if (
-        exists
-        and found.weight is None
-        and policy == "decaying"
-        and any(c.void for c in certificates)
-    ):
+    if exists and found.weight is None and policy == "decaying" and any(c.void for c in certificates):
         console.print("--weight chosen searches for a norm in which more is certified")
 
 
@@ -304,9 +302,7 @@ _RARE = 1e-4
 _MOMENT = {1: "mean", 2: "root mean square"}
 
 
-def print_unlimited(
-    console: Console, found: UnlimitedLosses | None, unpredictable: str | None
-) -> None:
+def print_unlimited(console: Console, found: UnlimitedLosses | None, unpredictable: str | None) -> None:
     """Print what holds although the network does not limit the losses."""
     if unpredictable is not None:
         console.print(f"[yellow]no statement without the guarantee:[/] {unpredictable}")
@@ -323,11 +319,16 @@ def print_unlimited(
             f"hold as long as none is longer; runs of {found.horizon_s:g} s",
             ("longest burst", "P(longer burst)", "events", "Δ", "X"),
             [
-                (f"{one.most}", f"≤ {number(1 - one.probability, 3)}", f"≤ {one.events}",
-                 number(one.delta, 4), number(one.state, 4))
+                (
+                    f"{one.most}",
+                    f"≤ {number(1 - one.probability, 3)}",
+                    f"≤ {one.events}",
+                    number(one.delta, 4),
+                    number(one.state, 4),
+                )
                 for one in shown
             ],
-        )  # fmt: skip
+        )
         console.print(terminal_table(table, left=()))
     for sentence in sentences(found):
         console.print(sentence, markup=False, highlight=False)
@@ -353,8 +354,7 @@ def sentences(found: UnlimitedLosses) -> Iterator[str]:
         yield f"x decays almost surely: decay rate {found.sure_rate_per_s:.3g} /s."
     if found.paper_rate_per_s is not None:
         at = ", ".join(
-            f"{_MOMENT[order]} at most {value:.4g}"
-            for order, value in enumerate(found.at_events, start=1)
+            f"{_MOMENT[order]} at most {value:.4g}" for order, value in enumerate(found.at_events, start=1)
         )
         yield (
             f"Under the paper's conditions ‖e_c‖ e^(αt)/β at events has a {at}, and x decays "

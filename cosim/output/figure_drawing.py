@@ -159,10 +159,13 @@ def _head(axes: Axes, figure: Figure, box: Box, title: str, shown: Sequence[Show
     for number, entries in enumerate(rows):
         above = len(rows) - 1 - number
         legend = axes.legend(
-            [shown[i][0] for i in entries], [legend_text(shown[i][1]) for i in entries],
-            loc="lower right", bbox_to_anchor=(right_in, bottom_in + above * space.legend_row_in),
-            bbox_transform=figure.dpi_scale_trans, ncols=len(entries),
-        )  # fmt: skip
+            [shown[i][0] for i in entries],
+            [legend_text(shown[i][1]) for i in entries],
+            loc="lower right",
+            bbox_to_anchor=(right_in, bottom_in + above * space.legend_row_in),
+            bbox_transform=figure.dpi_scale_trans,
+            ncols=len(entries),
+        )
         if above:  # the next row would replace it
             axes.add_artist(legend)
     pad_pt = POINTS_PER_IN * title_in + mpl.rcParams["axes.titlepad"]
@@ -178,10 +181,14 @@ def _draw(item: object, axes: Axes, norm: Normalize | None) -> Artist | None:
 @_draw.register
 def _(item: Line, axes: Axes, norm: Normalize | None) -> Artist | None:
     style: dict[str, Any] = {
-        "color": rgb(item.colour), "linewidth": item.width, "zorder": item.order,
-        "linestyle": (0, item.dash) if item.dash else "-", "marker": item.marker,
-        "markersize": item.size, "alpha": item.opacity,
-    }  # fmt: skip
+        "color": rgb(item.colour),
+        "linewidth": item.width,
+        "zorder": item.order,
+        "linestyle": (0, item.dash) if item.dash else "-",
+        "marker": item.marker,
+        "markersize": item.size,
+        "alpha": item.opacity,
+    }
     if item.steps:
         style["drawstyle"] = f"steps-{item.steps}"
     is_log = axes.get_yscale() == "log"
@@ -220,9 +227,13 @@ def _(item: Marks, axes: Axes, norm: Normalize | None) -> Artist | None:
     if not len(x):
         return None
     style: dict[str, Any] = {
-        "color": rgb(item.colour), "marker": item.marker, "markeredgewidth": item.stroke,
-        "alpha": item.opacity, "zorder": item.order, "linestyle": "none",
-    }  # fmt: skip
+        "color": rgb(item.colour),
+        "marker": item.marker,
+        "markeredgewidth": item.stroke,
+        "alpha": item.opacity,
+        "zorder": item.order,
+        "linestyle": "none",
+    }
     if item.x_error is not None or item.y_error is not None:
         y_error, x_error = (
             None if error is None else error[..., seen] for error in (item.y_error, item.x_error)
@@ -257,8 +268,9 @@ def _(item: Bars, axes: Axes, norm: Normalize | None) -> Artist | None:
         axes.margins(y=0.15)
         for x, height in zip(middles, item.heights, strict=True):
             if height:
-                axes.text(x, height, f"{height:,g}", ha="center", va="bottom",
-                          size=mpl.rcParams["legend.fontsize"])  # fmt: skip
+                axes.text(
+                    x, height, f"{height:,g}", ha="center", va="bottom", size=mpl.rcParams["legend.fontsize"]
+                )
     return axes.bar(middles, item.heights, widths, **style).patches[0]
 
 
@@ -266,9 +278,7 @@ def _(item: Bars, axes: Axes, norm: Normalize | None) -> Artist | None:
 def _(item: Rule, axes: Axes, norm: Normalize | None) -> Artist | None:
     draw_rule = axes.axvline if item.vertical else axes.axhline
     dash = (0, item.dash) if item.dash else "-"
-    return draw_rule(
-        item.at, color=rgb(item.colour), linestyle=dash, linewidth=item.width, zorder=item.order
-    )
+    return draw_rule(item.at, color=rgb(item.colour), linestyle=dash, linewidth=item.width, zorder=item.order)
 
 
 @_draw.register
@@ -284,9 +294,13 @@ def _(item: Heat, axes: Axes, norm: Normalize | None) -> Artist | None:
     (left, right), values = item.x_ends, np.ma.masked_invalid(item.values)
     if item.values.size > _MOST_CELLS:
         axes.imshow(
-            values, aspect="auto", interpolation="nearest", norm=norm, cmap="viridis",
+            values,
+            aspect="auto",
+            interpolation="nearest",
+            norm=norm,
+            cmap="viridis",
             extent=(left, right, rows - 0.5, -0.5),
-        )  # fmt: skip
+        )
     else:
         edges = np.linspace(left, right, columns + 1), np.arange(rows + 1) - 0.5
         axes.pcolormesh(*edges, values, norm=norm, cmap="viridis")
@@ -298,9 +312,7 @@ def _(item: Heat, axes: Axes, norm: Normalize | None) -> Artist | None:
             if np.isfinite(value):
                 middle = left + (column + 0.5) * (right - left) / columns
                 colour = "#ffffff" if float(norm(value)) < _DARK else "#000000"
-                axes.text(
-                    middle, row, f"{value:.3g}", ha="center", va="center", size=7.5, color=colour
-                )
+                axes.text(middle, row, f"{value:.3g}", ha="center", va="center", size=7.5, color=colour)
     return None
 
 
@@ -310,9 +322,7 @@ def _norm(scale: ColourScale | None) -> Normalize | None:
     return (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
 
 
-def _colour_bar(
-    figure: Figure, scale: ColourScale, norm: Normalize | None, places: Sequence[Place]
-) -> None:
+def _colour_bar(figure: Figure, scale: ColourScale, norm: Normalize | None, places: Sequence[Place]) -> None:
     """Draw the bar that explains the colours, at the right of all panels."""
     boxes = [place.box for place in places]
     top_in = min(box.top for box in boxes)

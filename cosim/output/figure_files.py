@@ -47,9 +47,7 @@ def save_figure(figure: FigureDescription, path: Path, width: str | float | None
     write_whole(path, file_content(figure, kind, figure_width_in(kind, width)))
 
 
-def save_figures(
-    figures: Iterable[FigureDescription], page: Path, files: FigureFiles | None
-) -> list[Path]:
+def save_figures(figures: Iterable[FigureDescription], page: Path, files: FigureFiles | None) -> list[Path]:
     """Write the figures of a page into ``PAGE-figures`` beside it; return the written files.
 
     Args:

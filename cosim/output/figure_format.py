@@ -62,7 +62,6 @@ def figure_width_in(kind: FigureFormat, width: str | float | None) -> float:
         inches = 0.0
     if not _NARROWEST_IN <= inches <= _WIDEST_IN:
         raise CallerError(
-            f"width {width}: expected column, page, or inches from {_NARROWEST_IN:g} to "
-            f"{_WIDEST_IN:g}"
+            f"width {width}: expected column, page, or inches from {_NARROWEST_IN:g} to {_WIDEST_IN:g}"
         )
     return inches

@@ -111,12 +111,19 @@ def figure_width(width_in: float, *, latex: bool = False) -> Iterator[None]:
 def _of_paper(width_in: float) -> FigureLayout:
     """Return the layout of a figure in a paper, with texts of 8 points."""
     return FigureLayout(
-        width_in, left_in=0.76, right_in=0.17, below_in=0.42, above_in=0.24, gap_in=0.16,
-        legend_row_in=0.155, handle_in=0.4,
-        scale=min(max(width_in / SCREEN_IN, _LEAST_SCALE), 1.0), line_scale=0.65,
+        width_in,
+        left_in=0.76,
+        right_in=0.17,
+        below_in=0.42,
+        above_in=0.24,
+        gap_in=0.16,
+        legend_row_in=0.155,
+        handle_in=0.4,
+        scale=min(max(width_in / SCREEN_IN, _LEAST_SCALE), 1.0),
+        line_scale=0.65,
         beside_scale=max(width_in / SCREEN_IN, _LEAST_BESIDE),
         beside_title=width_in >= _ROOM_BESIDE_TITLE_IN,
-    )  # fmt: skip
+    )
 
 
 @contextmanager

@@ -92,20 +92,16 @@ def network_figures(run: RecordedRun, summary: RunSummary) -> list[FigureDescrip
         norms_figure(over_time, names, stayed).captioned(
             "Largest error ‖e_c‖ of the controller's model, and largest norm ‖x‖ of the plant's "
             f"state, in each of {len(over_time.middles_s)} intervals. {curves}{diverged}",
-            f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at most "
-            f"{number(largest)}.",
+            f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at most {number(largest)}.",
         ),
         error_map(over_time, names, stayed).captioned(
-            "Largest ‖e_c‖ of each loop in each interval; no colour before its first "
-            f"delivery.{order}",
+            f"Largest ‖e_c‖ of each loop in each interval; no colour before its first delivery.{order}",
             f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
         ),
     ]
 
 
-def _link_rows(
-    over_time: LoopsOverTime, names: Sequence[str], in_flight: InFlightPart
-) -> list[Row]:
+def _link_rows(over_time: LoopsOverTime, names: Sequence[str], in_flight: InFlightPart) -> list[Row]:
     """Describe the number of datagrams in the network, and the share of each loop of the bytes."""
     most = np.asarray(in_flight.max_by_interval, np.float64)
     mean = np.asarray(in_flight.mean_by_interval, np.float64)
@@ -119,14 +115,15 @@ def _link_rows(
     return _rows(
         over_time,
         ("Datagrams in the network", queue, Axis(label="datagrams", ends=(0.0, None))),
-        ("Share of the link", _curves(ends_s - ends_s[0] / 2, 100 * shares, names),
-         Axis(label="%", ends=(0.0, None))),
-    )  # fmt: skip
+        (
+            "Share of the link",
+            _curves(ends_s - ends_s[0] / 2, 100 * shares, names),
+            Axis(label="%", ends=(0.0, None)),
+        ),
+    )
 
 
-def norms_figure(
-    over_time: LoopsOverTime, names: Sequence[str], stayed: Bools
-) -> FigureDescription:
+def norms_figure(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> FigureDescription:
     """Describe ‖e_c‖ and ‖x‖ of all loops; the range of the axes is for those that stayed."""
     panels = []
     for title, values in (
@@ -160,14 +157,19 @@ def _curves(t_s: Reals, values: Reals, names: Sequence[str]) -> list[Item]:
     levels = quantiles(values)
     return [
         *(
-            Band(x=t_s, low=levels[low], high=levels[high], label=label, opacity=opacity,
-                 colour=palette.CONTROLLER)
+            Band(
+                x=t_s,
+                low=levels[low],
+                high=levels[high],
+                label=label,
+                opacity=opacity,
+                colour=palette.CONTROLLER,
+            )
             for low, high, opacity, label in _BANDS
         ),
         Line(x=t_s, y=levels[_MEDIAN], label="median", colour=palette.CONTROLLER),
-        Line(x=t_s, y=levels[_LARGEST], label="largest", colour=palette.LOST, width=1.0,
-             dash=(3, 1.5)),
-    ]  # fmt: skip
+        Line(x=t_s, y=levels[_LARGEST], label="largest", colour=palette.LOST, width=1.0, dash=(3, 1.5)),
+    ]
 
 
 def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> FigureDescription:
@@ -186,9 +188,11 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> 
         least = max(float(np.nanmin(measured)), most / 10**_MAP_DECADES)
         values[over_time.errors == 0] = least  # just after an update
         scale = ColourScale(
-            low=least, high=most if most > least else 2 * least, logarithmic=True,
+            low=least,
+            high=most if most > least else 2 * least,
+            logarithmic=True,
             exceeded=float(np.nanmax(values)) > most,
-        )  # fmt: skip
+        )
     heat = Heat(values=values, x_ends=(0.0, float(over_time.edges_s[-1])), downwards=True)
     are_named = count <= _MOST_ROWS
     panel = Panel(

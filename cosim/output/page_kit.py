@@ -20,9 +20,7 @@ from noack.core.number_format import number, percent
 PAGES = Path(__file__).with_name("pages")
 TERMS: tuple[tuple[str, str], ...] = tuple(
     (entry["term"], entry["meaning"])
-    for entry in tomllib.loads(PAGES.with_name("glossary.toml").read_text(encoding="utf-8"))[
-        "terms"
-    ]
+    for entry in tomllib.loads(PAGES.with_name("glossary.toml").read_text(encoding="utf-8"))["terms"]
 )
 """The project's words and their meanings, in an order in which each uses earlier ones only."""
 _NONE = "–"

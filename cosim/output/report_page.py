@@ -31,13 +31,7 @@ from cosim.output.run_tables import (
     timing_table,
 )
 from cosim.output.run_verdict import BAD, GOOD, NEUTRAL, remarks, verdict
-from cosim.record.run_directory import (
-    ENVIRONMENT_FILE,
-    REPORT_FILE,
-    SCENARIO_FILE,
-    file_of_loop,
-    read_object,
-)
+from cosim.record.run_directory import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE, file_of_loop, read_object
 from cosim.record.run_record import RecordedRun
 from noack.core.file_access import write_whole
 from noack.core.number_format import seconds
@@ -103,9 +97,7 @@ class Report:
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def write_report(
-    run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None = None
-) -> Path:
+def write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None = None) -> Path:
     """Write the report of a run, or of one of its loops; replace an existing one.
 
     Returns:
@@ -119,15 +111,21 @@ def write_report(
     record = run.loops[worst.number]
     described = run_figures(record, envelopes(record), timed=shown.kind == "live")
     report = Report(
-        shown, record.scenario, worst.number, worst.why,
+        shown,
+        record.scenario,
+        worst.number,
+        worst.why,
         figures=[describe() for describe in described.values()],
         network_figures=network_figures(run, shown) if shown.loops[1:] else (),
         description=(run if shown.loops[1:] else record).scenario.description,
         scenario_toml=(run_dir / SCENARIO_FILE).read_text(encoding="utf-8"),
         environment=read_object(run_dir / ENVIRONMENT_FILE),
-        links={one.name: quote(file) for one in shown.loops
-               if (run_dir / (file := file_of_loop(REPORT_FILE, one.name))).is_file()},
-    )  # fmt: skip
+        links={
+            one.name: quote(file)
+            for one in shown.loops
+            if (run_dir / (file := file_of_loop(REPORT_FILE, one.name))).is_file()
+        },
+    )
     return write_whole(run_dir / file_of_loop(REPORT_FILE, loop), page(report))
 
 
@@ -182,8 +180,7 @@ def _worst_loop(report: Report) -> Content | None:
     loop, why = report.loop, report.why
     return {
         "name": f"{loop.name} (number {loop.number})",
-        "why": f"{why[:1].upper()}{why[1:]}. Its time starts {seconds(loop.phase_s)} after that "
-        "of the run.",
+        "why": f"{why[:1].upper()}{why[1:]}. Its time starts {seconds(loop.phase_s)} after that of the run.",
         "remarks": [remark.text for remark in remarks(report.detail)],
     }
 

@@ -72,16 +72,19 @@ def terminal_table(
         table: the table.
         left: numbers of the columns that begin at the left; the others end at the right.
         styles: styles of texts in the last column, by their first words.
-        dense: save width, and break no words.
+        dense: save width, break no words, and no lines at the right.
     """
     shown = Table(
         title=escape(table.caption) if table.caption else None,
-        box=SIMPLE_HEAD if dense else HEAVY_HEAD, collapse_padding=dense, pad_edge=not dense,
-    )  # fmt: skip
+        box=SIMPLE_HEAD if dense else HEAVY_HEAD,
+        collapse_padding=dense,
+        pad_edge=not dense,
+    )
     for i, heading in enumerate(table.headings):
         words = " ".join([heading, *(row[i] for row in table.rows)]).split()
         least = max(map(len, words)) if dense else None
         shown.add_column(escape(heading), justify="left" if i in left else "right", min_width=least)
+        shown.columns[-1].no_wrap = dense and i not in left
     for *cells, last in table.rows:
         style = next((one for word, one in (styles or {}).items() if last.startswith(word)), "")
         shown.add_row(*map(escape, cells), Text(last, style))

@@ -429,8 +429,7 @@ def _inter_event(record: RunRecord, bounds: list[Line]) -> FigureDescription:
     shortest = f", the shortest {interval_s.min():.3g} s" if len(interval_s) else ""
     label = "inter-event time [s]"
     return times_figure("inter-event", title, dots, label, horizon_s, bounds).captioned(
-        "Inter-event times, over time and as a histogram."
-        + (" Dashed: claimed bounds." if bounds else ""),
+        "Inter-event times, over time and as a histogram." + (" Dashed: claimed bounds." if bounds else ""),
         f"Inter-event times on a logarithmic axis{shortest}.",
     )
 
@@ -463,9 +462,7 @@ def _losses(record: RunRecord) -> FigureDescription:
     )
 
 
-def _loss_panel(
-    title: str, what: str, counted: str, values: NDArray[np.int64], limit: int | None
-) -> Panel:
+def _loss_panel(title: str, what: str, counted: str, values: NDArray[np.int64], limit: int | None) -> Panel:
     """Describe a histogram of whole numbers (k,), and the largest number that is allowed."""
     counts = Counter(values.tolist())
     low, high = min([1, *counts]), max([1 if limit is None else limit, *counts])

@@ -123,9 +123,7 @@ def run_title(summary: RunSummary) -> str:
     return title_of(summary.scenario, mode, summary.mansd, summary.constraints, kind)
 
 
-def title_of(
-    scenario: str, mode: str, mansd: int, constraints: Sequence[str] = (), kind: str = ""
-) -> str:
+def title_of(scenario: str, mode: str, mansd: int, constraints: Sequence[str] = (), kind: str = "") -> str:
     """Return the title of the tables of a run; ``kind`` is empty for a live run."""
     words = (scenario, mode and mode_words(mode), f"M − 1 = {mansd}", *constraints, kind)
     return ", ".join(filter(None, words))
@@ -143,9 +141,7 @@ def key_numbers(summary: RunSummary) -> Numbers:
         ("transmissions", str(loop.events)),
         ("deliveries", str(loop.deliveries)),
         *_losses(summary, loop),
-        *interval_rows(
-            loop.inter_event_min_s, loop.inter_event_median_s, loop.inter_delivery_median_s
-        ),
+        *interval_rows(loop.inter_event_min_s, loop.inter_event_median_s, loop.inter_delivery_median_s),
         (f"{state_norm(loop)} at the start", number(loop.initial_state_norm)),
         (f"{state_norm(loop)} at the end", number(loop.final_state_norm)),
         ("maximum ‖e_s‖, ‖e_c‖", f"{number(loop.sup_e_s_norm)}, {number(loop.sup_e_c_norm)}"),
@@ -201,9 +197,7 @@ def longest_burst(cap: int, constraints: Sequence[str], longest: int) -> tuple[s
     return f"longest loss burst (cap M − 1 = {cap})", str(longest)
 
 
-def interval_rows(
-    shortest_s: float | None, median_s: float | None, delivered_s: float | None
-) -> Numbers:
+def interval_rows(shortest_s: float | None, median_s: float | None, delivered_s: float | None) -> Numbers:
     """Return the rows of the inter-event times, and of the median time between deliveries."""
     return (
         ("shortest inter-event time", seconds(shortest_s)),
@@ -307,8 +301,9 @@ def _claims_table(claims: Claims, title: str) -> ResultTable:
     for claim, interval in zip(claims, intervals, strict=True):
         since = "" if claim.since_s is None else f" since {claim.since_s:.3f} s"
         share = NONE if claim.ratio is None else f"{100 * claim.ratio:.3g} %"
-        rows.append((claim.source, claim.bound, *(interval if has_interval else ()), share,
-                     claim.verdict + since))  # fmt: skip
+        rows.append(
+            (claim.source, claim.bound, *(interval if has_interval else ()), share, claim.verdict + since)
+        )
     return ResultTable("claims", title, headings, rows)
 
 
@@ -365,9 +360,12 @@ def badness(loop: LoopSummary) -> tuple[float, ...]:
     """Return a key that is larger for a worse loop."""
     claims, error = _verdicts(loop), loop.sup_e_c_norm
     return (
-        loop.exit.status != ExitStatus.OK, claims["violated"], claims["void"],
-        loop.longest_loss_burst, float("inf") if error is None else error,
-    )  # fmt: skip
+        loop.exit.status != ExitStatus.OK,
+        claims["violated"],
+        claims["void"],
+        loop.longest_loss_burst,
+        float("inf") if error is None else error,
+    )
 
 
 def _verdicts(loop: LoopSummary) -> Counter[str]:
@@ -410,19 +408,14 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
         count = sum(one.replay is not None and one.replay.bit_exact is True for one in loops)
         rows.append(("replay of the loops", f"bit-exact: {count} of {len(loops)}"))
         missing, lost = (
-            sum(getattr(one, key) for one in loops)
-            for key in ("missing_samples", "unintended_losses")
+            sum(getattr(one, key) for one in loops) for key in ("missing_samples", "unintended_losses")
         )
         rows.append(("missing samples, unintended losses", f"{missing}, {lost}"))
     return [*rows, *changes_in(summary.changes)]
 
 
 def _missed(deadlines: Mapping[str, DeadlinesPart]) -> str:
-    missed = [
-        f"{role} {one.late_steps} of {one.steps}"
-        for role, one in deadlines.items()
-        if one.late_steps
-    ]
+    missed = [f"{role} {one.late_steps} of {one.steps}" for role, one in deadlines.items() if one.late_steps]
     return ", ".join(missed) or "none"
 
 
@@ -439,8 +432,13 @@ def loop_row(loop: LoopSummary) -> tuple[str, ...]:
     if loop.exit.status == ExitStatus.FAILED:
         worse = ["failed"]
     return (
-        loop.name, str(loop.events), str(loop.drops),
-        str(loop.longest_loss_burst), str(loop.forced_deliveries),
-        number(100 * (loop.link_share or 0.0)), number(loop.delay_max_s),
-        number(loop.sup_e_c_norm), ", ".join([held, *worse]),
-    )  # fmt: skip
+        loop.name,
+        str(loop.events),
+        str(loop.drops),
+        str(loop.longest_loss_burst),
+        str(loop.forced_deliveries),
+        number(100 * (loop.link_share or 0.0)),
+        number(loop.delay_max_s),
+        number(loop.sup_e_c_norm),
+        ", ".join([held, *worse]),
+    )

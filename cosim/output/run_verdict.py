@@ -85,12 +85,14 @@ def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
     diverged = any(one.diverged_at_s is not None for one in loops)
     return (
         ending_line(
-            summary.exit, summary.reached_s, summary.horizon_s,
+            summary.exit,
+            summary.reached_s,
+            summary.horizon_s,
             "" if diverged and summary.exit.status == ExitStatus.FAILED else _states(loops),
         ),
         _guarantee_line(loops),
         transmission_line(events, delivered, ideal),
-    )  # fmt: skip
+    )
 
 
 def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str = "") -> VerdictLine:
@@ -148,7 +150,7 @@ def _states(loops: Sequence[LoopSummary]) -> str:
 
 def transmission_line(events: int, deliveries: int, ideal: int | None = None) -> VerdictLine:
     """Return the numbers of transmissions and deliveries, and that of the ideal loop."""
-    beside = "" if ideal is None else f" (ideal loop: {ideal})"
+    beside = "" if ideal is None else f" ({ideal} in the ideal loop)"
     sent = "1 transmission" if events == 1 else f"{events} transmissions"
     return VerdictLine(f"{sent}{beside}, {deliveries} delivered", NEUTRAL)
 
@@ -229,9 +231,7 @@ def _guarantee_line(loops: Sequence[LoopSummary]) -> VerdictLine:
     found = [(guarantee_of(loop), loop) for loop in loops]
     held = sum(claim.verdict == "held" for loop in loops for claim in loop.claims)
     claims = f"{held} {'claim' if held == 1 else 'claims'} held, none violated"
-    worst = next(
-        (style for style in (BAD, DOUBTFUL) if any(one.style == style for one, _ in found)), GOOD
-    )
+    worst = next((style for style in (BAD, DOUBTFUL) if any(one.style == style for one, _ in found)), GOOD)
     concerned = [(one, loop) for one, loop in found if one.style == worst]
     one, loop = min(concerned, key=lambda pair: pair[0].since_s if pair[0].why else math.inf)
     name, count = "" if len(loops) == 1 else f"{loop.name}: ", f"{len(concerned)} of {len(loops)}"
@@ -467,15 +467,23 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
     headings = ("effect", "RMS", "max", "share", "events", "Δt, ms", "split at event")
     stages = [
         (
-            stage.name, *_sizes(stage.difference), percent(stage.share), str(stage.events),
-            _milliseconds(stage.max_event_difference_s), _event(stage.first_different_event),
+            stage.name,
+            *_sizes(stage.difference),
+            percent(stage.share),
+            str(stage.events),
+            _milliseconds(stage.max_event_difference_s),
+            _event(stage.first_different_event),
         )
         for stage in fidelity.stages
-    ]  # fmt: skip
+    ]
     total = (
-        "total", *_sizes(fidelity.total), "100.0 %", str(fidelity.events_live),
-        _milliseconds(fidelity.max_event_difference_s), _event(fidelity.first_different_event),
-    )  # fmt: skip
+        "total",
+        *_sizes(fidelity.total),
+        "100.0 %",
+        str(fidelity.events_live),
+        _milliseconds(fidelity.max_event_difference_s),
+        _event(fidelity.first_different_event),
+    )
     ideal = ("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
     caption = f"{fidelity.scenario}: difference in x to the ideal loop"
     differences = [(one.name, one.difference) for one in fidelity.stages]

@@ -46,9 +46,7 @@ def times_figure(
     edges, counts = histogram(dots.y)
     bars = Bars(edges=edges, heights=counts, colour=dots.colour, share=0.9, horizontal=True)
     least = [
-        Rule(at=float(line.y.min()), colour=line.colour, dash=line.dash)
-        for line in bounds
-        if len(line.y)
+        Rule(at=float(line.y.min()), colour=line.colour, dash=line.dash) for line in bounds if len(line.y)
     ]
     counted = Axis(label="count", whole=True)
     panel = Panel(
@@ -100,8 +98,7 @@ def lateness_figure(record: RunRecord) -> FigureDescription:
         "Share of a process's steps with at least this lateness. Lateness is measured "
         "from the deadline (plant, controller), the time of the measurement (sensor), or the "
         "arrival of the datagram at the socket (network).",
-        "Complementary distribution of lateness on logarithmic axes; maximum: "
-        f"{', '.join(longest)}.",
+        f"Complementary distribution of lateness on logarithmic axes; maximum: {', '.join(longest)}.",
     )
 
 

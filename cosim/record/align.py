@@ -270,9 +270,7 @@ def _aligned(record: RunRecord) -> Iterator[AlignedPart]:
 def align_tables(record: RunRecord) -> AlignedRun:
     """Align a whole run; for a long run, see :func:`aligned_parts`."""
     parts = [one.aligned for one in aligned_parts(record)]
-    return (
-        parts[0] if len(parts) == 1 else AlignedRun(*map(np.concatenate, zip(*parts, strict=True)))
-    )
+    return parts[0] if len(parts) == 1 else AlignedRun(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def bounded_parts(record: RunRecord) -> Iterator[tuple[AlignedPart, ErrorBounds]]:

@@ -179,9 +179,7 @@ def _chunks(path: Path, name: str) -> Iterator[Chunk]:
             raise PeerError(f"{name} has {error}") from None
 
 
-def _require_own(
-    table: str, process: _Process, types: Mapping[str, np.dtype[np.void]], name: str
-) -> None:
+def _require_own(table: str, process: _Process, types: Mapping[str, np.dtype[np.void]], name: str) -> None:
     own = [one for one in types if OWNER[one] == process.role]
     if table not in (*own, notices_of(process.role), KEPT_REPORT):
         raise PeerError(f"{name}: the {process.role} has no table of this name")
@@ -229,8 +227,7 @@ def _require_consistent(before_dir: Path, after_dir: Path, source: str) -> None:
                 for table in reported.keys() & life.rows.keys():
                     if (surplus := life.rows[table] - reported[table]) > 0:
                         raise PeerError(
-                            f"{source}: with its rows, {table} has {surplus} more than the {role} "
-                            "reported"
+                            f"{source}: with its rows, {table} has {surplus} more than the {role} reported"
                         )
 
 
@@ -270,9 +267,7 @@ def _reachable(source: str) -> Iterator[Path]:
         try:
             subprocess.run(command, check=True, capture_output=True, text=True)
         except FileNotFoundError:
-            raise MachineError(
-                f"{source}: no scp here; copy the folder, and give its path here"
-            ) from None
+            raise MachineError(f"{source}: no scp here; copy the folder, and give its path here") from None
         except subprocess.CalledProcessError as error:
             lines = error.stderr.strip().splitlines()
             # ssh's reason is above the last line.

@@ -90,9 +90,7 @@ def report_entries(run_dir: Path) -> Entries:
         return []
 
 
-def entries_of_loop(
-    entries: Entries, number: int, others: Callable[[int, str, int], int]
-) -> Entries:
+def entries_of_loop(entries: Entries, number: int, others: Callable[[int, str, int], int]) -> Entries:
     """Return the reports as of one loop: with its own rows, and its own counters of datagrams.
 
     ``others(number, table, generation)`` returns how many rows of a table of the network are of
@@ -127,9 +125,7 @@ def _of_loop(report: Report, number: int, others: Callable[[int, str, int], int]
     return rest | {"rows": written, "channel": channel}
 
 
-def joint_reports(
-    network: Mapping[str, Report], loops: Sequence[Mapping[str, Report]]
-) -> dict[str, Report]:
+def joint_reports(network: Mapping[str, Report], loops: Sequence[Mapping[str, Report]]) -> dict[str, Report]:
     """Return the reports of a run from those of its loops; the emulator's are of all loops."""
     found: dict[str, Report] = {}
     if "netem" in network:
@@ -243,9 +239,7 @@ class _Counts:
         inputs, now_ns = inputs[order], now_ns[order]
         holes = np.flatnonzero(np.diff(inputs, prepend=self._input) > 1)
         if len(holes) and self.hole_ns is None:
-            before = (
-                self._now_ns if holes[0] == 0 and self._numbers else now_ns[max(holes[0] - 1, 0)]
-            )
+            before = self._now_ns if holes[0] == 0 and self._numbers else now_ns[max(holes[0] - 1, 0)]
             self.hole_ns = int(before)
         self._input, self._now_ns = int(inputs[-1]), int(now_ns[-1])
         first, last = (int(number) // GENERATION for number in (inputs[0], inputs[-1]))
@@ -275,11 +269,16 @@ def lives_of(
             count.add(own)
     return [
         Life(
-            generation, one.rows, reports.get(generation),
-            one.first_ns, one.last_ns, one.hole_ns, one.missing_inputs,
+            generation,
+            one.rows,
+            reports.get(generation),
+            one.first_ns,
+            one.last_ns,
+            one.hole_ns,
+            one.missing_inputs,
         )
         for generation, one in zip(begun, counts, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def split_by_life(part: Slice, begun: Sequence[int]) -> Iterator[Slice]:

@@ -182,7 +182,8 @@ class _TableReader:
         while self.next_ns() is not None:
             later = self._rows["now_ns"] >= end_ns
             count = int(np.argmax(later)) if later.any() else len(later)
-            found.append(self._rows[:count])
+            if count:  # a part of its own need not be copied
+                found.append(self._rows[:count])
             self._rows = self._rows[count:]
             if len(self._rows):
                 break
@@ -306,10 +307,7 @@ class NetworkRows:
     def of_loops(self, table: str, numbers: Sequence[int]) -> Iterator[list[Rows]]:
         """Yield the next rows of each of some loops, in order; the table is read once."""
         every = [[places[number] for places in self._places.values()] for number in numbers]
-        mine = [
-            np.sort(np.concatenate([*map(np.take, self._inputs.values(), places)]))
-            for places in every
-        ]
+        mine = [np.sort(np.concatenate([*map(np.take, self._inputs.values(), places)])) for places in every]
         first = 0
         for rows in self._source.batches(table):
             found = []
@@ -322,9 +320,7 @@ class NetworkRows:
             yield found
             first += len(rows)
 
-    def _numbered_before(
-        self, numbers: NDArray[np.int64], mine: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
+    def _numbered_before(self, numbers: NDArray[np.int64], mine: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return how many inputs of other loops precede those of a loop, in their generation.
 
         ``mine`` has all numbers of the loop, ascending. Rows that are missing count as the loop's.

@@ -120,9 +120,7 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
         return found
 
     def located(folder: str) -> "Scenario":
-        moved = scenarios.with_loop_tables(
-            scenario, lambda place, one: copied(f"{place}.", one, folder)
-        )
+        moved = scenarios.with_loop_tables(scenario, lambda place, one: copied(f"{place}.", one, folder))
         return user_files.with_tables(moved, copied("", scenario, folder))
 
     write_whole(run_dir / SCENARIO_FILE, scenario_file.dumps(located("")))

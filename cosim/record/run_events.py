@@ -116,9 +116,7 @@ def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
 
 def claimed_until_s(received: Rows) -> float:
     """Return the time of the first change of a table that ends the claims; infinite if none."""
-    ends_ns = [
-        change.t_ns for change, _ in _changes_in(received) if not is_of_loss_alone(change.settings)
-    ]
+    ends_ns = [change.t_ns for change, _ in _changes_in(received) if not is_of_loss_alone(change.settings)]
     return min(ends_ns, default=np.inf) / NS_PER_S
 
 
@@ -201,9 +199,13 @@ def _released(record: RunRecord, flow: Flow) -> tuple[NDArray[np.int64], NDArray
     direction = direction_of(flow)
     every = len(record.scenario.network.flows) == 1
     releases = record.columns(
-        NETEM_RELEASE, "sequence", "flow", "copy", "stale",
+        NETEM_RELEASE,
+        "sequence",
+        "flow",
+        "copy",
+        "stale",
         where=lambda rows: np.full(len(rows), every) | (rows["flow"] == direction),
-    )  # fmt: skip
+    )
     return 2 * releases["sequence"] + releases["copy"], releases["stale"] != 0
 
 
@@ -222,9 +224,7 @@ def _outcomes(
     return PacketOutcome(sequence, event_ns, rows["now_ns"].copy(), fate, lost, in_flight, due_ns)
 
 
-def updates_in(
-    packets: Rows, flow: Flow = Flow.UPDATE
-) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
+def updates_in(packets: Rows, flow: Flow = Flow.UPDATE) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
     """Select the loop's messages of a flow from the packets that reached the network emulator.
 
     The emulator reads no payload, so the packets' headers are read here.

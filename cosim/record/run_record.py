@@ -160,9 +160,13 @@ class RunRecord:
         if not any(network.link_of(flow).chooses for flow in network.flows):
             return packets
         left = self.columns(
-            NETEM_RELEASE, "sequence", "flow", "copy", "t_ns",
+            NETEM_RELEASE,
+            "sequence",
+            "flow",
+            "copy",
+            "t_ns",
             where=lambda rows: rows["copy"] == 0,
-        )  # fmt: skip
+        )
         count = max(left["flow"].max(initial=0), packets["flow"].max(initial=0)) + 1
         numbers = left["sequence"] * count + left["flow"]
         order = np.argsort(numbers)
@@ -172,9 +176,7 @@ class RunRecord:
         waits = ~has_left & (packets["release_ns"] > packets["now_ns"])
         packets = packets.copy()
         packets["release_ns"][has_left] = left["t_ns"][order][place[has_left]]
-        packets["release_ns"][waits] = np.maximum(
-            packets["release_ns"][waits], left["t_ns"].max(initial=-1)
-        )
+        packets["release_ns"][waits] = np.maximum(packets["release_ns"][waits], left["t_ns"].max(initial=-1))
         return packets
 
     def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:
@@ -207,9 +209,12 @@ class RunRecord:
     def events(self) -> Rows:
         """Return number, nominal and actual time of each event: ``event``, ``t_ns``, ``now_ns``."""
         return self.columns(
-            SENSOR_MEASUREMENT, "event", "t_ns", "now_ns",
+            SENSOR_MEASUREMENT,
+            "event",
+            "t_ns",
+            "now_ns",
             where=lambda rows: rows["event"] != NO_SEQUENCE,
-        )  # fmt: skip
+        )
 
     def last_ns(self, table: str) -> int | None:
         """Return the nominal time of the last row of a table; None if it has none."""
@@ -225,9 +230,15 @@ class RunRecord:
         """
         rows = DerivedRows(self.source, derive)
         derived = RunRecord(
-            scenario, rows, self.notices, self.reports, self.kind, self.earlier, self.number,
+            scenario,
+            rows,
+            self.notices,
+            self.reports,
+            self.kind,
+            self.earlier,
+            self.number,
             self.roles,
-        )  # fmt: skip
+        )
         derived.tables = self.tables  # they are those of the run that was recorded
         return derived
 
@@ -401,9 +412,7 @@ class StoredLoops(Sequence[RunRecord]):
     def _record_of(self, number: int) -> RunRecord:
         loop = self._loops[number]
         entries = entries_of_loop(self._entries, number, self._shared.count_of_others)
-        source = LoopTables(
-            number, tables_of(loop), self._stored, self._shared, self._phases_ns[number]
-        )
+        source = LoopTables(number, tables_of(loop), self._stored, self._shared, self._phases_ns[number])
         reports, earlier = valid_reports(entries, source, source.types)
         notices = [
             {key: value for key, value in notice.items() if key != LOOP}
@@ -445,9 +454,7 @@ def load_run(run_dir: Path) -> RecordedRun:
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
     if not folder.is_dir():
-        raise CallerError(
-            f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run"
-        )
+        raise CallerError(f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run")
     scenario, loops = scenarios_of(run_dir)
     most_rows = _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS
     stored = table_files.StoredTables(folder, run_tables(scenario), most_rows)
@@ -475,12 +482,14 @@ def steps_of(scenario: Scenario) -> int:
     """
     exchange_ns = round(scenario.speed * _CLOCK_EXCHANGE_NS)
     return sum(
-        section.count * (timing.horizon_ns // min(
-            timing.plant_period_ns, timing.controller_period_ns, max(exchange_ns, 1)
-        ) + 1)
+        section.count
+        * (
+            timing.horizon_ns // min(timing.plant_period_ns, timing.controller_period_ns, max(exchange_ns, 1))
+            + 1
+        )
         for section in loop_sections(scenario)
         for timing in [loop_scenario(scenario, section).timing]
-    )  # fmt: skip
+    )
 
 
 def write_run(run: RecordedRun, run_dir: Path) -> None:
@@ -515,9 +524,7 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     folder, names = run_dir / RECORD, vector_names(run.scenario)
     with record_folder(folder, notices), ThreadPoolExecutor(cores()) as threads:
         written = [
-            threads.submit(
-                table_files.write_table, folder / f"{table}.parquet", rows(table), dtype, names
-            )
+            threads.submit(table_files.write_table, folder / f"{table}.parquet", rows(table), dtype, names)
             for table, dtype in types.items()
         ]
         for one in written:

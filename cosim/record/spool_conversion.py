@@ -126,9 +126,7 @@ _BLOCK_BYTES = 32 * 1024 * 1024
 Each = Callable[[Callable[[str], None], Sequence[str]], Iterable[None]]
 
 
-def finish_record(
-    run_dir: Path, each: Each = map, early: Mapping[str, int] | None = None
-) -> RecordedRun:
+def finish_record(run_dir: Path, each: Each = map, early: Mapping[str, int] | None = None) -> RecordedRun:
     """Convert a run's spool to its record, and remove the spool.
 
     All spools are merged, without duplicate rows. An interrupted attempt can be repeated.

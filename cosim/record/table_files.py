@@ -36,6 +36,8 @@ from noack.protocol.wire_format import MAX_LOOPS
 _MOST_GROUP_ROWS = 2 * BATCH_ROWS
 """Largest number of rows of a group that is read; earlier versions wrote so many."""
 _LEAST_GROUP_ROWS = 3 * BATCH_ROWS // 4
+_ROWS_IN_CACHE = 2048
+"""Rows that stay in the processor's cache while they are filled column by column."""
 MOST_ROWS = 2**62
 """More than any file has."""
 _ENCODINGS = {
@@ -63,8 +65,7 @@ class StoredTables(RecordSource):
     def __init__(self, folder: Path, types: Mapping[str, RowType], most_rows: int) -> None:
         super().__init__(types)
         self._files = {
-            table: TableFile(folder / f"{table}.parquet", dtype, most_rows)
-            for table, dtype in types.items()
+            table: TableFile(folder / f"{table}.parquet", dtype, most_rows) for table, dtype in types.items()
         }
         self._newest: dict[str, dict[int, Rows]] = {}
         """The groups of several loops that were read last, by table and place."""
@@ -143,9 +144,7 @@ class StoredTables(RecordSource):
         """Return the highest number of an input in a table; −1 without rows."""
         highest = [group.highest_input for group in self._files[table].groups]
         known = [number for number in highest if number is not None]
-        return (
-            max(known, default=-1) if len(known) == len(highest) else super().highest_input(table)
-        )
+        return max(known, default=-1) if len(known) == len(highest) else super().highest_input(table)
 
 
 class _Group(NamedTuple):
@@ -196,9 +195,7 @@ class TableFile:
                 raise CallerError(f"{path}: column {name} has holes")
         self.groups = [_group(group, places) for group in groups]
 
-    def batches(
-        self, dtype: RowType | None = None, groups: Iterable[int] | None = None
-    ) -> Iterator[Rows]:
+    def batches(self, dtype: RowType | None = None, groups: Iterable[int] | None = None) -> Iterator[Rows]:
         """Yield the rows of each group, or of some, as rows of a type that has fewer columns."""
         with self._open() as file:
             for group in range(len(self.groups)) if groups is None else groups:
@@ -240,19 +237,21 @@ class TableFile:
         # One thread, whose memory is used again.
         table = file.read_row_group(group, columns=names, use_threads=False).combine_chunks()
         table.validate(full=True)
-        rows, columns = np.empty(len(table), dtype), iter(names)
+        rows, columns, copies = np.empty(len(table), dtype), iter(names), []
         for name in dtype.names or ():
             field = dtype[name]
             for entry in rows[name].T if field.shape else [rows[name]]:
                 column = next(columns)
-                entry[...] = _values(self._path, column, table[column], field.base)
+                copies.append((entry, _values(self._path, column, table[column], field.base)))
+        for first in range(0, len(rows), _ROWS_IN_CACHE):
+            for entry, values in copies:
+                entry[first : first + _ROWS_IN_CACHE] = values[first : first + _ROWS_IN_CACHE]
         return rows
 
 
 def _group(group: Any, places: Mapping[str, int]) -> _Group:
     loops, inputs = (
-        group.column(places[name]).statistics if name in places else None
-        for name in (LOOP, "input")
+        group.column(places[name]).statistics if name in places else None for name in (LOOP, "input")
     )
     highest = int(inputs.max) if inputs is not None and inputs.has_min_max else None
     if loops is None or not loops.has_min_max:
@@ -355,9 +354,7 @@ def _values(path: Path, name: str, column: Any, field: np.dtype[Any]) -> NDArray
     if not len(column):
         return np.zeros(0, field)
     chunk = column.chunk(0)
-    return np.frombuffer(
-        memoryview(chunk.buffers()[1]), field, len(chunk), chunk.offset * field.itemsize
-    )
+    return np.frombuffer(memoryview(chunk.buffers()[1]), field, len(chunk), chunk.offset * field.itemsize)
 
 
 def _columns(dtype: RowType) -> Iterator[tuple[str, pa.DataType]]:

@@ -92,9 +92,15 @@ class ContinuousLoop:
     ) -> ExactSimulation:
         """Return the core's simulation of the loop; the arguments are those of its class."""
         return ExactSimulation(
-            self.loop.H, self.loop.K, self.trigger,
-            horizon_s=horizon_s, known_start=known_start, link=None, delivered=delivered, **numbers,
-        )  # fmt: skip
+            self.loop.H,
+            self.loop.K,
+            self.trigger,
+            horizon_s=horizon_s,
+            known_start=known_start,
+            link=None,
+            delivered=delivered,
+            **numbers,
+        )
 
     @property
     def generator(self) -> Matrix:
@@ -113,8 +119,7 @@ class ContinuousLoop:
         """
         if not self.trigger.is_decaying:
             raise CallerError(
-                "trigger.policy: with a continuous trigger (--trigger continuous) only "
-                '"decaying" is searched'
+                'trigger.policy: with a continuous trigger (--trigger continuous) only "decaying" is searched'
             )
         return self.trigger
 
@@ -165,7 +170,7 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     return ContinuousLoop(loop_of(resolved), rule_of(resolved))
 
 
-_PLACES = 512
+_PLACES = 64
 """Room for events in the first attempt; each further one has four times as much."""
 
 
@@ -267,9 +272,7 @@ def simulate_continuous(
             "too close to its threshold, or the plant is too fast"
         )
     diverged_at_s = float(row["diverged_at_s"]) if row["status"] == DIVERGED else None
-    run = _read_run(
-        system, horizon_s, x0, log, int(row["transmissions"]), diverged_at_s, known_start
-    )
+    run = _read_run(system, horizon_s, x0, log, int(row["transmissions"]), diverged_at_s, known_start)
     if row["status"] == TOO_MANY_EVENTS:
         last_s = run.event_s[-1] if len(run.event_s) else 0.0
         too_many = TooManyEventsError(
@@ -282,9 +285,13 @@ def simulate_continuous(
 
 
 def _with_room(
-    system: ContinuousLoop, until_s: float, x0: Vector,
-    delivered: Callable[[int], bool] | Sequence[bool], known_start: bool, max_events: int,
-) -> tuple[np.void, EventLog]:  # fmt: skip
+    system: ContinuousLoop,
+    until_s: float,
+    x0: Vector,
+    delivered: Callable[[int], bool] | Sequence[bool],
+    known_start: bool,
+    max_events: int,
+) -> tuple[np.void, EventLog]:
     """Return row and events of a run, for which more room is made until its events fit."""
     loop, fates = system.loop, [] if callable(delivered) else list(delivered)
     places = min(_PLACES, max_events)
@@ -292,12 +299,13 @@ def _with_room(
         if callable(delivered):
             fates += [bool(delivered(event)) for event in range(len(fates), places)]
         simulation = system.simulation(
-            until_s, known_start=known_start, most_events=places, delivered=np.array(fates, bool),
+            until_s,
+            known_start=known_start,
+            most_events=places,
+            delivered=np.array(fates, bool),
             measure=core.NOACK_EXACT_TIMES,
-        )  # fmt: skip
-        rows, log = simulation.runs(
-            loop.A[None], loop.B[None], x0[None], places=places, states=True
         )
+        rows, log = simulation.runs(loop.A[None], loop.B[None], x0[None], places=places, states=True)
         row: np.void = rows[0]
         full = row["status"] == TOO_MANY_EVENTS and row["transmissions"] == places
         if not full or places == max_events:
@@ -306,9 +314,14 @@ def _with_room(
 
 
 def _read_run(
-    system: ContinuousLoop, horizon_s: float, x0: Vector, log: EventLog, events: int,
-    diverged_at_s: float | None, known_start: bool,
-) -> ContinuousRun:  # fmt: skip
+    system: ContinuousLoop,
+    horizon_s: float,
+    x0: Vector,
+    log: EventLog,
+    events: int,
+    diverged_at_s: float | None,
+    known_start: bool,
+) -> ContinuousRun:
     """Read a run from its events."""
     assert log.states is not None
     delivered, zero = log.delivered[0, :events], np.zeros_like(x0)

@@ -104,9 +104,7 @@ class ExactSimulation:
     ) -> None:
         m, n = K.shape
         if max(n, m) > _MOST_ENTRIES:
-            raise CallerError(
-                f"plant: exact simulation has at most {_MOST_ENTRIES} states and inputs"
-            )
+            raise CallerError(f"plant: exact simulation has at most {_MOST_ENTRIES} states and inputs")
         self.n, self.m, self._link, self._memory = n, m, link, CoreMemory()
         self.core: CData = ffi.new("noack_exact *")
         """The structure, as the core's functions take it."""
@@ -128,9 +126,15 @@ class ExactSimulation:
             raise ValueError(ffi.string(mistake).decode())
 
     def runs(
-        self, A: Matrix, B: Matrix, x0: Matrix, keys: NDArray[np.int64] | None = None,
-        places: int = 0, *, states: bool = False,
-    ) -> tuple[NDArray[np.void], EventLog]:  # fmt: skip
+        self,
+        A: Matrix,
+        B: Matrix,
+        x0: Matrix,
+        keys: NDArray[np.int64] | None = None,
+        places: int = 0,
+        *,
+        states: bool = False,
+    ) -> tuple[NDArray[np.void], EventLog]:
         """Run k draws; a row depends bit-exactly on what the runs share and its own draw only.
 
         Args:
@@ -166,16 +170,24 @@ class ExactSimulation:
         return rows, log
 
     def segments(
-        self, A: Matrix, B: Matrix, t_s: Vector, states: NDArray[np.float64],
+        self,
+        A: Matrix,
+        B: Matrix,
+        t_s: Vector,
+        states: NDArray[np.float64],
         auxiliaries: Vector | None = None,
-    ) -> Segments:  # fmt: skip
+    ) -> Segments:
         """Follow a plant from k states, (k, 3, n), just after events at times (k,)."""
         k = len(t_s)
         found = Segments(
-            np.array(t_s, np.float64), np.array(states, np.float64, order="C"),
+            np.array(t_s, np.float64),
+            np.array(states, np.float64, order="C"),
             np.zeros(k) if auxiliaries is None else np.array(auxiliaries, np.float64),
-            np.zeros(k, np.int64), np.zeros(k), np.zeros(k), np.zeros(k, np.int64),
-        )  # fmt: skip
+            np.zeros(k, np.int64),
+            np.zeros(k),
+            np.zeros(k),
+            np.zeros(k, np.int64),
+        )
         plant = (pointer_to(np.ascontiguousarray(part, np.float64), "double *") for part in (A, B))
         kinds = ["double *"] * 3 + ["int64_t *"] + ["double *"] * 2 + ["int64_t *"]
         core.noack_exact_segments(self.core, *plant, k, *map(pointer_to, found, kinds))
@@ -193,9 +205,14 @@ class ExactSimulation:
         arrays = [np.ascontiguousarray(part, np.float64) for part in (A, B, start_s, starts, t_s)]
         *known, times = (pointer_to(array, "double *") for array in arrays)
         core.noack_exact_sample(
-            self.core, *known[:2], len(start_s), *known[2:], len(t_s), times,
+            self.core,
+            *known[:2],
+            len(start_s),
+            *known[2:],
+            len(t_s),
+            times,
             pointer_to(states, "double *"),
-        )  # fmt: skip
+        )
         return states
 
 
@@ -301,9 +318,7 @@ def run_batch(setting: Setting, population: Population) -> NDArray[np.void]:
     return rows
 
 
-def run_with_events(
-    setting: Setting, population: Population
-) -> tuple[NDArray[np.void], list[Events]]:
+def run_with_events(setting: Setting, population: Population) -> tuple[NDArray[np.void], list[Events]]:
     """Run every draw; return its row, as :func:`run_batch` does, and its events.
 
     There is room for ``setting.most_events`` events of each draw; only the used part takes memory.
@@ -315,9 +330,7 @@ def run_with_events(
     return rows, [Events(*(part[:count] for part in own)) for count, *own in parts]
 
 
-def _run(
-    setting: Setting, population: Population, places: int
-) -> tuple[NDArray[np.void], EventLog]:
+def _run(setting: Setting, population: Population, places: int) -> tuple[NDArray[np.void], EventLog]:
     _check(setting, population)
     if (gone_s := vanishes_s(setting.trigger)) < setting.horizon_s:
         raise vanished(gone_s)
@@ -353,8 +366,7 @@ def _check(setting: Setting, population: Population) -> None:
         raise ValueError(f"loss_seeds: expected uint64, found {population.loss_seeds.dtype}")
     if timeless(setting.link) != setting.link:
         raise CallerError(
-            "network.impairments: a batch knows losses and corruption only; "
-            "leave out what takes time"
+            "network.impairments: a batch knows losses and corruption only; leave out what takes time"
         )
     rule = setting.trigger
     for form in (rule.form, *([rule.dynamic_variable.gain] if rule.dynamic_variable else [])):

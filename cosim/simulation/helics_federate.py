@@ -143,8 +143,7 @@ class _Network:
                 own = {f"{self._federate.name}/{one.destination}" for one in self.routes}
                 others = ", ".join(sorted({*known} - own)) or "none"
                 raise CallerError(
-                    f"--endpoint {route.destination}: the federation has no such endpoint; "
-                    f"it has {others}"
+                    f"--endpoint {route.destination}: the federation has no such endpoint; it has {others}"
                 )
 
     def run(self) -> None:

@@ -63,9 +63,7 @@ class PlantGridRun:
 class PlantGridLoop:
     """The loop under a schedule."""
 
-    def __init__(
-        self, system: ContinuousLoop, schedule: StepSchedule, *, known_start: bool
-    ) -> None:
+    def __init__(self, system: ContinuousLoop, schedule: StepSchedule, *, known_start: bool) -> None:
         self._system = system
         self._schedule = schedule
         self._known_start = known_start
@@ -116,9 +114,7 @@ class PlantGridLoop:
             measured = np.flatnonzero(schedule.measured[following])
             if in_common:
                 block = states[following][measured]
-                found = trigger.test(
-                    (step + 1 + measured) * period_ns, block, x_s_block[measured] - block
-                )
+                found = trigger.test((step + 1 + measured) * period_ns, block, x_s_block[measured] - block)
             else:
                 found = 0 if len(measured) else None
             event = found is not None
@@ -198,8 +194,14 @@ class _CoreTrigger:
         states, errors = pointer_to(x, "double *"), pointer_to(e_s, "double *")
         for i, at_ns in enumerate(np.atleast_1d(t_ns).tolist()):
             if core.noack_trigger_test(
-                self._rule, self._state, self._n, at_ns, states + i * self._n,
-                errors + i * self._n, self._sides, self._scratch,
-            ):  # fmt: skip
+                self._rule,
+                self._state,
+                self._n,
+                at_ns,
+                states + i * self._n,
+                errors + i * self._n,
+                self._sides,
+                self._scratch,
+            ):
                 return i
         return None

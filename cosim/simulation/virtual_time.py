@@ -209,12 +209,17 @@ class VirtualRun:
     def _new_core(self, loops: int) -> CData:
         """Return the ``noack_simulation``."""
         key, flows = ffi.from_buffer("uint8_t[]", bytes(KEY_BYTES)), self._scenario.network.flows
-        simulation = ffi.new("noack_simulation *", {
-            "loops": loops, "processes": [machines.core for machines in self.machines.values()],
-            "channel": self.channel.core, "wire": {"run_id": RUN_ID},
-            "directions": [flows.index(flow) if flow in flows else -1 for flow in (0, *Flow)],
-            "steps_left": _INPUTS_PER_PROGRESS,
-        })  # fmt: skip
+        simulation = ffi.new(
+            "noack_simulation *",
+            {
+                "loops": loops,
+                "processes": [machines.core for machines in self.machines.values()],
+                "channel": self.channel.core,
+                "wire": {"run_id": RUN_ID},
+                "directions": [flows.index(flow) if flow in flows else -1 for flow in (0, *Flow)],
+                "steps_left": _INPUTS_PER_PROGRESS,
+            },
+        )
         core.noack_wire_key(ffi.addressof(simulation, "wire"), key)
         self._sent = ffi.new("noack_sent_datagram[]", _SENT_PLACES)
         simulation.sent, simulation.sent_places = self._sent, _SENT_PLACES
@@ -300,9 +305,7 @@ def _simulated(
         records.append(RunRecord(loop, rows, notices, reports, "simulated", (), number, roles))
     of_all = {table: len(rows) for table, rows in of_network.items()}
     reports = {"netem": _report(of_all, "netem", {"rejected": {}})}
-    common = RunRecord(
-        scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES
-    )
+    common = RunRecord(scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES)
     return RecordedRun(common, records)
 
 
@@ -355,9 +358,7 @@ def _reports(
     if scenario.protocol.acknowledges:
         received = run.reception("sensor", loop, acknowledges=True)
         channels["sensor"]["acknowledgements"] = received
-    return {
-        role: _report(counts, role, channels.get(role, {"rejected": {}})) for role in LOOP_ROLES
-    }
+    return {role: _report(counts, role, channels.get(role, {"rejected": {}})) for role in LOOP_ROLES}
 
 
 def _report(counts: Mapping[str, int], role: str, channel: ReadTable) -> dict[str, object]:

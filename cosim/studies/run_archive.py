@@ -170,9 +170,7 @@ def _copy_in(source: IO[bytes], archive: zipfile.ZipFile, info: zipfile.ZipInfo)
             target.write(chunk)
 
 
-def _checked_entries(
-    path: Path, archive: zipfile.ZipFile, most_bytes: int
-) -> dict[str, zipfile.ZipInfo]:
+def _checked_entries(path: Path, archive: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:
     """Return the entries by name; refuse what no archive of noack's has."""
     infos = archive.infolist()
     if len(infos) > _MOST_ENTRIES:
@@ -210,9 +208,7 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
         raise CallerError(f"{path}: {MANIFEST}: {printable(place)}: {first['msg']}") from None
 
 
-def _copy_out(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, entry: Entry, what: str
-) -> None:
+def _copy_out(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, entry: Entry, what: str) -> None:
     """Write an entry, and check its size and its SHA-256."""
     digest, size = hashlib.sha256(), 0
     target.parent.mkdir(parents=True, exist_ok=True)

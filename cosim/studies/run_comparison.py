@@ -32,12 +32,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, shortened
 from noack.core.file_access import write_whole
 from noack.core.number_format import as_text
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    NO_SEQUENCE,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-)
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,9 +77,7 @@ class KeyNumber(NamedTuple):
     def differences(self) -> tuple[float | None, ...]:
         """Each value minus the first run's; None if one of them is missing."""
         first = self.values[0]
-        return tuple(
-            None if first is None or value is None else value - first for value in self.values
-        )
+        return tuple(None if first is None or value is None else value - first for value in self.values)
 
     @property
     def cells(self) -> list[str]:
@@ -108,13 +101,9 @@ class RunComparison:
     @cached_property
     def numbers(self) -> list[KeyNumber]:
         """The key numbers that at least one of the runs has."""
-        found = {
-            name: tuple(value(run.loop) for run in self.runs) for name, value in _NUMBERS.items()
-        }
+        found = {name: tuple(value(run.loop) for run in self.runs) for name, value in _NUMBERS.items()}
         apart = [_distance(self.runs[0].record, run.record) for run in self.runs]
-        found["distance in x to A, RMS"], found["distance in x to A, maximum"] = zip(
-            *apart, strict=True
-        )
+        found["distance in x to A, RMS"], found["distance in x to A, maximum"] = zip(*apart, strict=True)
         return [KeyNumber(*one) for one in found.items() if any(v is not None for v in one[1])]
 
     @cached_property
@@ -164,8 +153,7 @@ class RunComparison:
         """Return the comparison without the figure, for programs."""
         return {
             "runs": [
-                {"label": run.label, "directory": str(run.directory), "title": run.title}
-                for run in self.runs
+                {"label": run.label, "directory": str(run.directory), "title": run.title} for run in self.runs
             ],
             "numbers": {key.name: list(key.values) for key in self.numbers},
             "differences": {key.name: list(key.differences) for key in self.numbers},
@@ -318,15 +306,14 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
             curves: list[tuple[Reals, Dash]] = [(getattr(samples, name), ())]
             curves += [(samples.threshold, (5, 2))] if name == "e_s_norm" else []
             items += [
-                Line(x=t_s, y=values, colour=series_colour(k), width=_NORM_WIDTH,
-                     order=3 - 0.1 * k, dash=dash)
+                Line(
+                    x=t_s, y=values, colour=series_colour(k), width=_NORM_WIDTH, order=3 - 0.1 * k, dash=dash
+                )
                 for values, dash in curves
-            ]  # fmt: skip
+            ]
         about = np.concatenate([getattr(samples, name) for samples in aligned])
         y = Axis(label="norm", logarithmic=True, about=about, decades=_DECADES)
-        rows.append(
-            Row(panels=[Panel(title=title, items=items, x=longest, y=y)], height_in=_NORM_IN)
-        )
+        rows.append(Row(panels=[Panel(title=title, items=items, x=longest, y=y)], height_in=_NORM_IN))
     events = replace(_events(runs), x=replace(longest, label=TIME, numbers=True))
     return FigureDescription(
         name="runs",

@@ -18,9 +18,7 @@ A, B, X0 = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [0.9]]), np.arra
 kind = "sensor_msgs/msg/JointState"
 store = get_typestore(Stores.ROS2_JAZZY)
 parts = ("builtin_interfaces/msg/Time", "std_msgs/msg/Header", kind)
-definitions = {
-    part: store.generate_msgdef(part, ros_version=2)[0].partition("=" * 80)[0] for part in parts
-}
+definitions = {part: store.generate_msgdef(part, ros_version=2)[0].partition("=" * 80)[0] for part in parts}
 x, t_ns = X0.copy(), 0
 
 

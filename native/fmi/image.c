@@ -41,6 +41,8 @@ static const char *read_image(FILE *file, noack_fmu_image **image) {
     **image = head;
     if (fread(*image + 1, 1, rest, file) != rest)
         return "noack.bin is too short";
+    if (fgetc(file) != EOF)
+        return "noack.bin is too long";
     tag_image(*image, tag);
     return memcmp(head.tag, tag, sizeof tag) == 0 ? NULL
                                                   : "noack.bin is damaged: its check sum is wrong";

@@ -11,7 +11,7 @@ typedef enum { FMI_OK, FMI_ERROR = 3 } status;
 enum mode { INSTANTIATED, INITIALIZING, STEPPING, TERMINATED };
 
 static status fail(const fmu *instance, const char *text) {
-    if (instance->log_message != NULL)
+    if (instance != NULL && instance->log_message != NULL)
         instance->log_message(instance->environment, FMI_ERROR, "logStatusError", text);
     return FMI_ERROR;
 }
@@ -158,7 +158,7 @@ status fmi3GetFMUState(fmu *instance, void **state) {
 
 status fmi3SetFMUState(fmu *instance, const void *state) {
     if (instance == NULL || state == NULL)
-        return FMI_ERROR;
+        return fail(instance, "there is no state");
     memcpy(instance->image, state, (size_t)instance->initial->bytes);
     point(instance->image, (uintptr_t)instance->image);
     return FMI_OK;
@@ -188,7 +188,7 @@ static void tag_state(const fmu *instance, const noack_fmu_image *state, uint8_t
 
 status fmi3SerializeFMUState(fmu *instance, const void *state, uint8_t *bytes, size_t count) {
     if (instance == NULL || state == NULL || count != (size_t)instance->initial->bytes)
-        return FMI_ERROR;
+        return fail(instance, "there is no state, or its place has another size");
     memcpy(bytes, state, count);
     tag_state(instance, state, bytes);
     return FMI_OK;
@@ -216,10 +216,20 @@ status fmi3DeserializeFMUState(fmu *instance, const uint8_t *bytes, size_t count
 
 /* What these FMUs do not have. Importers look all functions up; arguments are not read. */
 #define REFUSE(name)                                                                               \
-    int fmi3##name(void *instance) { return FMI_ERROR; }
+    status fmi3##name(const fmu *instance) {                                                       \
+        return fail(instance, "fmi3" #name " is not a function of this FMU");                      \
+    }
 #define REFUSE_BOTH(name) REFUSE(Get##name) REFUSE(Set##name)
-void *fmi3InstantiateModelExchange(const char *name) { return NULL; }
-void *fmi3InstantiateScheduledExecution(const char *name) { return NULL; }
+#define REFUSE_KIND(name)                                                                          \
+    void *fmi3Instantiate##name(                                                                   \
+        const char *n, const char *token, const char *folder, _Bool visible, _Bool logging,        \
+        void *environment, void (*log_message)(void *, int, const char *, const char *)) {         \
+        fmu none = {.environment = environment, .log_message = log_message};                       \
+        fail(&none, "this FMU is for co-simulation only");                                         \
+        return NULL;                                                                               \
+    }
+REFUSE_KIND(ModelExchange)
+REFUSE_KIND(ScheduledExecution)
 // clang-format off
 REFUSE_BOTH(Float32) REFUSE_BOTH(Int8) REFUSE_BOTH(UInt8) REFUSE_BOTH(Int16) REFUSE_BOTH(UInt16)
 REFUSE_BOTH(Int32) REFUSE_BOTH(UInt32) REFUSE_BOTH(UInt64) REFUSE_BOTH(Boolean)

@@ -115,11 +115,15 @@ static const char *step_controller(fmu *instance, int64_t to_ns) {
     const noack_machine *machine = &controller->machine;
     int64_t arrivals = *(int64_t *)values_of(image, NOACK_FMU_ARRIVALS);
     const double *arrival_s = values_of(image, NOACK_FMU_ARRIVAL_S);
+    if (arrivals < image->taken)
+        return "`arrivals` counts all packets that have arrived: it must not decrease";
     if (!is_between(image->taken, arrivals, image->taken + image->packets))
         return "more packets have arrived than `packets` has room for: make shorter steps";
     for (;;) {
         int64_t place = arrivals - image->taken - 1, due_ns = tick_ns(machine);
         int64_t arrival_ns = place >= 0 ? ns_of(arrival_s[place]) : INT64_MAX;
+        if (arrival_ns < 0)
+            return "`packet_arrival_s` of an arrival is not a time from 0 to 4,000,000 s";
         if (arrival_ns <= due_ns && arrival_ns < to_ns) {
             receive(instance, place);
             image->taken++;

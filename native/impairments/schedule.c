@@ -1,4 +1,5 @@
-/* A channel with a static schedule: slots of a fixed length, in a periodic order, each for one flow.
+/* A channel with a static schedule: slots of a fixed length, in a periodic order, each for one
+   flow.
 
    A packet leaves at the begin of its flow's first own slot that is neither before its arrival nor
    taken; one that arrives just then leaves at once. A packet that finds as many own slots after its
@@ -19,7 +20,8 @@ typedef struct {
 
 /* The number of the first own slot that begins at a time, or later. */
 static int64_t turn_from(const turns *turns, int64_t now_ns) {
-    int64_t before = floor_div(now_ns - 1, turns->own->slot_ns); /* the last slot that is too early */
+    int64_t before =
+        floor_div(now_ns - 1, turns->own->slot_ns); /* the last slot that is too early */
     int64_t round = floor_div(before, turns->own->slots);
     int64_t place = first_above(turns->slots, 0, turns->count, before - round * turns->own->slots);
     return round * turns->count + place;

@@ -124,7 +124,9 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
             .delayed = 1,
         };
         line_up(relay);
-        serve(relay, slot->direction, entry.release_ns);
+        serve(
+            relay->directions[slot->direction].link, relay->waiting, entry.release_ns, relay->heap,
+            &relay->heap_length);
         if (relay->records)
             record_release(relay, leaving, until_ns);
     }
@@ -224,7 +226,8 @@ static void release(
     int64_t order = departure_order(direction & 1, relay->put);
     if (decision->waits)
         wait_for_link(
-            relay->directions[direction].link, relay->waiting, leaving->slot, order, decision);
+            relay->directions[direction].link, relay->clients[client].place, relay->waiting,
+            leaving->slot, order, decision);
     else
         heap_push(
             relay->heap, &relay->heap_length, (noack_heap_entry){release_ns, order, leaving->slot});
@@ -236,12 +239,13 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
     relay_scratch *own = scratch_of(relay);
     noack_client *client = &relay->clients[row];
     const uint8_t *data = own->buffers[own->batch_next];
+    noack_link *link = relay->directions[number].link;
     noack_decision decision;
     client->last_ns = relay->now_ns;
-    serve(relay, number, relay->now_ns);
+    serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
     noack_link_decide(
-        relay->directions[number].link, client->place, max_of(size_bytes - headers_bytes(relay), 0),
-        relay->now_ns, &decision);
+        link, client->place, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,
+        &decision);
     if (relay->taps)
         report_arrival(relay, number, row, data, size_bytes, &decision);
     if (relay->records)
@@ -250,7 +254,7 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
         release(relay, number, row, &decision, 0);
     if (decision.copy_ns != NOACK_NEVER_NS)
         release(relay, number, row, &decision, 1);
-    serve(relay, number, relay->now_ns);
+    serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
 }
 
 /* Decide for the datagrams received from one socket; return CARRY_ON, or why this ended. */

@@ -77,8 +77,6 @@ uint8_t *block_address(const noack_relay *relay, int64_t block);
 int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datagram);
 void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into);
 void free_payload(noack_relay *relay, int64_t slot);
-/* Begin to send what can begin until now_ns in a queue that chooses when the link is free. */
-void serve(noack_relay *relay, int64_t direction, int64_t now_ns);
 
 /* device.c */
 int64_t headers_bytes(const noack_relay *relay);

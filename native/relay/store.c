@@ -64,14 +64,10 @@ void free_payload(noack_relay *relay, int64_t number) {
     relay->free_slots++;
 }
 
-void serve(noack_relay *relay, int64_t direction, int64_t now_ns) {
-    noack_heap_entry entry;
-    while (begin_sending(relay->directions[direction].link, relay->waiting, now_ns, &entry))
-        heap_push(relay->heap, &relay->heap_length, entry);
-}
-
 void noack_relay_latest(noack_relay *relay, int64_t direction, int64_t *latest_ns) {
-    serve(relay, direction, INT64_MAX);
+    serve(
+        relay->directions[direction].link, relay->waiting, INT64_MAX, relay->heap,
+        &relay->heap_length);
     for (int64_t i = 0; i < relay->heap_length; i++) {
         const noack_slot *slot = &relay->slots[relay->heap[i].slot];
         if (slot->direction == direction) {

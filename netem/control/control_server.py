@@ -204,8 +204,7 @@ class ControlServer:
 
     def _settings(self, _: Mapping[str, object]) -> object:
         links = [
-            {"name": link.name}
-            | {name: _settings(getattr(link, name).settings) for name in DIRECTIONS}
+            {"name": link.name} | {name: _settings(getattr(link, name).settings) for name in DIRECTIONS}
             for link in self._commands.snapshot().links
         ]
         return {"links": links}
@@ -223,9 +222,7 @@ class ControlServer:
             with_kept_loss(settings)
         except ValueError as error:
             raise CallerError(str(error)) from None
-        directions: Sequence[Direction] = (
-            DIRECTIONS if change.direction == "both" else (change.direction,)
-        )
+        directions: Sequence[Direction] = DIRECTIONS if change.direction == "both" else (change.direction,)
         self._commands.change(self._link(change.link), directions, settings)
         return self._settings({})
 

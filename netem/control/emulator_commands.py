@@ -106,9 +106,7 @@ def main(arguments: Sequence[str]) -> ExitStatus:
         return ExitStatus.OK
 
 
-def _parser(
-    command: str, description: str, examples: Sequence[str], json_help: str, **more: Any
-) -> Parser:
+def _parser(command: str, description: str, examples: Sequence[str], json_help: str, **more: Any) -> Parser:
     parser = Parser(
         prog=f"noack netem {command}",
         description=description,
@@ -157,9 +155,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
         "print the links' settings as JSON",
         usage="%(prog)s [NAME] [--link LINK] [--direction forward|reverse|both] WORDS ...",
     )
-    parser.add_argument(
-        "words", nargs="*", metavar="[NAME] WORDS", help="for example loss 5%% mansd 4"
-    )
+    parser.add_argument("words", nargs="*", metavar="[NAME] WORDS", help="for example loss 5%% mansd 4")
     parser.add_argument("--link", help="name of the link; optional if there is only one")
     parser.add_argument(
         "--direction", choices=(*DIRECTIONS, "both"), default="forward", help="default: forward"
@@ -187,9 +183,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     return ExitStatus.OK
 
 
-def _warn_of_removed_caps(
-    before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]
-) -> None:
+def _warn_of_removed_caps(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> None:
     for old, new in zip(before, after, strict=True):
         for direction in DIRECTIONS:
             was, now = (

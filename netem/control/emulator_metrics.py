@@ -86,12 +86,8 @@ def metrics(found: Statistics) -> Iterator[Metric]:
     """Yield the metrics of a relay's statistics; ``docs/operations.md`` lists them."""
     links: Any = found["links"]
     sides: Any = [([link["name"], name], link[name]) for link in links for name in DIRECTIONS]
-    yield _gauge(
-        "elapsed_seconds", "time since the emulator started", [], [([], found["elapsed_s"])]
-    )
-    yield _gauge(
-        "clients", "clients of a link", ["link"], [([one["name"]], one["clients"]) for one in links]
-    )
+    yield _gauge("elapsed_seconds", "time since the emulator started", [], [([], found["elapsed_s"])])
+    yield _gauge("clients", "clients of a link", ["link"], [([one["name"]], one["clients"]) for one in links])
     for name, (key, text) in _OF_LINK.items():
         yield _counter(name, text, ["link"], [([link["name"]], link[key]) for link in links])
     for name, (key, text) in _COUNTERS.items():
@@ -101,15 +97,23 @@ def metrics(found: Statistics) -> Iterator[Metric]:
     for name, (key, text) in _LOSSES.items():
         yield _gauge(name, text, _LABELS, [(labels, side["loss"][key]) for labels, side in sides])
     for name, (key, label, text) in _BY_KEY.items():
-        yield _counter(name, text, [*_LABELS, label], [
-            ([*labels, which], count) for labels, side in sides
-            for which, count in side[key].items()
-        ])  # fmt: skip
+        yield _counter(
+            name,
+            text,
+            [*_LABELS, label],
+            [([*labels, which], count) for labels, side in sides for which, count in side[key].items()],
+        )
     for name, (key, text) in _TIMES.items():
-        yield _gauge(name, text, [*_LABELS, "quantile"], [
-            ([*labels, label], None if side[key][p] is None else side[key][p] / NS_PER_S)
-            for labels, side in sides for p, label in _QUANTILES.items()
-        ])  # fmt: skip
+        yield _gauge(
+            name,
+            text,
+            [*_LABELS, "quantile"],
+            [
+                ([*labels, label], None if side[key][p] is None else side[key][p] / NS_PER_S)
+                for labels, side in sides
+                for p, label in _QUANTILES.items()
+            ],
+        )
 
 
 def _counter(name: str, text: str, labels: Sequence[str], rows: _Rows) -> Metric:

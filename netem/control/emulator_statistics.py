@@ -24,14 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.relay import Relay
-from netem.relay_links import (
-    DIRECTIONS,
-    Direction,
-    DirectionReport,
-    LinkReport,
-    coarse,
-    quantile_ns,
-)
+from netem.relay_links import DIRECTIONS, Direction, DirectionReport, LinkReport, coarse, quantile_ns
 from netem.tc_words import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
@@ -299,9 +292,7 @@ def statistics(after: Snapshot, before: Snapshot | None = None) -> Statistics:
     }
 
 
-def _link(
-    after: LinkReport, before: LinkReport | None, seconds: float, snapshot: Snapshot
-) -> LinkStatistics:
+def _link(after: LinkReport, before: LinkReport | None, seconds: float, snapshot: Snapshot) -> LinkStatistics:
     def direction(name: Direction) -> DirectionStatistics:
         in_force = snapshot.in_force[after.name, name]
         return _direction(getattr(after, name), in_force, getattr(before, name, None), seconds)

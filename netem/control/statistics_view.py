@@ -98,8 +98,8 @@ class History:
 
     def __init__(self) -> None:
         self.latest: Statistics | None = None
-        self._samples: defaultdict[tuple[str, Direction], deque[tuple[float, RecentRates]]] = (
-            defaultdict(deque)
+        self._samples: defaultdict[tuple[str, Direction], deque[tuple[float, RecentRates]]] = defaultdict(
+            deque
         )
 
     def add(self, statistics: Statistics) -> None:
@@ -115,9 +115,7 @@ class History:
                 while samples and samples[0][0] <= now_s - _SPAN_S:
                     samples.popleft()
 
-    def series(
-        self, link: str, direction: Direction, key: str, points: int
-    ) -> Sequence[float | None]:
+    def series(self, link: str, direction: Direction, key: str, points: int) -> Sequence[float | None]:
         """Return the last minute of a value of :class:`RecentRates`, (points,); None: unknown.
 
         A sample covers the time since the previous sample. A point is the mean of its samples.
@@ -150,9 +148,7 @@ def render(history: History, title: str, width: int, height: int | None) -> Rend
     latest = history.latest
     if latest is None:
         return Text(f"{title}: waiting for statistics", style="dim")
-    heading = Text.assemble(
-        (f" {title}", "bold"), (f"  {elapsed_text(latest['elapsed_s'])}", "dim")
-    )
+    heading = Text.assemble((f" {title}", "bold"), (f"  {elapsed_text(latest['elapsed_s'])}", "dim"))
     column = (width - _FRAME_WIDTH - _LABEL_WIDTH - 2) // 2
     panels = [_panel(history, link, column) for link in latest["links"]]
     if height is None or 1 + sum(lines for _, lines in panels) <= height:
@@ -175,9 +171,7 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
         lines += 1 + max(cell.plain.count("\n") for cell in (left, right))
     unintended = _unintended(link)
     ends = (link[end].removesuffix(":0") for end in ("listen", "to"))  # a shell's have no port
-    title = Text.assemble(
-        (link["name"], "bold"), f"  {' → '.join(ends)}  ", (_clients_text(link), "dim")
-    )
+    title = Text.assemble((link["name"], "bold"), f"  {' → '.join(ends)}  ", (_clients_text(link), "dim"))
     panel = Panel(
         Group(grid, *unintended),
         title=title,
@@ -345,9 +339,7 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
     shown = rows[:lines]
     names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in shown]
     name_width = min(max(map(len, names), default=0), width // 3)
-    columns = {
-        heading: [text(link[name]) for link, name in shown] for heading, text in _COLUMNS.items()
-    }
+    columns = {heading: [text(link[name]) for link, name in shown] for heading, text in _COLUMNS.items()}
 
     def room() -> int:
         widths = [max(map(len, (heading, *texts))) for heading, texts in columns.items()]
@@ -358,10 +350,7 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
             del columns[heading]
     chart_width = min(room() - 1, _CHART_WIDTH)
     if chart_width >= _MIN_CHART_WIDTH:
-        series = [
-            history.series(link["name"], name, "received_per_s", chart_width)
-            for link, name in shown
-        ]
+        series = [history.series(link["name"], name, "received_per_s", chart_width) for link, name in shown]
         columns["last minute"[:chart_width]] = [sparkline(one, _top(one)) for one in series]
 
     table = Table(box=None, padding=(0, 1, 0, 0), header_style="dim", pad_edge=False)
@@ -390,12 +379,17 @@ def plain_lines(statistics: Statistics) -> list[str]:
 def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:
     of = link[name]
     parts = [
-        f"{elapsed_s:.1f} s", f"{link['name']} {name}", f"received {_flow(of, 'received')}",
-        f"forwarded {_flow(of, 'forwarded')}", f"loss {_loss(of)}", f"drawn {_drawn(of)}",
-        f"longest loss burst {burst_text(of)}", f"forced {of['fates']['forced']:,}",
+        f"{elapsed_s:.1f} s",
+        f"{link['name']} {name}",
+        f"received {_flow(of, 'received')}",
+        f"forwarded {_flow(of, 'forwarded')}",
+        f"loss {_loss(of)}",
+        f"drawn {_drawn(of)}",
+        f"longest loss burst {burst_text(of)}",
+        f"forced {of['fates']['forced']:,}",
         f"delay p99 {time_text((of['recent'] or of)['delay_ns']['p99'])}",
         f"in flight {of['in_flight']:,}",
-    ]  # fmt: skip
+    ]
     parts += [f"UNINTENDED {n:,} {cause}" for cause, n in of["unintended"].items() if n]
     return "  ".join(parts)
 
@@ -426,9 +420,12 @@ class Screen:
     def __enter__(self) -> Self:
         if self._console.is_terminal and not self._console.is_dumb_terminal and not self._as_json:
             live = Live(
-                console=self._console, screen=True, auto_refresh=False,
-                redirect_stdout=False, redirect_stderr=False,
-            )  # fmt: skip
+                console=self._console,
+                screen=True,
+                auto_refresh=False,
+                redirect_stdout=False,
+                redirect_stderr=False,
+            )
             with ExitStack() as stack:
                 stack.callback(self._leave)
                 stack.enter_context(contextlib.redirect_stderr(self._messages))

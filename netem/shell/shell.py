@@ -67,9 +67,7 @@ def _split(text: str) -> list[str]:
 class _Program:
     """The command of a shell, and those outside; the relay runs within :meth:`running`."""
 
-    def __init__(
-        self, devices: DeviceLink, command: Sequence[str], outside: Sequence[Sequence[str]]
-    ) -> None:
+    def __init__(self, devices: DeviceLink, command: Sequence[str], outside: Sequence[Sequence[str]]) -> None:
         self.devices = devices
         self._command, self._outside = command, outside
         self.status: int = ExitStatus.FAILED
@@ -106,8 +104,6 @@ class _Program:
                 self.status = signals.status
 
 
-def _start(
-    command: Sequence[str], variables: dict[str, str] | None = None
-) -> subprocess.Popen[bytes]:
+def _start(command: Sequence[str], variables: dict[str, str] | None = None) -> subprocess.Popen[bytes]:
     guard = python_command("-IS", process.__file__, "inside", os.getpid())
     return subprocess.Popen([*guard, *command], env=os.environ | (variables or {}))

@@ -8,11 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from noack.controllers.controller_settings import (
-    ControlFailedError,
-    ControllerSettings,
-    ControlModel,
-)
+from noack.controllers.controller_settings import ControlFailedError, ControllerSettings, ControlModel
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector

@@ -67,9 +67,14 @@ def require_live_runs() -> None:
 
 
 _FORMATS = {
-    "int64_t": "<i8", "int32_t": "<i4", "uint8_t": "u1", "uint16_t": "<u2", "uint32_t": "<u4",
-    "uint64_t": "<u8", "double": "<f8",
-}  # fmt: skip
+    "int64_t": "<i8",
+    "int32_t": "<i4",
+    "uint8_t": "u1",
+    "uint16_t": "<u2",
+    "uint32_t": "<u4",
+    "uint64_t": "<u8",
+    "double": "<f8",
+}
 
 
 @cache
@@ -213,9 +218,7 @@ class CoreMemory:
         steps_ns, matrices = np.zeros(places, np.int64), np.zeros(places * n * n)
         scratch = np.zeros(SCRATCH_MATRICES * n * n + 3 * n)
         made.H, made.steps_ns = pointer_to(H, "double *"), pointer_to(steps_ns, "int64_t *")
-        made.matrices, made.scratch = (
-            pointer_to(array, "double *") for array in (matrices, scratch)
-        )
+        made.matrices, made.scratch = (pointer_to(array, "double *") for array in (matrices, scratch))
         self._shared += [H, steps_ns, matrices, scratch]
         return made
 

@@ -10,6 +10,7 @@ Lyapunov equations are solved in numpy, since importing scipy.linalg takes 0.2 s
 bounds, which are enlarged by more than the rounding.
 """
 
+import math
 from bisect import bisect_right
 from functools import lru_cache, reduce
 
@@ -29,6 +30,7 @@ _SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
 _MOST_IN_TURN = 8
 """Of fewer terms, numpy computes a sum in turn; it takes ten times as long for many short rows."""
+_BALANCINGS, _FARTHEST = 20, 200
 _MOST_STATES = 12
 """The linear equations of a Lyapunov equation grow with the fourth power of the states."""
 
@@ -183,6 +185,32 @@ def largest_sizes(rows: Matrix) -> Vector:
 def spectral_abscissa(matrix: Matrix) -> float:
     """Return the largest real part of the eigenvalues, per second."""
     return float(np.linalg.eigvals(matrix).real.max())
+
+
+def balancing_exponents(sizes: Matrix) -> NDArray[np.int64]:
+    """Return e for which rows and columns of S_ij 2^(e_i − e_j) have similar sizes, (n,).
+
+    These are other units of the states, x_i 2^(e_i), which change no digit (Osborne, *J. ACM* 7,
+    1960).
+
+    Args:
+        sizes: S, absolute values of entries, (n, n), finite.
+    """
+    exponents = np.zeros(len(sizes), np.int64)
+    radius = float(np.abs(np.linalg.eigvals(sizes)).max())  # the same in all units
+    radius = radius if radius > _SAFE else 1.0
+    others = np.where(np.eye(len(sizes)) + (sizes < _SAFE), 0.0, sizes)
+    for _ in range(_BALANCINGS):
+        before = exponents.copy()
+        for i in range(len(sizes)):
+            scaled = np.ldexp(others, exponents[:, None] - exponents)
+            row, column = float(scaled[i].max()), float(scaled[:, i].max())
+            # What has no influence, or is not influenced, has its other size near the radius.
+            ratio = math.log2(column or radius) - math.log2(row or radius)
+            exponents[i] += round(ratio / 2 if row and column else ratio)
+        if (exponents == before).all():
+            break
+    return np.clip(exponents - int(np.median(exponents)), -_FARTHEST, _FARTHEST)
 
 
 def _reals(values: Matrix | Vector) -> CData:

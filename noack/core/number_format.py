@@ -100,9 +100,7 @@ def as_text(rows: Rows) -> str:
     """Return rows as aligned columns."""
     widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
     lines = (
-        "  ".join(
-            entry + " " * (width - _width(entry)) for entry, width in zip(row, widths, strict=True)
-        )
+        "  ".join(entry + " " * (width - _width(entry)) for entry, width in zip(row, widths, strict=True))
         for row in rows
     )
     return "\n".join(line.rstrip() for line in lines)

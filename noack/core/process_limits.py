@@ -31,8 +31,7 @@ def require_limits() -> None:
     if soft < _FILES:
         if hard < _FILES:
             raise MachineError(
-                f"at most {hard} open files are permitted; a process of a run needs {_FILES}: "
-                "ulimit -n 1024"
+                f"at most {hard} open files are permitted; a process of a run needs {_FILES}: ulimit -n 1024"
             )
         _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (_FILES, hard_limit))

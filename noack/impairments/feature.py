@@ -24,14 +24,7 @@ from noack.core.random_streams import uniform_pair
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.loss_guarantee import LossRule
 from noack.impairments.markov_chain import Chain, Pattern, chance_chain
-from noack.impairments.words import (
-    CORRELATION,
-    OWN_TIME_S,
-    PERCENT,
-    Quantity,
-    brief_percent,
-    time_text,
-)
+from noack.impairments.words import CORRELATION, OWN_TIME_S, PERCENT, Quantity, brief_percent, time_text
 from noack.settings.section import Correlation, Probability, ScenarioSection
 from noack.settings.user_files import NamedFile
 
@@ -114,9 +107,7 @@ class QueueDiscipline(Feature):
     kind: str
 
     @abstractmethod
-    def queue_stage(
-        self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables
-    ) -> Stage:
+    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables) -> Stage:
         """Return the settings as numbers, with those of the bottleneck."""
 
 
@@ -147,9 +138,7 @@ class Scheduler(QueueDiscipline):
         """Return the number of a flow; flows count from 0."""
         return self.numbers[min(flow, len(self.numbers) - 1)]
 
-    def queue_stage(
-        self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables
-    ) -> Stage:
+    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables) -> Stage:
         begin, _ = add_numbers(tables.integers, self.numbers)
         numbers = {**bottleneck, "begin": begin, "flows": len(self.numbers)}
         return Stage(self.kind, numbers, "bottleneck", queue_places, schedules=True)

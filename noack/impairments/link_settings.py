@@ -15,6 +15,8 @@ from noack.core.core_library import core
 from noack.impairments.constraints import AnyConstraint, find_longest_burst, require_consistent
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.blackout import Blackout
+from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
@@ -88,23 +90,24 @@ def require_scores(impairments: Iterable[AnyImpairment], loss: LossModel | None 
 
 
 def require_order(impairments: Sequence[AnyImpairment]) -> None:
-    """Check that a queue which chooses when the link is free keeps the order within each flow.
+    """Check what stands beside a rate that chooses what it sends when the link is free.
 
     Raises:
-        ValueError: another impairment could change it; the message begins with the key.
+        ValueError: its effect would depend on the order; the message begins with the key.
     """
-    places = [k for k, one in enumerate(impairments) if isinstance(one, Rate) and one.scheduler]
-    for number, other in enumerate(impairments):
-        if not places or number == places[0]:
-            continue
-        varies = other.reorders(True, False)[1] or other.copies or not other.is_bounded
-        varies = varies or (other.delays and not isinstance(other, Delay))
-        if varies or (number > places[0] and not other.delays and not other.flips_bits):
-            raise ValueError(
-                f"impairments.{number}: {other.kind} cannot stand "
-                f"{'before' if number < places[0] else 'after'} a rate that chooses what it sends; "
-                "only losses can before it, and constant delays and corruption anywhere"
-            )
+    rates = [(place, one) for place, one in enumerate(impairments) if isinstance(one, Rate) and one.scheduler]
+    for place, rate in rates[:1]:
+        for number, other in enumerate(impairments):
+            where = "before" if number < place else "after"
+            least_s, largest_s = other.delay_range_s(0.0, 0.0)
+            fits = number == place or isinstance(other, Corrupt)
+            fits = fits or (isinstance(other, Delay) and least_s == largest_s)
+            if not fits and not (where == "before" and isinstance(other, LossOf | Blackout)):
+                raise ValueError(
+                    f"impairments.{number}: {other.kind} cannot stand {where} a rate with "
+                    f"{rate.discipline.kind}; losses and blackouts can stand before such a rate, "
+                    "constant delays and corruption before or after it"
+                )
 
 
 class RecordedDecision(NamedTuple):

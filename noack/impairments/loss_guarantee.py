@@ -121,9 +121,7 @@ class DeliveriesBetweenBursts(LossRule):
 
     @property
     def meaning(self) -> str:
-        count = (
-            "1 delivery" if self.deliveries == 1 else f"{self.deliveries} consecutive deliveries"
-        )
+        count = "1 delivery" if self.deliveries == 1 else f"{self.deliveries} consecutive deliveries"
         return f"at least {count} between two bursts of losses"
 
     def after(self, state: int, lost: bool) -> tuple[int, int]:

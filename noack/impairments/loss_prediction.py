@@ -94,9 +94,7 @@ def predict(settings: LinkSettings) -> LossPrediction:
     except NotPredictableError as error:
         return LossPrediction(None, str(error))
     notes = list(
-        dict.fromkeys(
-            impairment.prediction_note for impairment in impairments if impairment.prediction_note
-        )
+        dict.fromkeys(impairment.prediction_note for impairment in impairments if impairment.prediction_note)
     )
     delayed, reordered = False, False
     for impairment in impairments:
@@ -163,13 +161,9 @@ def _together_lost(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
 
 def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
     """Return the joint chain: start, matrix, probability of no effective delivery."""
-    states = math.prod(
-        len(part.lost if isinstance(part, Pattern) else part.start) for part in parts
-    )
+    states = math.prod(len(part.lost if isinstance(part, Pattern) else part.start) for part in parts)
     if states > MOST_STATES:
-        raise NotPredictableError(
-            f"together the impairments have {states} states, too many to compute with"
-        )
+        raise NotPredictableError(f"together the impairments have {states} states, too many to compute with")
     start: Array = np.ones(1)
     moves: Array = np.ones((1, 1))
     chains = [part.chain if isinstance(part, Pattern) else part for part in parts]
@@ -178,9 +172,7 @@ def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
         n, others = len(chain.start), len(start)
         start = np.kron(start, chain.start).astype(np.float64)
         moves = np.kron(moves, chain.moves).astype(np.float64)
-        done = [
-            chain_before._replace(acts=np.repeat(chain_before.acts, n)) for chain_before in done
-        ]
+        done = [chain_before._replace(acts=np.repeat(chain_before.acts, n)) for chain_before in done]
         done.append(chain._replace(acts=np.tile(chain.acts, others)))
     return start, moves, _ineffective(done, states)
 
@@ -446,9 +438,7 @@ def remember(probabilities: Mapping[str, float]) -> Mapping[str, float]:
 def _key(settings: LinkSettings) -> str:
     """Return all that the prediction depends on."""
     parts = [impairment.text() for impairment in settings.impairments if _matters(impairment)]
-    return json.dumps(
-        [parts, settings.mansd, *(constraint.text() for constraint in settings.constraints)]
-    )
+    return json.dumps([parts, settings.mansd, *(constraint.text() for constraint in settings.constraints)])
 
 
 def _matters(impairment: Impairment) -> bool:
@@ -479,9 +469,7 @@ def _probability(settings: LinkSettings, kept: _Kept) -> float:
     # Without the guarantee, more packets are lost: all but (1 − p)(1 − others).
     others = rate_at(0.0, settings.model_copy(update={"mansd": None, "constraints": ()}))
     if others > target and (others := rate_at(0.0)) > target + _TINY:
-        raise ValueError(
-            f"{text}: impossible, the other impairments lose {brief_percent(others)} already"
-        )
+        raise ValueError(f"{text}: impossible, the other impairments lose {brief_percent(others)} already")
     least = 0.0 if others >= target else (target - others) / (1 - others)
     places = np.linspace(least, 1.0, _PARTS + 1)
     rates = [rate_at(least)]

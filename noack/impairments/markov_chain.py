@@ -53,9 +53,7 @@ class Pattern(NamedTuple):
     def chain(self) -> Chain:
         """Return the pattern as a Markov chain."""
         period = len(self.lost)
-        return Chain(
-            np.eye(period)[-1], np.roll(np.eye(period), 1, axis=1), self.lost.astype(float)
-        )
+        return Chain(np.eye(period)[-1], np.roll(np.eye(period), 1, axis=1), self.lost.astype(float))
 
 
 def pattern(period: int, lost: Iterable[int]) -> Pattern:
@@ -255,8 +253,6 @@ def _balance(moves: "csr_array[np.float64]") -> Array:
     system = (eye_array(count) - moves.T).tocsc()
     flow = moves[[likely]].toarray()[0, others]
     distribution[likely] = 1.0
-    distribution[others] = np.maximum(
-        linalg.splu(system[others][:, others].tocsc()).solve(flow), 0.0
-    )
+    distribution[others] = np.maximum(linalg.splu(system[others][:, others].tocsc()).solve(flow), 0.0)
     distribution /= distribution.sum()
     return distribution

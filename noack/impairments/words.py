@@ -197,22 +197,14 @@ PERCENT = Quantity("a percentage from 0% to 100%, e.g. 5%", _percent(0, 100), pe
 CORRELATION = Quantity(
     "a correlation from 0% to below 100%, e.g. 25%", _percent(0, 100, below=True), percent_text
 )
-SIGNED_PERCENT = Quantity(
-    "a correlation from -100% to 100%, e.g. 80%", _percent(-100, 100), percent_text
-)
-TIME_S = Quantity(
-    "a time in s, ms, us or ns, e.g. 10ms (a bare number is in us)", _time_s, time_text
-)
+SIGNED_PERCENT = Quantity("a correlation from -100% to 100%, e.g. 80%", _percent(-100, 100), percent_text)
+TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms (a bare number is in us)", _time_s, time_text)
 """A time of tc: a number without a unit is in microseconds."""
 OWN_TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms", _own_time_s, time_text)
 """A time of a word that tc does not have: requires a unit, may be negative."""
-OWN_TIME_NS = Quantity(
-    "a time in s, ms, us or ns, in whole ns, e.g. 10ms", _own_time_ns, time_ns_text
-)
+OWN_TIME_NS = Quantity("a time in s, ms, us or ns, in whole ns, e.g. 10ms", _own_time_ns, time_ns_text)
 """The same, exactly."""
-RATE_BPS = Quantity(
-    "a rate in bit, kbit, mbit, gbit, kbps (bytes!), ..., e.g. 1mbit", _rate_bps, rate_text
-)
+RATE_BPS = Quantity("a rate in bit, kbit, mbit, gbit, kbps (bytes!), ..., e.g. 1mbit", _rate_bps, rate_text)
 COUNT = Quantity("a whole number, e.g. 5", _integer("[0-9]{1,20}"))
 SIGNED_COUNT = Quantity("a whole number, e.g. 28 or -14", _integer("-?[0-9]{1,20}"), signs="-")
 NUMBER = Quantity("a number, e.g. 2.5", _number, number_text)

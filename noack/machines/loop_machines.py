@@ -23,12 +23,7 @@ from noack.core.errors import CallerError
 from noack.protocol.machine_interface import External, Notice, Record
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.wire_format import Flow
-from noack.scenario.parameter_changes import (
-    AppliedParameters,
-    ChangeSchedule,
-    ParameterChange,
-    settings_key,
-)
+from noack.scenario.parameter_changes import AppliedParameters, ChangeSchedule, ParameterChange, settings_key
 from noack.scenario.scenario import Scenario
 
 Rows = NDArray[np.void]

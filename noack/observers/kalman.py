@@ -21,8 +21,11 @@ class KalmanSettings(ObserverSettings):
     """The time-varying Kalman filter of the model, with Joseph's covariance update."""
 
     example: ClassVar = {
-        "kind": "kalman", "input_std": [0.2], "noise_std": [0.01], "initial_std": [1.0, 1.0],
-    }  # fmt: skip
+        "kind": "kalman",
+        "input_std": [0.2],
+        "noise_std": [0.01],
+        "initial_std": [1.0, 1.0],
+    }
 
     kind: Literal["kalman"]
     process_std: Deviations | None = None
@@ -114,14 +117,17 @@ class KalmanSettings(ObserverSettings):
             for _ in range(assumed.steps):
                 core.noack_observer_predict(observer, n, m, nothing)
 
-    def fill(
-        self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory
-    ) -> None:
+    def fill(self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
         super().fill(observer, assumed, x, memory)
-        memory.fill(observer, {
-            "kind": core.NOACK_KALMAN, "P": np.diag(np.square(self.initial_std)),
-            "Q": assumed.Q, "R": assumed.R,
-        })  # fmt: skip
+        memory.fill(
+            observer,
+            {
+                "kind": core.NOACK_KALMAN,
+                "P": np.diag(np.square(self.initial_std)),
+                "Q": assumed.Q,
+                "R": assumed.R,
+            },
+        )
 
 
 def _require_covariance(key: str, rows: Rows | None, *, definite: bool) -> None:

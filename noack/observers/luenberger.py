@@ -14,12 +14,7 @@ from pydantic import FiniteFloat, model_validator
 from noack.core.core_library import CData, CoreMemory, core
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
-from noack.observers.observer_settings import (
-    EstimationModel,
-    NoiseVariances,
-    ObserverSettings,
-    observer_gain,
-)
+from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings, observer_gain
 from noack.settings.section import Rows, require_shape
 
 Pole = FiniteFloat | tuple[FiniteFloat, ...]
@@ -48,9 +43,7 @@ class LuenbergerSettings(ObserverSettings):
             if (pole[0] if isinstance(pole, tuple) else pole) >= 0:
                 raise ValueError("poles_per_s: need negative real parts, else the error grows")
             if isinstance(pole, tuple) and pole[1] <= 0:
-                raise ValueError(
-                    "poles_per_s: a pair [re, im] needs im > 0; write a real pole as a number"
-                )
+                raise ValueError("poles_per_s: a pair [re, im] needs im > 0; write a real pole as a number")
         return self
 
     def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
@@ -90,8 +83,6 @@ class LuenbergerSettings(ObserverSettings):
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
         return repeat(np.array(self.gain))
 
-    def fill(
-        self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory
-    ) -> None:
+    def fill(self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
         super().fill(observer, assumed, x, memory)
         memory.fill(observer, {"kind": core.NOACK_LUENBERGER, "gain": np.array(self.gain)})

@@ -96,9 +96,7 @@ class ObserverSettings(ScenarioSection):
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
         """Yield L of every measurement, (n, p), without end."""
 
-    def fill(
-        self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory
-    ) -> None:
+    def fill(self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
         """Fill all of a ``noack_observer`` but its kind, with x̂ before the first measurement."""
         (n, n), p = assumed.Ad.shape, len(assumed.C)
         memory.fill(observer, {

@@ -245,6 +245,4 @@ class _Motion:
 def _expm1(z: complex) -> complex:
     """e^z − 1 without cancellation; the standard library has it for real numbers only."""
     a, b = z.real, z.imag
-    return complex(
-        math.expm1(a) * math.cos(b) - 2.0 * math.sin(0.5 * b) ** 2, math.exp(a) * math.sin(b)
-    )
+    return complex(math.expm1(a) * math.cos(b) - 2.0 * math.sin(0.5 * b) ** 2, math.exp(a) * math.sin(b))

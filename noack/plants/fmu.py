@@ -28,13 +28,7 @@ from pydantic import Field, FiniteFloat
 from noack.core.errors import CallerError
 from noack.core.file_access import lock
 from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import (
-    Names,
-    PlantSettings,
-    PlantStart,
-    PlantSystem,
-    SystemFailedError,
-)
+from noack.plants.plant_settings import Names, PlantSettings, PlantStart, PlantSystem, SystemFailedError
 from noack.settings.section import Row, require_length
 from noack.settings.user_files import FileSettings, NamedFile, unchanged
 
@@ -159,9 +153,7 @@ class FmuSystem:
     def _wrong(self, message: str) -> NoReturn:
         raise CallerError(f"{self._place}: {message}")
 
-    def _loaded(
-        self, path: Path, end: contextlib.ExitStack, description: "ModelDescription"
-    ) -> "_Instance":
+    def _loaded(self, path: Path, end: contextlib.ExitStack, description: "ModelDescription") -> "_Instance":
         fmpy, folder = _fmpy(), end.enter_context(temporary_folder())
         fmpy.extract(str(path), str(folder))
         self._require_binary(folder, description)
@@ -318,9 +310,7 @@ class _Variables:
         variable = self._named("parameters", name)
         kinds, needed = _VALUES.get(variable.type, ((int,), "a whole number"))
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            _refuse(
-                "parameters", variable, f"is of type {variable.type}; give {needed}, not {value!r}"
-            )
+            _refuse("parameters", variable, f"is of type {variable.type}; give {needed}, not {value!r}")
         if variable.causality == "input":
             _refuse("parameters", variable, "is an input; its value at rest is operating_input")
         if why := _not_settable(variable):

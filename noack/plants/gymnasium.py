@@ -20,9 +20,7 @@ from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.section import Positive, Row, Rows, require_length, require_shape
 from noack.settings.user_files import FileSettings, UserCode, real_vector, unchanged
 
-Indices = Annotated[
-    tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, max_length=MAX_DIMENSION)
-]
+Indices = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 _OBSERVATION = "observation"
 _MUJOCO = ("data.qpos", "data.qvel")
 _ALIKE = 1e-6
@@ -141,9 +139,13 @@ class Environment:
         is_mujoco = not hasattr(self._own, "state") and hasattr(self._own, "init_qpos")
         self._names = settings.state or (_MUJOCO if is_mujoco else ("state",))
         if self._names == _MUJOCO:
+            mujoco = import_module("mujoco")
             # Otherwise MuJoCo starts again from its initial state when a motion diverges.
-            bits = import_module("mujoco").mjtDisableBit
-            self._own.model.opt.disableflags |= int(getattr(bits, "mjDSBL_AUTORESET", 0))
+            disabled = int(getattr(mujoco.mjtDisableBit, "mjDSBL_AUTORESET", 0))
+            self._own.model.opt.disableflags |= disabled
+            # It would print a line for each such step, and write MUJOCO_LOG.TXT into the current
+            # folder. That a motion has diverged is reported anyway.
+            mujoco.set_mju_user_warning(lambda text: None)
             self._own.set_state(self._own.init_qpos, self._own.init_qvel)
         size, actions = len(self._state()), int(np.prod(space.shape))
         self._entries = np.arange(size) if settings.entries is None else np.array(settings.entries)

@@ -127,8 +127,7 @@ class PlantSettings(ScenarioSection):
         for what, names, count in (("states", self.states, n), ("inputs", self.inputs, m)):
             if names and len(names) != count:
                 raise ValueError(
-                    f"plant.system: it has {len(names)} {what} ({', '.join(names)}); "
-                    f"the model has {count}"
+                    f"plant.system: it has {len(names)} {what} ({', '.join(names)}); the model has {count}"
                 )
 
     def require_installed(self) -> None:
@@ -222,9 +221,12 @@ class OdeSystem:
 
         self._integrator = ode(self._guarded)
         self._integrator.set_integrator(
-            "dopri5", rtol=equations.relative, atol=equations.absolute, nsteps=_MAX_STEPS,
+            "dopri5",
+            rtol=equations.relative,
+            atol=equations.absolute,
+            nsteps=_MAX_STEPS,
             verbosity=-1,
-        )  # fmt: skip
+        )
 
     @property
     def x(self) -> Vector:
@@ -257,9 +259,7 @@ class OdeSystem:
         if not np.allclose(output(self._state + off) - here, off, rtol=0.0, atol=1e-9):
             return None
         try:
-            rates = self._equations.derivative(
-                0.0, self._state + (x - here), self._equations.physical(u)
-            )
+            rates = self._equations.derivative(0.0, self._state + (x - here), self._equations.physical(u))
         except (ArithmeticError, ValueError):  # outside the equations' domain
             return np.full_like(here, np.nan)
         return np.asarray(rates, dtype=np.float64)
@@ -304,9 +304,7 @@ class OdeSystem:
             escaped = not np.linalg.norm(z) < _ESCAPE * np.linalg.norm(self._state)
         if np.isfinite(slope).all() and not escaped:
             why = _GAVE_UP.get(code, "the tolerance cannot be met")
-            raise SystemFailedError(
-                f"the plant's equations cannot be integrated at {t_s:.6g} s: {why}"
-            )
+            raise SystemFailedError(f"the plant's equations cannot be integrated at {t_s:.6g} s: {why}")
 
     def _guarded(self, t_s: float, z: Vector, v: Vector) -> Sequence[float] | Vector:
         """Return f, or NaN after an exception: an exception cannot stop the integrator."""

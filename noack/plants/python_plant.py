@@ -20,14 +20,7 @@ from noack.plants.plant_settings import (
     PlantSystem,
     SystemFailedError,
 )
-from noack.settings.user_files import (
-    ClassSettings,
-    UserCode,
-    new_instance,
-    read_only,
-    real_vector,
-    user_code,
-)
+from noack.settings.user_files import ClassSettings, UserCode, new_instance, read_only, real_vector, user_code
 
 _PLACE = "plant.system"
 _START_TOLERANCE = 1e-6
@@ -113,9 +106,7 @@ class PythonSystem:
         if z0.ndim != 1:
             raise ValueError(f"state(x0) has shape {z0.shape}; a vector is needed")
         if self._recorded and self._recorded != len(z0):
-            raise ValueError(
-                f"z has {len(z0)} entries; plant.system.on_record names {self._recorded}"
-            )
+            raise ValueError(f"z has {len(z0)} entries; plant.system.on_record names {self._recorded}")
 
         def derivative(t_s: float, z: Vector, u: Vector) -> Vector:
             with self._user_code():
@@ -126,9 +117,7 @@ class PythonSystem:
 
         derivative(0.0, z0, np.zeros(m))  # report its errors before the run
         output = plant.output if hasattr(plant, "output") else np.copy
-        equations = PlantEquations(
-            derivative, lambda _: z0, output=output, is_recorded=bool(self._recorded)
-        )
+        equations = PlantEquations(derivative, lambda _: z0, output=output, is_recorded=bool(self._recorded))
         return OdeSystem(equations, x0)
 
 

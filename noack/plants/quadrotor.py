@@ -20,8 +20,12 @@ class QuadrotorSettings(EquationSettings):
         "v_x, m/s", "v_y, m/s", "v_z, m/s",
         "roll rate p, rad/s", "pitch rate q, rad/s", "yaw rate r, rad/s",
     )  # fmt: skip
-    inputs: ClassVar = ("thrust beyond the weight, N", "roll torque, N m",
-                        "pitch torque, N m", "yaw torque, N m")  # fmt: skip
+    inputs: ClassVar = (
+        "thrust beyond the weight, N",
+        "roll torque, N m",
+        "pitch torque, N m",
+        "yaw torque, N m",
+    )
     scenario: ClassVar = "quadrotor_hover"
 
     kind: Literal["quadrotor"]

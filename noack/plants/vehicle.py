@@ -32,13 +32,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import EquationSettings, PlantEquations
 from noack.plants.systems import jump_integrator
-from noack.plants.systems.code_cache import (
-    CALLED_BY_CODE,
-    cache_folder,
-    compiler,
-    is_kept,
-    while_compiling,
-)
+from noack.plants.systems.code_cache import CALLED_BY_CODE, cache_folder, compiler, is_kept, while_compiling
 from noack.plants.systems.jump_integrator import Work, advance, buffers
 from noack.settings.section import Positive
 
@@ -79,8 +73,11 @@ class VehicleSettings(EquationSettings):
     """
 
     states: ClassVar = (
-        "lateral velocity V, m/s", "yaw rate r, rad/s", "yaw psi, rad", "lateral position Y_g, m",
-    )  # fmt: skip
+        "lateral velocity V, m/s",
+        "yaw rate r, rad/s",
+        "yaw psi, rad",
+        "lateral position Y_g, m",
+    )
     inputs: ClassVar = ("steering angle, rad",)
     needs: ClassVar = ("vehiclemodels", "vehicle")
     scenario: ClassVar = "lane_vehicle"
@@ -136,9 +133,7 @@ class VehicleSettings(EquationSettings):
                 'needs; take model = "kinematic" or another vehicle'
             )
         if self.friction != 1 and self.model in ("kinematic", "single_track"):
-            raise ValueError(
-                f'friction: the model "{self.model}" has none; take "drift" or "multi_body"'
-            )
+            raise ValueError(f'friction: the model "{self.model}" has none; take "drift" or "multi_body"')
         return self
 
     def prepare(self) -> None:
@@ -273,9 +268,7 @@ class CompiledVehicle:
         slope: Vector = self._work.slopes[0].copy()
         return slope
 
-    def advance(
-        self, z: Vector, v: Vector, duration_s: float, tolerances: tuple[float, float]
-    ) -> int:
+    def advance(self, z: Vector, v: Vector, duration_s: float, tolerances: tuple[float, float]) -> int:
         """Advance z in place; return a status code of the integrator.
 
         Args:
@@ -324,9 +317,13 @@ def compiled_dynamics(model: str) -> Compiled | None:
         _print(while_compiling("the vehicle's equations", kept=_folder(model) is not None))
     compiled = _compiled(model)
     example = (
-        np.zeros(1), np.zeros(4), _record(library("vehicle_parameters", "VehicleParameters")()),
-        0.0, (0.0, 0.0), buffers(1, _WHEELS),
-    )  # fmt: skip
+        np.zeros(1),
+        np.zeros(4),
+        _record(library("vehicle_parameters", "VehicleParameters")()),
+        0.0,
+        (0.0, 0.0),
+        buffers(1, _WHEELS),
+    )
     try:
         compiled.compile(tuple(map(numba.typeof, example)))
     except NumbaError as error:  # numba may not support another version of the library

@@ -103,9 +103,7 @@ def decode_probe(data: bytes) -> ProbeDatagram:
     fields = _BODY.unpack_from(data, _BODY_AT)
     if reserved or kind not in ProbeKind.__members__.values():
         raise ValueError("impossible")
-    found = ProbeDatagram._make(
-        (ProbeKind(kind), *fields[:-1], int.from_bytes(fields[-1], "little"))
-    )
+    found = ProbeDatagram._make((ProbeKind(kind), *fields[:-1], int.from_bytes(fields[-1], "little")))
     possible = (
         found.sequence <= MAX_PROBES
         and found.planned <= MAX_PROBES

@@ -149,10 +149,13 @@ COMMON = (
 
 _MODEL_TIME = Column("model_t_ns", "ns", "time of the controller's model")
 _CHANGE = (
-    Column("since_ns", "ns", "from when on the change is in force in this process: T, or later if "
-           "it was received too late"),
+    Column(
+        "since_ns",
+        "ns",
+        "from when on the change is in force in this process: T, or later if it was received too late",
+    ),
     _bytes("change", CHANGE_BYTES, "the settings by their keys, as JSON, padded with zero bytes"),
-)  # fmt: skip
+)
 
 
 def clock_table(role: str) -> str:

@@ -133,9 +133,7 @@ class Node:
     def subscription(self, topic: str) -> "zenoh.Subscriber[Handler[zenoh.Sample]]":
         """Add a topic that this node receives; the newest messages wait."""
         self._end("MS", topic)
-        return self._session.declare_subscriber(
-            topic_key(self._domain, topic), RingChannel(_WAITING)
-        )
+        return self._session.declare_subscriber(topic_key(self._domain, topic), RingChannel(_WAITING))
 
     def _entity(self, kind: str) -> str:
         number = len(self._tokens)  # the node is 0, its ends count from 1
@@ -176,9 +174,7 @@ class Exchange:
         self._answers, self._questions = node.subscription(answer), node.publisher(ask)
         self._topics, self._frame = (ask, answer), frame
 
-    def ask(
-        self, entries: Entries, count: int, timeout_s: float, *, again_s: float | None = None
-    ) -> Entries:
+    def ask(self, entries: Entries, count: int, timeout_s: float, *, again_s: float | None = None) -> Entries:
         """Send a question and wait for the answer, which has ``count`` values.
 
         Args:

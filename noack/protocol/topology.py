@@ -79,8 +79,7 @@ class LoopProtocol:
 PROTOCOLS: Mapping[str, LoopProtocol] = {
     "none": LoopProtocol(
         acknowledges=False,
-        states_caption="At every event x_s jumps to {known}; x_c does so only when the update "
-        "arrives. ",
+        states_caption="At every event x_s jumps to {known}; x_c does so only when the update arrives. ",
         error_caption="The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset when it exceeds the "
         "threshold. The controller's error ‖e_c‖ = ‖x_c − x‖ may exceed the threshold while "
         "packets are lost; no process of the loop can measure it.",
@@ -89,8 +88,7 @@ PROTOCOLS: Mapping[str, LoopProtocol] = {
     ),
     "ack": LoopProtocol(
         acknowledges=True,
-        states_caption="x_c jumps to {known} when an update arrives, x_s when its acknowledgement "
-        "arrives. ",
+        states_caption="x_c jumps to {known} when an update arrives, x_s when its acknowledgement arrives. ",
         error_caption="The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset by acknowledgements; without "
         "one, the sensor transmits repeatedly. The controller's error is ‖e_c‖ = ‖x_c − x‖.",
         summary="**Updates are acknowledged.**",

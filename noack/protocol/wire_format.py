@@ -43,10 +43,16 @@ TIMES_NS = 2**62
 _HEADER = struct.Struct("<2sBBHHQQq")
 HEADER_ROW = np.dtype(
     [
-        ("magic", "S2"), ("version", "u1"), ("flow", "u1"), ("dimension", "<u2"), ("loop", "<u2"),
-        ("run_id", "<u8"), ("sequence", "<u8"), ("t_ns", "<i8"),
+        ("magic", "S2"),
+        ("version", "u1"),
+        ("flow", "u1"),
+        ("dimension", "<u2"),
+        ("loop", "<u2"),
+        ("run_id", "<u8"),
+        ("sequence", "<u8"),
+        ("t_ns", "<i8"),
     ]
-)  # fmt: skip
+)
 """The same as a row of an array."""
 HEADER_BYTES = _HEADER.size
 MAX_DATAGRAM_BYTES = HEADER_BYTES + 8 * MAX_DIMENSION + TAG_BYTES
@@ -195,9 +201,7 @@ class Wire:
 
     def __init__(self, run_id: int, key: bytes, *, encrypted: bool = False) -> None:
         require_key(key)
-        self.core = ffi.new(
-            "noack_wire *", {"run_id": _signed(run_id), "encrypted": int(encrypted)}
-        )
+        self.core = ffi.new("noack_wire *", {"run_id": _signed(run_id), "encrypted": int(encrypted)})
         core.noack_wire_key(self.core, key)
         self.seal = EncryptedSeal(key) if encrypted else None
         """What encrypts and decrypts."""
@@ -219,8 +223,7 @@ class Encoder:
                 raise ValueError(f"an acknowledgement carries no vector of shape {vector.shape}")
         elif vector.ndim != 1 or not 1 <= vector.size <= MAX_DIMENSION:
             raise ValueError(
-                f"a datagram carries a vector of 1 to {MAX_DIMENSION} entries, "
-                f"not shape {vector.shape}"
+                f"a datagram carries a vector of 1 to {MAX_DIMENSION} entries, not shape {vector.shape}"
             )
         own = self._message
         try:

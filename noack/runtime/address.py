@@ -26,8 +26,7 @@ def parse_address(text: str, what: str, like: Address | None = None) -> Address:
     if found is None or int(found["port"]) > 65_535:
         hint = "; put an IPv6 address in brackets" if text.count(":") > 1 else ""
         raise CallerError(
-            f"{what}: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; "
-            f"found {text!r}{hint}"
+            f"{what}: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; found {text!r}{hint}"
         )
     family = socket.AF_INET if like is None else family_of(like)
     host = found["six"] or found["host"] or ("::1" if family == socket.AF_INET6 else LOOPBACK)

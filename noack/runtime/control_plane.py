@@ -119,9 +119,7 @@ def session_config(path: str, *, listen: bool) -> zenoh.Config:
     return config
 
 
-def answer_to(
-    session: zenoh.Session, key: str, question: str | bytes, timeout_s: float
-) -> str | None:
+def answer_to(session: zenoh.Session, key: str, question: str | bytes, timeout_s: float) -> str | None:
     """Send a request to the listening session and return its answer; None without one in time.
 
     Raise CallerError if the request was refused as wrong.
@@ -271,9 +269,7 @@ class ControlPlane:
         """Send a message to the subscribers of a key."""
         key = self.key(*parts)
         sent_as = label(key, header)
-        self.session.put(
-            key, content, attachment=sent_as, priority=priority, congestion_control=congestion
-        )
+        self.session.put(key, content, attachment=sent_as, priority=priority, congestion_control=congestion)
 
     def request_stop(self, reason: str) -> None:
         """Ask all processes of the run to stop."""

@@ -45,9 +45,12 @@ def run_machines(process: RunProcess, machines: LoopMachines) -> None:
         PeerError: the run never started, or the system refused a socket for a peer.
     """
     driver = LiveDriver(
-        machines, process.wire, admitted_ns=process.admitted_ns, spin_ns=process.spin_ns,
+        machines,
+        process.wire,
+        admitted_ns=process.admitted_ns,
+        spin_ns=process.spin_ns,
         rest_ns=process.rest_ns,
-    )  # fmt: skip
+    )
     with process.open_socket() as endpoint:
         addresses = process.join(endpoint.getsockname()[:2])
         channel = LoopChannel(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
@@ -70,9 +73,7 @@ def ends_of(process: RunProcess, addresses: Mapping[str, Address]) -> Ends:
     return {
         "source": addresses[sender_to(role, RECEIVES[role], network)],
         "destination": addresses[receiver_of(role, SENDS[role], network)],
-        "acknowledged_by": (
-            addresses["netem"] if answers and role == ENDS[answer].receiver else None
-        ),
+        "acknowledged_by": (addresses["netem"] if answers and role == ENDS[answer].receiver else None),
         "acknowledges_to": addresses["netem"] if answers and role == ENDS[answer].sender else None,
     }
 
@@ -107,11 +108,14 @@ class LiveDriver:
         self.core: CData = ffi.new(
             "noack_driver *",
             {
-                "process": machines.core, "wire": wire.core[0], "clock": {"speed": 1.0},
-                "spin_ns": spin_ns, "rest_ns": rest_ns,
+                "process": machines.core,
+                "wire": wire.core[0],
+                "clock": {"speed": 1.0},
+                "spin_ns": spin_ns,
+                "rest_ns": rest_ns,
                 "scratch": ffi.cast("void *", -(-self._scratch.ctypes.data // 64) * 64),
             },
-        )  # fmt: skip
+        )
         for machine, phase_ns in zip(self._each_machine(), machines.phases_ns, strict=True):
             machine.received.not_before_ns = admitted_ns - phase_ns
             machine.acknowledgements.not_before_ns = admitted_ns - phase_ns

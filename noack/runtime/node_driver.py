@@ -5,10 +5,12 @@ settings: then noack is no longer in the path of the loop. It returns rows of th
 by frames (``enum noack_node_frame`` in native/noack.h, docs/node.md). Their place is the core's
 process of the same loop, so that everything else is as with the core's own driver.
 
-The program ends when its standard input does, and is killed if this process dies.
+The program ends when its standard input does, and is killed if this process dies. What it has
+started itself is killed with it at the end of the run, as far as it stayed in its process group.
 """
 
 import ctypes
+import os
 import select
 import signal
 import socket
@@ -36,7 +38,13 @@ from noack.settings.user_files import unchanged
 _PR_SET_PDEATHSIG = 1
 _PATIENCE_S = 10.0
 """Longest wait for the program's first line, and for its end."""
+_STUCK_S = 1.0
+"""A program that is late has stopped its ticks if the last one came longer ago than this."""
+_GREETING_BYTES = 200
 _READ_BYTES = 2**20
+_READS = 16
+"""Most reads of this size at once: a program may send faster than its frames are processed."""
+_LOOK_S = 0.05
 _ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
 _COPIED = (
     *("has_point", "acknowledges", "predictions", "carries_model"),
@@ -46,9 +54,7 @@ _HEAD = struct.Struct("<qq")
 _GREETING = f"noack node {core.NOACK_NODE_VERSION} {ffi.sizeof('noack_node_settings')}"
 
 
-def run_program(
-    process: RunProcess, machines: LoopMachines, settings: ProgramControllerSettings
-) -> None:
+def run_program(process: RunProcess, machines: LoopMachines, settings: ProgramControllerSettings) -> None:
     """Join the run, let a program drive its controller to the horizon, and report.
 
     Raises:
@@ -68,11 +74,13 @@ class NodeDriver(LiveDriver):
         self, process: RunProcess, machines: LoopMachines, settings: ProgramControllerSettings
     ) -> None:
         super().__init__(machines, process.wire, admitted_ns=process.admitted_ns)
-        self._named = f'controller.file = "{settings.file}"'
+        # The file's name alone: the process is given a copy in the run directory.
+        self._named = f"controller.file ({Path(settings.file).name})"
         self._key, self._sockets = process.ticket.key, list[socket.socket]()
         self._clock, self._sent_clock = RunClock(0), b""
         self._to_send, self._received = bytearray(), bytearray()
-        self._foreign = 0
+        self._foreign, self._tick_s = 0, time.monotonic()
+        self._is_closed = False
         tables = machines.core.tables
         rows = {kind: tables[kind].row_bytes - core.NOACK_LOOP_BYTES for kind in _ROWS}
         counts = ffi.sizeof("noack_node_counts")
@@ -82,19 +90,22 @@ class NodeDriver(LiveDriver):
         with its:
             self._program = self._started(unchanged(settings, "controller"), settings.runner, its)
 
-    def _started(
-        self, path: Path, runner: Sequence[str], its: socket.socket
-    ) -> "subprocess.Popen[bytes]":
+    def _started(self, path: Path, runner: Sequence[str], its: socket.socket) -> "subprocess.Popen[bytes]":
         prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
         try:
             return subprocess.Popen(
                 [*runner, str(path)],
                 stdin=its.fileno(),
                 stdout=its.fileno(),
+                process_group=0,
                 # Not only the end of its input: the program may hang, or be stopped.
                 preexec_fn=partial(prctl, _PR_SET_PDEATHSIG, signal.SIGKILL),
             )
         except OSError as error:
+            if runner:
+                raise CallerError(
+                    f'controller.runner = "{runner[0]}": cannot be started: {error.strerror}'
+                ) from None
             raise CallerError(
                 f"{self._named}: cannot be started: {error.strerror}; it must be executable (chmod "
                 "+x), and of this processor, or controller.runner names what runs it"
@@ -102,12 +113,7 @@ class NodeDriver(LiveDriver):
 
     def __enter__(self) -> Self:
         """Wait for the program's first line; raise CallerError if it is not that of a node."""
-        line = b""
-        self._own.settimeout(_PATIENCE_S)
-        with suppress(TimeoutError):
-            while not line.endswith(b"\n") and len(line) < 200 and (one := self._own.recv(1)):
-                line += one
-        text = line.decode(errors="replace").strip()
+        text = self._first_line().decode(errors="replace").strip()
         if text != _GREETING:
             how = f"says {shortened(text)!r}" if text else self._how_it_ended()
             self.__exit__()
@@ -118,8 +124,20 @@ class NodeDriver(LiveDriver):
         self._own.setblocking(False)
         return self
 
+    def _first_line(self) -> bytes:
+        line, until_s = b"", time.monotonic() + _PATIENCE_S
+        with suppress(TimeoutError):
+            while not line.endswith(b"\n") and len(line) < _GREETING_BYTES:
+                self._own.settimeout(max(until_s - time.monotonic(), 1e-6))
+                if not (one := self._own.recv(1)):
+                    self._is_closed = True
+                    break
+                line += one
+        return line
+
     def __exit__(self, *_: object) -> None:
-        self._program.kill()
+        with suppress(ProcessLookupError):
+            os.killpg(self._program.pid, signal.SIGKILL)
         self._program.wait()
         self._own.close()
 
@@ -167,8 +185,7 @@ class NodeDriver(LiveDriver):
         )
         settings = ffi.new("noack_node_settings *", numbers)
         return bytes(ffi.buffer(settings)) + b"".join(
-            bytes(ffi.buffer(array, 8 * size)) if array else bytes(8 * size)
-            for array, size in arrays
+            bytes(ffi.buffer(array, 8 * size)) if array else bytes(8 * size) for array, size in arrays
         )
 
     def drive(self, until_ns: int, sink: RecordSink) -> None:
@@ -192,19 +209,28 @@ class NodeDriver(LiveDriver):
     def finish(self, sink: RecordSink) -> None:
         """Let the program end; take all that it has done.
 
-        Raise PeerError if it does not end, or fails.
+        Raise PeerError if it does not end, or fails, or has stopped its ticks before the horizon.
         """
-        until_s, goes_on = time.monotonic() + _PATIENCE_S, True
+        began_s, now_ns, goes_on = time.monotonic(), self._clock.now_ns(), True
+        until_s = began_s + _PATIENCE_S
         while goes_on and (wait_s := until_s - time.monotonic()) > 0:
             if not self._to_send:
                 with suppress(OSError):  # it has ended
                     self._own.shutdown(socket.SHUT_WR)
-            goes_on = self._exchange(wait_s, select.POLLIN)
+            goes_on = self._exchange(min(wait_s, _LOOK_S), select.POLLIN)
             self._take_frames(sink)
         self._pass_rows(sink)
         why = self._how_it_ended()
         if goes_on or self._program.returncode != 0:
             raise PeerError(f"{self._named}: {why}")
+        due_ns = self.next_deadline_ns()
+        late_s = 0.0 if due_ns is None else (now_ns - due_ns) / NS_PER_S / self._clock.speed
+        if min(late_s, began_s - self._tick_s) > _STUCK_S:
+            done = self.machines.machines[0].machine.step
+            raise PeerError(
+                f"{self._named}: has sent {done} ticks, and is {late_s:.1f} s late with the next; "
+                "it must send the row of each tick"
+            )
 
     def _put(self, kind: int, content: bytes) -> None:
         self._to_send += _HEAD.pack(kind, len(content)) + content
@@ -213,21 +239,26 @@ class NodeDriver(LiveDriver):
         """Wait, then send and receive; return whether the program may send more.
 
         Its rows do not end the wait, unless ``wake`` is POLLIN: they would take time of its core.
+        The program may have ended while another one, which it has started, keeps its stream.
         """
         poll = select.poll()
         poll.register(self._own, wake | (select.POLLOUT if self._to_send else 0))
         poll.poll(1000 * wait_s)
+        goes_on = self._program.poll() is None
         with suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
             while self._to_send:
                 del self._to_send[: self._own.send(self._to_send)]
         try:
-            while data := self._own.recv(_READ_BYTES):
+            for _ in range(_READS):
+                if not (data := self._own.recv(_READ_BYTES)):
+                    self._is_closed = True
+                    break
                 self._received += data
         except BlockingIOError:
-            return True
+            return goes_on
         except ConnectionResetError:
-            pass
-        return False
+            self._is_closed = True
+        return not self._is_closed
 
     def _take_frames(self, sink: RecordSink) -> None:
         """Put the complete frames where the core's driver puts what they have."""
@@ -267,16 +298,20 @@ class NodeDriver(LiveDriver):
             table.count += 1
             if kind == core.NOACK_TICKS:
                 sequence = struct.unpack_from("<q", content, 8)[0]
-                if not machine.first_number <= sequence < 2**62:
-                    raise PeerError(f"{self._named}: has sent a tick with the number {sequence}")
-                machine.step = sequence - machine.first_number + 1
+                if sequence != (due := machine.first_number + machine.step):
+                    raise PeerError(f"{self._named}: has sent tick {sequence} in place of {due}")
+                machine.step += 1
+                self._tick_s = time.monotonic()
             if table.count == table.places:
                 self._pass_rows(sink)
 
     def _how_it_ended(self) -> str:
+        """Return how; or that it has not, after its stream has ended or after a wait for it."""
         try:
-            code = self._program.wait(_PATIENCE_S)
+            code = self._program.wait(_PATIENCE_S if self._is_closed else 0.0)
         except subprocess.TimeoutExpired:
+            if self._is_closed:
+                return "the program has closed its stream, but has not ended"
             return f"the program has not answered for {_PATIENCE_S:g} s"
         how = f"exit status {code}"
         if code < 0:  # real-time signals have no names

@@ -105,9 +105,7 @@ def open_private(*inside: str, create: bool = False) -> Iterator[PrivateFolder]:
     """
     path = private_folder()
     if not path.parent.is_dir():
-        raise CallerError(
-            f"{path.parent}: no such folder; set XDG_RUNTIME_DIR to a folder of yours"
-        )
+        raise CallerError(f"{path.parent}: no such folder; set XDG_RUNTIME_DIR to a folder of yours")
     with ExitStack() as stack:
         descriptor: int | None = None
         for folder in (path, *(path := path / name for name in inside)):
@@ -128,9 +126,7 @@ def _open_folder(path: Path, name: Path | str, parent: int | None, *, create: bo
             raise CallerError(f"{path}: cannot be made ({error.strerror})") from None
     wrong = CallerError(f"{path}: must be a folder of yours, no link, closed to others (mode 700)")
     try:
-        descriptor = os.open(
-            name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent
-        )
+        descriptor = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent)
     except FileNotFoundError:
         raise
     except OSError:  # a link, no folder, or one that we may not read

@@ -48,9 +48,7 @@ _LAST_PLACE = 3
 _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 _LARGE_BYTES = 16 * 2**20
 _MAPPINGS = Path("/proc/self/smaps")
-_MAPPING = re.compile(
-    r"^([0-9a-f]+)-([0-9a-f]+) (...)(?s:.*?)^Shared_Dirty: +([0-9]+)", re.MULTILINE
-)
+_MAPPING = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (...)(?s:.*?)^Shared_Dirty: +([0-9]+)", re.MULTILINE)
 
 
 Arguments = TypeVarTuple("Arguments")
@@ -169,9 +167,7 @@ def _pass_on(outputs: Sequence[Record | Notice], sink: RecordSink) -> None:
 
 
 @contextmanager
-def realtime(
-    enabled: bool, fifo_priority: int, place: int | None = None
-) -> Iterator[dict[str, str]]:
+def realtime(enabled: bool, fifo_priority: int, place: int | None = None) -> Iterator[dict[str, str]]:
     """Apply the real-time settings to the calling thread, and undo them with the context.
 
     ``place`` counts the processes along the loop from 0, the plant. The plant has the first core,
@@ -268,9 +264,7 @@ def lock_memory() -> None:
     for mapping in _mappings():
         if mapping.bytes <= _LARGE_BYTES:
             # Fails for special mappings, and before Linux 5.14: then each page is locked at its use
-            libc.madvise(
-                ctypes.c_void_p(mapping.first), ctypes.c_size_t(mapping.bytes), mapping.advice
-            )
+            libc.madvise(ctypes.c_void_p(mapping.first), ctypes.c_size_t(mapping.bytes), mapping.advice)
 
 
 class _Mapping(NamedTuple):

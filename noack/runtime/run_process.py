@@ -25,14 +25,7 @@ from typing import Protocol, TypeVar
 from setproctitle import setproctitle
 
 from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
-from noack.core.errors import (
-    CallerError,
-    ExitStatus,
-    NoackError,
-    NoAnswerError,
-    PeerError,
-    one_line,
-)
+from noack.core.errors import CallerError, ExitStatus, NoackError, NoAnswerError, PeerError, one_line
 from noack.core.process_limits import exhausted_limit, require_limits
 from noack.protocol.machine_interface import BEGINNING, RESTART, Notice, Record, Start
 from noack.protocol.record_tables import OWNER, clock_table
@@ -124,9 +117,7 @@ class RunProcess:
 
         Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses.
         """
-        request = AdmissionRequest(
-            instance=self.plane.instance, admission_pass=self.ticket.admission_pass
-        )
+        request = AdmissionRequest(instance=self.plane.instance, admission_pass=self.ticket.admission_pass)
         admission = self._request("admit", request, Admission, _ADMISSION_TIMEOUT_S)
         self.life.apply(Event.ADMIT)
         self.start = Start(admission.generation, admission.from_ns)
@@ -296,9 +287,7 @@ class RunProcess:
         reached_ns = self.clock.now_ns() - late_ns
         if late_ns and not self.stopping:
             late_s = late_ns / NS_PER_S
-            self.life.apply(
-                Event.STOP, f"overrun: {late_s:g} s late; reduce the speed or the rates"
-            )
+            self.life.apply(Event.STOP, f"overrun: {late_s:g} s late; reduce the speed or the rates")
         return reached_ns
 
     def _all_done(self, done: bool) -> bool:
@@ -347,9 +336,7 @@ class RunProcess:
             return "lost the connection to the run's coordinator"
         return None
 
-    def _news(
-        self, machine: Reconfigurable, now_ns: int, at_most: int | None
-    ) -> Sequence[Record | Notice]:
+    def _news(self, machine: Reconfigurable, now_ns: int, at_most: int | None) -> Sequence[Record | Notice]:
         """Pass announced changes on, and compare the clocks; return the outputs."""
         outputs: list[Record | Notice] = []
         for announced in self.updates.take(at_most) if self.role in CHANGEABLE else ():
@@ -388,13 +375,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that all processes have."""
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
-    where.add_argument(
-        "--invitation", type=Path, metavar="FILE", help="from `noack record --listen`"
-    )
+    where.add_argument("--invitation", type=Path, metavar="FILE", help="from `noack record --listen`")
     parser.add_argument(
-        "--runs", type=Path, default=_RUNS, metavar="DIRECTORY",
+        "--runs",
+        type=Path,
+        default=_RUNS,
+        metavar="DIRECTORY",
         help="of an invited process: where rows stay that cannot be sent to the recorder",
-    )  # fmt: skip
+    )
     parser.add_argument("--json", action="store_true", help="print the final report as JSON")
 
 
@@ -478,9 +466,7 @@ def _ticket(role: str, session: str, signals: Signals) -> Ticket:
         "a run on another host, give its --invitation; Ctrl-C ends",
     )
     if ticket is None:
-        raise PeerError(
-            f"no run to join in session {session!r}: start `noack record SCENARIO` first"
-        )
+        raise PeerError(f"no run to join in session {session!r}: start `noack record SCENARIO` first")
     print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
     return ticket
 

@@ -72,9 +72,7 @@ class SpoolWriter:
         try:
             yield
         except OSError as error:
-            raise MachineError(
-                f"{self._folder}: the record cannot be written: {why(error)}"
-            ) from None
+            raise MachineError(f"{self._folder}: the record cannot be written: {why(error)}") from None
 
     def require_present(self) -> None:
         """Raise MachineError if a file was deleted or moved: rows in deleted files are lost."""

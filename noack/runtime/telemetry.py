@@ -245,9 +245,7 @@ def persisted_rows(plane: ControlPlane, generation: int) -> Mapping[str, Sequenc
     return {}
 
 
-def deliver_report(
-    plane: ControlPlane, report: Mapping[str, object], telemetry: TelemetryBuffer
-) -> bool:
+def deliver_report(plane: ControlPlane, report: Mapping[str, object], telemetry: TelemetryBuffer) -> bool:
     """Send the final report to the recorder, and again the rows that it misses.
 
     Rows that a slow recorder misses after that are stored. Return whether nothing is left to do.

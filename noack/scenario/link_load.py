@@ -6,25 +6,9 @@ these, 1/M or 1 − m/K. Let b be the bits of loop k's datagram on the link, d t
 largest time between two of its transmissions. The datagrams that must pass need between Σ s b/D and
 Σ s b/d bits per second. For actuations d and D are the controller's period.
 
-Without constraints: if r bits per second exceed m = Σ b/(M d), the delay D in a tail-drop queue of
-Q places is bounded. Datagrams leave in their order, so those before the end of a transmission came
-within D. At most Q of them found a free place; of each loop, at most 1 + D/(M d) had to pass. Hence
-D is at most (Q max b + Σ b)/(r − m). If r is even at least e = Σ b/d, a queue that has been busy
-for t got at most 1 + t/d datagrams of each loop, and has sent r t bits: D is at most Σ b/r.
-
-Impairments before the queue delay a datagram by a time between two bounds that differ by J. It
-enters the queue in the order of its transmission, and after a time between these bounds, too. So
-what enters within t was transmitted within t + J. Then D is at most (Q max b + Σ b + m J)/(r − m),
-or (Σ b + e J)/r. If they may send datagrams twice, each counts twice in the second bound.
-
-A loop has slots of a static schedule for itself. Let W(n) be the longest time until n of them have
-begun; a round has c of them and takes T. The n-th datagram since none waited leaves within W(n) of
-the first, and was transmitted at least (n - 1) d - J after it. So D is at most the largest
-W(n) - (n - 1) d + J. If T <= c d, only n up to c count, since W(n + c) = W(n) + T. If datagrams may
-be sent twice, n - 1 is halved and rounded down.
-Without constraints, and if T <= c M d, there is another bound. A datagram that finds its queue full
-must pass. Of these, since the last datagram that found a place, the n-th leaves within W(Q + n) of
-that one, and (n - 1) M d - J lie between. So D is at most the largest W(Q + n) - (n - 1) M d + J.
+From d, M, the queue and what is before it follow bounds of the delay in a tail-drop queue and in
+the slots of a static schedule (docs/derivations.md, "The delay on a link"). J is by how much the
+delays before it can differ, and W(n) the longest time until n of a loop's slots have begun.
 
 A rate that chooses what it sends has a bound for each loop: noack/scenario/response_times.py.
 
@@ -91,6 +75,8 @@ class LinkLoad(NamedTuple):
     """The same, if each loop transmits as rarely as it can."""
     delay_bound_s: float | None
     """Bound of a datagram's delay in this queue, in the whole run; None: there is none."""
+    loop_bounds_s: tuple[tuple[str, float], ...] = ()
+    """The bounds of the loops that have one each, infinite if there is none: which loops, bound."""
 
 
 class DelayBound(NamedTuple):
@@ -130,9 +116,7 @@ def update_delay(scenario: Scenario) -> DelayBound:
         CallerError: as :func:`link_loads`.
     """
     delays, largest_s = _largest_delays(_stages(scenario)[0])
-    own_s = {
-        f"network.impairments.{place}": max(one) for place, one in enumerate(delays) if any(one)
-    }
+    own_s = {f"network.impairments.{place}": max(one) for place, one in enumerate(delays) if any(one)}
     certified_s = scenario.certificate.network_delay_s
     if certified_s is None:
         certified_s = scenario.network.link.longest_delay_s
@@ -170,6 +154,7 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
             continue
         before: LinkLoad | None = None
         delay_s = _known(delays[place])
+        by_loops = tuple(_by_loops(delays[place])) if len(delays[place]) > 1 else ()
         for begin, direction, loops in stages:
             window = _window(direction)
             bits = [int(one.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
@@ -179,22 +164,24 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
             )
             at_most_bps, at_least_bps = (_share(window) * bps for bps in needed_bps)
             load = LinkLoad(
-                begin, key, flow, window, one.rate_bps, at_most_bps, at_least_bps, delay_s
+                begin, key, flow, window, one.rate_bps, at_most_bps, at_least_bps, delay_s, by_loops
             )
             if before is None or load._replace(begin=before.begin) != before:
-                found += _loop_loads(load, delays[place])
+                found.append(load)
             before = load
     return found
 
 
-def _loop_loads(load: LinkLoad, delays_s: Sequence[float]) -> Iterator[LinkLoad]:
-    """Yield the load; if each loop has a bound, for the first loop with each bound."""
-    if len(delays_s) == 1:
-        yield load
-        return
-    firsts = {delay_s: loop for loop, delay_s in reversed([*enumerate(delays_s)])}
-    for delay_s, loop in sorted(firsts.items(), key=lambda item: item[1]):
-        yield load._replace(begin=f"{load.begin}loop {loop + 1}, ", delay_bound_s=_known([delay_s]))
+def _by_loops(delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
+    """Yield each bound of a delay, with the loops that have it, such as ``loops 1, 3 to 5``."""
+    for delay_s in dict.fromkeys(delays_s):
+        loops = {loop for loop, own_s in enumerate(delays_s, 1) if own_s == delay_s}
+        begins, ends = (
+            sorted(loops - {loop + 1 for loop in loops}),
+            sorted(loops - {loop - 1 for loop in loops}),
+        )
+        spans = (str(a) if a == b else f"{a} to {b}" for a, b in zip(begins, ends, strict=True))
+        yield f"loop{'s' * (len(loops) > 1)} {', '.join(spans)}", delay_s
 
 
 def _known(delays_s: Sequence[float]) -> float | None:
@@ -270,9 +257,7 @@ def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], float]
     return found, largest_s
 
 
-def _slot_delays_s(
-    one: Schedule, stages: Sequence[_Stage], spread_s: float, *, copied: bool
-) -> list[float]:
+def _slot_delays_s(one: Schedule, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> list[float]:
     """Return the bounds for the slots of each loop; see :func:`_queue_delay_s`."""
     least_s = [
         min(stage.loops[entry].least_s for stage in stages)
@@ -302,15 +287,12 @@ def _slot_delays_s(
 def _chosen_delays_s(one: Rate, chooses: Scheduler, stages: Sequence[_Stage]) -> list[float]:
     """Return the bounds for each loop of a rate that chooses what it sends.
 
-    A change of the direction's settings makes the order of what waits final, so there is no bound.
+    A change of the direction's settings makes the order of what waits final, so that any may go first.
     """
     sections = range(len(stages[0].loops))
     loops = [entry for entry in sections for _ in range(stages[0].loops[entry].loops)]
-    if any(stage.direction.link != stages[0].direction.link for stage in stages):
-        return [math.inf] * len(loops)
-    least_ns = [
-        round(min(stage.loops[entry].least_s for stage in stages) * NS_PER_S) for entry in sections
-    ]
+    changes = any(stage.direction.link != stages[0].direction.link for stage in stages)
+    least_ns = [round(min(stage.loops[entry].least_s for stage in stages) * NS_PER_S) for entry in sections]
     sent_ns = [
         max(-(-int(one.line_bits(demand.payload_bytes)) * NS_PER_S // one.rate_bps), 1)
         for demand in stages[0].loops
@@ -321,7 +303,9 @@ def _chosen_delays_s(one: Rate, chooses: Scheduler, stages: Sequence[_Stage]) ->
         if kind not in found:
             own = Sender(least_ns[entry], sent_ns[entry])
             others = Counter(
-                Sender(least_ns[other], sent_ns[other], chooses.yields_ns(loop, number))
+                Sender(
+                    least_ns[other], sent_ns[other], math.inf if changes else chooses.yields_ns(loop, number)
+                )
                 for number, other in enumerate(loops)
                 if number != loop
             )
@@ -358,25 +342,28 @@ def _queue_delay_s(one: Rate, stages: Sequence[_Stage], spread_s: float, *, copi
     return math.inf
 
 
-def require_capacity(scenario: Scenario) -> None:
-    """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass.
-
-    A schedule needs slots for each loop, and for no other.
-    """
+def require_slots(scenario: Scenario) -> None:
+    """Raise CallerError if a schedule has no slot for a loop, or one for another loop."""
     loops = sum(section.count for section in loop_sections(scenario))
     for path, section in scenario.network.directions.items():
         for place, one in enumerate(section.impairments):
             missing = set(range(1, loops + 1)) - set(one.order) if isinstance(one, Schedule) else ()
             if isinstance(one, Schedule) and (missing or max(one.order) > loops):
                 wrong = (
-                    f"loop {min(missing)} has no slot"
-                    if missing
-                    else f"a slot is for loop {max(one.order)}"
+                    f"loop {min(missing)} has no slot" if missing else f"a slot is for loop {max(one.order)}"
                 )
                 raise CallerError(
                     f"{path}.impairments.{place}.order: {wrong}; the run has the loops "
                     f"1 to {loops}, and each needs a slot (0: an idle slot)"
                 )
+
+
+def require_capacity(scenario: Scenario) -> None:
+    """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass.
+
+    So it does if a schedule does not fit the loops.
+    """
+    require_slots(scenario)
     for load in link_loads(scenario):
         if load.mandatory_at_least_bps > load.rate_bps:
             losses, packets = load.window

@@ -29,9 +29,7 @@ def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
     """
     command = python_command("-m", __name__, most_entries)
     try:
-        done = subprocess.run(
-            command, input=content, capture_output=True, timeout=_PATIENCE_S, check=False
-        )
+        done = subprocess.run(command, input=content, capture_output=True, timeout=_PATIENCE_S, check=False)
     except subprocess.TimeoutExpired:
         raise ValueError("it cannot be read in time") from None
     if done.returncode == _MODERN:
@@ -56,10 +54,7 @@ def _main() -> int:
         read = loadmat(file, variable_names=names)  # type: ignore[arg-type]
     except NotImplementedError:
         return _MODERN
-    found = {
-        name: read[name].toarray() if hasattr(read[name], "toarray") else read[name]
-        for name in names
-    }
+    found = {name: read[name].toarray() if hasattr(read[name], "toarray") else read[name] for name in names}
     np.savez(sys.stdout.buffer, allow_pickle=False, **found)
     return 0
 

@@ -291,9 +291,7 @@ def _numbers_of(name: str, value: ArrayLike) -> Matrix:
     except (TypeError, ValueError):
         raise CallerError(f"{name}: is not a matrix of real numbers") from None
     if found.ndim != 2 or not found.size or not np.isfinite(found).all():
-        raise CallerError(
-            f"{name}: a matrix of finite numbers is needed, by rows: [[1, 2], [3, 4]]"
-        )
+        raise CallerError(f"{name}: a matrix of finite numbers is needed, by rows: [[1, 2], [3, 4]]")
     return found
 
 

@@ -52,11 +52,17 @@ def lane_following(
 
 
 def single_track_lane(
-    *, mass_kg: float = 1093.3, inertia_kg_m2: float = 1791.6,
-    front_m: float = 1.1562, rear_m: float = 1.4227,
-    front_n_per_rad: float = 129_697.0, rear_n_per_rad: float = 105_400.0,
-    speed_m_per_s: float = 15.0, look_ahead_m: float = 20.0, gain: float = 0.5,
-) -> NamedModel:  # fmt: skip
+    *,
+    mass_kg: float = 1093.3,
+    inertia_kg_m2: float = 1791.6,
+    front_m: float = 1.1562,
+    rear_m: float = 1.4227,
+    front_n_per_rad: float = 129_697.0,
+    rear_n_per_rad: float = 105_400.0,
+    speed_m_per_s: float = 15.0,
+    look_ahead_m: float = 20.0,
+    gain: float = 0.5,
+) -> NamedModel:
     """A car on a lane, as the linear single-track model (Riekert and Schunck, 1940).
 
     The car has mass m and moment of inertia I about the vertical axis. Its axles are at distances a

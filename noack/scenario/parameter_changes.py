@@ -17,14 +17,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import CHANGE_BYTES
-from noack.scenario.runtime_parameters import (
-    CONSTRAINTS,
-    LOSS,
-    MANSD,
-    SETPOINT,
-    text_of,
-    trigger_parameters,
-)
+from noack.scenario.runtime_parameters import CONSTRAINTS, LOSS, MANSD, SETPOINT, text_of, trigger_parameters
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_checks import with_settings
 from noack.scenario.sections import PlantSection
@@ -50,9 +43,7 @@ def settings_bytes(settings: ReadTable) -> bytes:
     """
     data = json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()
     if len(data) > CHANGE_BYTES:
-        raise CallerError(
-            f"a change has {len(data)} bytes as JSON; at most {CHANGE_BYTES} can be recorded"
-        )
+        raise CallerError(f"a change has {len(data)} bytes as JSON; at most {CHANGE_BYTES} can be recorded")
     return data.ljust(CHANGE_BYTES, b"\0")
 
 
@@ -73,18 +64,14 @@ def changed(scenario: Scenario, settings: ReadTable) -> Scenario:
     try:
         return with_settings(scenario, settings)
     except ValueError as error:
-        raise CallerError(
-            "\n".join(f"the change: {line}" for line in str(error).splitlines())
-        ) from None
+        raise CallerError("\n".join(f"the change: {line}" for line in str(error).splitlines())) from None
 
 
 def current_parameters(scenario: Scenario) -> Table:
     """Return the parameters that can be changed during a run, with their values."""
     trigger = scenario.trigger
     loss = scenario.network.loss.content()
-    values = {
-        key: getattr(trigger, key.removeprefix("trigger.")) for key in trigger_parameters(trigger)
-    }
+    values = {key: getattr(trigger, key.removeprefix("trigger.")) for key in trigger_parameters(trigger)}
     n, _ = scenario.model.dimensions
     setpoint = list(scenario.controller.setpoint or [0.0] * n)
     network = {
@@ -97,10 +84,7 @@ def current_parameters(scenario: Scenario) -> Table:
 
 def scheduled(scenario: Scenario) -> list[ParameterChange]:
     """Return the changes that a scenario schedules."""
-    return [
-        ParameterChange(number, one.at_ns, dict(one.set))
-        for number, one in enumerate(scenario.changes)
-    ]
+    return [ParameterChange(number, one.at_ns, dict(one.set)) for number, one in enumerate(scenario.changes)]
 
 
 def settings_key(resolved: Scenario) -> tuple[int, ...]:
@@ -160,13 +144,9 @@ class ChangeSchedule(Generic[Prepared]):
     ``prepare`` computes the data that the machine needs of a scenario, before it is in force.
     """
 
-    def __init__(
-        self, scenario: Scenario, prepare: Callable[[Scenario], Prepared] | None = None
-    ) -> None:
+    def __init__(self, scenario: Scenario, prepare: Callable[[Scenario], Prepared] | None = None) -> None:
         self._prepare = prepare
-        self._results: dict[
-            tuple[tuple[int, int], ...], tuple[Scenario, Prepared | None, ReadTable]
-        ] = {}
+        self._results: dict[tuple[tuple[int, int], ...], tuple[Scenario, Prepared | None, ReadTable]] = {}
         self._all = [AppliedParameters[Prepared](-(2**63), -1, {}, scenario, None)]
         self._taken = 1
         self.next_ns: int | None = None

@@ -15,15 +15,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observer_settings import EstimationModel, unobservable_mode
-from noack.protocol.record_tables import (
-    CLOCK_TABLES,
-    LOOP,
-    OWNER,
-    RecordShape,
-    entry_names,
-    largest,
-    tables,
-)
+from noack.protocol.record_tables import CLOCK_TABLES, LOOP, OWNER, RecordShape, entry_names, largest, tables
 from noack.scenario.scenario import Scenario, loop_scenario, loop_sections, loops_by_entry, loops_of
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.sections import AnyObserver, ModelSection
@@ -77,9 +69,7 @@ def resolve(scenario: Scenario) -> Scenario:
     """
     loops = loops_of(scenario)
     if len(loops) > 1:
-        raise CallerError(
-            f"{scenario.name}: it has {len(loops)} loops; give a scenario of one loop"
-        )
+        raise CallerError(f"{scenario.name}: it has {len(loops)} loops; give a scenario of one loop")
     return _resolved(loops)[0]
 
 
@@ -145,9 +135,15 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
             if is_linear:
                 drawn |= {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
             own_plant = plant.model_copy(update=drawn)
-        found.append(loop.model_copy(update={
-            "model": model, "plant": own_plant, "observer": None,
-        }))  # fmt: skip
+        found.append(
+            loop.model_copy(
+                update={
+                    "model": model,
+                    "plant": own_plant,
+                    "observer": None,
+                }
+            )
+        )
     if scenario.mode == "model":
         H = A_model + B_model @ K
         _require_finite("model", H, K.T, scenario.timing.controller_period_ns)
@@ -226,8 +222,7 @@ def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
     if not finite:
         sizes = ", ".join(f"{name} to {np.abs(M).max():.3g}" for name, M in (("A", A), ("B", B)))
         raise CallerError(
-            f"{key}: these matrices take one step to infinity, with entries of {sizes}; "
-            "check their units"
+            f"{key}: these matrices take one step to infinity, with entries of {sizes}; check their units"
         )
 
 
@@ -285,15 +280,18 @@ def shape_of(resolved: Scenario) -> RecordShape:
     n, m = resolved.model.dimensions
     disturbed = {one.at for one in resolved.plant.disturbances}
     return RecordShape(
-        n, m, acknowledged=resolved.protocol.acknowledges,
+        n,
+        m,
+        acknowledged=resolved.protocol.acknowledges,
         predictive=resolved.message_sizes.is_predictive,
         internal=len(resolved.plant.system.internal_names),
         predictions=resolved.controller.predictions,
-        disturbed_input="input" in disturbed, disturbed_state="state" in disturbed,
+        disturbed_input="input" in disturbed,
+        disturbed_state="state" in disturbed,
         outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
         inputs_reported=resolved.message_sizes.inputs_reported,
         clocks=resolved.clocks is not None,
-    )  # fmt: skip
+    )
 
 
 def network_tables() -> Mapping[str, np.dtype[np.void]]:
@@ -343,9 +341,7 @@ def true_model(resolved: Scenario) -> EstimationModel:
     Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
     _, Gd = discretise(loop.A_model, np.eye(loop.n), resolved.timing.plant_period_ns)
     C = plant.measurement.matrix(loop.n)
-    model = EstimationModel(
-        Ad, Bd, Gd, C, np.zeros_like(Ad), np.diag(noise.output), plant.measure_every
-    )
+    model = EstimationModel(Ad, Bd, Gd, C, np.zeros_like(Ad), np.diag(noise.output), plant.measure_every)
     return model._replace(Q=model.process_covariance(noise.at_state, noise.at_input))
 
 

@@ -1,26 +1,11 @@
 """The largest delay of a loop's datagrams on a link that chooses, when it is free, what it sends.
 
-A datagram that arrives at time a of a busy period of the link is sent after at most one other that
-was begun before, and after all of each loop j that arrive until a + δ_j, and until it is begun.
-With priorities δ_j is ∞ for a loop of a higher priority, 0 for one of the same and −∞ for one of a
-lower priority; for earliest deadline first it is the difference of the two loops' times to the
-deadline. Let d and d_j be the least times between two datagrams of a loop, c and c_j the times to
-send one, and b the longest c_j of the loops with a + δ_j < 0. The datagram is begun at the least w
-with
-
-    w = b + floor(a/d) c + Σ_j (1 + floor(min(w, a + δ_j)/d_j)) c_j   (a + δ_j ≥ 0),
-
-at the latest, and its delay is at most the largest w + c − a. The right-hand side changes with a
-only at k d and at k d_j − δ_j; in between w + c − a falls. No a matters beyond the longest busy
-period, the least t > 0 with t = max c_j + Σ ceil(t/d_j) c_j over the loop itself and those with
-δ_j > −∞. There is no bound if these need the whole rate.
-
-With priorities this is the response-time analysis of Davis, Burns, Bril and Lukkien (Controller
-Area Network schedulability analysis: refuted, revisited and revised, Real-Time Systems 35, 2007);
-with deadlines that of George, Rivierre and Spuri (Preemptive and non-preemptive real-time
-uniprocessor scheduling, INRIA, RR-2966, 1996), with a whole c_j as blocking time: of two datagrams
-that arrive at the same time at a free link, the one that is decided first is sent. Datagrams that
-are lost only shorten the wait of the others.
+docs/derivations.md, "The delay on a link", has the derivation and the names. With priorities this
+is the response-time analysis of Davis, Burns, Bril and Lukkien (Controller Area Network
+schedulability analysis: refuted, revisited and revised, Real-Time Systems 35, 2007); with deadlines
+that of George, Rivierre and Spuri (Preemptive and non-preemptive real-time uniprocessor scheduling,
+INRIA, RR-2966, 1996), with a whole c_j as blocking time: of two datagrams that arrive at the same
+time at a free link, the one that is decided first is sent.
 """
 
 import math
@@ -71,9 +56,7 @@ def _delay_ns(a: int, own: Sender, others: Mapping[Sender, int]) -> int:
     kinds = [(*one, count) for one, count in others.items() if a + one.after_ns >= 0]
 
     def begin_ns(w: int) -> int:
-        return earlier_ns + sum(
-            count * c * (1 + int(min(w, a + after)) // d) for d, c, after, count in kinds
-        )
+        return earlier_ns + sum(count * c * (1 + int(min(w, a + after)) // d) for d, c, after, count in kinds)
 
     return _least(begin_ns) + own.sent_ns - a
 

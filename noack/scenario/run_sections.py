@@ -104,8 +104,7 @@ class PortsSection(ScenarioSection):
             port = getattr(self, key)
             if port and port in taken:
                 raise ValueError(
-                    f"{key}: port {port} is already given to {taken[port]}; "
-                    "take another, or 0 for any"
+                    f"{key}: port {port} is already given to {taken[port]}; take another, or 0 for any"
                 )
             taken[port] = key
         return self

@@ -150,9 +150,7 @@ def loop_scenario(scenario: Scenario, section: LoopSection) -> Scenario:
     return loop
 
 
-def _with_parts(
-    scenario: Scenario, content: ReadTable, parts: Iterable[str], place: str = ""
-) -> Scenario:
+def _with_parts(scenario: Scenario, content: ReadTable, parts: Iterable[str], place: str = "") -> Scenario:
     """Return a scenario with other parts; raise ValueError, after the place, if one is invalid."""
     model = parts_model(frozenset(parts))
     try:

@@ -55,9 +55,7 @@ def check_sections(scenario: ScenarioTables) -> None:
     """Raise ValueError if two sections do not fit together; the message begins with the key."""
     timing = scenario.timing
     if timing.horizon_ns < timing.plant_period_ns:
-        raise ValueError(
-            f"horizon_s: shorter than one plant step ({timing.plant_period_ns / NS_PER_S} s)"
-        )
+        raise ValueError(f"horizon_s: shorter than one plant step ({timing.plant_period_ns / NS_PER_S} s)")
     if timing.measurement_period_ns > 10**9 * NS_PER_S:
         raise ValueError("plant.measure_every: more than 1e9 s between two measurements")
     _check_plant(scenario)
@@ -102,8 +100,7 @@ def check_setpoint(scenario: ScenarioTables) -> None:
         raise ValueError(f'{key}: not with controller.kind = "{scenario.controller.kind}"')
     if scenario.message_sizes.is_predictive:
         raise ValueError(
-            f"{key}: the plant's watchdog does not have it; "
-            'use plant.watchdog.policy = "hold" or "zero"'
+            f'{key}: the plant\'s watchdog does not have it; use plant.watchdog.policy = "hold" or "zero"'
         )
     try:
         input_at(*scenario.model.matrices, np.array(setpoint))

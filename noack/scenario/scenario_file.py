@@ -35,9 +35,7 @@ MOST_RECORDED_BYTES = 2**28
 """Largest size of a run's scenario file, which includes the losses and delays read from files."""
 
 
-def load(
-    path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.MOST_BYTES
-) -> Scenario:
+def load(path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.MOST_BYTES) -> Scenario:
     """Read and validate a scenario file.
 
     Args:
@@ -49,11 +47,15 @@ def load(
         CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
     """
     content = toml_file.read(path, Scenario, most_bytes)
-    keys = [_apply(content, override) for override in overrides]
+    given = [*overrides]
+    keys = [_apply(content, override) for override in given]
     try:
         return completed(content, path)
     except CallerError as error:
-        raise CallerError(_attributed(str(error), path, keys) if keys else str(error)) from None
+        lines = str(error)
+        for key, override in zip(keys, given, strict=True):
+            lines = _of_another_kind(lines, path, key, override.partition("=")[2])
+        raise CallerError(_attributed(lines, path, keys) if keys else lines) from None
 
 
 def completed(content: ReadTable, path: Path, source: str | None = None) -> Scenario:
@@ -129,9 +131,7 @@ def _loop_tables(path: Path, named: str) -> Table:
         raise CallerError(f"{named}: that file has loops itself; name a file of one loop")
     whole = with_matrices(content, path.parent, str(path))
     file = toml_file.validated(parts_model(frozenset(PARTS), others=True), whole, str(path))
-    tables = {
-        where: located(table, path.parent, f"{path}: {where}") for where, table in file_tables(file)
-    }
+    tables = {where: located(table, path.parent, f"{path}: {where}") for where, table in file_tables(file)}
     parts = set(PARTS)
     return with_tables(file, tables).model_dump(mode="json", exclude_none=True, include=parts)
 
@@ -158,6 +158,23 @@ def toml_text(content: ReadTable) -> str:
     """Return tables as TOML, with each row of numbers or names on one line."""
     text = tomli_w.dumps(content, indent=2)
     return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
+
+
+def _of_another_kind(lines: str, path: Path, key: str, value: str) -> str:
+    """Make one line of all mistakes that arise because only the kind of a table was set."""
+    table, _, kind = key.rpartition(".")
+    value, start = value.strip().strip("\"'"), re.escape(printable(f"{path}: {table}."))
+    unknown = re.findall(rf"^{start}(\w+) = .*: unknown key; .*", lines, re.MULTILINE)
+    if kind not in ("kind", "model", "policy") or not unknown:
+        return lines
+    missing = re.findall(rf"^{start}(\w+): missing.*", lines, re.MULTILINE)
+    others = re.sub(rf"^{start}\w+(: missing| = .*: unknown key; ).*\n?", "", lines, flags=re.MULTILINE)
+    needed = "".join(f", {one}=..." for one in missing)
+    line = (
+        f"--set {table}.{kind} = {value}: the file has {', '.join(unknown)} of another {kind}; "
+        f"set the table: --set '{table}={{{kind}=\"{value}\"{needed}}}'"
+    )
+    return "\n".join([line, *others.splitlines()])
 
 
 def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:

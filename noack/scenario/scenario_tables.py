@@ -89,9 +89,7 @@ class ScenarioTables(ScenarioSection):
             ("horizon", f"{self.horizon_s:g} s"),
         ]
         if self.loops:
-            loops = (
-                one.name if one.count == 1 else f"{one.count} x {one.name}" for one in self.loops
-            )
+            loops = (one.name if one.count == 1 else f"{one.count} x {one.name}" for one in self.loops)
             rows.append(("loops", ", ".join(loops)))
         return rows
 
@@ -141,10 +139,7 @@ class ScenarioTables(ScenarioSection):
 def _said(section: ScenarioSection, kind: str) -> str:
     """Describe a section by its kind, and its values that differ from the defaults."""
     given = section.model_dump(mode="json", exclude_defaults=True, exclude={kind})
-    values = (
-        f"{key} = {'…' if isinstance(value, dict | list) else value}"
-        for key, value in given.items()
-    )
+    values = (f"{key} = {'…' if isinstance(value, dict | list) else value}" for key, value in given.items())
     return ", ".join((getattr(section, kind), *values))
 
 
@@ -350,8 +345,7 @@ class TheoryCoverage:
         timing, policy = self.scenario.timing, self.scenario.plant.watchdog.policy
         if (gap_ns := timing.actuation_gap_ns) is None:
             return (
-                "network.actuation: without mansd or constraints, the age of the applied input has "
-                "no bound"
+                "network.actuation: without mansd or constraints, the age of the applied input has no bound"
             )
         oldest_ns = timing.controller_period_ns + gap_ns
         if gap_ns and policy != "hold" and timing.actuation_timeout_ns < oldest_ns:
@@ -400,9 +394,7 @@ class TheoryCoverage:
         if direct and self.scenario.controller.predictions == 1:
             return
         key = "controller.predictions" if direct else "network.actuation"
-        raise CallerError(
-            f"{key}: needs actuations that reach the plant at once and carry one input"
-        )
+        raise CallerError(f"{key}: needs actuations that reach the plant at once and carry one input")
 
     def require_certifiable(self) -> None:
         """Raise CallerError if no certificate covers the scenario."""

@@ -16,7 +16,7 @@ from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
 from noack.impairments.constraints import join_guarantee, require_consistent
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_scores
+from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_order, require_scores
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
@@ -127,9 +127,7 @@ class ModelSection(ScenarioSection):
         known = parameters_of(name)
         for key in self.parameters:
             if key not in known:
-                raise ValueError(
-                    f"parameters.{key}: {name} has no such parameter; it has {', '.join(known)}"
-                )
+                raise ValueError(f"parameters.{key}: {name} has no such parameter; it has {', '.join(known)}")
         if not all(np.isfinite(matrix).all() for matrix in self.named[:3]):
             raise ValueError("parameters: these give matrices with infinite entries")
 
@@ -217,9 +215,7 @@ class MeasurementSection(ScenarioSection):
 
     def selects_all(self, n: int) -> bool:
         """Whether C is the identity."""
-        return self.C is None or (
-            np.shape(self.C) == (n, n) and bool((np.array(self.C) == np.eye(n)).all())
-        )
+        return self.C is None or (np.shape(self.C) == (n, n) and bool((np.array(self.C) == np.eye(n)).all()))
 
     @property
     def is_noisy(self) -> bool:
@@ -306,14 +302,10 @@ class PlantSection(ScenarioSection):
             if self.draw != "given" and matrix is not None:
                 raise ValueError(f'{key}: matrices are for draw = "given", not "{self.draw}"')
         if self.draw != "nominal" and not isinstance(self.system, LinearSettings):
-            raise ValueError(
-                f'draw: "{self.draw}" is for linear plants; a {self.system.kind} is what it is'
-            )
+            raise ValueError(f'draw: "{self.draw}" is for linear plants; a {self.system.kind} is what it is')
         box = (self.uncertainty_A or ()) + (self.uncertainty_B or ())
         if self.draw in ("uniform", "vertex") and not box:
-            raise ValueError(
-                f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B'
-            )
+            raise ValueError(f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B')
         return self
 
     def noise_variances(self, n: int, m: int) -> NoiseVariances:
@@ -345,6 +337,7 @@ class DirectionSection(ScenarioSection):
     def _check_direction(self) -> Self:
         require_consistent(self.mansd, self.constraints)
         require_scores(self.impairments, self.loss)
+        require_order(self.impairments)
         return self
 
     @property

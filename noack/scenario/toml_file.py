@@ -52,9 +52,7 @@ _MOST_LOOKED_AT = 100
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_LEVELS}}}")
 
 
-def read(
-    path: Path, model: type[ScenarioSection] = ScenarioSection, most_bytes: int = MOST_BYTES
-) -> Table:
+def read(path: Path, model: type[ScenarioSection] = ScenarioSection, most_bytes: int = MOST_BYTES) -> Table:
     """Read a TOML file of at most ``most_bytes``.
 
     If the file does not exist, the message suggests a similar file of the type ``model`` beside it.
@@ -187,8 +185,7 @@ def _unfit(value: object) -> None:
 _PATTERNS = {
     r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$": "use letters, digits, _ and -, beginning with a letter "
     "or digit, at most 64",
-    r"^[a-z][a-z0-9_]{0,31}$": "use small letters, digits and _, beginning with a letter, "
-    "at most 32",
+    r"^[a-z][a-z0-9_]{0,31}$": "use small letters, digits and _, beginning with a letter, at most 32",
     r"^[A-Za-z_][\w.:-]*$": "use an entry point's name, or package.module:Class",
     "^[0-9a-f]{64}$": "use 64 hexadecimal digits, in small letters",
 }
@@ -239,9 +236,7 @@ def keys(section: type[BaseModel]) -> list[str]:
     return list(dict.fromkeys(_keys(section, "", ())))
 
 
-def _keys(
-    section: type[BaseModel], prefix: str, within: tuple[type[BaseModel], ...]
-) -> Iterator[str]:
+def _keys(section: type[BaseModel], prefix: str, within: tuple[type[BaseModel], ...]) -> Iterator[str]:
     for name, field in section.model_fields.items():
         inner = [one for one in sections_of(field.annotation) if one not in within]
         for one in inner:  # a trigger may contain another
@@ -382,9 +377,7 @@ def _choices(kind: Kind) -> tuple[Mapping[str, type[ScenarioSection]], str]:
     if len(sections) < 2:
         return {}, ""
     key = next(
-        name
-        for name, field in sections[0].model_fields.items()
-        if get_origin(field.annotation) is Literal
+        name for name, field in sections[0].model_fields.items() if get_origin(field.annotation) is Literal
     )
     return {get_args(one.model_fields[key].annotation)[0]: one for one in sections}, key
 
@@ -425,10 +418,13 @@ def _table_example(value: object, at: _Place) -> str:
         return f', e.g. {{ {at.discriminator} = "python", file = "{file}", name = "{value}" }}'
     if at.choices:
         needed = {
-            choice: [name for name, field in settings.model_fields.items()
-                     if field.is_required() and name != at.discriminator]
+            choice: [
+                name
+                for name, field in settings.model_fields.items()
+                if field.is_required() and name != at.discriminator
+            ]
             for choice, settings in at.choices.items()
-        }  # fmt: skip
+        }
         # The simplest that has settings shows how they are written.
         chosen = str(value) if known else min(needed, key=lambda one: len(needed[one]) or 99)
         keys = "".join(f", {name} = ..." for name in needed[chosen])

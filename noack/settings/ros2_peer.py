@@ -81,9 +81,7 @@ class Ros2Peer(External):
         node = Node(f"noack_{name}", settings.router, settings.domain, listen=settings.listen)
         exchange = Exchange(node, *self._topics, self._place)
         try:
-            answer = exchange.ask(
-                self._first, self._count, settings.start_timeout_s, again_s=_AGAIN_S
-            )
+            answer = exchange.ask(self._first, self._count, settings.start_timeout_s, again_s=_AGAIN_S)
         except (TimeoutError, ValueError) as error:
             node.close()
             raise CallerError(f'{self._place}.kind = "ros2": {error}') from None

@@ -67,9 +67,7 @@ class ScenarioSection(BaseModel):
         return found
 
     @classmethod
-    def __get_pydantic_json_schema__(
-        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler, /
-    ) -> Table:
+    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler, /) -> Table:
         """Return the JSON Schema with the descriptions of the keys."""
         schema = handler(core_schema)
         properties = handler.resolve_ref_schema(schema).get("properties", {})

@@ -251,9 +251,7 @@ def _executed(path: Path) -> ModuleType:
 
 def _is_ours(frame: traceback.FrameSummary) -> bool:
     file = Path(frame.filename)
-    return "importlib" in frame.filename or any(
-        file.is_relative_to(_ROOT / package) for package in _PACKAGES
-    )
+    return "importlib" in frame.filename or any(file.is_relative_to(_ROOT / package) for package in _PACKAGES)
 
 
 def _as_list(value: object) -> object:

@@ -284,9 +284,15 @@ def _theorem_2(
     F = max(start, 0.0) / (a_hat + alpha_bar_per_s) + forced / (a_hat + alpha_per_s)
     inter_event_s = math.log1p(beta / F) / (a_hat + alpha_bar_per_s) if F > 0 else math.inf
     return Theorem2(
-        c, alpha_bar_per_s, delta, a_hat, a_tilde, inter_event_s,
-        c * x0, beta * c * delta * BK / gap,
-    )  # fmt: skip
+        c,
+        alpha_bar_per_s,
+        delta,
+        a_hat,
+        a_tilde,
+        inter_event_s,
+        c * x0,
+        beta * c * delta * BK / gap,
+    )
 
 
 class Interval(NamedTuple):

@@ -204,8 +204,11 @@ class CapturedFlow(NamedTuple):
     def is_reverse_of(self, other: "CapturedFlow") -> bool:
         """Whether its datagrams go the other way."""
         return (self.source, self.source_port, self.destination, self.destination_port) == (
-            other.destination, other.destination_port, other.source, other.source_port,
-        )  # fmt: skip
+            other.destination,
+            other.destination_port,
+            other.source,
+            other.source_port,
+        )
 
 
 def _ethernet(data: bytes) -> int:
@@ -232,9 +235,7 @@ _IP_AT: Mapping[int, Callable[[bytes], int]] = {
 """Place of the IP header, by link type."""
 
 
-def find_udp(
-    interface: int, link_type: int, data: bytes
-) -> tuple[CapturedFlow, bytes, bool] | None:
+def find_udp(interface: int, link_type: int, data: bytes) -> tuple[CapturedFlow, bytes, bool] | None:
     """Return the flow of a packet, the payload, and whether the payload is complete.
 
     None: it is no UDP datagram, or a fragment of one.

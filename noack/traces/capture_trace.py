@@ -22,13 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.protocol.probe_format import MAGIC, ProbeKind, decode_probe
-from noack.traces.capture_packets import (
-    CapturedFlow,
-    CutCaptureError,
-    captured_packets,
-    find_udp,
-    is_capture,
-)
+from noack.traces.capture_packets import CapturedFlow, CutCaptureError, captured_packets, find_udp, is_capture
 from noack.traces.packet_trace import (
     MAX_PACKETS,
     Int64s,
@@ -90,9 +84,7 @@ class Capture:
             if not datagram.is_cut:
                 digest = hashlib.blake2b(datagram.payload, digest_size=8, key=_KEY).digest()
                 hashed = int.from_bytes(digest, "little", signed=True)
-                for column, value in zip(
-                    columns, (datagram.t_ns, hashed, number_and_count[0]), strict=True
-                ):
+                for column, value in zip(columns, (datagram.t_ns, hashed, number_and_count[0]), strict=True):
                     column.append(value)
         if not counts:
             cut = self.notes[0].partition(";")[0] if self.notes else ""
@@ -126,9 +118,7 @@ class Capture:
                 if datagram is None or _is_end_of_probe(datagram[1]):
                     continue
                 flow, payload, is_complete = datagram
-                yield CapturedDatagram(
-                    packet.t_ns, flow, payload, not is_complete, packet.is_outbound
-                )
+                yield CapturedDatagram(packet.t_ns, flow, payload, not is_complete, packet.is_outbound)
         except CutCaptureError as error:
             if notes is not None:
                 notes.append(f"the capture {error}; what is before is used")
@@ -138,9 +128,7 @@ def _is_end_of_probe(payload: bytes) -> bool:
     return payload[:4] == MAGIC and payload[5:6] in (b"\4", b"\5")
 
 
-def two_captures(
-    sender: Capture, flow: CapturedFlow, receiver: Capture
-) -> tuple[Datagrams, Datagrams]:
+def two_captures(sender: Capture, flow: CapturedFlow, receiver: Capture) -> tuple[Datagrams, Datagrams]:
     """Return the datagrams of a flow at its sender, and all that may be the same at the receiver.
 
     The addresses may differ (NAT, a relay); only the reverse flow of an echo is left out.
@@ -206,9 +194,7 @@ def matched_trace(
     received_ns[arrived] = received.t_ns[here[first]]
     lost = np.ones(len(sent.t_ns), bool)
     lost[arrived] = False
-    trace = packet_trace(
-        sent.t_ns, received_ns, lost, clocks_differ=clocks_differ, most_packets=most
-    )
+    trace = packet_trace(sent.t_ns, received_ns, lost, clocks_differ=clocks_differ, most_packets=most)
     return relative_delays(trace) if clocks_differ else trace
 
 
@@ -235,8 +221,7 @@ class SequenceField(NamedTuple):
         match = _FIELD.fullmatch(text)
         if match is None:
             raise ValueError(
-                f"expected OFFSET:BYTES with 1 to 8 bytes, e.g. 2:2 for RTP, or 8:4:little; "
-                f"found {text!r}"
+                f"expected OFFSET:BYTES with 1 to 8 bytes, e.g. 2:2 for RTP, or 8:4:little; found {text!r}"
             )
         return cls(int(match[1]), int(match[2]), match[3] is not None)
 
@@ -308,9 +293,13 @@ def trace_of_probe(capture: Capture, flow: CapturedFlow, most_packets: int) -> P
     numbered = _first_of_each(numbered, capture.notes)
     nothing_lost = np.zeros(len(numbered.number), bool)
     trace = packet_trace(
-        numbered.sent_ns, numbered.received_ns, nothing_lost, numbered.number,
-        clocks_differ=True, most_packets=most_packets,
-    )  # fmt: skip
+        numbered.sent_ns,
+        numbered.received_ns,
+        nothing_lost,
+        numbered.number,
+        clocks_differ=True,
+        most_packets=most_packets,
+    )
     return relative_delays(trace)
 
 
@@ -350,9 +339,13 @@ def trace_of_numbers(
         f"{period_ns / 1e6:.6g} ms (lower envelope of the arrivals); delays are relative"
     )
     return packet_trace(
-        sent_ns, received_ns, np.zeros(len(k), bool), numbered.number,
-        clocks_differ=True, most_packets=most_packets,
-    )  # fmt: skip
+        sent_ns,
+        received_ns,
+        np.zeros(len(k), bool),
+        numbered.number,
+        clocks_differ=True,
+        most_packets=most_packets,
+    )
 
 
 def _unwrapped(number: Int64s, bits: int) -> NDArray[np.int64]:

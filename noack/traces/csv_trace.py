@@ -56,9 +56,7 @@ def _columns(header: Sequence[str]) -> tuple[_Column | None, _Column, _Column]:
         time = _TIME_COLUMN.fullmatch(name)
         what = time[1].removesuffix(_OTHER) if time else name
         if what in columns and (time or what == "sequence"):
-            raise ValueError(
-                f"line 1: has the columns {columns[what].name} and {name}; one is needed"
-            )
+            raise ValueError(f"line 1: has the columns {columns[what].name} and {name}; one is needed")
         if time or what == "sequence":
             columns[what] = _Column(name, index, _UNITS_NS[time[2]] if time else 1)
     for what in ("sent", "received"):
@@ -97,9 +95,7 @@ def _read(file: IO[bytes], most_packets: int, clocks_differ: bool) -> tuple[Pack
             if not row:
                 continue
             if len(row) != len(header):
-                raise ValueError(
-                    f"line {line}: has {len(row)} columns; the header has {len(header)}"
-                )
+                raise ValueError(f"line {line}: has {len(row)} columns; the header has {len(header)}")
             if len(lines) == most_packets:
                 raise ValueError(f"line {line}: has more than {most_packets} packets")
             arrival = row[received.place].strip()
@@ -110,10 +106,13 @@ def _read(file: IO[bytes], most_packets: int, clocks_differ: bool) -> tuple[Pack
             if sequence is not None:
                 numbers.append(sequence.number(line, row[sequence.place].strip()))
         trace = packet_trace(
-            np.array(sent_ns), np.array(received_ns), np.array(lost, np.bool_),
+            np.array(sent_ns),
+            np.array(received_ns),
+            np.array(lost, np.bool_),
             np.array(numbers) if sequence is not None else None,
-            clocks_differ=clocks_differ, most_packets=most_packets,
-        )  # fmt: skip
+            clocks_differ=clocks_differ,
+            most_packets=most_packets,
+        )
         return trace, clocks_differ
     except csv.Error as error:
         raise ValueError(f"line {rows.line_num}: {error}") from None

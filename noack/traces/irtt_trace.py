@@ -43,9 +43,12 @@ def read_irtt(file: IO[bytes], most_packets: int) -> PacketTrace:
             ways[way] += 1
         arrivals_ns = np.array(received_ns)
         trace = packet_trace(
-            np.array(sent_ns), arrivals_ns, arrivals_ns == LOST_NS, np.array(numbers),
+            np.array(sent_ns),
+            arrivals_ns,
+            arrivals_ns == LOST_NS,
+            np.array(numbers),
             most_packets=most_packets,
-        )  # fmt: skip
+        )
     except TraceRecordError as error:
         raise ValueError(f"round trip {error.row + 1}: {error}") from None
     notes = [f"lost {_WAYS[way]}: {ways[way]}" for way in _WAYS if ways[way]]
@@ -85,9 +88,7 @@ def _entries(texts: Iterator[str]) -> Iterator[object]:
         if not piece:
             raise ValueError("ends within its round trips, or has an entry that is not JSON")
         if len(text) > _LONGEST_ENTRY:
-            raise ValueError(
-                f"has a round trip of more than {_LONGEST_ENTRY} characters, or no JSON"
-            )
+            raise ValueError(f"has a round trip of more than {_LONGEST_ENTRY} characters, or no JSON")
         text += piece
 
 

@@ -222,9 +222,7 @@ def envelope_slope(t: NDArray[np.int64], y: NDArray[np.int64]) -> float:
         while len(hull) > 1 and _cross(hull[-2], hull[-1], point) <= 0:
             hull.pop()
         hull.append(point)
-    rising = [
-        (b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(hull) if b[0] >= mean and b[0] > a[0]
-    ]
+    rising = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(hull) if b[0] >= mean and b[0] > a[0]]
     return rising[0] if rising else 0.0
 
 

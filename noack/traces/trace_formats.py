@@ -41,9 +41,7 @@ class TraceFormat:
 def _formats() -> Sequence[TraceFormat]:
     entries = iter_modules(import_module(__package__).__path__, f"{__package__}.")
     modules = (vars(import_module(entry.name)) for entry in entries if entry.name != __name__)
-    return [
-        value for module in modules for value in module.values() if isinstance(value, TraceFormat)
-    ]
+    return [value for module in modules for value in module.values() if isinstance(value, TraceFormat)]
 
 
 def read_trace(
@@ -70,9 +68,7 @@ def read_trace(
     try:
         with open_regular(path) as file:
             head, file = _decompressed(file)
-            known_format = next(
-                (candidate for candidate in known if candidate.recognises(head)), None
-            )
+            known_format = next((candidate for candidate in known if candidate.recognises(head)), None)
             if known_format is None:
                 names = ", ".join(sorted(candidate.name for candidate in known))
                 raise ValueError(

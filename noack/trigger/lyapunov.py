@@ -33,9 +33,7 @@ class LyapunovSettings(LyapunovFunctionSettings):
         P, _ = self.lyapunov_function(model)
         factor = np.ascontiguousarray(np.linalg.cholesky(P).T)  # V(x) = ‖L x‖²
         form = QuadraticForm(state_map(len(P), factor), empty_map(len(P)))
-        return TriggerRule(
-            form, rate_per_s=self.rate_per_s / 2, from_event=True, weight=self.weight_matrix
-        )
+        return TriggerRule(form, rate_per_s=self.rate_per_s / 2, from_event=True, weight=self.weight_matrix)
 
     @property
     def description(self) -> str:

@@ -140,9 +140,7 @@ class LyapunovFunctionSettings(WeightedSettings):
 
         A = model.A + model.B @ model.K
         if spectral_abscissa(A) >= 0:
-            raise CallerError(
-                "trigger.policy: this one needs a Lyapunov function, but Â + B̂K is not stable"
-            )
+            raise CallerError("trigger.policy: this one needs a Lyapunov function, but Â + B̂K is not stable")
         Q = np.eye(len(A)) if self.Q is None else np.array(self.Q)
         with warnings.catch_warnings(action="ignore"):  # of an inaccurate P, which is checked
             P = np.asarray(solve_continuous_lyapunov(A.T, -Q), dtype=np.float64)

@@ -28,9 +28,13 @@ class SelfTriggeredSettings(WeightedSettings):
     """
 
     example_keys: ClassVar = {
-        "beta": 0.5, "alpha_per_s": 0.25, "growth_per_s": 1.0, "mismatch_per_s": 1.0,
-        "shortest_s": 0.1, "longest_s": 5.0,
-    }  # fmt: skip
+        "beta": 0.5,
+        "alpha_per_s": 0.25,
+        "growth_per_s": 1.0,
+        "mismatch_per_s": 1.0,
+        "shortest_s": 0.1,
+        "longest_s": 5.0,
+    }
 
     policy: Literal["self_triggered"]
     beta: Positive
@@ -58,13 +62,20 @@ class SelfTriggeredSettings(WeightedSettings):
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         forecast = Forecast(
-            self.beta, self.alpha_per_s, self.floor,
-            self.growth_per_s, self.mismatch_per_s, self.disturbance_per_s,
-        )  # fmt: skip
+            self.beta,
+            self.alpha_per_s,
+            self.floor,
+            self.growth_per_s,
+            self.mismatch_per_s,
+            self.disturbance_per_s,
+        )
         return TriggerRule(
-            no_form(len(model.A)), shortest_ns=nanoseconds(self.shortest_s),
-            longest_ns=nanoseconds(self.longest_s), forecast=forecast, weight=self.weight_matrix,
-        )  # fmt: skip
+            no_form(len(model.A)),
+            shortest_ns=nanoseconds(self.shortest_s),
+            longest_ns=nanoseconds(self.longest_s),
+            forecast=forecast,
+            weight=self.weight_matrix,
+        )
 
     @property
     def description(self) -> str:

@@ -226,12 +226,17 @@ def fill_rule(structure: CData, rule: TriggerRule, n: int, memory: CoreMemory) -
         "forecast_weight": None if forecast is None else rule.weight,
     })  # fmt: skip
     if forecast is not None:
-        memory.fill(structure, {
-            "beta": forecast.beta, "alpha_per_s": forecast.alpha_per_s,
-            "forecast_floor": forecast.floor, "growth_per_s": forecast.growth_per_s,
-            "mismatch_per_s": forecast.mismatch_per_s,
-            "disturbance_per_s": forecast.disturbance_per_s,
-        })  # fmt: skip
+        memory.fill(
+            structure,
+            {
+                "beta": forecast.beta,
+                "alpha_per_s": forecast.alpha_per_s,
+                "forecast_floor": forecast.floor,
+                "growth_per_s": forecast.growth_per_s,
+                "mismatch_per_s": forecast.mismatch_per_s,
+                "disturbance_per_s": forecast.disturbance_per_s,
+            },
+        )
     forms = {"": rule.form, "gain_": None if dynamic is None else dynamic.gain}
     for prefix, form in forms.items():
         for name in ("up", "down"):

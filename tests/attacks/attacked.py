@@ -81,9 +81,7 @@ def may_forge_addresses() -> bool:
 class Run:
     """An active run, started one process at a time; ``stack`` ends what remains."""
 
-    def __init__(
-        self, stack: ExitStack, folder: Path, hosts: TwoHosts | None, *arguments: str
-    ) -> None:
+    def __init__(self, stack: ExitStack, folder: Path, hosts: TwoHosts | None, *arguments: str) -> None:
         self._folder, self._hosts = folder, hosts
         self._begin = stack.enter_context(starting())
         invitation = str(folder / "invitation.json")

@@ -52,9 +52,7 @@ def _authentic(
         draw.getrandbits(32),  # within the run
         np.array([draw.gauss(0, 1e6) for _ in range(target.dimension)]),
     )
-    encoder = Encoder(
-        target.run_id if run_id is None else run_id, target.key if key is None else key
-    )
+    encoder = Encoder(target.run_id if run_id is None else run_id, target.key if key is None else key)
     return encoder.encode(message)
 
 
@@ -218,9 +216,7 @@ def carry_out(plan: Plan) -> Sent:
         # The emulator accepts the sensor's address.
         if plan.forge_addresses and target.is_forgeable and target.role != "netem":
             kinds += [(PEER, kind) for kind in FROM_THE_PEER]
-        arms.append(
-            [(by, kind, _datagrams(FROM_ANYWHERE[kind], target, draw)) for by, kind in kinds]
-        )
+        arms.append([(by, kind, _datagrams(FROM_ANYWHERE[kind], target, draw)) for by, kind in kinds])
     for number in _paced(plan.per_port, plan.rate_hz, plan.until_s):
         for target, of_target in zip(plan.targets, arms, strict=True):
             by, kind, datagrams = of_target[number % len(of_target)]

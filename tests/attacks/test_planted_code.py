@@ -111,9 +111,7 @@ def test_folders_are_private_and_made_so(home: Path) -> None:
         assert stat.S_IMODE((home / "noack").stat().st_mode) == 0o700
 
 
-def test_a_sticky_folder_is_allowed_and_the_target_of_a_link_is_checked(
-    home: Path, tmp_path: Path
-) -> None:
+def test_a_sticky_folder_is_allowed_and_the_target_of_a_link_is_checked(home: Path, tmp_path: Path) -> None:
     """In a sticky folder, others can create files but cannot replace or remove this user's."""
     home.parent.mkdir()
     home.parent.chmod(0o1777)

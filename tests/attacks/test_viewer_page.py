@@ -56,9 +56,7 @@ def ask(url: str, host: str | None = None) -> tuple[int, http.client.HTTPMessage
     parts = urlsplit(url)
     target = url.removeprefix(f"{parts.scheme}://{parts.netloc}")
     with socket.create_connection((str(parts.hostname), parts.port)) as connection:
-        connection.sendall(
-            f"GET {target} HTTP/1.1\r\nHost: {host or parts.netloc}\r\n\r\n".encode("latin-1")
-        )
+        connection.sendall(f"GET {target} HTTP/1.1\r\nHost: {host or parts.netloc}\r\n\r\n".encode("latin-1"))
         answer = http.client.HTTPResponse(connection)
         with closing(answer):
             answer.begin()
@@ -104,9 +102,7 @@ def test_the_secret_is_new_each_time_long_and_on_no_command_line(server: Recordi
     assert not any(secret_of(server) in line for line in lines)
 
 
-def test_an_invalid_path_gets_status_400(
-    server: RecordingServer, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_invalid_path_gets_status_400(server: RecordingServer, capfd: pytest.CaptureFixture[str]) -> None:
     for prefix in (f"{server.origin}/", server.address):
         for path in ("\xe9", "\x01", "\x7f", "?\xe9"):
             assert ask(prefix + path)[0] == 400

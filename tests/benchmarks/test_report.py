@@ -4,29 +4,10 @@ import argparse
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from benchmarks.__main__ import (
-    BEGIN,
-    END,
-    OF_GOALS,
-    all_benchmarks,
-    rows_of_figures,
-    run,
-    write_docs,
-)
-from benchmarks.report import (
-    Benchmark,
-    Goal,
-    Load,
-    MeasurementError,
-    Peer,
-    Rounds,
-    Row,
-    compared,
-    per_cpu_s,
-)
+from benchmarks.__main__ import BEGIN, END, OF_GOALS, all_benchmarks, rows_of_figures, run, write_docs
+from benchmarks.report import Benchmark, Goal, MeasurementError, Peer, Rounds, Row, compared, per_cpu_s
 
 HALF = Goal("<=", 0.5)
 
@@ -48,14 +29,6 @@ HALF = Goal("<=", 0.5)
 )
 def test_a_row_holds_fails_or_cannot_be_judged(row: Row, holds: bool | None) -> None:
     assert row.holds is holds
-
-
-def test_a_busy_machine_is_reported() -> None:
-    load = Load()
-    load._before = tuple(np.subtract(load._before, (100.0, 60.0, 2.0, 20.0)))
-    others, steal = load.rows()
-    assert (others.value, steal.value) == pytest.approx((40.0, 2.0), abs=1.0)
-    assert others.note == steal.note == "the machine was busy: figures are doubtful"
 
 
 def named(name: str, *rows: Row, done: list[str] | None = None) -> Benchmark:
@@ -87,23 +60,6 @@ def test_rows_and_reasons_are_printed_and_written_as_json(
     assert "no such program" in said
 
 
-def test_benchmarks_are_chosen_by_name_and_get_their_options(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    done: list[str] = []
-    benchmarks = by_name(*(named(name, done=done) for name in "abc"))
-    assert run(benchmarks, ["c", "a"]) == run(benchmarks, []) == 0
-    assert done == ["a", "c", "a", "b", "c"]
-    with pytest.raises(SystemExit):
-        run(benchmarks, ["d"])
-    assert "no benchmark 'd'; benchmarks: a, b, c" in capsys.readouterr().err
-    seen: list[argparse.Namespace] = []
-    options = {"--install": {"action": "store_true"}}
-    own = Benchmark("example", "An example", lambda given: seen.append(given) or [], options)
-    run(by_name(own), ["--install"])
-    assert seen[0].install
-
-
 def rounds_of(ours: list[float], theirs: list[float]) -> Rounds:
     rounds = Rounds()
     for side, values in (("ours", ours), ("theirs", theirs)):
@@ -120,9 +76,7 @@ def test_a_row_has_the_medians_of_the_rounds_or_the_median_of_their_ratios() -> 
     assert (row.value, row.peer) == (3.0, Peer("theirs", 8.0))
     assert row.ratio == 0.5  # not 3 / 8
     ours, theirs = iter([1.0, 30.0, 3.0]), iter([2.0, 60.0, 8.0])
-    again = compared(
-        "cost", "µs", lambda: next(ours), ("theirs", lambda: next(theirs)), HALF, rounds=3
-    )
+    again = compared("cost", "µs", lambda: next(ours), ("theirs", lambda: next(theirs)), HALF, rounds=3)
     assert again == row
     assert compared("a", "/s", per_cpu_s(1, lambda: None), Peer("known", 2.0)).ratio is not None
 

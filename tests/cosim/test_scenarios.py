@@ -196,9 +196,7 @@ def test_luukkonens_gains_level_the_quadrotor_within_his_five_seconds() -> None:
     for axis, inertia in enumerate(settings.inertia_kg_m2):
         K[1 + axis, [3 + axis, 9 + axis]] = np.array([-6.0, -1.75]) * inertia
     aslant = math.radians(10)
-    system = OdeSystem(
-        settings.equations(), np.array([0.0, 0, 1, aslant, aslant, aslant, 0, 0, 0, 0, 0, 0])
-    )
+    system = OdeSystem(settings.equations(), np.array([0.0, 0, 1, aslant, aslant, aslant, 0, 0, 0, 0, 0, 0]))
     h_ns = 2_000_000
     for step in range(2500):
         system.advance(K @ system.x, step * h_ns, h_ns)

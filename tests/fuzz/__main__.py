@@ -43,9 +43,7 @@ def fuzz(name: str, seconds: int) -> tuple[bool, str]:
         with suppress(sanitized_core.NoSanitizersError):
             child, environment = sanitized_core.command("tests.fuzz.random_child", name, *flags)
     with log.open("wb") as file:
-        done = subprocess.run(
-            child, cwd=ROOT, stdout=file, stderr=file, check=False, env=environment
-        )
+        done = subprocess.run(child, cwd=ROOT, stdout=file, stderr=file, check=False, env=environment)
     reports = _STATUS.findall(log.read_bytes())
     executions, _, features = map(int, reports[-1]) if reports else (0, 0, 0)
     findings = _findings_in(folder)
@@ -80,9 +78,7 @@ def main() -> int:
         return 0
     names = options.names or parsers()
     if wrong := set(names) - set(parsers()):
-        parser.error(
-            f"no such parser: {', '.join(sorted(wrong))}; there are {', '.join(parsers())}"
-        )
+        parser.error(f"no such parser: {', '.join(sorted(wrong))}; there are {', '.join(parsers())}")
     if importlib.util.find_spec("atheris") is None:
         print("the fuzzer, atheris, is not installed; it has wheels for Linux and few Pythons")
         return 2

@@ -151,10 +151,7 @@ def value(choices: Choices, known: Vocabulary, depth: int = 0) -> Any:
         case 6:
             return [value(choices, known, depth + 1) for _ in range(choices.below(4))]
         case 7:
-            return {
-                key(choices, known): value(choices, known, depth + 1)
-                for _ in range(choices.below(4))
-            }
+            return {key(choices, known): value(choices, known, depth + 1) for _ in range(choices.below(4))}
         case _:
             nested: Any = value(choices, known, depth + 1)
             for _ in range(choices.below(20)):
@@ -253,9 +250,7 @@ def edited_table(choices: Choices, table: pa.Table) -> pa.Table:
             case 4:
                 table = pa.concat_tables([table, table.slice(0, choices.below(len(table) + 1))])
             case _:
-                table = table.set_column(
-                    at, table.schema.field(at), _one_changed(choices, table[at])
-                )
+                table = table.set_column(at, table.schema.field(at), _one_changed(choices, table[at]))
     return table
 
 

@@ -25,9 +25,7 @@ class Payload:
 class Sample:
     """A publication; ``sent_as`` is the key with which it was sent."""
 
-    def __init__(
-        self, key: str, payload: bytes | None = b"", header: bytes | None = b"", sent_as: str = ""
-    ):
+    def __init__(self, key: str, payload: bytes | None = b"", header: bytes | None = b"", sent_as: str = ""):
         self.key_expr = key
         self.payload = Payload(payload or b"")
         self.attachment = None if header is None else Payload(label(sent_as or key, header))
@@ -89,9 +87,7 @@ class FakePlane:
     def key(self, *parts: str) -> str:
         return "/".join(parts)
 
-    def declare_subscriber(
-        self, key: str, handler: object = None, *, history: bool = False
-    ) -> _Channel:
+    def declare_subscriber(self, key: str, handler: object = None, *, history: bool = False) -> _Channel:
         return self._channels.setdefault(key.partition("/")[0], _Channel())
 
     declare_queryable = declare_subscriber

@@ -43,8 +43,6 @@ def on_sample(sample) -> None:  # type: ignore[no-untyped-def]
 raw = session.session.declare_subscriber("0/noack/state/**", on_sample)
 tokens = []
 while not last.wait(0.5):
-    tokens += [
-        str(r.ok.key_expr) for r in session.liveliness.get("@ros2_lv/**", timeout=2.0) if r.ok
-    ]
+    tokens += [str(r.ok.key_expr) for r in session.liveliness.get("@ros2_lv/**", timeout=2.0) if r.ok]
 print(json.dumps({"messages": found, "tokens": tokens, "attachments": attachments}), flush=True)
 threading.Event().wait()

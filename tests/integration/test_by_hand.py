@@ -119,9 +119,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def visible_in_processes(
-    recording: live.Running, processes: list[subprocess.Popen[str]]
-) -> dict[str, bytes]:
+def visible_in_processes(recording: live.Running, processes: list[subprocess.Popen[str]]) -> dict[str, bytes]:
     """Return command lines, environments and names of the processes."""
     launcher = psutil.Process(recording.process.pid)
     pids = [launcher.pid, *(child.pid for child in launcher.children(recursive=True))]
@@ -139,7 +137,9 @@ def test_the_key_of_a_run_by_hand_is_visible_in_its_ticket_only(
     private = tmp_path / f"noack-{os.getuid()}"
     early = [by_hand(role) for role in LOOP_ROLES[:2]]
     recording = start(
-        *live.settings(speed=2.0, horizon_s=400.0), command=("record", "lane_following")
+        *live.AT_RATE,
+        *live.settings(speed=2.0, horizon_s=400.0),
+        command=("record", "lane_following"),
     )
     path = private / "default.json"
     live.wait_for(path.exists)

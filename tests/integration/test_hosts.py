@@ -137,26 +137,7 @@ def test_several_loops_run_on_hosts_with_different_clocks(
         assert (np.abs(known["offset_ns"] - true_ns) <= known["error_ns"]).all()
 
 
-def test_without_an_invitation_nothing_is_reached(start: Start, tmp_path: Path) -> None:
-    """An invitation of another run has other keys, also for the same address."""
-    record(start, tmp_path, "10.83.3.1")
-    known = json.loads((tmp_path / "invitation.json").read_text())
-    other = record(start, tmp_path, "10.83.3.1", "--invitation", "other.json", "--session", "two")
-    live.wait_for((tmp_path / "other.json").exists)
-    foreign = json.loads((tmp_path / "other.json").read_text())
-    foreign["remote"] |= {key: known["remote"][key] for key in ("host", "port")}
-    (tmp_path / "other.json").write_text(json.dumps(foreign))
-    joining = start(1, "plant", "--invitation", "other.json")
-    _, stderr = ended(joining)
-    assert joining.returncode == 1
-    assert stderr.startswith("noack plant: joining run of 'lane_following' at 10.83.3.1:")
-    assert "a program listens there, but does not accept this invitation" in stderr
-    assert other.poll() is None
-
-
-def test_rows_of_a_host_that_was_cut_off_are_collected(
-    start: Start, hosts: TwoHosts, tmp_path: Path
-) -> None:
+def test_rows_of_a_host_that_was_cut_off_are_collected(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:
     """The link goes down in the run; its processes work on and keep their rows and reports."""
     recording = record(start, tmp_path, "10.83.3.1", *live.settings(horizon_s=8.0), impatient=True)
     at_home = [start(0, role) for role in ("plant", "sensor")]

@@ -54,9 +54,7 @@ def record(finished: Finished) -> RunRecord:
     return load_record(finished.run_dir)
 
 
-def test_the_run_is_complete_and_replayed_bit_for_bit(
-    finished: Finished, record: RunRecord
-) -> None:
+def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished, record: RunRecord) -> None:
     summary = finished.summary
     assert summary["exit"] == {"status": 0, "reason": "horizon"}
     assert_complete(finished.loop)

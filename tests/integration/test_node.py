@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -86,7 +87,7 @@ def test_a_killed_program_ends_the_run_and_its_rows_are_kept(start: Start, tmp_p
     finished = running.finish()
     assert finished.status == 1
     reason = finished.summary["exit"]["reason"]
-    assert reason.startswith('controller: controller.file = "')
+    assert reason.startswith("controller: controller.file (controller_node): ")
     assert reason.endswith("the program has ended: killed by SIGKILL")
     rows = load_record(finished.run_dir)["controller_step"]
     assert len(rows) > 10
@@ -95,9 +96,7 @@ def test_a_killed_program_ends_the_run_and_its_rows_are_kept(start: Start, tmp_p
     assert running.left_behind() == []
 
 
-def test_a_stopped_program_ends_with_its_process_and_another_goes_on(
-    start: Start, tmp_path: Path
-) -> None:
+def test_a_stopped_program_ends_with_its_process_and_another_goes_on(start: Start, tmp_path: Path) -> None:
     """A program that is stopped does not see the end of its input."""
     options = by(built(tmp_path), speed=2.0, horizon_s=60.0, recovery__rejoin_within_s=60.0)
     running = start(*options)
@@ -124,9 +123,7 @@ def test_a_stopped_program_ends_with_its_process_and_another_goes_on(
         ("echo noack node 7 8", "says 'noack node 7 8'; a node of this version says"),
     ],
 )  # fmt: skip
-def test_what_is_no_node_is_refused_in_one_line(
-    script: str | None, line: str, tmp_path: Path
-) -> None:
+def test_what_is_no_node_is_refused_in_one_line(script: str | None, line: str, tmp_path: Path) -> None:
     program = tmp_path / "node"
     if script is not None:
         program.write_text(f"#!/bin/sh\n{script}\n")
@@ -143,13 +140,31 @@ def test_what_is_no_node_is_refused_in_one_line(
     assert "\n" not in error
 
 
-def test_a_program_that_breaks_the_protocol_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("sends", "line"),
+    [
+        ("head -c 64 /dev/zero", "has sent a frame of kind 0 and 0 bytes"),
+        ("true", "has sent 0 ticks, and is"),
+    ],
+)
+def test_a_program_that_breaks_the_protocol_is_named(sends: str, line: str, tmp_path: Path) -> None:
     program = tmp_path / "node"
-    program.write_text(f"#!/bin/sh\necho {GREETING}; head -c 64 /dev/zero; exec cat >/dev/null\n")
+    program.write_text(f"#!/bin/sh\necho {GREETING}; {sends}; exec cat >/dev/null\n")
     program.chmod(0o700)
     finished = live.run_scenario(tmp_path / "runs", *by(program, horizon_s=3.0))
     assert finished.status == 1
-    assert "has sent a frame of kind 0 and 0 bytes" in finished.summary["exit"]["reason"]
+    assert f"controller.file (node): {line}" in finished.summary["exit"]["reason"]
+
+
+def test_what_a_program_has_started_ends_with_the_run(tmp_path: Path) -> None:
+    """Also while it keeps the program's stream open."""
+    node, program, number = built(tmp_path), tmp_path / "node", tmp_path / "number"
+    program.write_text(f"#!/bin/sh\nsleep 600 & echo $! >{number}; exec {node}\n")
+    program.chmod(0o700)
+    finished = live.run_scenario(tmp_path / "runs", *by(program, horizon_s=1.0))
+    assert finished.status == 0, finished.stderr
+    with suppress(psutil.NoSuchProcess):
+        live.wait_for(lambda: live.is_over(psutil.Process(int(number.read_text()))))
 
 
 @pytest.mark.parametrize(

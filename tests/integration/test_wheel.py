@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from dataclasses import dataclass
 from email import message_from_bytes
@@ -16,6 +17,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from cosim.doctor.machine_measures import EXTRAS
+from native.build import HEADER, INTO, LIBRARY
 from tests.integration.conftest import EPHEMERAL, PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -47,9 +49,21 @@ def built(*arguments: str | Path) -> Path:
 
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the sdist and the wheel built from it."""
-    out = tmp_path_factory.mktemp("dist")
-    built(ROOT, "--out-dir", out)
+    """A folder with the sdist and the wheel built from it.
+
+    The core is given to it: it is built again only if the sdist has other sources.
+    """
+    out, into = tmp_path_factory.mktemp("dist"), tmp_path_factory.mktemp("sources")
+    done = uv("build", "--sdist", "--no-build-isolation", "--python", sys.executable, ROOT,
+              "--out-dir", out)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (sdist,) = out.glob("*.tar.gz")
+    with tarfile.open(sdist) as file:
+        file.extractall(into, filter="data")
+    (sources,) = into.iterdir()
+    for name in (LIBRARY, HEADER):
+        shutil.copyfile(INTO / name, sources / "noack" / "core" / name)
+    built("--wheel", sources, "--out-dir", out)
     return out
 
 

@@ -112,9 +112,7 @@ def copy(tmp_path: Path) -> Path:
     return native
 
 
-def build(
-    native: Path, *arguments: str | Path, **environment: str
-) -> subprocess.CompletedProcess[str]:
+def build(native: Path, *arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """Build into the folder beside ``native``."""
     return subprocess.run(
         [sys.executable, native / "build.py", "--into", native.parent / "core", *arguments],

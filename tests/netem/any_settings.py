@@ -86,15 +86,11 @@ def _consistent(settings: dict[str, Any]) -> bool:
 constraints = st.lists(st.one_of([varied(kind) for kind in CONSTRAINTS]), max_size=3).map(tuple)
 
 
-def _settings(
-    impairments: st.SearchStrategy[Impairment], most: int = 5
-) -> st.SearchStrategy[LinkSettings]:
+def _settings(impairments: st.SearchStrategy[Impairment], most: int = 5) -> st.SearchStrategy[LinkSettings]:
     return _chained(st.lists(impairments, max_size=5), most)
 
 
-def _chained(
-    chains: st.SearchStrategy[list[Impairment]], most: int = 5
-) -> st.SearchStrategy[LinkSettings]:
+def _chained(chains: st.SearchStrategy[list[Impairment]], most: int = 5) -> st.SearchStrategy[LinkSettings]:
     return st.fixed_dictionaries({
         "impairments": chains.filter(_goes_together).map(tuple),
         "mansd": st.none() | st.sampled_from([0, 1, 2, 5]) | st.integers(0, most),
@@ -118,9 +114,7 @@ _choosing = st.tuples(
     st.none() | st.sampled_from([*EXAMPLES[Corrupt], Delay(delay_s=0.004)]),
 ).map(lambda chain: [one for one in chain if one and _is_computable(one)])
 """Impairments with a queue that chooses what it sends."""
-harsh = _settings(st.sampled_from([one for one in IMPAIRED if _is_computable(one)])) | _chained(
-    _choosing
-)
+harsh = _settings(st.sampled_from([one for one in IMPAIRED if _is_computable(one)])) | _chained(_choosing)
 """Examples of the features in any order, with short times."""
 capped = harsh.filter(lambda one: one.impairments and one.mansd is not None).map(
     lambda one: one.model_copy(update={"first_delivered": True})

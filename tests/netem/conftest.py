@@ -105,9 +105,7 @@ class Emulator:
         inside: a command prefix, e.g. to run the emulator in a network namespace.
     """
 
-    def __init__(
-        self, folder: Path, to: str, *words: str, listen: str, inside: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, folder: Path, to: str, *words: str, listen: str, inside: Sequence[str] = ()) -> None:
         self._trace = folder / "fates.parquet"
         self.process = subprocess.Popen(
             [
@@ -154,9 +152,7 @@ def emulate(tmp_path: Path) -> Iterator[Emulate]:
     """Start emulators; kill the remaining ones at the end."""
     started: list[Emulator] = []
 
-    def start(
-        to: str, *words: str, listen: str = "127.0.0.1:0", inside: Sequence[str] = ()
-    ) -> Emulator:
+    def start(to: str, *words: str, listen: str = "127.0.0.1:0", inside: Sequence[str] = ()) -> Emulator:
         folder = tmp_path / f"emulator {len(started)}"
         folder.mkdir()
         started.append(Emulator(folder, to, *words, listen=listen, inside=inside))

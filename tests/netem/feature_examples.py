@@ -31,7 +31,7 @@ WORDS = f"""
     rate 5mbit queue 1; rate 5mbit queue 1 codel; rate 5mbit queue 50; rate 5mbit queue 50 codel
     rate 5mbit queue 50 codel target 10us interval 100us mtu 0
     rate 5mbit queue 3 priority 2,1; rate 5mbit queue 50 priority 1,0,1
-    rate 5mbit queue 3 edf 1ms,0s; rate 5mbit queue 50 48 48 5 edf 0s,300us,100us
+    rate 5mbit queue 3 earliest_deadline 1ms,0s; rate 5mbit queue 50 48 48 5 earliest_deadline 0s,300us,100us
     rate 100mbit queue 5; rate 100mbit queue 5 codel; rate 1gbit -10 48 5
     rate 100mbit queue 5 codel target 10us interval 100us mtu 0
     opportunities at 0,0,1,2,2,2,5 queue 2
@@ -49,9 +49,7 @@ WORDS = f"""
     atmost 0 in 1; atmost 1 in 2; atmost 1 in 3; atmost 2 in 5; atmost 3 in 10; atmost 5 in 7
     recover 1; recover 2; recover 3; recover 7
 """
-_CLAUSES = {
-    clause.word: (kind, clause) for kind in (*IMPAIRMENTS, *CONSTRAINTS) for clause in kind.clauses
-}
+_CLAUSES = {clause.word: (kind, clause) for kind in (*IMPAIRMENTS, *CONSTRAINTS) for clause in kind.clauses}
 
 
 def _read(words: str) -> Any:

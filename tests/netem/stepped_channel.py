@@ -64,8 +64,7 @@ class SteppedChannel:
                 self.channel.answer(question)
         leaving = (channel.leaving[place] for place in range(channel.leaving_count))
         datagrams = [
-            Datagram(one.flow, flipped(self._payloads[one.message.sequence], one.bit))
-            for one in leaving
+            Datagram(one.flow, flipped(self._payloads[one.message.sequence], one.bit)) for one in leaving
         ]
         batches = self.channel.take_rows()
         rows = [Record(table, row) for table, batch in batches for row in batch.tolist()]

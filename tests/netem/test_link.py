@@ -219,9 +219,7 @@ def test_it_does_what_the_plain_network_does(
             assert channel.next_deadline_ns() == due_ns
             assert content_of(channel.on_timer(now_ns)) == content_of(expected.on_timer(now_ns))
         datagram = Datagram(flow, rng.bytes(size))
-        assert content_of(channel.handle(datagram, now_ns)) == content_of(
-            expected.handle(datagram, now_ns)
-        )
+        assert content_of(channel.handle(datagram, now_ns)) == content_of(expected.handle(datagram, now_ns))
     while (due_ns := expected.next_deadline_ns()) is not None:
         assert channel.next_deadline_ns() == due_ns
         assert content_of(channel.on_timer(due_ns)) == content_of(expected.on_timer(due_ns))

@@ -57,9 +57,7 @@ def arrived(ends: Ends, words: str, seed: int, count: int = 300) -> list[bool]:
             pass
         received = ends.received(intact(link.forward["fates"]))
     assert link.forward["received"] == count  # also after the end
-    lost = [
-        len(list(run)) for kept, run in groupby(range(count), received.__contains__) if not kept
-    ]
+    lost = [len(list(run)) for kept, run in groupby(range(count), received.__contains__) if not kept]
     assert max(lost) == link.forward["longest_loss_burst"]
     return [number in received for number in range(count)]
 
@@ -123,9 +121,7 @@ def test_words_may_name_files(ends: Ends, tmp_path: Path, monkeypatch: pytest.Mo
     assert arrived(ends, "loss trace trace.txt", 0, 6) == [True, False, False] * 2
 
 
-def run_pytest(
-    folder: Path, *arguments: str, **environment: str
-) -> subprocess.CompletedProcess[str]:
+def run_pytest(folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     plugin = ["-p", "no:noack", "-p", "netem.pytest_plugin"]  # if it is not installed here, too
     return subprocess.run(
         [sys.executable, "-m", "pytest", *plugin, "-p", "no:cacheprovider", *arguments],

@@ -209,9 +209,7 @@ def test_a_restarted_link_keeps_the_guarantee_behind_any_history(words: str) -> 
     before = [list(one) for one in HISTORIES if is_allowed(one, settings)]
     assert all(is_allowed([*one, *lost], settings) for one in before)
     earlier = lost.index(True) - 1
-    assert earlier == 0 or any(
-        not is_allowed([*one, *[False] * earlier, True], settings) for one in before
-    )
+    assert earlier == 0 or any(not is_allowed([*one, *[False] * earlier, True], settings) for one in before)
 
 
 def lost_of(releases: Sequence[int | None]) -> list[bool]:

@@ -128,10 +128,7 @@ def attacked(
     assert region is not None
     limit_x, limit_u = np.array(region.x)[:, None], np.array(region.u)[:, None]
     t_s = np.arange(steps) * h
-    bounds = [
-        of(t_s)
-        for of in (certificate.state, certificate.sensor_error, certificate.controller_error)
-    ]
+    bounds = [of(t_s) for of in (certificate.state, certificate.sensor_error, certificate.controller_error)]
 
     def share(what: str, values: Reals, limits: Reals | float) -> None:
         used = np.max(values / limits, initial=0.0)
@@ -141,11 +138,7 @@ def attacked(
     for number, t in enumerate(t_s.tolist()):
         error = np.linalg.norm(W @ (x_s - x), axis=0)
         share("‖e_s‖", error, bounds[1][number])
-        event = (
-            error > max(rule.beta * np.exp(-rule.alpha_per_s * t), rule.floor)
-            if number
-            else lazy | True
-        )
+        event = error > max(rule.beta * np.exp(-rule.alpha_per_s * t), rule.floor) if number else lazy | True
         share_lost = rng.random(runs) < often
         drops = event & share_lost & (lost < conditions.dropouts) & (number > 0)
         lost = np.where(event, np.where(drops, lost + 1, 0), lost)
@@ -153,8 +146,7 @@ def attacked(
         x_s = np.where(event, x, x_s)
         delay = np.where(lazy, latest, rng.integers(0, latest + 1, runs))
         place = (
-            number
-            + (np.minimum(delay, int(conditions.start_s / h + 1e-9)) if not number else delay)
+            number + (np.minimum(delay, int(conditions.start_s / h + 1e-9)) if not number else delay)
         ) % (latest + 1)
         on_its_way = np.flatnonzero(event & ~drops)
         ahead = np.einsum("rij,jr->ri", later[delay[on_its_way]], x[:, on_its_way])

@@ -94,9 +94,7 @@ class Comparison:
         error = np.abs(recorded - own).reshape(len(own), -1).max(axis=1, initial=0.0) / size
         place = int(error.argmax())
         self.error = max(self.error, float(error[place]))
-        assert error[place] <= TOLERANCE, (
-            f"{name} at {t_ns[place]} ns: {recorded[place]}, {own[place]}"
-        )
+        assert error[place] <= TOLERANCE, f"{name} at {t_ns[place]} ns: {recorded[place]}, {own[place]}"
 
 
 NOT_COMPUTED = {table: {"loop", "input", "now_ns"} for table in TIMES} | {

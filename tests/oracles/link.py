@@ -20,13 +20,7 @@ from noack.impairments.disciplines.priority import Priority
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
-from noack.protocol.record_tables import (
-    NETEM_PACKET,
-    NETEM_RELEASE,
-    NETEM_SETTING,
-    PACKET_HEAD_BYTES,
-    Fate,
-)
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
 from tests.machine_parts import Machine
@@ -50,7 +44,7 @@ class _Waiting(NamedTuple):
 
     key: int
     number: int
-    arrival_ns: int
+    entry_ns: int
     after_ns: int
     """The constant delays."""
     leaving: _InFlight
@@ -119,16 +113,14 @@ class Link:
     def change(self, settings: LinkSettings) -> None:
         """Apply other settings; see native/link_change.c."""
         self._serve(math.inf)
-        before, after = _scheduler(self._state.settings), _scheduler(settings)
-        if not (before and after and before.discipline.kind == after.discipline.kind):
-            self._free = Fraction(0)
-        elif before.rate_bps != after.rate_bps:
-            self._free = Fraction(int(self._free))
         latest_ns = np.full(self._state.rows, NEVER_NS, np.int64)
         for leaving in self._in_flight:
             row = self._rows[leaving.datagram.flow]
             latest_ns[row] = max(latest_ns[row], leaving.release_ns)
         self._state.change(settings, latest_ns)
+        if (rate := _scheduler(settings)) is not None:
+            queue = self._queue
+            self._free = queue.busy_until_ns + Fraction(queue.carry, rate.rate_bps)
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Accept a change; it applies from the first datagram that arrives at or after its time T.
@@ -193,9 +185,7 @@ class Link:
             self._state.start_flow(row, flow)
         return self._state.decide(row, size_bytes, now_ns)
 
-    def _release(
-        self, message: Datagram, release_ns: int, bit: int, *, copy: bool
-    ) -> tuple[Datagram, ...]:
+    def _release(self, message: Datagram, release_ns: int, bit: int, *, copy: bool) -> tuple[Datagram, ...]:
         """Return a datagram that leaves at once, or keep it until it is due."""
         decision = self.decision
         counts = bit < 0 and not (copy and decision.bit < 0)
@@ -207,15 +197,17 @@ class Link:
             release_ns > decision.arrival_ns, message,
         )  # fmt: skip
         if decision.waits:
-            rate, row = _scheduler(self._state.settings), self._rows[message.flow]
+            rate, row, entry_ns = (
+                _scheduler(self._state.settings),
+                self._rows[message.flow],
+                self._queue.entry_ns,
+            )
             assert rate is not None
             key = rate.discipline.numbers[min(row, len(rate.discipline.numbers) - 1)]
             if isinstance(rate.discipline, EarliestDeadline):
-                key += decision.arrival_ns
-            self._waiting.append(
-                _Waiting(key, leaving.number, decision.arrival_ns, decision.after_ns, leaving)
-            )
-            self._state.core.queues[self._state.core.scheduler].waits = len(self._waiting)
+                key += entry_ns
+            self._waiting.append(_Waiting(key, leaving.number, entry_ns, decision.after_ns, leaving))
+            self._queue.waits = len(self._waiting)
             return ()
         # Overdue datagrams leave first, even if ``on_timer`` has not been called for them yet.
         overdue = bool(self._in_flight) and self._in_flight[0].release_ns <= release_ns
@@ -227,22 +219,28 @@ class Link:
 
     def _serve(self, until_ns: float) -> None:
         """Begin to send what can begin until then: of what waits, the smallest."""
-        while self._waiting and int(self._free) <= until_ns:
+        while self._waiting and (int(self._free) <= until_ns or len(self._waiting) == self.in_flight):
             first = min(self._waiting)
             self._waiting.remove(first)
             rate = _scheduler(self._state.settings)
             assert rate is not None
-            begin = (
-                self._free if int(self._free) >= first.arrival_ns else Fraction(first.arrival_ns)
-            )
-            size_bytes = len(first.leaving.datagram.data)
+            begin = self._free if int(self._free) >= first.entry_ns else Fraction(first.entry_ns)
+            flow, size_bytes = first.leaving.datagram.flow, len(first.leaving.datagram.data)
             bits = int(rate.line_bits(size_bytes))
             self._free = begin + Fraction(bits * 10**9, rate.rate_bps)
             link = self._state.core  # it knows how many wait, and until when the link is busy
-            link.queues[link.scheduler].waits = len(self._waiting)
+            self._queue.waits = len(self._waiting)
             assert core.noack_queue_serve(link, link.scheduler, size_bytes) == int(self._free)
-            leaves_ns = max(int(self._free) + first.after_ns, first.leaving.release_ns)
+            leaves_ns = max(
+                int(self._free) + first.after_ns, first.leaving.release_ns, self.flow(flow).first_release_ns
+            )
+            self.flow(flow).first_release_ns = leaves_ns
             heapq.heappush(self._in_flight, first.leaving._replace(release_ns=leaves_ns))
+
+    @property
+    def _queue(self) -> Any:
+        """The state of the queue that chooses, a ``noack_queue``."""
+        return self._state.core.queues[self._state.core.scheduler]
 
     def _leave(self, leaving: _InFlight) -> bool:
         row, size_bytes = self._rows[leaving.datagram.flow], len(leaving.datagram.data)

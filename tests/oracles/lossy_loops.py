@@ -100,9 +100,7 @@ class System:
     def lag(self) -> int:
         return self.lag_steps if self.hold_steps else 0
 
-    def gains(
-        self, error: type[ErrorGains] = ErrorGains, plant: type[PlantGains] = PlantGains
-    ) -> PlantGains:
+    def gains(self, error: type[ErrorGains] = ErrorGains, plant: type[PlantGains] = PlantGains) -> PlantGains:
         models = error(self.H, self.K, self.weight, self.alpha)
         return plant(models, self.A, self.B, self.x0[:, None], self.alpha)
 

@@ -125,9 +125,7 @@ remove(socket, OF_SOCKET)
 remove(select, re.compile("e?poll"))
 remove(
     signal,
-    re.compile(
-        f"SIG(?!_)(?!({'|'.join(OF_WINDOWS)})$)|pthread_|sig(wait|pend|int|timed)|setitimer"
-    ),
+    re.compile(f"SIG(?!_)(?!({'|'.join(OF_WINDOWS)})$)|pthread_|sig(wait|pend|int|timed)|setitimer"),
 )
 remove(time, re.compile("clock_|CLOCK_|tzset"))
 del ctypes.CDLL, ctypes.cdll

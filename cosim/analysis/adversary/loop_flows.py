@@ -18,14 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from cosim.analysis.adversary.objective import (
-    Flags,
-    Measure,
-    Objective,
-    Pattern,
-    Segments,
-    weight_of,
-)
+from cosim.analysis.adversary.objective import Flags, Measure, Objective, Pattern, Segments, weight_of
 from cosim.simulation.continuous import ContinuousLoop, ContinuousRun
 from cosim.simulation.exact_simulation import DIVERGED, OK, ExactSimulation
 from cosim.simulation.sampled_loop import Numbers, Runs, SampledLoop, Scales
@@ -77,10 +70,13 @@ class SegmentFlow:
         if measure.floor and measure.rate_per_s:
             until_s = math.log(measure.beta / measure.floor) / measure.rate_per_s
         return self.system.simulation(
-            self.horizon_s, known_start=True, R=np.zeros((m, m)),
-            measure=_MEASURES[measure.objective], fading_per_s=measure.rate_per_s,
+            self.horizon_s,
+            known_start=True,
+            R=np.zeros((m, m)),
+            measure=_MEASURES[measure.objective],
+            fading_per_s=measure.rate_per_s,
             fading_until_s=until_s,
-        )  # fmt: skip
+        )
 
     def start(self) -> Segments:
         """As :meth:`PatternFlow.start`: sensor and controller have x(0)."""
@@ -116,9 +112,7 @@ class SegmentFlow:
         loop, measure, n = self.system.loop, self.measure, self.system.loop.n
         found = self._simulation.segments(loop.A, loop.B, t_s, z.reshape(-1, 3, n))
         if not np.isin(found.statuses, (OK, DIVERGED)).all():
-            raise CallerError(
-                "trigger: an error stays too close to a level to decide when it passes"
-            )
+            raise CallerError("trigger: an error stays too close to a level to decide when it passes")
         diverged, is_event = found.statuses == DIVERGED, found.events == 1
         z = found.states.reshape(-1, 3 * n)
         if measure.objective is Objective.INTER_EVENT:
@@ -257,10 +251,14 @@ class SampledFlow:
         step = np.maximum(runs.step, 0)
         state, error = self._scales.state[step, None], self._scales.error[step, None]
         parts = [
-            runs.x * state, (runs.x_s - runs.y) * error, (runs.x_c - runs.y) * error,
-            runs.u * state, runs.updates.reshape(len(z), -1) * state,
-            runs.sent, runs.auxiliary[:, None],
-        ]  # fmt: skip
+            runs.x * state,
+            (runs.x_s - runs.y) * error,
+            (runs.x_c - runs.y) * error,
+            runs.u * state,
+            runs.updates.reshape(len(z), -1) * state,
+            runs.sent,
+            runs.auxiliary[:, None],
+        ]
         return np.hstack([part / (np.abs(part).max(initial=0.0) or 1.0) for part in parts])
 
     def _time(self, step: Numbers) -> Vector:
@@ -295,9 +293,16 @@ class SampledFlow:
 def _states(runs: Runs) -> tuple[Matrix, ...]:
     """Return the arrays of which a run's state consists."""
     return (
-        runs.x, runs.y, runs.x_s, runs.x_c, runs.u, runs.u_next, runs.sent, runs.updates,
+        runs.x,
+        runs.y,
+        runs.x_s,
+        runs.x_c,
+        runs.u,
+        runs.u_next,
+        runs.sent,
+        runs.updates,
         runs.auxiliary,
-    )  # fmt: skip
+    )
 
 
 def _packed(runs: Runs) -> Matrix:

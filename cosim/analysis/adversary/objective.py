@@ -69,9 +69,7 @@ class Measure:
         return np.asarray(np.maximum(level, self.floor / self.beta) if self.floor else level)
 
 
-def measure_of(
-    system: ContinuousLoop, objective: Objective, rate_per_s: float | None = None
-) -> Measure:
+def measure_of(system: ContinuousLoop, objective: Objective, rate_per_s: float | None = None) -> Measure:
     """Make a loop's measure; its level decays at α unless ``rate_per_s`` is given."""
     n, trigger = system.loop.n, system.decaying
     if objective is Objective.INTER_EVENT:

@@ -48,9 +48,7 @@ class Nodes(NamedTuple):
 
     def take(self, which: Indices | Flags | slice) -> "Nodes":
         """Return a selection of the runs."""
-        return Nodes(
-            self.t_s[which], self.z[which], self.state[which], self.value[which], self.entry[which]
-        )
+        return Nodes(self.t_s[which], self.z[which], self.state[which], self.value[which], self.entry[which])
 
 
 def root(flow: PatternFlow) -> Nodes:
@@ -155,9 +153,15 @@ class PatternSearch:
 
 
 def after_events(
-    flow: PatternFlow, nodes: Nodes, segments: Segments, value: Vector, these: Indices,
-    delivered: Flags, state: Indices, log: DecisionLog,
-) -> Nodes:  # fmt: skip
+    flow: PatternFlow,
+    nodes: Nodes,
+    segments: Segments,
+    value: Vector,
+    these: Indices,
+    delivered: Flags,
+    state: Indices,
+    log: DecisionLog,
+) -> Nodes:
     """Return the runs ``these``, (k,), just after the events at the end of their segments.
 
     ``delivered``, (k,), tells whether the update of each run arrives; the ``log`` receives that.

@@ -15,13 +15,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from cosim.analysis.adversary.loop_flows import (
-    SampledFlow,
-    SampledRun,
-    SegmentFlow,
-    evaluate,
-    run_of,
-)
+from cosim.analysis.adversary.loop_flows import SampledFlow, SampledRun, SegmentFlow, evaluate, run_of
 from cosim.analysis.adversary.objective import Objective, Pattern, measure_of, weight_of
 from cosim.analysis.adversary.pattern_search import (
     Ceiling,
@@ -108,9 +102,13 @@ def conditions_of(resolved: Scenario, *, continuous: bool) -> NetworkConditions:
 
 
 def _find_sampled(
-    resolved: Scenario, objective: Objective, certificate: ScenarioCertificate, beam: int,
-    most_nodes: int, report: SearchReport,
-) -> Worst:  # fmt: skip
+    resolved: Scenario,
+    objective: Objective,
+    certificate: ScenarioCertificate,
+    beam: int,
+    most_nodes: int,
+    report: SearchReport,
+) -> Worst:
     began_s = time.monotonic()
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
     own = run_of(flow, network_fates(resolved))
@@ -159,9 +157,13 @@ def _push(flow: SampledFlow, bounds: Bounds, worst: SampledRun) -> tuple[Sampled
 
 
 def _find_continuous(
-    resolved: Scenario, objective: Objective, certificate: ScenarioCertificate, beam: int,
-    most_nodes: int, report: SearchReport,
-) -> Worst:  # fmt: skip
+    resolved: Scenario,
+    objective: Objective,
+    certificate: ScenarioCertificate,
+    beam: int,
+    most_nodes: int,
+    report: SearchReport,
+) -> Worst:
     began_s, horizon_s = time.monotonic(), resolved.horizon_s
     constants = certificate.constants
     system = continuous_loop_of(resolved)
@@ -171,9 +173,7 @@ def _find_continuous(
     first: Pattern = () if known_start else (True,)
 
     def simulated(delivered: Callable[[int], bool] | Pattern) -> ContinuousRun:
-        return simulate_continuous(
-            system, horizon_s=horizon_s, delivered=delivered, known_start=known_start
-        )
+        return simulate_continuous(system, horizon_s=horizon_s, delivered=delivered, known_start=known_start)
 
     own = simulated(network_fates(resolved))
     flow = SegmentFlow(system, measure, horizon_s, known_start=known_start)
@@ -215,9 +215,7 @@ def _search(search: PatternSearch, own: Pattern, beam: int, most_nodes: int) -> 
     return False
 
 
-def cost_ceiling(
-    system: ContinuousLoop, longest_burst: int | None, horizon_s: float
-) -> Ceiling | None:
+def cost_ceiling(system: ContinuousLoop, longest_burst: int | None, horizon_s: float) -> Ceiling | None:
     """Return an upper bound of what the rest of a run adds to ∫‖x‖².
 
     From x' = (A+BK) x + B p, p = K e_c, and the triangle inequality in L₂[t, ∞),

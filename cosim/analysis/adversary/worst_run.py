@@ -18,15 +18,7 @@ from rich.table import Table
 
 from cosim.analysis.adversary.loop_flows import SampledFlow, SampledRun, Valued
 from cosim.analysis.adversary.objective import Measure, Objective, Pattern
-from cosim.simulation.sampled_loop import (
-    Numbers,
-    Runs,
-    SampledLoop,
-    Scales,
-    noise_of,
-    pushes_of,
-    through_of,
-)
+from cosim.simulation.sampled_loop import Numbers, Runs, SampledLoop, Scales, noise_of, pushes_of, through_of
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
 from noack.disturbances.uniform import UniformDisturbance
@@ -62,9 +54,7 @@ def bounds_of(resolved: Scenario) -> Bounds | None:
     return Bounds(found, noise) if found.size or noise.any() else None
 
 
-def worst_causes(
-    flow: SampledFlow, bounds: Bounds, run: SampledRun, at_s: float
-) -> Iterator[SampledLoop]:
+def worst_causes(flow: SampledFlow, bounds: Bounds, run: SampledRun, at_s: float) -> Iterator[SampledLoop]:
     """Yield loops with the causes that are worst at a time, for the events of a run.
 
     The norm is largest in some direction: each loop maximises one entry of the vector, with either
@@ -78,8 +68,7 @@ def worst_causes(
     linear = loop.with_causes(np.zeros((0, n)), np.zeros((0, drawn[1].shape[1])))
     pushes = [_responses_to_push(linear, flow, one, run, at) for one in bounds.columns.T]
     noises = [
-        _responses_to_noise(linear, flow, entry, bound, run, at)
-        for entry, bound in enumerate(bounds.noise)
+        _responses_to_noise(linear, flow, entry, bound, run, at) for entry, bound in enumerate(bounds.noise)
     ]
     axes = np.eye(n)
     for direction in (_vectors(flow, start)[0], *axes, *-axes):
@@ -290,9 +279,12 @@ def document(
 
 
 def print_worst(
-    console: Console, found: Sequence[Worst], resolved: Scenario,
-    certificate: ScenarioCertificate, trigger: str,
-) -> None:  # fmt: skip
+    console: Console,
+    found: Sequence[Worst],
+    resolved: Scenario,
+    certificate: ScenarioCertificate,
+    trigger: str,
+) -> None:
     """Print the results and their loss patterns."""
     table = Table(
         title=f"{resolved.name}: worst losses found, {resolved.network.guarantee.meaning}, "
@@ -312,8 +304,7 @@ def print_worst(
         at = "" if worst.at_s is None else f"worst at {worst.at_s:.6f} s; "
         how = "all patterns searched" if worst.exact else "not all patterns searched"
         speed = (
-            f"{worst.runs:,} runs; {worst.nodes:,} segments, "
-            f"{worst.nodes / worst.elapsed_s:,.0f} per second"
+            f"{worst.runs:,} runs; {worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f} per second"
         )
         console.print(f"{worst.objective.value}: {at}{how} ({speed})")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)

@@ -78,9 +78,7 @@ def claim(
 
 def certified(
     statement: str,
-) -> Callable[
-    [Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], Findings]], CertifiedClaim
-]:
+) -> Callable[[Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], Findings]], CertifiedClaim]:
     """Make a function the definition of a claim of certificates."""
     return lambda find: CertifiedClaim(statement, find)
 

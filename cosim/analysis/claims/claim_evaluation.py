@@ -26,21 +26,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from cosim.analysis.claims import catalogue
-from cosim.analysis.claims.claim_definition import (
-    Bound,
-    CertifiedClaim,
-    ClaimDefinition,
-    Envelope,
-    Findings,
-)
+from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, ClaimDefinition, Envelope, Findings
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
-from cosim.analysis.claims.run_evidence import (
-    ROUNDING,
-    RunEvidence,
-    RunPart,
-    Samples,
-    late_certificates,
-)
+from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, RunPart, Samples, late_certificates
 from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.analysis.value_reduction import decimate
 from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
@@ -65,17 +53,10 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import (
-    BOX,
-    about_setpoint,
-    allowed_conditions,
-    void_at_setpoint,
-)
+from noack.theory.certificates.conditions import BOX, about_setpoint, allowed_conditions, void_at_setpoint
 from noack.theory.certificates.scenario_certificates import outside_box
 
-_IDEAL_LOOP = (
-    "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
-)
+_IDEAL_LOOP = "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
 _ACKNOWLEDGED = (
     'network.protocol = "ack": x_s is reset when an update is acknowledged, and not at every '
     "event as (I1), and every claim that follows from it, assumes"
@@ -91,14 +72,10 @@ def definitions(kind: type[_Kind]) -> list[_Kind]:
     """
     names = sorted(found.name for found in pkgutil.iter_modules(catalogue.__path__))
     modules = [importlib.import_module(f"{catalogue.__name__}.{name}") for name in names]
-    return [
-        claim for module in modules for claim in vars(module).values() if isinstance(claim, kind)
-    ]
+    return [claim for module in modules for claim in vars(module).values() if isinstance(claim, kind)]
 
 
-def void_claim(
-    what: str, source: str, since_s: float, why: str, until_s: float | None = None
-) -> Claim:
+def void_claim(what: str, source: str, since_s: float, why: str, until_s: float | None = None) -> Claim:
     """Return a claim that cannot be checked because there is no bound."""
     return Claim(
         what=what, source=source, bound="none", certified=None, observed=None, ratio=None,
@@ -112,12 +89,8 @@ class ClaimCheck:
     If the run cannot meet an assumption, ``unmet`` names it.
     """
 
-    def __init__(
-        self, statement: str, source: str, until_s: float = math.inf, unmet: str = ""
-    ) -> None:
-        self._statement, self._source, self._until_s, self._unmet = (
-            statement, source, until_s, unmet
-        )  # fmt: skip
+    def __init__(self, statement: str, source: str, until_s: float = math.inf, unmet: str = "") -> None:
+        self._statement, self._source, self._until_s, self._unmet = (statement, source, until_s, unmet)
         self._ratio: float | None = None
         self._exceeded_s: float | None = None
         self._bound: Bound | None = None
@@ -389,9 +362,11 @@ class RunClaims:
         record = self._judged
         known = record.events()["event"]
         after = record.columns(
-            CONTROLLER_DELIVERY, "t_ns", "sequence",
+            CONTROLLER_DELIVERY,
+            "t_ns",
+            "sequence",
             where=lambda rows: rows["t_ns"] >= made.everywhere_ns,
-        )  # fmt: skip
+        )
         after = after[np.isin(after["sequence"], known)]
         if made.everywhere_ns == NEVER_NS:
             return _nothing_after(made, until_ns, "not every process received the change")
@@ -449,9 +424,7 @@ def _until(envelope: Envelope, until_s: float) -> Envelope:
     return envelope._replace(values=np.where(envelope.t_s < until_s, envelope.values, np.nan))
 
 
-def _part_of(
-    record: RunRecord, scenario: Scenario, origin_ns: int, sequence: int | None
-) -> RunRecord:
+def _part_of(record: RunRecord, scenario: Scenario, origin_ns: int, sequence: int | None) -> RunRecord:
     """Return the part of a run after the event ``sequence``, in the form of a separate record.
 
     The time of the event becomes time 0. Without an event it is the whole run.

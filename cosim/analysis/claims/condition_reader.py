@@ -348,9 +348,7 @@ class _Updates:
             SampledSeries(late[:, 0] * 1e-9, late[:, 1] * 1e-9),
         )
 
-    def _fate(
-        self, sequence: int, event_ns: int, end_ns: int | None
-    ) -> tuple[float, int | None] | None:
+    def _fate(self, sequence: int, event_ns: int, end_ns: int | None) -> tuple[float, int | None] | None:
         """Return when a newer update replaced a lost one, in s, and when the update acted, in ns.
 
         None if this is not determined yet. An update in flight at the end is not lost; it counts as
@@ -376,9 +374,13 @@ class _Updates:
 
 
 READ = (
-    SENSOR_MEASUREMENT, PLANT_STEP, PLANT_ACTUATION, CONTROLLER_STEP, CONTROLLER_DELIVERY,
+    SENSOR_MEASUREMENT,
+    PLANT_STEP,
+    PLANT_ACTUATION,
+    CONTROLLER_STEP,
+    CONTROLLER_DELIVERY,
     NETEM_PACKET,
-)  # fmt: skip
+)
 """The tables that the conditions depend on."""
 _COLUMNS = (
     "input", "sequence", "t_ns", "event", "actuation", "u", "entry", "model_t_ns", "error_ns",
@@ -445,10 +447,17 @@ class ConditionReader:
         if not self._inputs.started and not ended:
             start_s = self._inputs.classified_ns * 1e-9
         return ObservedConditions(
-            losses, self._measurements.gaps(end_ns), delay, hold, start_s, watchdog, safe_input,
-            self._measurements.restarts(), self._timeout_s,
+            losses,
+            self._measurements.gaps(end_ns),
+            delay,
+            hold,
+            start_s,
+            watchdog,
+            safe_input,
+            self._measurements.restarts(),
+            self._timeout_s,
             **({} if self._clocks is None else self._clocks.observed()),
-        )  # fmt: skip
+        )
 
 
 def read_conditions(record: RunRecord) -> ObservedConditions:

@@ -42,20 +42,14 @@ CAUSES = {
     "delay": "an update took effect after {:.4g} s, {:.4g} s allowed",
     "hold": "an input was {:.4g} s old, {:.4g} s allowed",
     "start": "the plant applied no input until {:.4g} s, {:.4g} s allowed",
-    "watchdog": "the watchdog replaced the input: the newest actuation was {:.4g} s old, "
-    "{:.4g} s allowed",
+    "watchdog": "the watchdog replaced the input: the newest actuation was {:.4g} s old, {:.4g} s allowed",
     "safe input": "the controller had no state and sent its safe input, largest entry {:.4g}",
     "restart": "the sensor was restarted: its first transmission is no event of the trigger",
     **{
-        clock_cause(
-            role
-        ): f"the clock of {role} may have been off by {{:.4g}} s, {{:.4g}} s allowed"
+        clock_cause(role): f"the clock of {role} may have been off by {{:.4g}} s, {{:.4g}} s allowed"
         for role in LOOP_ROLES
     },
-    **{
-        lost_cause(role): f"the bound of the error of {role}'s clock was lost"
-        for role in LOOP_ROLES
-    },
+    **{lost_cause(role): f"the bound of the error of {role}'s clock was lost" for role in LOOP_ROLES},
 }
 """The assumptions about the schedule, each with the message of a violation: worst value and limit.
 
@@ -234,12 +228,12 @@ class ObservedConditions(NamedTuple):
         """Return when the run became later than ``allowed``, and later than it had been so far."""
         start = SampledSeries(np.zeros(1), np.array([self.start_s]))
         every = (
-            (self.delay, allowed.delay_s), (self.hold, allowed.hold_s), (start, allowed.start_s),
-        )  # fmt: skip
-        peaks = [(series.peaks(), limit_s + _TOLERANCE_S) for series, limit_s in every]
-        return sorted(
-            {t_s for one, most_s in peaks for t_s in one.t_s[one.value > most_s].tolist()}
+            (self.delay, allowed.delay_s),
+            (self.hold, allowed.hold_s),
+            (start, allowed.start_s),
         )
+        peaks = [(series.peaks(), limit_s + _TOLERANCE_S) for series, limit_s in every]
+        return sorted({t_s for one, most_s in peaks for t_s in one.t_s[one.value > most_s].tolist()})
 
     def widened(self, allowed: NetworkConditions, until_s: float = np.inf) -> NetworkConditions:
         """Return conditions that the run's schedule meets up to a time.
@@ -261,9 +255,7 @@ class ObservedConditions(NamedTuple):
 
     def summary(self) -> dict[str, float | None]:
         """The largest value of each condition."""
-        clocks = [
-            self.clocks[cause].largest() for cause in map(clock_cause, LOOP_ROLES) if self.clocks
-        ]
+        clocks = [self.clocks[cause].largest() for cause in map(clock_cause, LOOP_ROLES) if self.clocks]
         return {
             DROPOUTS: self.losses.consecutive(0.0).largest(),
             "sampling_s": self.sampling.largest(),

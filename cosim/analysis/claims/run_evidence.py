@@ -28,12 +28,7 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
-from cosim.analysis.loop_statistics import (
-    SampleFacts,
-    SampleFactsReader,
-    shares_update,
-    signal_statistics,
-)
+from cosim.analysis.loop_statistics import SampleFacts, SampleFactsReader, shares_update, signal_statistics
 from cosim.record.align import (
     UNKNOWN,
     AlignedRun,
@@ -54,11 +49,7 @@ from noack.theory.certificates.certified_bounds import (
     ScenarioCertificate,
     known_state_bounds,
 )
-from noack.theory.certificates.conditions import (
-    allowed_conditions,
-    ideal_conditions,
-    nominal_conditions,
-)
+from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
 from noack.theory.certificates.region import scopes
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.certificates.solution import Search, completed
@@ -406,9 +397,7 @@ def late_certificates(runs: Sequence[RunEvidence]) -> list[Sequence[ScenarioCert
     return found
 
 
-def scheduled_certificates(
-    scenario: Scenario, start_error: float | None = None
-) -> list[ScenarioCertificate]:
+def scheduled_certificates(scenario: Scenario, start_error: float | None = None) -> list[ScenarioCertificate]:
     """Return the certificates of a resolved scenario under its schedule, if it can have any.
 
     A part of a run that starts with an input of the part before has a ``start_error``.

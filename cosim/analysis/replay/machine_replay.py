@@ -72,10 +72,16 @@ class InputReplay:
         self._machine, self._sizes = machine, sizes
         self._is_network = isinstance(machine, Channel)
         width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values())
-        self._core: CData = ffi.new("noack_input_replay *", {
-            "role": _ROLES[role], "before_ns": -(2**63), "sent_width": width, "loop": loop,
-            ("channel" if self._is_network else "process"): machine.core,
-        })  # fmt: skip
+        self._core: CData = ffi.new(
+            "noack_input_replay *",
+            {
+                "role": _ROLES[role],
+                "before_ns": -(2**63),
+                "sent_width": width,
+                "loop": loop,
+                ("channel" if self._is_network else "process"): machine.core,
+            },
+        )
         self._sent = np.zeros((0, width), np.int64)
 
     def replay(self, owned: Slice, order: Numbers, before: Mapping[str, int]) -> int:
@@ -150,9 +156,10 @@ class InputReplay:
         table, row, rows = place_of(replay.next)
         recorded = rows[row]
         change = ParameterChange(
-            int(recorded["sequence"]), int(recorded["t_ns"]),
+            int(recorded["sequence"]),
+            int(recorded["t_ns"]),
             _settings(recorded["change"].tobytes()),
-        )  # fmt: skip
+        )
         outputs = self._machine.announce(change, int(recorded["now_ns"]))
         (emitted,) = (output for output in outputs if type(output) is Record)
         values = emitted.row if self._is_network else emitted.row[1:]  # without the loop's number
@@ -187,15 +194,11 @@ class InputReplay:
             replayed = rows[row : row + 1].copy()
             own = replayed.view(np.uint8).reshape(-1)
             skipped = _prefix_bytes(rows.dtype)
-            own[skipped:] = np.frombuffer(ffi.buffer(replay.replayed), np.uint8)[
-                : len(own) - skipped
-            ]
+            own[skipped:] = np.frombuffer(ffi.buffer(replay.replayed), np.uint8)[: len(own) - skipped]
             number = place_of.number(table, row)
             self.difference = rows_differ(table, number, rows[row], replayed[0])
 
-    def _note(
-        self, place_of: "_Places", at: int, what: str, column: str = "", *values: int | None
-    ) -> None:
+    def _note(self, place_of: "_Places", at: int, what: str, column: str = "", *values: int | None) -> None:
         """Keep a difference at an input, if it is the first one."""
         table, row, rows = place_of(at)
         number, now_ns = place_of.number(table, row), int(rows["now_ns"][row])
@@ -268,9 +271,13 @@ def _recorded_table(table: str, rows: Rows) -> dict[str, object]:
             columns = (fields[column] for column in received_columns(table, rows.dtype))
             vector = [(offset - skipped, of.shape[0]) for of, offset, *_ in columns]
     return {
-        "kind": kind, "row_bytes": stride - skipped, "stride": stride, "count": len(rows),
-        "rows": pointer_to(rows, "uint8_t *") + skipped, "vector": vector,
-    }  # fmt: skip
+        "kind": kind,
+        "row_bytes": stride - skipped,
+        "stride": stride,
+        "count": len(rows),
+        "rows": pointer_to(rows, "uint8_t *") + skipped,
+        "vector": vector,
+    }
 
 
 def _own_names(dtype: np.dtype[np.void]) -> Sequence[str]:
@@ -305,9 +312,7 @@ class SharedMachines:
 
     def __init__(self, records: Sequence[RunRecord]) -> None:
         self._loops = [
-            record
-            for record in records
-            if record.is_short and not any(record.count(one) for one in SETTINGS)
+            record for record in records if record.is_short and not any(record.count(one) for one in SETTINGS)
         ]
 
     def place(self, record: RunRecord) -> int | None:
@@ -438,9 +443,14 @@ class _LifeReplay:
         self._missing_from = None
         table, row = table_and_row(owned, int(order[suspect]))
         self._damage = difference(
-            table, self._before[table] + row, int(owned[table]["now_ns"][row]),
-            "the inputs are not numbered in turn", "input", int(numbers[suspect]), expected,
-        )  # fmt: skip
+            table,
+            self._before[table] + row,
+            int(owned[table]["now_ns"][row]),
+            "the inputs are not numbered in turn",
+            "input",
+            int(numbers[suspect]),
+            expected,
+        )
 
 
 def _sizes(role: str, scenario: Scenario) -> Mapping[Flow, int]:

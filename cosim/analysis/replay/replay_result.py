@@ -28,9 +28,16 @@ def difference(
     """Return a difference with its values formatted."""
     (first, first_hex), (second, second_hex) = _shown(recorded), _shown(replayed)
     return ReplayDifference(
-        table=table, row=row, column=column, recorded=first, recorded_hex=first_hex,
-        replayed=second, replayed_hex=second_hex, what=what, now_ns=now_ns,
-    )  # fmt: skip
+        table=table,
+        row=row,
+        column=column,
+        recorded=first,
+        recorded_hex=first_hex,
+        replayed=second,
+        replayed_hex=second_hex,
+        what=what,
+        now_ns=now_ns,
+    )
 
 
 def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> ReplayDifference:

@@ -47,9 +47,12 @@ def doctor(
         machine = machine_measures.measure(resolved, wanted, runs, seconds)
     found = findings.judge(machine, wanted)
     cli.show(
-        json, lambda: findings.document(machine, wanted, found),
-        findings.print_findings, wanted, found,
-    )  # fmt: skip
+        json,
+        lambda: findings.document(machine, wanted, found),
+        findings.print_findings,
+        wanted,
+        found,
+    )
     is_bad = findings.worst(found) is findings.FindingStatus.BAD
     return ExitStatus.FAILED if is_bad else ExitStatus.OK
 
@@ -78,8 +81,7 @@ def lab(
     """
     if find_spec("nicegui") is None:
         raise CallerError(
-            "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the "
-            "repository"
+            "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the repository"
         )
     edited = draft.open_draft(given.scenario)
     for setting in given.settings or ():

@@ -12,12 +12,7 @@ from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus
 
 with lazy_modules():
-    from cosim.measurement import (
-        loss_bursts,
-        measurement_outputs,
-        network_measurement,
-        trace_sources,
-    )
+    from cosim.measurement import loss_bursts, measurement_outputs, network_measurement, trace_sources
     from cosim.measurement.live import live_measurement, probe_ends
     from noack.core import core_library
     from noack.traces import trace_formats
@@ -63,9 +58,14 @@ class ProbeOptions:
     def live(self, deadline_s: float | None) -> "live_measurement.LiveOptions":
         """Return the options of a live measurement."""
         return live_measurement.LiveOptions(
-            self.rate, self.duration, self.size, self.round_trip, self.silence, self.save,
+            self.rate,
+            self.duration,
+            self.size,
+            self.round_trip,
+            self.silence,
+            self.save,
             deadline_s,
-        )  # fmt: skip
+        )
 
 
 @cli.option_group
@@ -127,9 +127,9 @@ class WrittenOptions(cli.FigureOptions):
         form: Write the network as the trace itself, or as a fitted model.
     """
 
-    for_scenario: Annotated[
-        str | None, Option(metavar="SCENARIO", autocompletion=completion.scenarios)
-    ] = None
+    for_scenario: Annotated[str | None, Option(metavar="SCENARIO", autocompletion=completion.scenarios)] = (
+        None
+    )
     settings: cli.SetOption = None
     out: cli.OutOption = None
     write: Path | None = None
@@ -175,10 +175,15 @@ def measure(
     """
     options, request = losses.measurement(), written.request()
     is_probe = sources is not None and len(sources) == 1 and live_measurement.is_address(sources[0])
-    if is_probe and probe.listen is None and not probe.round_trip and (
-        options != network_measurement.MeasurementOptions(deadline_s=options.deadline_s)
-        or request != measurement_outputs.OutputRequest()
-    ):  # fmt: skip
+    if (
+        is_probe
+        and probe.listen is None
+        and not probe.round_trip
+        and (
+            options != network_measurement.MeasurementOptions(deadline_s=options.deadline_s)
+            or request != measurement_outputs.OutputRequest()
+        )
+    ):
         raise CallerError(
             "the sender of a one-way probe does not know what arrives: give the options of the "
             "measurement to the listener, or add --round-trip"

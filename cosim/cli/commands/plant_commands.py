@@ -113,7 +113,8 @@ def new(
 ) -> None:
     """Write a complete scenario for a plant, with comments, and settings that are certified.
 
-    The gain is chosen, too, unless the plant is a file that gain wrote. If no certificate is found,
+    The gain is chosen, too, unless the plant is a file that gain wrote. Choose it by weights or
+    poles there: `noack gain PLANT --q 10,1 --r 0.1 --out pole.json`. If no certificate is found,
     the scenario is written all the same, with the reason. --set fixes settings.
 
     Options:
@@ -155,9 +156,7 @@ def _settings(given: Sequence[str] | None) -> "Table":
     return found
 
 
-def _numbers(
-    option: str, text: str | None, kind: Callable[[str], Number] = float
-) -> list[Number] | None:
+def _numbers(option: str, text: str | None, kind: Callable[[str], Number] = float) -> list[Number] | None:
     if text is None:
         return None
     try:
@@ -166,9 +165,7 @@ def _numbers(
         raise CallerError(f"{option} {text}: give numbers with commas, e.g. -1,-0.5") from None
 
 
-def _show(
-    found: "linear_model.LinearModel | linear_model.LoopGain", out: Path | None, *, json: bool
-) -> None:
+def _show(found: "linear_model.LinearModel | linear_model.LoopGain", out: Path | None, *, json: bool) -> None:
     """Print a result, and write its document, not over that of another plant."""
     if out is not None:
         if out.suffix != ".json":

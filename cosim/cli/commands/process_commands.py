@@ -67,9 +67,13 @@ def record(
         address = remote_access.listen_address(listen)
         listening = remote_access.Listening(address, invitation, role, 60 * valid_minutes)
     return run_processes(
-        given.load(), options, spawn=(topology.RECORDER,), session=session, server=context.obj,
+        given.load(),
+        options,
+        spawn=(topology.RECORDER,),
+        session=session,
+        server=context.obj,
         listening=listening,
-    )  # fmt: skip
+    )
 
 
 @cli.option_group

@@ -187,7 +187,7 @@ def export(
 
     Options:
         file_format: Format of the file, or of the folder's files.
-        out: File, or folder of CSV; RUN.mat and so on by default.
+        out: File, or folder of CSV or FMUs; RUN.mat and so on by default.
         certificates: Certificates of each loop in a file of MATLAB; about a second for each loop.
 
     Examples:
@@ -203,10 +203,11 @@ def export(
         name = run.loop or chosen.resolve().name
         path = out or Path(f"{name}{export_suffix(file_format)}")
         with cli.status("exporting"):
-            written = export_run(
-                chosen, path, file_format, loop=run.loop, certificates=certificates
-            )
+            written = export_run(chosen, path, file_format, loop=run.loop, certificates=certificates)
     else:
+        if run.loop or not certificates:
+            option = "--loop" if run.loop else "--no-certificates"
+            raise CallerError(f"{option}: not with {file_format}, which is made of a scenario")
         scenario = cli.load_scenario(_scenario_name(run), settings)
         path = out or Path(f"{scenario.name}{export_suffix(file_format)}")
         written = export_scenario(scenario, path, file_format)
@@ -222,9 +223,7 @@ def _scenario_name(run: cli.LoopOptions) -> str:
 
 
 @cli.command(cli.RUNS, 92, takes="about a second")
-def archive(
-    run: cli.RunOptions, *, out: cli.OutOption = None, json: cli.JsonOption = False
-) -> None:
+def archive(run: cli.RunOptions, *, out: cli.OutOption = None, json: cli.JsonOption = False) -> None:
     """Archive a run: one file with everything that its repetition needs.
 
     `noack reproduce` repeats it.
@@ -304,9 +303,7 @@ def collect(
 
 @cli.command(cli.RUNS, 80, takes="about a second")
 def compare(
-    directories: Annotated[
-        list[Path], Argument(metavar="RUN...", autocompletion=completion.run_directories)
-    ],
+    directories: Annotated[list[Path], Argument(metavar="RUN...", autocompletion=completion.run_directories)],
     *,
     out: Path = cli.DEFAULT_RUNS / "comparison.html",
     width: cli.WidthOption = None,

@@ -8,13 +8,7 @@ from typer import Argument, Option
 
 from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.cli.execute_run import (
-    LiveOptions,
-    OutputOptions,
-    finalize_run,
-    run_processes,
-    warn_of_violations,
-)
+from cosim.cli.execute_run import LiveOptions, OutputOptions, finalize_run, run_processes, warn_of_violations
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError
 from noack.core.number_format import number
@@ -34,9 +28,7 @@ if TYPE_CHECKING:
 _EVENTS_SHOWN = 40
 
 
-@cli.command(
-    cli.RUNS, 20, takes="as long as the scenario's horizon, and a few seconds", on_linux=True
-)
+@cli.command(cli.RUNS, 20, takes="as long as the scenario's horizon, and a few seconds", on_linux=True)
 def run(
     context: typer.Context,
     given: cli.ScenarioOptions,
@@ -81,9 +73,7 @@ def demo(
     return run_processes(cli.load_scenario("lane_following", wanted), options, server=context.obj)
 
 
-@cli.command(
-    cli.RUNS, 22, takes="as long as the scenario's horizon, and a few seconds", on_linux=True
-)
+@cli.command(cli.RUNS, 22, takes="as long as the scenario's horizon, and a few seconds", on_linux=True)
 def bridge(
     context: typer.Context,
     given: cli.ScenarioOptions,

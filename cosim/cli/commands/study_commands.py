@@ -99,7 +99,7 @@ def paper(
 
     Options:
         name: Name of another published result; --list shows them.
-        list_names: List the other published results.
+        list_names: List the other published results, or show one of these.
         draws: Number of random plants, losses and initial states; 1,000 by default.
         out: Folder for paper.md and its figures; runs/paper by default.
 
@@ -110,7 +110,8 @@ def paper(
         noack paper selivanov_fridman   one of them
     """
     if list_names:
-        known = {one: paper_results.named(one).about for one in paper_results.NAMES}
+        names = paper_results.NAMES if name is None else [name]
+        known = {one: paper_results.named(one).about for one in names}
         cli.print_lines(json, known, *(f"{one:<18} {about}" for one, about in known.items()))
         return ExitStatus.OK
     if name is not None:
@@ -284,9 +285,7 @@ class GainOptions:
             raise CallerError("--Q, --R: are for --gain lqr only")
         return None
 
-    def costs(
-        self, given: "scenario.Scenario"
-    ) -> "tuple[linear_systems.Matrix, linear_systems.Matrix]":
+    def costs(self, given: "scenario.Scenario") -> "tuple[linear_systems.Matrix, linear_systems.Matrix]":
         """Return Q (n, n) and R (m, m); raise CallerError if one is wrong."""
         n, m = given.model.dimensions
         return cli.weight_matrix("--Q", self.Q, n), cli.weight_matrix("--R", self.R, m)
@@ -345,9 +344,7 @@ def design(
             figure_files,
             json,
         )
-    return _design_for_settling(
-        loaded, wanted, weights, feedback, draws, seed, out, page, figure_files, json
-    )
+    return _design_for_settling(loaded, wanted, weights, feedback, draws, seed, out, page, figure_files, json)
 
 
 def _design_for_settling(
@@ -445,12 +442,11 @@ class StudyOptions(cli.ScenarioOptions):
             ]
         capacity_plan.bottleneck(given)
         for option, seconds in (
-            ("--update-period", self.update_period), ("--late-after", self.late_after),
-        ):  # fmt: skip
+            ("--update-period", self.update_period),
+            ("--late-after", self.late_after),
+        ):
             if seconds is not None and not 0 < seconds < given.horizon_s:
-                raise CallerError(
-                    f"{option} {seconds:g}: between 0 and the horizon of the scenario"
-                )
+                raise CallerError(f"{option} {seconds:g}: between 0 and the horizon of the scenario")
         kinds = capacity_plan.kinds_of(given, self.update_period)
         shortest_s = min(kind.period_s for kind in kinds)
         deadline_s = self.late_after or given.certificate.network_delay_s or shortest_s
@@ -462,10 +458,17 @@ class StudyOptions(cli.ScenarioOptions):
         else:
             counts = capacity_plan.require_counts(_counts(self.loops), least)
         return capacity_plan.CapacityPlan(
-            scenario=given, kinds=kinds, file=path, settings=settings, deadline_s=deadline_s,
-            counts=counts, policies=capacity_plan.policies_of(kinds) | self._policies(kinds),
-            amplitude=depth.amplitude, draws=depth.draws, seed=self.seed,
-        )  # fmt: skip
+            scenario=given,
+            kinds=kinds,
+            file=path,
+            settings=settings,
+            deadline_s=deadline_s,
+            counts=counts,
+            policies=capacity_plan.policies_of(kinds) | self._policies(kinds),
+            amplitude=depth.amplitude,
+            draws=depth.draws,
+            seed=self.seed,
+        )
 
     def _depth(self) -> "capacity_plan.Depth":
         depth = capacity_plan.THOROUGH if self.thorough else capacity_plan.QUICK
@@ -487,8 +490,7 @@ class StudyOptions(cli.ScenarioOptions):
             is_new = name not in known and name not in found
             if not equals or not re.match(run_sections.NAME_PATTERN, name) or not is_new:
                 raise CallerError(
-                    f"--policy {text}: write it as NAME=TRIGGER, with a new name of letters, "
-                    "digits, _ and -"
+                    f"--policy {text}: write it as NAME=TRIGGER, with a new name of letters, digits, _ and -"
                 )
             value: Any = scenario_file.value_of(trigger, f"--policy {name}")
             found[name] = {"loops": [kind.under({"trigger": value}) for kind in kinds]}

@@ -22,7 +22,7 @@ with lazy_modules():
     from noack.theory.certificates import scenario_certificates
 
 
-@cli.command(cli.THEORY, 10, takes="about two seconds")
+@cli.command(cli.THEORY, 10, takes="about two seconds; half a minute where events are due after many tests")
 def certify(
     given: cli.ScenarioOptions,
     *,
@@ -111,10 +111,14 @@ def margin(
     resolved = resolution.resolve(given.load())
     with cli.status("examining") as status:
         found = margin_search.find_margin(
-            resolved, most_m=most, accuracy=accuracy, with_period=period,
-            guarantees=guarantee or (), effort=effort,
+            resolved,
+            most_m=most,
+            accuracy=accuracy,
+            with_period=period,
+            guarantees=guarantee or (),
+            effort=effort,
             progress=lambda text: status.update(f"examining {text}"),
-        )  # fmt: skip
+        )
     cli.show(json, found.to_json, certificate_report.print_margin, found)
     cli.write_tables(certificate_report.margin_tables(found), tables, json=json)
     if not play:
@@ -193,9 +197,7 @@ def adversary(
         noack adversary unstable_pendulum --horizon 2 --beam 64   a faster search
         noack adversary lane_following --trigger continuous   the paper's loop, in exact time
     """
-    resolved = resolution.resolve(
-        given.load(*([] if horizon is None else [f"horizon_s={horizon}"]))
-    )
+    resolved = resolution.resolve(given.load(*([] if horizon is None else [f"horizon_s={horizon}"])))
     continuous = trigger is cli.TriggerMode.CONTINUOUS
     conditions = adversary_search.conditions_of(resolved, continuous=continuous)
     certificate = scenario_certificates.certify(resolved, conditions)
@@ -203,11 +205,16 @@ def adversary(
     with progress.search_status() as report:
         found = [
             adversary_search.find_worst(
-                resolved, aim, continuous=continuous, most_nodes=nodes, beam=beam,
-                certificate=certificate, report=report(aim.value),
+                resolved,
+                aim,
+                continuous=continuous,
+                most_nodes=nodes,
+                beam=beam,
+                certificate=certificate,
+                report=report(aim.value),
             )
             for aim in (kinds if is_all else (kinds(objective.value),))
-        ]  # fmt: skip
+        ]
     about = found, resolved, certificate, trigger.value
     cli.show(json, lambda: worst_run.document(*about), worst_run.print_worst, *about)
     return ExitStatus.FAILED if any(worst.breaches for worst in found) else ExitStatus.OK

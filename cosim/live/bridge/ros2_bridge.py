@@ -103,9 +103,7 @@ def _telemetry(run: OpenRun) -> "Iterator[zenoh.Subscriber[zenoh.handlers.Handle
         try:
             session = stack.enter_context(open_session(RUNS, run.name, listen=False))
         except zenoh.ZError as error:
-            raise PeerError(
-                f"{run.run_dir}: the run cannot be reached: {cause_of(error)}"
-            ) from None
+            raise PeerError(f"{run.run_dir}: the run cannot be reached: {cause_of(error)}") from None
         key = f"noack/{run.name}/telemetry/*/*"
         yield session.declare_subscriber(key, RingChannel(_WAITING_BATCHES))
 

@@ -54,9 +54,13 @@ class LiveOptions:
 
 
 LIVE_OPTIONS = {
-    "rate": "--rate", "duration": "--for", "size_bytes": "--size", "round_trip": "--round-trip",
-    "silence": "--silence", "save": "--save",
-}  # fmt: skip
+    "rate": "--rate",
+    "duration": "--for",
+    "size_bytes": "--size",
+    "round_trip": "--round-trip",
+    "silence": "--silence",
+    "save": "--save",
+}
 """Options of the command line, by field of :class:`LiveOptions`."""
 
 
@@ -99,9 +103,7 @@ def send_live(address: str, options: LiveOptions) -> ProbeResult:
     if planned > MAX_PROBES:
         raise CallerError(f"--for {options.duration}: {planned} datagrams; at most {MAX_PROBES}")
     if not PROBE_BYTES <= options.size_bytes <= MAX_PROBE_BYTES:
-        raise CallerError(
-            f"--size {options.size_bytes}: expected {PROBE_BYTES} to {MAX_PROBE_BYTES} bytes"
-        )
+        raise CallerError(f"--size {options.size_bytes}: expected {PROBE_BYTES} to {MAX_PROBE_BYTES} bytes")
     wait_ns = max(_SHORTEST_WAIT_NS, round(2 * (options.deadline_s or 0) * NS_PER_S))
     plan = ProbePlan(period_ns, planned, options.size_bytes, options.round_trip, wait_ns)
     to = parse_destination(address, "address")
@@ -193,9 +195,7 @@ class ProbeSocket:
         return drops_of(self.endpoint)
 
 
-def listen(
-    address: Address, silence_s: float, save: Path | None, log: Callable[[str], None]
-) -> ProbeResult:
+def listen(address: Address, silence_s: float, save: Path | None, log: Callable[[str], None]) -> ProbeResult:
     """Receive one probe, until its sender has ended it, a long silence, or a signal.
 
     Args:
@@ -210,9 +210,7 @@ def listen(
     socket = ProbeSocket(listen=address)
     with socket.endpoint, ProbeRows(save, log) as rows, Signals().handled() as signals:
         log(f"listening on {text_of(socket.endpoint.getsockname())}")
-        receiver = ProbeReceiver(
-            host_number(), time.monotonic_ns(), int(silence_s * 1e9), log, rows.add
-        )
+        receiver = ProbeReceiver(host_number(), time.monotonic_ns(), int(silence_s * 1e9), log, rows.add)
         while signals.received is None:
             select.select([socket.endpoint], (), (), _LONGEST_WAIT_S)
             arrivals = socket.receive()
@@ -229,9 +227,7 @@ def listen(
     return result
 
 
-def send(
-    address: Address, plan: ProbePlan, save: Path | None, log: Callable[[str], None]
-) -> ProbeResult:
+def send(address: Address, plan: ProbePlan, save: Path | None, log: Callable[[str], None]) -> ProbeResult:
     """Send a probe; a signal ends it early.
 
     Args:
@@ -245,9 +241,7 @@ def send(
     """
     socket = ProbeSocket(to=address)
     with socket.endpoint, ProbeRows(save, log) as rows, Signals().handled() as signals:
-        sender = ProbeSender(
-            plan, secrets.randbits(64), host_number(), time.monotonic_ns(), rows.add
-        )
+        sender = ProbeSender(plan, secrets.randbits(64), host_number(), time.monotonic_ns(), rows.add)
         refused = 0
         while not sender.is_over(now_ns := time.monotonic_ns()):
             wait_ns = sender.next_deadline_ns() - now_ns
@@ -287,8 +281,7 @@ def _consistent(
     notes = list(result.notes)
     if clock_sets := socket.arrivals.clock_sets:
         notes.append(
-            f"this host's real-time clock was set {clock_sets} times; "
-            "the probe uses the monotonic clock"
+            f"this host's real-time clock was set {clock_sets} times; the probe uses the monotonic clock"
         )
     if result.kernel_drops:
         notes.append(

@@ -100,9 +100,7 @@ class ProbeSender:
     ) -> None:
         self._plan, self._rows = plan, rows
         self._kind = ProbeKind.REQUEST if plan.is_round_trip else ProbeKind.PROBE
-        self._content = ProbeDatagram(
-            self._kind, session, host, 0, 0, start_ns, plan.period_ns, plan.planned
-        )
+        self._content = ProbeDatagram(self._kind, session, host, 0, 0, start_ns, plan.period_ns, plan.planned)
         self._sent_ns, self._received_ns = array("q"), array("q")
         self._to_send = plan.planned
         self._late = self._longest_late_ns = 0
@@ -113,8 +111,13 @@ class ProbeSender:
         self._all_answers: int | None = None
         self._numbers, self._newest, self._seen = array("Q"), array("Q"), bytearray()
         self._ignored: Counter[str] = Counter()
-        rows(*(["sequence", "sent_ns", "received_ns", "lost"] if plan.is_round_trip
-               else ["sequence", "sent_ns", "late_ns"]))  # fmt: skip
+        rows(
+            *(
+                ["sequence", "sent_ns", "received_ns", "lost"]
+                if plan.is_round_trip
+                else ["sequence", "sent_ns", "late_ns"]
+            )
+        )
 
     @property
     def sent(self) -> int:
@@ -132,9 +135,13 @@ class ProbeSender:
         if self.sent >= self._to_send:
             self.ends += 1
             end = self._content._replace(
-                kind=ProbeKind.END, sequence=self.sent, sent_ns=now_ns, planned=self._to_send,
-                number=self._late, newest=self._longest_late_ns,
-            )  # fmt: skip
+                kind=ProbeKind.END,
+                sequence=self.sent,
+                sent_ns=now_ns,
+                planned=self._to_send,
+                number=self._late,
+                newest=self._longest_late_ns,
+            )
             return encode_probe(end, self._plan.size_bytes)
         late_ns = now_ns - self.next_deadline_ns()
         if late_ns > self._late_ns:
@@ -208,9 +215,7 @@ class ProbeSender:
         """
         arrived, covered = self._arrived()
         lost = np.flatnonzero(np.array(self._received_ns) == LOST_NS)
-        return {
-            int(k): _REVERSE if arrived[k] else _FORWARD if covered[k] else _UNKNOWN for k in lost
-        }
+        return {int(k): _REVERSE if arrived[k] else _FORWARD if covered[k] else _UNKNOWN for k in lost}
 
     def _arrived(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which numbers the answers show as arrived, and which they cover."""
@@ -387,9 +392,7 @@ class ProbeReceiver:
         )
         lost = np.zeros(len(sequence), bool)
         lost[len(lost) - outside :] = True
-        trace = packet_trace(
-            sent_ns, received_ns, lost, sequence, clocks_differ=not self.is_same_host
-        )
+        trace = packet_trace(sent_ns, received_ns, lost, sequence, clocks_differ=not self.is_same_host)
         notes = [self._ending()]
         if not self.is_same_host:
             trace = relative_delays(trace)
@@ -421,7 +424,5 @@ class ProbeReceiver:
 
     def _ending(self) -> str:
         if self._end is None:
-            return (
-                "no end datagram arrived: losses after the last received datagram are not counted"
-            )
+            return "no end datagram arrived: losses after the last received datagram are not counted"
         return late_sends(self._end.sequence, self._end.number, self._end.newest)

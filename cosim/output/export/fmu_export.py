@@ -101,11 +101,15 @@ def write(run: "ExportedRun", path: Path, *, certificates: bool = True) -> list[
 def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
     """Write ``NAME_channel.fmu`` and ``NAME_controller.fmu`` beside a path ``NAME.fmu``.
 
+    Of a folder, the files are in it, and NAME is that of the scenario.
+
     Raises:
         CallerError: the scenario has something that an FMU cannot have.
         MachineError: a file cannot be written.
     """
-    if not path.stem or path.is_dir():
+    if path.is_dir():
+        path /= scenario.name
+    if not (name := path.name.removesuffix(SUFFIX)):
         raise CallerError(f"{path}: must be the name of a file, such as loop{SUFFIX}")
     alone(scenario)
     kind = scenario.controller.kind
@@ -114,12 +118,10 @@ def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
             "network.actuation: an FMU's channel leads to the controller only; remove this table"
         )
     if not scenario.controller.is_linear:
-        raise CallerError(
-            f'controller.kind = "{kind}": an FMU has the linear law only, kind = "linear"'
-        )
+        raise CallerError(f'controller.kind = "{kind}": an FMU has the linear law only, kind = "linear"')
     (resolved,) = resolved_loops(scenario)
     return [
-        write_whole(path.with_name(f"{path.stem}_{role}{SUFFIX}"), _archive(resolved, role))
+        write_whole(path.with_name(f"{name}_{role}{SUFFIX}"), _archive(resolved, role))
         for role in ("channel", "controller")
     ]
 
@@ -211,9 +213,7 @@ class _Image:
         core.noack_wire_tag(wire, len(content), content, tag)
         return bytes(tag) + content
 
-    def add_variable(
-        self, reference: int, numbers: list[int], *, is_real: bool, is_input: bool
-    ) -> None:
+    def add_variable(self, reference: int, numbers: list[int], *, is_real: bool, is_input: bool) -> None:
         """Append the numbers of a variable."""
         at = self._add(ffi.new("double[]" if is_real else "int64_t[]", numbers))
         self.head.values[reference] = (len(numbers), is_real, is_input, at)

@@ -56,17 +56,20 @@ def _content(run: ExportedRun, *, certificates: bool) -> dict[str, object]:
     found["scenario"] = record.scenario.model_dump(mode="json", exclude_none=True)
     found["environment"] = run.environment
     if record.is_network:
-        found["loops"] = {
-            loop.name: _content(loop, certificates=certificates) for loop in run.inner
-        }
+        found["loops"] = {loop.name: _content(loop, certificates=certificates) for loop in run.inner}
         return found
     for name, table in (("samples", samples(record)), ("events", events(record))):
         found[name] = {column: _array(table[column].to_numpy()) for column in table.column_names}
     loop = record.loop
     found["loop"] = {
-        "A": loop.A, "B": loop.B, "K": loop.K, "A_model": loop.A_model, "B_model": loop.B_model,
-        "state_names": list(loop.state_names), "input_names": list(loop.input_names),
-    }  # fmt: skip
+        "A": loop.A,
+        "B": loop.B,
+        "K": loop.K,
+        "A_model": loop.A_model,
+        "B_model": loop.B_model,
+        "state_names": list(loop.state_names),
+        "input_names": list(loop.input_names),
+    }
     if certificates:
         found["certificates"] = _certificates(record.scenario)
     return found

@@ -73,10 +73,13 @@ def _write(writer: "Writer", run: ExportedRun) -> None:
     record = run.record
     writer.add_metadata(
         "noack",
-        {"scenario": record.scenario.name, "kind": record.kind,
-         "started": str(run.environment.get("started", "")),
-         "time": "simulated nanoseconds since the epoch of the run"},
-    )  # fmt: skip
+        {
+            "scenario": record.scenario.name,
+            "kind": record.kind,
+            "started": str(run.environment.get("started", "")),
+            "time": "simulated nanoseconds since the epoch of the run",
+        },
+    )
     for name, media in ((SCENARIO_FILE, "application/toml"), (SUMMARY_FILE, "application/json")):
         if (run.directory / name).is_file():
             writer.add_attachment(0, 0, name, media, (run.directory / name).read_bytes())
@@ -103,8 +106,7 @@ def _write_tables(writer: "Writer", run: ExportedRun, tables: list[str]) -> None
     """Write the rows of some tables in the order of their log time."""
     record = run.record
     channels = {
-        table: _channel(writer, run, _topic(table), _schema(table, record.tables[table]))
-        for table in tables
+        table: _channel(writer, run, _topic(table), _schema(table, record.tables[table])) for table in tables
     }
     for part in record.slices(*tables):
         merged = [
@@ -193,9 +195,13 @@ def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, object]:
         text = described[name].meaning + (f" [{unit}]" if unit else "")
         properties[name] = {**_type(name, rows[name]), "description": text}
     return {
-        "$schema": _DIALECT, "title": f"noack.{table}", "description": _TABLES[table].row,
-        "type": "object", "properties": properties, "required": [*properties],
-    }  # fmt: skip
+        "$schema": _DIALECT,
+        "title": f"noack.{table}",
+        "description": _TABLES[table].row,
+        "type": "object",
+        "properties": properties,
+        "required": [*properties],
+    }
 
 
 def _type(name: str, field: np.dtype[np.generic]) -> dict[str, object]:

@@ -48,9 +48,7 @@ class _Bag:
                 content = ros2.definition(kind).encode()
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", content)
             profile = {"offered_qos_profiles": ""}
-            self._channels[topic] = self._writer.register_channel(
-                topic, "cdr", self._schemas[kind], profile
-            )
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], profile)
         return self._channels[topic]
 
     def write_loop(self, run: ExportedRun, *, is_only: bool) -> None:

@@ -50,15 +50,7 @@ from cosim.output.palette import (
 )
 from cosim.output.palette import FORCED as FORCED_COLOUR
 from cosim.output.viewer.network_diagram import DIAGRAM, NetworkDiagram
-from cosim.output.viewer.pictures.picture import (
-    PICTURE,
-    TIMELINE,
-    Picture,
-    Shape,
-    label,
-    lines,
-    panel,
-)
+from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Picture, Shape, label, lines, panel
 
 Static = rr.TextDocument | rr.SeriesLines | rr.SeriesPoints | Shape
 """Data that do not change during a run."""
@@ -267,9 +259,7 @@ def _intervals() -> rrb.Container:
 
 
 def _norms() -> rrb.Container:
-    return rrb.Tabs(
-        plot("log10 ‖e‖", ERROR_LOG10), plot("‖e‖", ERROR), plot("log10 ‖x‖", SIZE_LOG10)
-    )
+    return rrb.Tabs(plot("log10 ‖e‖", ERROR_LOG10), plot("‖e‖", ERROR), plot("log10 ‖x‖", SIZE_LOG10))
 
 
 def _texts(shown: ShownLoop) -> rrb.Container:

@@ -74,9 +74,7 @@ class NetworkDiagram:
         return rrb.Spatial2DView(
             origin=DIAGRAM,
             name=f"Packets (animated {LEG_S:g} s per hop)",
-            visual_bounds=rrb.VisualBounds2D(
-                x_range=[-1.9, _CONTROLLER + 1.9], y_range=[-1.7, -_LOW + 0.6]
-            ),
+            visual_bounds=rrb.VisualBounds2D(x_range=[-1.9, _CONTROLLER + 1.9], y_range=[-1.7, -_LOW + 0.6]),
         )
 
     def scenery(self) -> Mapping[str, Shape]:
@@ -106,8 +104,10 @@ class NetworkDiagram:
         found["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
         found["forced/word"] = label("forced", (_NETWORK + _APART / 2, 1.55), FORCED)
         for entity, colour in (
-            ("broadcast", SENSOR), ("delivered", CONTROLLER), ("reverse", NETWORK),
-        ):  # fmt: skip
+            ("broadcast", SENSOR),
+            ("delivered", CONTROLLER),
+            ("reverse", NETWORK),
+        ):
             found[entity] = rr.Points2D.from_fields(
                 radii=_SIZE if entity != "reverse" else 0.6 * _SIZE,
                 colors=colour,
@@ -117,9 +117,7 @@ class NetworkDiagram:
         found["lost"] = style(LOST, 0.1, order=6.0)
         return found
 
-    def add(
-        self, t_ns: Times, release_ns: Times, fate: NDArray[np.int64], *, reverse: bool = False
-    ) -> None:
+    def add(self, t_ns: Times, release_ns: Times, fate: NDArray[np.int64], *, reverse: bool = False) -> None:
         """Add packets (p,) that follow the previously added ones.
 
         Args:
@@ -155,17 +153,13 @@ class NetworkDiagram:
         end = np.minimum(-(-end_ns // _FRAME_NS), last + 1)
         counts = np.maximum(end - begin, 0)
         packet = np.repeat(np.arange(len(counts)), counts)
-        frame = (
-            begin[packet] + np.arange(len(packet)) - np.repeat(np.cumsum(counts) - counts, counts)
-        )
+        frame = begin[packet] + np.arange(len(packet)) - np.repeat(np.cumsum(counts) - counts, counts)
         order = np.argsort(frame, kind="stable")
         pairs, frame = flying[packet[order]], frame[order]
         self._in_flight = flying[end_ns > self._drawn_ns]
         return self._moving(pairs, frame, first, last)
 
-    def _moving(
-        self, pairs: NDArray[np.void], frame: Times, first: int, last: int
-    ) -> Mapping[str, Moving]:
+    def _moving(self, pairs: NDArray[np.void], frame: Times, first: int, last: int) -> Mapping[str, Moving]:
         """Return the rows of all entities; ``pairs`` (q,) are packets at frames, by frame."""
         now_ns = frame * _FRAME_NS
         t_ns, out_ns, reverse = pairs["t_ns"], pairs["out_ns"], pairs["reverse"]
@@ -181,9 +175,7 @@ class NetworkDiagram:
         y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
         forced = pairs["fate"] == Fate.FORCED
         if self._reverse is Flow.ACTUATION:
-            back = np.where(
-                leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _APART * there
-            )
+            back = np.where(leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _APART * there)
             x, y = np.where(reverse, back, x), np.where(reverse, _LOW + 0.4 * y, y)
         else:
             x = np.where(reverse, 2 * _NETWORK - x, x)

@@ -83,9 +83,7 @@ class RecordingFile:
             finite = np.where(np.isfinite(values), values, np.nan)
             self.send_columns(entity, t_ns, rr.Scalars.columns(scalars=finite))
 
-    def send_columns(
-        self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]
-    ) -> None:
+    def send_columns(self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]) -> None:
         """Add columns of any components at times (k,).
 
         Raises:
@@ -196,9 +194,7 @@ class LoopView:
         at_ns = np.asarray(t_ns) + self._shown.phase_ns
         self._file.send(f"{self._shown.folder}{entity}", at_ns, values)
 
-    def _send_columns(
-        self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]
-    ) -> None:
+    def _send_columns(self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]) -> None:
         at_ns = np.asarray(t_ns) + self._shown.phase_ns
         self._file.send_columns(f"{self._shown.folder}{entity}", at_ns, columns)
 
@@ -288,9 +284,7 @@ class LoopView:
         self._send_stems(bp.EVENT_STEM, t_ns, interval_s)
         self._send(bp.EVENT, t_ns, interval_s)
 
-    def receptions(
-        self, t_ns: Nanoseconds, interval_s: Floats, forced: npt.NDArray[np.bool_]
-    ) -> None:
+    def receptions(self, t_ns: Nanoseconds, interval_s: Floats, forced: npt.NDArray[np.bool_]) -> None:
         """Add deliveries: times (k,), seconds since the previous one (k,), forced (k,).
 
         A delivery is forced if M − 1 consecutive updates were lost before it. An interval that is

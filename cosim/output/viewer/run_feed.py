@@ -131,9 +131,7 @@ class RunFeed:
         """Begin a round: give each loop its rows."""
         waiting, self._waiting = self._waiting, {}
         for table, batches in waiting.items():
-            for loop, rows in rows_by_loop(
-                table, np.concatenate(batches), self._phases_ns, self._types
-            ):
+            for loop, rows in rows_by_loop(table, np.concatenate(batches), self._phases_ns, self._types):
                 if loop in self._feeds:
                     self._feeds[loop].add(table, rows)
         self._due = [*self._feeds]
@@ -191,9 +189,7 @@ class _AllLoops:
         """Add rows."""
         if table == NETEM_PACKET:
             add_link_bytes(self._over_time.link_bytes, rows, self._horizon_ns)
-            begin_ns, end_ns = map(
-                np.concatenate, zip(self._inside, times_inside(rows), strict=True)
-            )
+            begin_ns, end_ns = map(np.concatenate, zip(self._inside, times_inside(rows), strict=True))
             self._inside = begin_ns, end_ns
         elif table == SENSOR_MEASUREMENT:
             self._measured.append(self._reduced(rows, "t_ns", "x"))

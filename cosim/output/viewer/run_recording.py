@@ -133,9 +133,7 @@ class RunRecording(RecordingFile):
 
     def _describe(self, run: Scenario, worst: WorstLoop | None) -> None:
         """Write the static data of what all loops share."""
-        named = (
-            "" if worst is None else f"Worst loop: **{self.names[worst.number]}** ({worst.why})."
-        )
+        named = "" if worst is None else f"Worst loop: **{self.names[worst.number]}** ({worst.why})."
         text = f"""# {run.name}
 
 {run.description}
@@ -218,9 +216,7 @@ def _shown_loop(
     )
 
 
-def _layout(
-    loops: Mapping[str, bp.ShownLoop], count: int, worst: WorstLoop | None
-) -> rrb.Container:
+def _layout(loops: Mapping[str, bp.ShownLoop], count: int, worst: WorstLoop | None) -> rrb.Container:
     """Lay out a page of all ``count`` loops, and one for each that is shown."""
     kind = "" if count <= len(SERIES) else ", quantiles over the loops"
     plots = [
@@ -276,9 +272,7 @@ def map_pixels(errors: Reals) -> NDArray[np.uint8]:
     return np.asarray(pixels.repeat(high, axis=0).repeat(wide, axis=1), np.uint8)
 
 
-def open_recording(
-    scenario: Scenario, run_dir: Path, run_id: int, live: LiveView | None
-) -> RunRecording:
+def open_recording(scenario: Scenario, run_dir: Path, run_id: int, live: LiveView | None) -> RunRecording:
     """Create the recording of a run, which is written while the run goes on."""
     loops = dict(enumerate(resolved_loops(scenario)))
     shown = loops if len(loops) <= PICTURED else {}
@@ -326,9 +320,7 @@ def _write_network_view(
     worst, count, path = worst_loop(summary.loops), len(run.loops), run_dir / RECORDING_FILE
     numbers = range(count) if count <= PICTURED else [worst.number]
     loops = {number: run.loops[number].scenario for number in numbers}
-    with RunRecording(
-        run.scenario, path, _new_id(), loops, run.kind, worst=worst, at_once=True
-    ) as whole:
+    with RunRecording(run.scenario, path, _new_id(), loops, run.kind, worst=worst, at_once=True) as whole:
         flying = summary.network.in_flight
         largest = np.array(flying.max_by_interval, np.float64)
         queue_ns = (np.arange(len(largest)) + 0.5) * flying.width_s * NS_PER_S

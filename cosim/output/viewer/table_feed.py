@@ -56,9 +56,13 @@ _PATIENCE_S = 1.0
 """Maximum wall time to wait for a controller that sends no rows."""
 
 SHOWN = (
-    CONTROLLER_STEP, CONTROLLER_DELIVERY, CONTROLLER_SETTING, NETEM_PACKET, PLANT_STEP,
+    CONTROLLER_STEP,
+    CONTROLLER_DELIVERY,
+    CONTROLLER_SETTING,
+    NETEM_PACKET,
+    PLANT_STEP,
     SENSOR_MEASUREMENT,
-)  # fmt: skip
+)
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
@@ -98,15 +102,11 @@ class ViewFeed:
         # Other tables are not shown.
         self._types = tables_of(scenario)
         self._clock_tables = [table for table in CLOCK_TABLES if table in self._types]
-        self._pending: dict[str, list[Rows]] = {
-            table: [] for table in (*SHOWN, *self._clock_tables)
-        }
+        self._pending: dict[str, list[Rows]] = {table: [] for table in (*SHOWN, *self._clock_tables)}
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
-        self._monitor = ErrorMonitor(
-            self._loop.H, policy_of(scenario), scenario.timing.measurement_period_ns
-        )
+        self._monitor = ErrorMonitor(self._loop.H, policy_of(scenario), scenario.timing.measurement_period_ns)
         self._follower = EventFollower(scenario)
         # Plant steps whose x or z is shown with the measurements at their times.
         self._steps = np.zeros(0, self._types[PLANT_STEP])
@@ -181,18 +181,14 @@ class ViewFeed:
         if not len(rows):
             return
         acknowledged = self._scenario.protocol.acknowledges
-        aligned = join(
-            self._loop, rows, self._track, reach_ns, flow=self._flow, acknowledged=acknowledged
-        )
+        aligned = join(self._loop, rows, self._track, reach_ns, flow=self._flow, acknowledged=acknowledged)
         # If the sensor does not measure x exactly, the plant's own x is shown.
         if not self._scenario.coverage.knows_state:
             aligned = aligned._replace(x=true_states(self._steps, aligned.t_ns))
         z = true_states(self._steps, aligned.t_ns, "z") if self._has_internal_state else None
         self._steps = self._steps[self._steps["t_ns"] > aligned.t_ns[-1]]
         t_s = np.asarray(aligned.t_ns * 1e-9)
-        bounds = np.column_stack(
-            [self._bounds(rows, aligned), self._certified(t_s, "controller_error")]
-        )
+        bounds = np.column_stack([self._bounds(rows, aligned), self._certified(t_s, "controller_error")])
         if not self._scenario.protocol.acknowledges:
             bounds[~in_common(self._scenario, aligned)] = np.nan
         curves = [aligned.x, aligned.x_s, aligned.x_c, aligned.e_s_norm, aligned.e_c_norm, bounds]
@@ -220,9 +216,7 @@ class ViewFeed:
             return None  # with a set-point, it bounds the deviations from it
         certificate = certify(self._scenario, allowed_conditions(self._scenario))
         if certificate.inter_event_s is not None:
-            self._view.certified_interval(
-                certificate.inter_event_s, self._scenario.timing.horizon_ns
-            )
+            self._view.certified_interval(certificate.inter_event_s, self._scenario.timing.horizon_ns)
         return certificate
 
     def _certified(
@@ -291,9 +285,7 @@ class ViewFeed:
             return
         for flow in self._scenario.network.flows[1:]:
             reverse = updates_in(rows, flow)[0]
-            self._view.packets(
-                reverse["t_ns"], reverse["release_ns"], reverse["fate"], reverse=True
-            )
+            self._view.packets(reverse["t_ns"], reverse["release_ns"], reverse["fate"], reverse=True)
         rows, sequence, event_ns = updates_in(rows)
         self._view.packets(event_ns, rows["release_ns"], rows["fate"])
         self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())

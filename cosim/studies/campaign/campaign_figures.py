@@ -75,9 +75,7 @@ def pareto_figure(
             Line(x=xs[front], y=ys[front], colour=colour, steps="post", dash=dash),
         ]  # fmt: skip
     means_x, means_y = ([e.mean for pair in series.values() for e in pair[k]] for k in (0, 1))
-    return one_panel(
-        "pareto", Panel(items=items, x=_axis(x, means_x), y=_axis(y, means_y)), _HEIGHT_IN
-    )
+    return one_panel("pareto", Panel(items=items, x=_axis(x, means_x), y=_axis(y, means_y)), _HEIGHT_IN)
 
 
 def undominated(x: Vector, y: Vector) -> NDArray[np.intp]:
@@ -108,10 +106,9 @@ def curve_figure(
         mean, half = (values[order] for values in _means(estimates))
         colour, marker, dash = _look(i)
         items += [
-            Line(x=at[order], y=mean, label=_name(name), colour=colour, size=4, marker=marker,
-                 dash=dash),
+            Line(x=at[order], y=mean, label=_name(name), colour=colour, size=4, marker=marker, dash=dash),
             Band(x=at[order], low=mean - half, high=mean + half, colour=colour),
-        ]  # fmt: skip
+        ]
     ticks = dict(zip(at.tolist(), map(plain, labels), strict=True)) if x is None else None
     means = [e.mean for estimates in series.values() for e in estimates if e]
     panel = Panel(items=items, x=Axis(label=_name(axis), ticks=ticks), y=_axis(metric, means))
@@ -144,15 +141,21 @@ def heat_map_figure(
         for name, labels in (x, y)
     ]
     panels = [
-        Panel(title=_name(title), x=axes[0], y=axes[1], items=[
-            Heat(values=values, x_ends=(-0.5, len(x[1]) - 0.5), numbers=True)
-        ] if scale else [])
+        Panel(
+            title=_name(title),
+            x=axes[0],
+            y=axes[1],
+            items=[Heat(values=values, x_ends=(-0.5, len(x[1]) - 0.5), numbers=True)] if scale else [],
+        )
         for title, values in maps.items()
-    ]  # fmt: skip
+    ]
     row = Row(
-        panels=panels, height_in=_MAP_HEIGHT_IN, columns=_MAPS_IN_A_ROW, common="xy",
+        panels=panels,
+        height_in=_MAP_HEIGHT_IN,
+        columns=_MAPS_IN_A_ROW,
+        common="xy",
         narrowest_in=_NARROWEST_MAP_IN,
-    )  # fmt: skip
+    )
     return FigureDescription(name="heat-map", rows=[row], scale=scale)
 
 
@@ -164,8 +167,9 @@ def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> FigureD
         at = np.quantile(values, share, method="inverted_cdf")
         seen = np.isfinite(at)
         colour, _, dash = _look(i)
-        items.append(Line(x=at[seen], y=share[seen], label=_name(name), colour=colour, dash=dash,
-                          steps="post"))  # fmt: skip
+        items.append(
+            Line(x=at[seen], y=share[seen], label=_name(name), colour=colour, dash=dash, steps="post")
+        )
     x = _axis(metric, np.concatenate(list(series.values())))
     panel = Panel(items=items, x=x, y=Axis(label="share of runs", ends=(0, 1.02)))
     return one_panel("distribution", panel, _HEIGHT_IN)
@@ -197,9 +201,7 @@ def _curve(
     }
     places = [i for i, x in enumerate(axis.labels) if any(one.get(x) for one in known.values())]
     labels = [axis.labels[i] for i in places]
-    series = {
-        name: [one.get(x) for x in labels] for name, one in known.items() if any(one.values())
-    }
+    series = {name: [one.get(x) for x in labels] for name, one in known.items() if any(one.values())}
     numbers = None if axis.numbers is None else np.array(axis.numbers)[places]
     return curve_figure(numbers, labels, series, axis.called, wanted.metric), (
         f"{_title(wanted.metric)} over {axis.called}: means and 95 % confidence intervals"

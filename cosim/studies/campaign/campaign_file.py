@@ -145,9 +145,13 @@ class Metrics(ScenarioSection):
     """How runs are measured, and the columns of the tables."""
 
     shown: Annotated[tuple[Metric, ...], Field(min_length=1)] = (
-        "transmissions", "deliveries", "inter_event_min_s", "settling_s", "cost",
+        "transmissions",
+        "deliveries",
+        "inter_event_min_s",
+        "settling_s",
+        "cost",
         "certificate_used",
-    )  # fmt: skip
+    )
     """Columns of the tables."""
     Q: Rows | None = None
     """Weight of the state in the cost ∫ xᵀQx + uᵀRu dt, by rows; by default the identity."""
@@ -249,9 +253,7 @@ class Term(NamedTuple):
             return cls(None, None, float(text))
         except ValueError:
             known = ", ".join(METRICS)
-            raise ValueError(
-                f"holds: {text.strip()}: should be a number or one of {known}"
-            ) from None
+            raise ValueError(f"holds: {text.strip()}: should be a number or one of {known}") from None
 
 
 class Claim(ScenarioSection):
@@ -335,12 +337,8 @@ class Campaign(ScenarioSection):
     @property
     def measured_metrics(self) -> set[Metric]:
         """The metrics of the tables, the figures and the claims."""
-        of_figures = {
-            getattr(figure, key, None) for figure in self.figures for key in ("metric", "x", "y")
-        }
-        of_claims = {
-            term.metric for claim in self.claims for pair in claim.conditions for term in pair
-        }
+        of_figures = {getattr(figure, key, None) for figure in self.figures for key in ("metric", "x", "y")}
+        of_claims = {term.metric for claim in self.claims for pair in claim.conditions for term in pair}
         return {*self.metrics.shown, *(one for one in METRICS if one in of_figures | of_claims)}
 
     @model_validator(mode="after")
@@ -408,10 +406,13 @@ class Campaign(ScenarioSection):
     def selected(self, where: Mapping[str, Value]) -> Iterator[tuple[int, ...]]:
         """Return the places in the grid, one index per axis, of the points with these values."""
         ranges = [
-            [i for i, label in enumerate(axis.labels) if axis.name not in where
-             or label == label_of(where[axis.name])]
+            [
+                i
+                for i, label in enumerate(axis.labels)
+                if axis.name not in where or label == label_of(where[axis.name])
+            ]
             for axis in self.axes
-        ]  # fmt: skip
+        ]
         return itertools.product(*ranges)
 
 
@@ -423,9 +424,7 @@ def load(path: Path) -> Campaign:
     """
     content = toml_file.read(path, Campaign)
     if "model" in content and "axes" not in content:
-        raise CallerError(
-            f"{path}: a scenario, not a campaign; a campaign names one by scenario = FILE"
-        )
+        raise CallerError(f"{path}: a scenario, not a campaign; a campaign names one by scenario = FILE")
     return toml_file.validated(Campaign, content, str(path))
 
 

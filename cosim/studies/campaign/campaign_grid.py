@@ -22,6 +22,7 @@ from cosim.studies.campaign.sampled_draws import SampledWork, SharedNetworkWork,
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario import toml_file
+from noack.scenario.link_load import require_slots
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put
@@ -72,9 +73,7 @@ def base_of(campaign: Campaign, path: Path) -> tuple[Path, Table]:
     scenario = path.parent / campaign.scenario
     if not scenario.is_file():
         if scenario.suffix == ".toml" or scenario.exists():
-            raise CallerError(
-                f"{source}: no such file beside the campaign file, and no shipped scenario"
-            )
+            raise CallerError(f"{source}: no such file beside the campaign file, and no shipped scenario")
         try:
             scenario = find_shipped(campaign.scenario, SCENARIOS)
         except CallerError as error:
@@ -109,6 +108,7 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
             content[LOOPS] = _scaled(content[LOOPS], value, source)
         scenario = completed(content, scenario_path, source)
         try:
+            require_slots(scenario)
             work, certified = _work(campaign, scenario)
         except (CallerError, ValueError) as error:
             raise CallerError(f"{source}: {error}") from None
@@ -151,9 +151,7 @@ def _scaled(entries: object, value: int, source: str) -> list[Table]:
             f"of [[loops]]: {names}"
         )
     total = sum(counts)
-    return [
-        one | {"count": count * value // total} for one, count in zip(entries, counts, strict=True)
-    ]
+    return [one | {"count": count * value // total} for one, count in zip(entries, counts, strict=True)]
 
 
 def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
@@ -200,9 +198,7 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
             raise CallerError('loops: a network that loops share needs time = "sampled"')
         judges = "loops_claims_held" in campaign.measured_metrics
         loops, from_s = in_virtual_time(scenario), metrics.count_from_s
-        work = SharedNetworkWork(
-            loops, campaign.seed, **measured, judges=judges, count_from_s=from_s
-        )
+        work = SharedNetworkWork(loops, campaign.seed, **measured, judges=judges, count_from_s=from_s)
         return work, None
     resolved = resolve(scenario)
     if campaign.time == "sampled":

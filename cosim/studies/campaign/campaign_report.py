@@ -102,21 +102,25 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, object]) -> 
     content = campaign.model_dump(mode="json", exclude_none=True)
     remarks = list(_unfinished(summary))
     tables = {table.name: table for table in campaign_tables(summary, shares=True)}
-    return templates(Path(__file__).parent).get_template("campaign.html.jinja").render(
-        title=campaign.name,
-        description=campaign.description,
-        subtitle=f"{len(summary.found):,} grid points, {summary.draws:,} draws at each, "
-        f"seed {campaign.seed}",
-        verdict=_verdict(summary),
-        tone="bad" if summary.breaches else "doubt" if remarks else "good",
-        remarks=[*remarks, *_bursts(summary)],
-        figures=list(figures(summary, store)),
-        tables=tables,
-        axes=len(campaign.axes),
-        reference=_reference(summary),
-        campaign_toml=tomli_w.dumps(content, indent=2),
-        scenario_toml=tomli_w.dumps(base, indent=2),
-    )  # fmt: skip
+    return (
+        templates(Path(__file__).parent)
+        .get_template("campaign.html.jinja")
+        .render(
+            title=campaign.name,
+            description=campaign.description,
+            subtitle=f"{len(summary.found):,} grid points, {summary.draws:,} draws at each, "
+            f"seed {campaign.seed}",
+            verdict=_verdict(summary),
+            tone="bad" if summary.breaches else "doubt" if remarks else "good",
+            remarks=[*remarks, *_bursts(summary)],
+            figures=list(figures(summary, store)),
+            tables=tables,
+            axes=len(campaign.axes),
+            reference=_reference(summary),
+            campaign_toml=tomli_w.dumps(content, indent=2),
+            scenario_toml=tomli_w.dumps(base, indent=2),
+        )
+    )
 
 
 def print_summary(console: Console, summary: CampaignSummary) -> None:
@@ -160,9 +164,12 @@ def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
         while end < len(columns) and sum(widths[:names]) + sum(widths[begin : end + 1]) <= width:
             end += 1
         shown = Table(
-            title=escape(table.caption) if begin == names else None, title_justify="left",
-            box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
-        )  # fmt: skip
+            title=escape(table.caption) if begin == names else None,
+            title_justify="left",
+            box=SIMPLE_HEAD,
+            pad_edge=False,
+            collapse_padding=True,
+        )
         places = [*range(names), *range(begin, end)]
         unbroken = sum(max(len(table.headings[i]) + _APART, widths[i]) for i in places)
         for i in places:

@@ -61,9 +61,7 @@ class JudgedClaim(NamedTuple):
     def reason(self) -> str:
         """The shares and medians in words."""
         least = f" (least: {share_text(self.least)}, {self.least_at})"
-        where = (
-            f"in {share_text(self.share)} of the draws{'' if self.least == self.share else least}"
-        )
+        where = f"in {share_text(self.share)} of the draws{'' if self.least == self.share else least}"
         return f"{where}; medians: {self.medians}"
 
 
@@ -74,9 +72,7 @@ def share_text(share: float) -> str:
     return f"{100 * share:.1f} %" if rounded else f"{text} %"
 
 
-def judge_claims(
-    campaign: Campaign, points: Sequence[Point], values: Values
-) -> Iterator[JudgedClaim]:
+def judge_claims(campaign: Campaign, points: Sequence[Point], values: Values) -> Iterator[JudgedClaim]:
     """Yield the claims of a campaign with their verdicts."""
     by_number = {point.number: point for point in points}
     cached = lru_cache(_POINTS_AT_ONCE)(lambda number: values(by_number[number]))
@@ -85,9 +81,7 @@ def judge_claims(
         named = {axis: {label_of(value)} for axis, value in claim.where.items()}
         groups: dict[str, list[Point]] = {}
         for point in points:
-            allowed = (
-                at | named | ({} if claim.axis is None else {claim.axis: point.labels.values()})
-            )
+            allowed = at | named | ({} if claim.axis is None else {claim.axis: point.labels.values()})
             if all(point.labels[axis] in known for axis, known in allowed.items()):
                 rest = (
                     f"{axis} {label}"
@@ -202,8 +196,7 @@ class CampaignSummary(NamedTuple):
                 for compared in self.compared
             ],
             "claims": [
-                {**claim._asdict(), "verdict": claim.verdict, "reason": claim.reason}
-                for claim in self.claims
+                {**claim._asdict(), "verdict": claim.verdict, "reason": claim.reason} for claim in self.claims
             ],
         }
 

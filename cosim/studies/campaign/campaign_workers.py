@@ -183,9 +183,7 @@ def run_alike(work: Work, draws: range, wanted: Mapping[str, str] | None) -> NDA
         OtherArithmeticError: its results would differ from those of the caller.
     """
     if wanted is not None and (other := difference(arithmetic(), wanted)) is not None:
-        raise OtherArithmeticError(
-            f"a worker on {socket.gethostname()} would compute other results: {other}"
-        )
+        raise OtherArithmeticError(f"a worker on {socket.gethostname()} would compute other results: {other}")
     return work.run(draws)
 
 

@@ -59,10 +59,7 @@ class Store:
             [
                 *((name, text if isinstance(value, str) else number) for name, value in axes),
                 ("draw", pa.int64()),
-                *(
-                    (name, pa.from_numpy_dtype(self.row_type[name]))
-                    for name in self.row_type.names or ()
-                ),
+                *((name, pa.from_numpy_dtype(self.row_type[name])) for name in self.row_type.names or ()),
             ]
         )
 
@@ -120,8 +117,7 @@ class Store:
         except (OSError, pa.ArrowException):
             return False
         return bool(
-            found.num_rows >= len(chunk.draws)
-            and found.schema.to_arrow_schema().names == self._schema.names
+            found.num_rows >= len(chunk.draws) and found.schema.to_arrow_schema().names == self._schema.names
         )
 
     def _path(self, chunk: Chunk) -> Path:
@@ -179,9 +175,7 @@ def _claim(folder: Path, manifest: Mapping[str, object]) -> Mapping[str, str]:
         there = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         if (folder / RUNS).exists():
-            raise CallerError(
-                f"{folder}: holds runs, but no {MANIFEST}; give another --out"
-            ) from None
+            raise CallerError(f"{folder}: holds runs, but no {MANIFEST}; give another --out") from None
         write_whole(path, json.dumps(manifest, indent=1))
         there = dict(manifest)
     except ValueError:

@@ -89,9 +89,7 @@ METRICS: Mapping[Metric, Description] = {
 }
 
 
-def measured(
-    columns: Mapping[str, NDArray[np.generic]], certified: float | None
-) -> dict[Metric, Vector]:
+def measured(columns: Mapping[str, NDArray[np.generic]], certified: float | None) -> dict[Metric, Vector]:
     """Return all metrics of k runs.
 
     A time is infinite if its event does not happen. All metrics of a failed run are infinite.
@@ -173,9 +171,7 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
     q05, q25, median, q75, q95 = _quantiles(values, QUANTILES)
     low, high = quantile_interval(values, 0.5)
     largest = float(values.max())
-    return Estimate(
-        len(values), len(finite), mean, halfwidth, q05, q25, median, q75, q95, low, high, largest
-    )
+    return Estimate(len(values), len(finite), mean, halfwidth, q05, q25, median, q75, q95, low, high, largest)
 
 
 class Quartiles(NamedTuple):

@@ -90,9 +90,7 @@ def drawn_scenario(scenario: Scenario, seed: int, draw: int) -> Scenario:
 def seeds_of(seed: int, draw: int) -> SeedsSection:
     """Return the seeds of a run of several loops, from which the loops draw theirs."""
     draws = range(draw, draw + 1)
-    return SeedsSection(
-        **{name: int(_seeds(seed, name, draws)[0]) for name in SeedsSection.model_fields}
-    )
+    return SeedsSection(**{name: int(_seeds(seed, name, draws)[0]) for name in SeedsSection.model_fields})
 
 
 def _seeds(seed: int, name: str, draws: range) -> NDArray[np.uint64]:

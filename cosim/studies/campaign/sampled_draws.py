@@ -42,9 +42,14 @@ from noack.scenario.run_sections import PortsSection, RealtimeSection, SeedsSect
 from noack.scenario.scenario import Scenario
 
 _UNKNOWN = (
-    "inter_event_min_s", "inter_event_mean_s", "settling_s", "cost", "sup_e_c_scaled",
-    "final_norm", "diverged_at_s",
-)  # fmt: skip
+    "inter_event_min_s",
+    "inter_event_mean_s",
+    "settling_s",
+    "cost",
+    "sup_e_c_scaled",
+    "final_norm",
+    "diverged_at_s",
+)
 """Columns without a value in some runs."""
 
 
@@ -140,9 +145,7 @@ class SampledWork:
 def in_virtual_time(scenario: Scenario) -> Scenario:
     """Return the scenario without the settings that do not affect its simulation."""
     sections = {"seeds": SeedsSection(), "ports": PortsSection(), "realtime": RealtimeSection()}
-    return scenario.model_copy(
-        update={"name": "campaign", "description": "", "speed": 1.0, **sections}
-    )
+    return scenario.model_copy(update={"name": "campaign", "description": "", "speed": 1.0, **sections})
 
 
 LOOPS_ROW = np.dtype(
@@ -151,12 +154,16 @@ LOOPS_ROW = np.dtype(
         *(
             (name, "<f8")
             for name in (
-                "cost_worst", "loops_failed", "loops_claims_held",
-                "loops_guarantee_used", "updates_late", "delay_max_s",
+                "cost_worst",
+                "loops_failed",
+                "loops_claims_held",
+                "loops_guarantee_used",
+                "updates_late",
+                "delay_max_s",
             )
         ),
     ]
-)  # fmt: skip
+)
 """The row of a run of loops that share a network.
 
 cost_worst: the largest cost of a loop. loops_failed: share of the loops that diverged or exceeded
@@ -165,10 +172,16 @@ loops_guarantee_used: share of the loops that used up the guarantee. updates_lat
 delivered updates that were late. delay_max_s: largest time of a delivered update in the network.
 """
 _OF_ALL: Mapping[str, Callable[[NDArray[np.float64]], float]] = {
-    "transmissions": np.sum, "deliveries": np.sum, "longest_loss_burst": np.max,
-    "inter_event_min_s": np.min, "inter_event_mean_s": np.mean, "settling_s": np.max,
-    "cost": np.mean, "sup_e_c_scaled": np.max, "final_norm": np.max,
-}  # fmt: skip
+    "transmissions": np.sum,
+    "deliveries": np.sum,
+    "longest_loss_burst": np.max,
+    "inter_event_min_s": np.min,
+    "inter_event_mean_s": np.mean,
+    "settling_s": np.max,
+    "cost": np.mean,
+    "sup_e_c_scaled": np.max,
+    "final_norm": np.max,
+}
 
 
 @dataclass(frozen=True)

@@ -64,25 +64,26 @@ class CapacityResult(NamedTuple):
         """Return the results for JSON."""
         plan = self.plan
         return {
-            "scenario": plan.scenario.name, "rate_bps": plan.rate_bps,
+            "scenario": plan.scenario.name,
+            "rate_bps": plan.rate_bps,
             "delay_bounds_s": delay_bounds_s(self),
-            "deadline_s": plan.deadline_s, "periodic_loops_by_rate": plan.periodic_loops,
+            "deadline_s": plan.deadline_s,
+            "periodic_loops_by_rate": plan.periodic_loops,
             "mixture": [
-                {"name": kind.name, "count": kind.given, "period_s": kind.period_s}
-                for kind in plan.kinds
+                {"name": kind.name, "count": kind.given, "period_s": kind.period_s} for kind in plan.kinds
             ],
-            "loops": list(plan.counts), "draws": plan.draws, "disturbance": plan.amplitude,
+            "loops": list(plan.counts),
+            "draws": plan.draws,
+            "disturbance": plan.amplitude,
             "seed": plan.seed,
             "capacities": [one.document(plan) for one in self.capacities],
             "comparisons": list(comparisons(self)),
             "points": self.summary.document()["points"],
             "live": [one.document() for one in self.live],
-        }  # fmt: skip
+        }
 
 
-def write(
-    result: CapacityResult, folder: Path, figure_files: FigureFiles | None = None
-) -> list[Path]:
+def write(result: CapacityResult, folder: Path, figure_files: FigureFiles | None = None) -> list[Path]:
     """Write page, JSON and figures; return their paths.
 
     Raises:
@@ -103,21 +104,24 @@ def write(
 def page(result: CapacityResult) -> str:
     """Return the page as HTML; all text except the figures is escaped."""
     plan = result.plan
-    return templates(Path(__file__).parent).get_template("capacity.html.jinja").render(
-        title=plan.scenario.name,
-        subtitle=f"{plan.link}, {plan.draws:,} draws at each number of loops, "
-        f"seed {plan.seed}",
-        verdict=f"{by_rate(plan).capitalize()}.",
-        comparisons=[*comparisons(result), *mixtures(result), *waiting(result), *caveats(plan)],
-        counts=", ".join(map(str, plan.counts)),
-        deadline=f"{plan.deadline_s:g} s",
-        from_s=f"{plan.counted_from_s:g} s",
-        limits=[(name, _SENTENCES[name]) for name in LIMITS],
-        rows=list(rows(result)),
-        headings=HEADINGS,
-        figures=list(figures(result)),
-        live=[live_row(one) for one in result.live],
-    )  # fmt: skip
+    return (
+        templates(Path(__file__).parent)
+        .get_template("capacity.html.jinja")
+        .render(
+            title=plan.scenario.name,
+            subtitle=f"{plan.link}, {plan.draws:,} draws at each number of loops, seed {plan.seed}",
+            verdict=f"{by_rate(plan).capitalize()}.",
+            comparisons=[*comparisons(result), *mixtures(result), *waiting(result), *caveats(plan)],
+            counts=", ".join(map(str, plan.counts)),
+            deadline=f"{plan.deadline_s:g} s",
+            from_s=f"{plan.counted_from_s:g} s",
+            limits=[(name, _SENTENCES[name]) for name in LIMITS],
+            rows=list(rows(result)),
+            headings=HEADINGS,
+            figures=list(figures(result)),
+            live=[live_row(one) for one in result.live],
+        )
+    )
 
 
 HEADINGS = ("policy", "disturbance", "loops carried", "limited by", *LIMITS)
@@ -128,9 +132,7 @@ def rows(result: CapacityResult) -> Iterator[tuple[str, ...]]:
     last = result.plan.counts[-1]
     for one in result.capacities:
         limits = [_shown(one.limits[limit], last) for limit in LIMITS]
-        yield (
-            one.policy, one.disturbance, _shown(one.any_limit, last), one.limited_by or "–", *limits
-        )  # fmt: skip
+        yield (one.policy, one.disturbance, _shown(one.any_limit, last), one.limited_by or "–", *limits)
 
 
 def by_rate(plan: CapacityPlan) -> str:
@@ -141,10 +143,7 @@ def by_rate(plan: CapacityPlan) -> str:
         return f"{what} {plan.periodic_loops:.1f} loops, periodic every {kind.period_s:g} s"
     periods = ", ".join(f"{kind.name} every {kind.period_s:g} s" for kind in plan.kinds)
     factor = plan.factor(plan.periodic_loops)
-    return (
-        f"{what} {factor:.2f} × the given mixture, {plan.periodic_loops:.1f} loops, "
-        f"periodic: {periods}"
-    )
+    return f"{what} {factor:.2f} × the given mixture, {plan.periodic_loops:.1f} loops, periodic: {periods}"
 
 
 def mixtures(result: CapacityResult) -> Iterator[str]:
@@ -252,14 +251,18 @@ def _figure(result: CapacityResult, limit: Limit, disturbance: str) -> FigureDes
     ]
     if _is_live(result, disturbance):
         items += [
-            Marks(x=np.array([float(one.loops)]), y=np.array([one.values[metric]]), marker="x",
-                  size=9, stroke=2.2, colour=series_colour(policies.index(one.policy)))
+            Marks(
+                x=np.array([float(one.loops)]),
+                y=np.array([one.values[metric]]),
+                marker="x",
+                size=9,
+                stroke=2.2,
+                colour=series_colour(policies.index(one.policy)),
+            )
             for one in result.live
-        ]  # fmt: skip
+        ]
     y = panel.y if limit == "cost" else replace(panel.y, ends=(-0.02, 1.02))
-    return replace(
-        figure, rows=[replace(figure.rows[0], panels=[replace(panel, items=items, y=y)])]
-    )
+    return replace(figure, rows=[replace(figure.rows[0], panels=[replace(panel, items=items, y=y)])])
 
 
 def _is_live(result: CapacityResult, disturbance: str) -> bool:

@@ -286,12 +286,17 @@ class CapacityPlan:
             axes=tuple(axes),
             metrics=Metrics(
                 shown=(
-                    "transmissions", "lost_share", "loops_guarantee_used", "updates_late",
-                    "delay_max_s", "cost", "cost_worst",
+                    "transmissions",
+                    "lost_share",
+                    "loops_guarantee_used",
+                    "updates_late",
+                    "delay_max_s",
+                    "cost",
+                    "cost_worst",
                 ),
                 count_from_s=self.counted_from_s,
             ),
-        )  # fmt: skip
+        )
 
     def _numbers(self) -> Axis:
         """Return the axis of the numbers of loops."""
@@ -350,9 +355,7 @@ def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
         return min(kind.period_s for kind in kinds) / queue.slot_s
     loops = sum(kind.given for kind in kinds)
     needed_bps = sum(
-        kind.given
-        * int(queue.line_bits(datagram_bytes(kind.scenario.model.dimensions[0])))
-        / kind.period_s
+        kind.given * int(queue.line_bits(datagram_bytes(kind.scenario.model.dimensions[0]))) / kind.period_s
         for kind in kinds
     )
     return queue.rate_bps * loops / needed_bps

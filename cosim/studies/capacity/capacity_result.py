@@ -42,14 +42,7 @@ from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.metrics import Estimate, Metric, measured, quantile_interval, quartiles
 from cosim.studies.campaign.random_draws import seeds_of
 from cosim.studies.campaign.sampled_draws import SharedNetworkWork
-from cosim.studies.capacity.capacity_plan import (
-    DISTURBANCE,
-    LOOPS,
-    OWN,
-    POLICY,
-    CapacityPlan,
-    unshared,
-)
+from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan, unshared
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
@@ -203,9 +196,7 @@ def chosen_points(text: str | None, plan: CapacityPlan) -> list[tuple[str, int]]
     return [points[part] for part in texts]
 
 
-def live_point(
-    chosen: tuple[str, int], found: Sequence[GridPointResult], folder: Path
-) -> LivePoint:
+def live_point(chosen: tuple[str, int], found: Sequence[GridPointResult], folder: Path) -> LivePoint:
     """Run a grid point live, without the common disturbance and with the seeds of draw 0.
 
     Raises:
@@ -217,20 +208,22 @@ def live_point(
     point, work = simulated.point, simulated.point.work
     assert isinstance(work, SharedNetworkWork)
     changes = {"seeds": seeds_of(work.seed, 0), "name": f"{policy}-{count}"}
-    outcome = finalize(
-        launch(point.scenario.model_copy(update=changes), folder), report=False, view=False
-    )
+    outcome = finalize(launch(point.scenario.model_copy(update=changes), folder), report=False, view=False)
     rows = np.zeros(1, work.row_type)
     work.measure_loops(load_run(outcome.run_dir).loops, rows[0])
     columns = {column: rows[column] for column in work.row_type.names or ()}
     values = {key: float(value[0]) for key, value in measured(columns, None).items()}
     judged: list[Metric] = ["transmissions", *LIMITS.values()]
     return LivePoint(
-        policy, count, outcome.run_dir, int(outcome.status), outcome.reason,
+        policy,
+        count,
+        outcome.run_dir,
+        int(outcome.status),
+        outcome.reason,
         sum(loop.unintended_losses for loop in outcome.summary.loops),
         {metric: values[metric] for metric in [*judged, "delay_max_s"]},
         {metric: prediction_interval(simulated.estimates[metric]) for metric in judged},
-    )  # fmt: skip
+    )
 
 
 def prediction_interval(metric: Estimate) -> tuple[float, float]:

@@ -38,9 +38,7 @@ _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
 
 
-def write_page(
-    found: DesignResult, path: Path, figure_files: FigureFiles | None = None
-) -> list[Path]:
+def write_page(found: DesignResult, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
     """Write page and figure; return the files.
 
     Raises:
@@ -57,20 +55,23 @@ def page(found: DesignResult) -> str:
         f"within {limits.settling_s:g} s",
         *(f"{WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
     ]
-    return templates(Path(__file__).parent).get_template("design.html.jinja").render(
-        title=found.name,
-        subtitle=f"{len(found.trials):,} candidates, {found.fresh.draws:,} draws, "
-        f"seed {found.seed}",
-        verdict=found.verdict(),
-        tone="good" if found.confirmed else "doubt" if found.feasible else "bad",
-        limits=lines,
-        certified=[certified(name, value) for name, value in bounds.items()],
-        conditions=found.conditions,
-        figure=trade_off(found),
-        headings=HEADINGS,
-        rows=rows(found),
-        scenario_toml=dumps(found.scenario),
-    )  # fmt: skip
+    return (
+        templates(Path(__file__).parent)
+        .get_template("design.html.jinja")
+        .render(
+            title=found.name,
+            subtitle=f"{len(found.trials):,} candidates, {found.fresh.draws:,} draws, seed {found.seed}",
+            verdict=found.verdict(),
+            tone="good" if found.confirmed else "doubt" if found.feasible else "bad",
+            limits=lines,
+            certified=[certified(name, value) for name, value in bounds.items()],
+            conditions=found.conditions,
+            figure=trade_off(found),
+            headings=HEADINGS,
+            rows=rows(found),
+            scenario_toml=dumps(found.scenario),
+        )
+    )
 
 
 def trade_off(found: DesignResult) -> FigureDescription:
@@ -82,11 +83,15 @@ def trade_off(found: DesignResult) -> FigureDescription:
         items.append(
             Marks(
                 x=np.array([m.transmissions for m in own]),
-                y=np.array([m.settling_s for m in own]), label=plain(f"W {family.name}", 24),
-                colour=series_colour(i), marker=MARKERS[i % len(MARKERS)], size=3.5, opacity=0.5,
+                y=np.array([m.settling_s for m in own]),
+                label=plain(f"W {family.name}", 24),
+                colour=series_colour(i),
+                marker=MARKERS[i % len(MARKERS)],
+                size=3.5,
+                opacity=0.5,
                 reduced=False,
             )
-        )  # fmt: skip
+        )
     front, best = [trial.measured for trial in found.front], found.fresh
     high_s = best.settling_high_s if np.isfinite(best.settling_high_s) else best.settling_s
     items += [

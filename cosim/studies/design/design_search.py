@@ -136,9 +136,7 @@ def require_draws(draws: int, quantile: float) -> None:
     while interval_ranks(enough, quantile)[1] == enough:
         enough += max(enough // 50, 1)
     if enough > draws:
-        raise CallerError(
-            f"--draws: {draws} are too few for the quantile {quantile:g}; {enough} are enough"
-        )
+        raise CallerError(f"--draws: {draws} are too few for the quantile {quantile:g}; {enough} are enough")
 
 
 def _require_certifiable(scenario: Scenario) -> None:
@@ -153,9 +151,7 @@ def certificate_of(scenario: Scenario, limits: DesignLimits) -> ScenarioCertific
     """Return the certificate of all plants in the box, or of the plant if there is no box."""
     resolved = resolve(scenario)
     late = resolved.certificate.late_periods
-    conditions = (
-        nominal_conditions(resolved, late) if limits.schedule else ideal_conditions(resolved)
-    )
+    conditions = nominal_conditions(resolved, late) if limits.schedule else ideal_conditions(resolved)
     return certify_box(resolved, conditions) or certify(resolved, conditions)
 
 
@@ -180,9 +176,7 @@ def bounds_of(found: ScenarioCertificate, scenario: Scenario) -> Bounds:
 class Search:
     """All trials of a space on common draws; the draws after them confirm the choice."""
 
-    def __init__(
-        self, space: DesignSpace, limits: DesignLimits, box: Box, seed: int, draws: int
-    ) -> None:
+    def __init__(self, space: DesignSpace, limits: DesignLimits, box: Box, seed: int, draws: int) -> None:
         self.space, self.limits = space, limits
         self._few = box.population(seed, range(max(draws // _SCREENING, 1)))
         self._all = box.population(seed, range(draws))
@@ -411,9 +405,7 @@ def design(
     first = next(iter(families.values()))
     first.coverage.require_exact()
     if limits.settling_s > first.horizon_s:
-        raise CallerError(
-            f"--settling: {limits.settling_s:g} s lie beyond horizon_s = {first.horizon_s:g}"
-        )
+        raise CallerError(f"--settling: {limits.settling_s:g} s lie beyond horizon_s = {first.horizon_s:g}")
     require_draws(draws, limits.quantile)
     if limits.bounds:
         _require_certifiable(first)

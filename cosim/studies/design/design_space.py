@@ -121,9 +121,7 @@ def space_of(families: Mapping[tuple[str, str], Scenario]) -> DesignSpace:
     first = found[0].scenario
     initial_norm = math.hypot(*first.plant.initial_state)
     if initial_norm == 0:
-        raise CallerError(
-            "plant.initial_state: is 0, but a loop settles to a share of ‖x(0)‖; give another"
-        )
+        raise CallerError("plant.initial_state: is 0, but a loop settles to a share of ‖x(0)‖; give another")
     floor, highest = first.decaying.floor, float(LEVELS[-1]) * initial_norm
     if floor >= highest:
         raise CallerError(
@@ -172,9 +170,7 @@ def _regulated(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str, Scen
     loop = loop_of(resolve(scenario))
     for name, matrix, size in (("--Q", Q, loop.n), ("--R", R, loop.m)):
         if matrix.shape != (size, size):
-            raise CallerError(
-                f"{name}: expected {size} x {size}, or {size} numbers for its diagonal"
-            )
+            raise CallerError(f"{name}: expected {size} x {size}, or {size} numbers for its diagonal")
     found = []
     for cost in COSTS_OF_INPUT:
         K = lqr_gain(loop.A_model, loop.B_model, Q, cost * R)
@@ -219,9 +215,7 @@ def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) ->
     if norm != "chosen":
         raise CallerError(f'--weights: {", ".join(NORMS)}, not "{norm}"')
     if scenario.mode == "zoh":
-        raise CallerError(
-            "--weights chosen: models that hold do not decay; take --weights identity"
-        )
+        raise CallerError("--weights chosen: models that hold do not decay; take --weights identity")
     loop = loop_of(resolve(scenario))
     nominal = replace(loop, A=loop.A_model, B=loop.B_model)
     # α in the middle of the grid: a norm that contracts at this rate does so at all lower rates.

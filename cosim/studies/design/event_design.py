@@ -102,9 +102,7 @@ class EventSearch:
     def scenario_of(self, loop: EventLoop, m: int | None = None) -> Scenario:
         """Return the scenario of a loop; with M, or with its own."""
         one = self.scenario
-        trigger = one.decaying.model_copy(
-            update={"alpha_per_s": loop.alpha_per_s, "beta": loop.beta}
-        )
+        trigger = one.decaying.model_copy(update={"alpha_per_s": loop.alpha_per_s, "beta": loop.beta})
         update: dict[str, object] = {
             "model": one.model.model_copy(update={"gain": loop.K}),
             "trigger": trigger,
@@ -320,9 +318,7 @@ def _figure(search: EventSearch, given: Certified, best: Certified) -> FigureDes
     items = []
     for one, label, colour in ((given, "given", NETWORK), (best, "designed", LOST)):
         bounds = np.array([search.state_bound(one.loop, int(m)) for m in numbers])
-        items.append(
-            Line(x=numbers.astype(float), y=bounds, colour=colour, label=label, marker="o")
-        )
+        items.append(Line(x=numbers.astype(float), y=bounds, colour=colour, label=label, marker="o"))
     x, y = Axis(label="M", logarithmic=True), Axis(label="certified sup‖x‖", logarithmic=True)
     caption = "Certified bound of the state over M. A curve ends where its certificate does."
     return figure_of("certified", Panel(items=items, x=x, y=y), caption)

@@ -176,8 +176,7 @@ class PatternGraph:
         for _ in range(self._rounds):
             norms = np.log(np.linalg.norm(products, axis=(1, 2)) + _TINY) / durations
             closed = np.flatnonzero(
-                (self._sources[paths[:, 0]] == self._targets[paths[:, -1]])
-                & (norms > best.logarithm)
+                (self._sources[paths[:, 0]] == self._targets[paths[:, -1]]) & (norms > best.logarithm)
             )
             if len(closed):
                 radii = np.abs(np.linalg.eigvals(products[closed])).max(axis=1)

@@ -94,9 +94,7 @@ def figure_of(name: str, panel: Panel, caption: str) -> FigureDescription:
     return one_panel(name, panel, _HEIGHT_IN).captioned(caption)
 
 
-def write_page(
-    found: DesignOutcome, path: Path, figure_files: FigureFiles | None = None
-) -> list[Path]:
+def write_page(found: DesignOutcome, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
     """Write page and figure; return the files.
 
     Raises:

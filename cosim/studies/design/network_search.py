@@ -160,8 +160,7 @@ def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
     most = wish.most or _MOST_M
     most = min(most, (others.longest_burst or most) + 1)
     return [
-        Rung(f"M = {m}", m, _capped(others, m - 1), period_ns, {"mansd": m - 1})
-        for m in range(1, most + 1)
+        Rung(f"M = {m}", m, _capped(others, m - 1), period_ns, {"mansd": m - 1}) for m in range(1, most + 1)
     ]
 
 
@@ -282,9 +281,7 @@ class NetworkSearch:
         found = margin.first_bounds()
         return margin.is_stable() if found.verdict == "undecided" else found
 
-    def reach(
-        self, candidate: Candidate, most: int, least: int = -1
-    ) -> tuple[int, Stability | None]:
+    def reach(self, candidate: Candidate, most: int, least: int = -1) -> tuple[int, Stability | None]:
         """Return the highest certified rung from ``most`` down to above ``least``."""
         for rung in range(most, least, -1):
             if (found := self.judge(candidate, rung)).verdict == "stable":

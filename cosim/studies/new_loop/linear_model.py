@@ -256,9 +256,7 @@ def gain(
     label, rest = model.plant.label, model.uncontrollable
     if len(rest) and rest[0].real >= 0:
         worst = eigenvalue_text(rest[:1])
-        raise CallerError(
-            f"{label}: no gain stabilises it: the eigenvalue {worst} /s is not controllable"
-        )
+        raise CallerError(f"{label}: no gain stabilises it: the eigenvalue {worst} /s is not controllable")
     if poles is None:
         Q, R = (_diagonal(*one) for one in (("q", q, model.A), ("r", r, model.B.T)))
         K = _regulator(model, Q, R)
@@ -291,9 +289,7 @@ def _placed(model: LinearModel, poles: Complex) -> Matrix:
     if not np.isfinite(poles).all() or (poles.real >= 0).any():
         raise CallerError("poles: they need negative real parts, e.g. -1,-2+1j,-2-1j")
     if len(poles) != model.rank:
-        raise CallerError(
-            f"poles: {len(poles)} given; the controllable part has {model.rank} eigenvalues"
-        )
+        raise CallerError(f"poles: {len(poles)} given; the controllable part has {model.rank} eigenvalues")
     try:
         placed = place_poles(basis.T @ model.A @ basis, basis.T @ model.B, poles)
     except ValueError as error:  # not in conjugate pairs, or one too often

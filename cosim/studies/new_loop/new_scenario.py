@@ -19,14 +19,7 @@ import numpy as np
 
 from cosim.analysis.certificates import with_linear_plant, with_weight
 from cosim.simulation.virtual_time import simulate_loops
-from cosim.studies.new_loop import (
-    ALPHA_SHARE,
-    BETA_SHARE,
-    LOSS_PROBABILITY,
-    MANSD,
-    SETTLED,
-    rounded,
-)
+from cosim.studies.new_loop import ALPHA_SHARE, BETA_SHARE, LOSS_PROBABILITY, MANSD, SETTLED, rounded
 from cosim.studies.new_loop.linear_model import (
     LinearModel,
     LoopGain,
@@ -137,9 +130,7 @@ def new(
         NoackError: the plant does not rest at x = 0, u = 0, or a value is wrong.
     """
     found = model_or_gain(plant, settings or {}) if isinstance(plant, str) else plant
-    fixed = {
-        key: one for key, one in (settings or {}).items() if not key.startswith("plant.system")
-    }
+    fixed = {key: one for key, one in (settings or {}).items() if not key.startswith("plant.system")}
     given = fixed.pop("plant.initial_state", initial_state)
     model = found.model if isinstance(found, LoopGain) else found
     _require_rest(model)
@@ -184,14 +175,9 @@ def _initial_state(model: LinearModel, given: object) -> Vector:
 
 def _trials(found: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
     """Yield what is tried, the preferred settings first."""
-    if isinstance(found, LoopGain):
-        gains = [found]
-    else:
-        gains = [gain(found, r=weight) for weight in _INPUT_WEIGHTS]
+    gains = [found] if isinstance(found, LoopGain) else [gain(found, r=weight) for weight in _INPUT_WEIGHTS]
     for one in gains:
-        fastest = max(
-            (size for size in np.abs(one.eigenvalues) if size < _FASTEST_PER_S), default=1
-        )
+        fastest = max((size for size in np.abs(one.eigenvalues) if size < _FASTEST_PER_S), default=1)
         wanted = _STEPS_PER_TIME_CONSTANT * fastest
         base = next((rate for rate in _RATES_HZ if rate >= wanted), _RATES_HZ[-1])
         base = one.model.plant.rates.get("rate_hz", base)
@@ -321,16 +307,14 @@ class _Builder:
         return bool(np.isfinite(sizes).all() and sizes[-1] <= _RETURNED * (sizes.max() or 1.0))
 
 
-def _notes(
-    trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_linear: bool
-) -> Iterator[str]:
+def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_linear: bool) -> Iterator[str]:
     """Yield what was chosen and found, a sentence each."""
     yield f"K: {trial.gain.method}; decay rate of Â + B̂K: {trial.gain.decay_per_s:.3g} /s."
     plant = "the plant" if is_linear else "the linear plant ẋ = Âx + B̂u"
     if certificate.constants is None:
         yield (
             f"No certificate was found for {plant}: {certificate.void}. A faster rate, a slower "
-            "gain (a larger --r) or a smaller network.mansd may have one."
+            "gain (a larger --r of noack gain) or a smaller network.mansd may have one."
         )
     else:
         bound = envelope_formula("‖x‖", certificate, "state").format(certificate.constants.state)

@@ -171,9 +171,7 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
     except CallerError as error:
         if shipped := did_you_mean(label, [*PLANTS, *shipped_names("scenarios")]):
             raise CallerError(f"{label}: no such plant; {shipped}") from None
-        raise CallerError(
-            f"{error}; {_FORMS}" if not Path(label).exists() else str(error)
-        ) from None
+        raise CallerError(f"{error}; {_FORMS}" if not Path(label).exists() else str(error)) from None
     for key, value in settings.items():
         scenario_file.put(content, key, value, f"--set {key}")
     resolved = resolve(scenario_file.completed(content, path))
@@ -194,9 +192,7 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
 def _of_environment(label: str, settings: ReadTable, system: GymnasiumSettings) -> PlantReference:
     environment = system.environment()
     rates = {"rate_hz": float(f"{1 / environment.step_s:.12g}")}
-    return PlantReference(
-        label, settings, system, environment.n, environment.m, (None, None), rates
-    )
+    return PlantReference(label, settings, system, environment.n, environment.m, (None, None), rates)
 
 
 def _plain(names: Sequence[str]) -> tuple[str, ...]:

@@ -149,11 +149,14 @@ def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
         before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, run.system.loop.n)
         at_events = run.system.norms(before) * np.exp(trigger.alpha_per_s * run.event_s[1:])
         error = max((run.e_c_norm(samples) * growth).max(), at_events.max(initial=0.0))
-        rows.append({
-            "error": error / trigger.beta, "delta": constants.delta,
-            "state": (np.linalg.norm(samples.x, axis=1) * growth).max() / constants.state,
-            "inter_event": np.diff(run.event_s).min() / (constants.inter_event_s or math.nan),
-        })  # fmt: skip
+        rows.append(
+            {
+                "error": error / trigger.beta,
+                "delta": constants.delta,
+                "state": (np.linalg.norm(samples.x, axis=1) * growth).max() / constants.state,
+                "inter_event": np.diff(run.event_s).min() / (constants.inter_event_s or math.nan),
+            }
+        )
         theorems += _theorem_2(resolved, constants)
     return {
         "draws": len(rows) - 1,
@@ -287,8 +290,7 @@ def _slow_model(M: int) -> Numbers:
         "model_per_s": -spectral_abscissa(loop.H),
         "deliveries_s": [state.t_s for state in ends],
         "thresholds": [
-            float(np.linalg.norm(state.e_c)) * math.exp(trigger.rate_per_s * state.t_s)
-            for state in ends
+            float(np.linalg.norm(state.e_c)) * math.exp(trigger.rate_per_s * state.t_s) for state in ends
         ],
         "first_ratios": (np.diff(run.event_s)[1:5] / run.event_s[1:5]).tolist(),
     }
@@ -404,9 +406,12 @@ def _sampled(scenario: Scenario, representative: int) -> Numbers:
 
 def _only_first_arrives(resolved: Scenario, x0: Vector | None = None) -> ContinuousRun:
     return simulate_continuous(
-        continuous_loop_of(resolved), horizon_s=resolved.horizon_s,
-        delivered=lambda event: event == 0, known_start=False, x0=x0,
-    )  # fmt: skip
+        continuous_loop_of(resolved),
+        horizon_s=resolved.horizon_s,
+        delivered=lambda event: event == 0,
+        known_start=False,
+        x0=x0,
+    )
 
 
 def _nominal(scenario: Scenario, horizon_s: float) -> Scenario:

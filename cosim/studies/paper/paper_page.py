@@ -38,8 +38,11 @@ POLICIES = ("MB-ET", "ZOH-ET")
 _OTHER_EXAMPLES = ("nothing lost", "box × 5", "box × 0: exact model")
 """Variations that change the paper's example. The others vary only unspecified settings."""
 _REPRESENTED: tuple[Metric, ...] = (
-    "transmissions", "deliveries", "settling_s", "inter_event_min_s",
-)  # fmt: skip
+    "transmissions",
+    "deliveries",
+    "settling_s",
+    "inter_event_min_s",
+)
 """The metrics by which the representative draw is chosen."""
 _DIGITS = 5
 """Number of significant digits in the file."""
@@ -159,9 +162,12 @@ def render(found: Document) -> str:
     point = {tuple(one["axes"].values()): one["metrics"] for one in summary["points"]}
     apart = {one["axes"]["variation"]: one["metrics"] for one in summary["differences"]}
     templates = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
+        loader=FileSystemLoader(Path(__file__).parent),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
     templates.filters |= {"n": number, "percent": share_text}
     return _wrapped(
         templates.get_template("paper.md.jinja").render(
@@ -247,7 +253,10 @@ def _filled(paragraph: str) -> list[str]:
     # No line may begin with an operator that Markdown reads as a list mark.
     glued = paragraph[:begin] + re.sub(r" (?=[-+>=*] )", _GLUE, paragraph[begin:])
     lines = textwrap.wrap(
-        glued, _COLUMNS, subsequent_indent=" " * begin,
-        break_long_words=False, break_on_hyphens=False,
-    )  # fmt: skip
+        glued,
+        _COLUMNS,
+        subsequent_indent=" " * begin,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
     return [line.replace(_GLUE, " ") for line in lines]

@@ -29,6 +29,8 @@ class Row(NamedTuple):
     quantity: str
     where: str
     """Where the published value stands."""
+    relation: str
+    """What the computed value is to be: =, <, ≤, > or ≥ the published one, or among these."""
     published: str
     computed: str
     how: str
@@ -75,8 +77,8 @@ class Reproduction(NamedTuple):
     @property
     def table(self) -> ResultTable:
         """Published against computed."""
-        headings = ("quantity", "where", "published", "computed", "verdict")
-        cells = [(*row[:4], row.verdict) for row in self.rows]
+        headings = ("quantity", "where", "relation", "published", "computed", "verdict")
+        cells = [(*row[:5], row.verdict) for row in self.rows]
         return ResultTable(self.name, self.result.reference, headings, cells)
 
     def remarks(self) -> list[str]:
@@ -94,29 +96,25 @@ class Reproduction(NamedTuple):
 
 def print_rows(console: "Console", found: Reproduction) -> None:
     """Print published against computed, and what is to be known about it."""
-    console.print(terminal_table(found.table, left=range(2), styles=_STYLES))
+    console.print(terminal_table(found.table, left=range(3), styles=_STYLES, dense=True))
     for remark in found.remarks():
         console.print(remark, markup=False, highlight=False)
     verdict = f"{sum(row.agrees for row in found.rows)} of {len(found.rows)} reproduced"
     console.print(verdict, style="bold" if found.as_expected else "bold red", highlight=False)
 
 
-def number(
-    quantity: str, where: str, published: float, computed: float, how: str, *, digits: int
-) -> Row:
+def number(quantity: str, where: str, published: float, computed: float, how: str, *, digits: int) -> Row:
     """Return the row of a number that is published with so many digits after the point."""
     agrees = abs(computed - published) <= 0.5000001 * 10.0**-digits
     texts = f"{published:.{digits}f}", f"{computed:.{digits + 1}f}"
-    return Row(quantity, where, *texts, how, agrees)
+    return Row(quantity, where, "=", *texts, how, agrees)
 
 
 def stored(name: str) -> dict[str, dict[str, Matrix]]:
     """Return the tables of numbers, published or found, beside the result in NAME.toml."""
     path = Path(__file__).parent / "results" / f"{name}.toml"
     tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    return {
-        key: {one: np.array(two) for one, two in table.items()} for key, table in tables.items()
-    }
+    return {key: {one: np.array(two) for one, two in table.items()} for key, table in tables.items()}
 
 
 def shipped_loop(name: str, settings: Iterable[str] = ()) -> ContinuousLoop:

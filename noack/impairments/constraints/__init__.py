@@ -48,6 +48,5 @@ def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) 
         seen.add(constraint.scope)
     if constraints and find_longest_burst(mansd, constraints) is None:
         raise ValueError(
-            f"constraints: {constraints[0].text()}: needs a maximum of losses, too: "
-            "mansd or at_most (atmost)"
+            f"constraints: {constraints[0].text()}: needs a maximum of losses, too: mansd or at_most (atmost)"
         )

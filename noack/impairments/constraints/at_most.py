@@ -31,9 +31,7 @@ class AtMost(Constraint):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.losses >= self.window:
-            raise ValueError(
-                f"losses: must be less than the window, {self.window}, else any loss is allowed"
-            )
+            raise ValueError(f"losses: must be less than the window, {self.window}, else any loss is allowed")
         return self
 
     @property
@@ -45,7 +43,4 @@ class AtMost(Constraint):
         return f"maximum for {self.window} packets"
 
     def meaning(self) -> str:
-        return (
-            f"of any {self.window} consecutive packets of a flow, at most {self.losses} are not "
-            "delivered"
-        )
+        return f"of any {self.window} consecutive packets of a flow, at most {self.losses} are not delivered"

@@ -32,6 +32,5 @@ class Recovery(Constraint):
 
     def meaning(self) -> str:
         return (
-            f"between two loss bursts, at least {self.deliveries} consecutive packets of a flow "
-            "are delivered"
+            f"between two loss bursts, at least {self.deliveries} consecutive packets of a flow are delivered"
         )

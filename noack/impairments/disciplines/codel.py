@@ -48,9 +48,7 @@ class Codel(QueueDiscipline):
             f"{time_text(self.target_s)} for {time_text(self.interval_s)} or longer"
         )
 
-    def queue_stage(
-        self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables
-    ) -> Stage:
+    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables) -> Stage:
         numbers = {
             **bottleneck,
             "target_ns": round(self.target_s * NS_PER_S),

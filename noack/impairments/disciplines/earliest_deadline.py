@@ -23,13 +23,13 @@ class EarliestDeadline(Scheduler):
 
     clauses: ClassVar = (
         Clause(
-            "edf",
-            "rate 1mbit queue 20 edf 10ms,50ms",
+            "earliest_deadline",
+            "rate 1mbit queue 20 earliest_deadline 10ms,50ms",
             Part("deadlines_s", list_of(OWN_TIME_S, "times, e.g. 10ms,50ms"), "T,T,..."),
             implied={"kind": "earliest_deadline"},
         ),
     )
-    tc_missing: ClassVar = "the discipline edf"
+    tc_missing: ClassVar = "the discipline earliest_deadline"
 
     @property
     def numbers(self) -> tuple[int, ...]:

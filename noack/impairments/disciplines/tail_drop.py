@@ -14,7 +14,5 @@ class TailDrop(QueueDiscipline):
     def meaning(self) -> str:
         return "more are dropped"
 
-    def queue_stage(
-        self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables
-    ) -> Stage:
+    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables) -> Stage:
         return Stage(self.kind, bottleneck, "bottleneck", queue_places)

@@ -40,8 +40,7 @@ class Blackout(FileFeature, Impairment):
 
     kind: Literal["blackout"] = "blackout"
     intervals_s: (
-        Annotated[tuple[tuple[_TimeS, _TimeS], ...], Field(min_length=1, max_length=MOST_INTERVALS)]
-        | None
+        Annotated[tuple[tuple[_TimeS, _TimeS], ...], Field(min_length=1, max_length=MOST_INTERVALS)] | None
     ) = None
     """Begin and end of each, in seconds from the emulator's start (in a run: its epoch)."""
     file: Annotated[str, Field(min_length=1)] | None = None
@@ -99,9 +98,7 @@ class Blackout(FileFeature, Impairment):
                 begin_s, end_s = map(OWN_TIME_S.read, line.split())
             except ValueError:
                 shown = shortened(line, 40)
-                file.wrong(
-                    f"line {number}: {shown!r}: expected begin and end with units, e.g. 2s 3500ms"
-                )
+                file.wrong(f"line {number}: {shown!r}: expected begin and end with units, e.g. 2s 3500ms")
             intervals_s.append((begin_s, end_s))
             try:
                 _require_order(intervals_s[-2:], self.every_s)

@@ -17,14 +17,7 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
 from noack.impairments.clauses import Clause, Part, Word
-from noack.impairments.feature import (
-    TC_CORRELATION,
-    FileFeature,
-    Impairment,
-    Stage,
-    StageTables,
-    add_numbers,
-)
+from noack.impairments.feature import TC_CORRELATION, FileFeature, Impairment, Stage, StageTables, add_numbers
 from noack.impairments.words import (
     CORRELATION,
     OWN_TIME_S,
@@ -200,9 +193,7 @@ class Delay(FileFeature, Impairment):
         elif self.jitter_s and self.distribution == "uniform":
             text += f" ± {time_text(self.jitter_s)}, uniformly distributed"
         elif self.jitter_s:
-            text += (
-                f", with a standard deviation of {time_text(self.jitter_s)} ({self.distribution})"
-            )
+            text += f", with a standard deviation of {time_text(self.jitter_s)} ({self.distribution})"
         below = self._share_below_zero()
         if below >= _NOTEWORTHY:
             share = percent_text(float(f"{below:.2g}"))
@@ -231,9 +222,7 @@ class Delay(FileFeature, Impairment):
 
     def stage(self, tables: StageTables) -> Stage:
         self.require_content()
-        begin, end = add_numbers(
-            tables.reals, sorted(t_s * NS_PER_S for t_s in self.samples_s or ())
-        )
+        begin, end = add_numbers(tables.reals, sorted(t_s * NS_PER_S for t_s in self.samples_s or ()))
         numbers = {
             "constant_ns": round(self.delay_s * NS_PER_S),
             "jitter_ns": self.jitter_s * NS_PER_S,

@@ -38,10 +38,13 @@ class Opportunities(FileFeature, Impairment):
     kind: Literal["opportunities"] = "opportunities"
     file: Annotated[str, Field(min_length=1)] | None = None
     """The trace: on each line a time in ms at which up to 1504 bytes can be delivered."""
-    times_ms: Annotated[
-        tuple[Annotated[int, Field(ge=0, le=_LONGEST_MS)], ...],
-        Field(min_length=1, max_length=MOST_TIMES),
-    ] | None = None  # fmt: skip
+    times_ms: (
+        Annotated[
+            tuple[Annotated[int, Field(ge=0, le=_LONGEST_MS)], ...],
+            Field(min_length=1, max_length=MOST_TIMES),
+        ]
+        | None
+    ) = None
     """Instead of a file: these times, which do not descend; they repeat after the last."""
     queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
     """Maximum number of packets that wait; further packets are dropped."""

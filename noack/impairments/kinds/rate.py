@@ -25,9 +25,7 @@ class _DisciplinePart(Part):
 
     @property
     def _clause(self) -> Clause:
-        return next(
-            clause for kind in DISCIPLINES for clause in kind.clauses if clause.word == self.word
-        )
+        return next(clause for kind in DISCIPLINES for clause in kind.clauses if clause.word == self.word)
 
     @property
     def grammar(self) -> str:
@@ -103,9 +101,7 @@ class Rate(Impairment):
         payload_bytes = np.asarray(payload_bytes, np.int64)
         line_bytes: NDArray[np.int64] = np.maximum(payload_bytes + self.overhead_bytes, 0)
         if self.cell_bytes:
-            line_bytes = -(-line_bytes // self.cell_bytes) * (
-                self.cell_bytes + self.cell_overhead_bytes
-            )
+            line_bytes = -(-line_bytes // self.cell_bytes) * (self.cell_bytes + self.cell_overhead_bytes)
         return 8 * line_bytes
 
     @property

@@ -23,14 +23,7 @@ from noack.impairments.feature import (
     require_inside,
 )
 from noack.impairments.markov_chain import NotPredictableError, Pattern
-from noack.impairments.words import (
-    OWN_TIME_NS,
-    PERCENT,
-    Quantity,
-    brief_number,
-    brief_percent,
-    time_ns_text,
-)
+from noack.impairments.words import OWN_TIME_NS, PERCENT, Quantity, brief_number, brief_percent, time_ns_text
 from noack.settings.section import Probability
 from noack.settings.user_files import NamedFile
 from noack.traces.packet_trace import LOST_NS, PacketTrace
@@ -124,9 +117,7 @@ class Replay(FileFeature, Impairment):
             raise ValueError(f"delays_ns: has {len(delays_ns)} records, sent_ns {len(sent_ns)}")
         sent, delays = np.array(sent_ns, object), np.array(delays_ns, object)
         if sent_ns[0] != 0 or sent_ns[-1] > LONGEST_NS or (sent[1:] < sent[:-1]).any():
-            raise ValueError(
-                "sent_ns: must begin with 0, must not descend, and end within 31 years"
-            )
+            raise ValueError("sent_ns: must begin with 0, must not descend, and end within 31 years")
         if ((delays < LOST_NS) | (delays > LONGEST_DELAY_NS)).any():
             raise ValueError(f"delays_ns: must be -1 to {LONGEST_DELAY_NS}, one hour")
         require_inside(self.offset_s, self.length_ns)
@@ -164,11 +155,7 @@ class Replay(FileFeature, Impairment):
             )
         which = "at its time since the start" if self.by == "time" else "by its number in its flow"
         again = ", repeated" if self.repeat else ", once"
-        share = (
-            ""
-            if self.delay_share == 1
-            else f", with {brief_percent(self.delay_share)} of the delay"
-        )
+        share = "" if self.delay_share == 1 else f", with {brief_percent(self.delay_share)} of the delay"
         return (
             f"loses or delays each packet as recorded {which}{share}: "
             f"{what}{offset_meaning(self.offset_s)}{again}"
@@ -196,9 +183,7 @@ class Replay(FileFeature, Impairment):
         latest_ns = 0
         for delay_ns in self.delays_ns or ():
             if delay_ns >= 0:
-                latest_ns = (
-                    delay_ns if self.delay_share == 1 else round(delay_ns * self.delay_share)
-                )
+                latest_ns = delay_ns if self.delay_share == 1 else round(delay_ns * self.delay_share)
             applied_ns.append(latest_ns if delay_ns >= 0 else -1 - latest_ns)
         return applied_ns
 

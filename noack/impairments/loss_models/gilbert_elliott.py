@@ -31,9 +31,7 @@ from noack.impairments.words import (
 )
 from noack.settings.section import Probability
 
-_COMMON = Part(
-    "step_s", OWN_TIME_S, "STEP", "common", "loss gemodel 1% 10% common 20ms", {"state": "link"}
-)
+_COMMON = Part("step_s", OWN_TIME_S, "STEP", "common", "loss gemodel 1% 10% common 20ms", {"state": "link"})
 
 
 class GilbertElliottLoss(LossModel):
@@ -93,9 +91,7 @@ class GilbertElliottLoss(LossModel):
         chain = (self.good_to_bad, self.bad_to_good)
         means = (self.mean_loss, self.mean_burst)
         if (None in chain) == (None in means) or (None in chain and chain != (None, None)):
-            raise ValueError(
-                "good_to_bad: give good_to_bad and bad_to_good, or mean_loss and mean_burst"
-            )
+            raise ValueError("good_to_bad: give good_to_bad and bad_to_good, or mean_loss and mean_burst")
         if None in chain:
             if (self.loss_in_good, self.loss_in_bad) != (0.0, 1.0):
                 raise ValueError(
@@ -154,9 +150,7 @@ class GilbertElliottLoss(LossModel):
             raise NotPredictableError("losses in a common state depend on when packets arrive")
         p, r = self.transitions
         moves = np.array([[1 - p, p], [r, 1 - r]])
-        return (
-            Chain(np.array([1.0, 0.0]), moves, np.array([self.loss_in_good, self.loss_in_bad])),
-        )
+        return (Chain(np.array([1.0, 0.0]), moves, np.array([self.loss_in_good, self.loss_in_bad])),)
 
     def tc_lacks(self, before: Sequence[Impairment]) -> str:
         return "" if self.step_s is None else "a state that all flows share"

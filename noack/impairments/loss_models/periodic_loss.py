@@ -18,9 +18,7 @@ def _read_share(word: str) -> list[int]:
     return list(map(int, word.split("/")))
 
 
-_SHARE = Quantity(
-    "losses per packets, e.g. 2/100", _read_share, lambda numbers: "/".join(map(str, numbers))
-)
+_SHARE = Quantity("losses per packets, e.g. 2/100", _read_share, lambda numbers: "/".join(map(str, numbers)))
 
 
 class PeriodicLoss(LossModel):

@@ -216,10 +216,7 @@ def _power_of_number(value: "arb", power: float) -> "arb":
         return value.sqrt()
     if power % 1:
         return (value.log() * power).exp()
-    found = _ball(1.0)
-    for _ in range(int(power)):
-        found *= value
-    return found
+    return value ** int(power)
 
 
 @dataclass(frozen=True)
@@ -294,10 +291,7 @@ class EnclosedMotion:
         if found is None:
             raise NotEnclosedError("x is neither its state nor its state minus a constant")
         rates, shown = (
-            [
-                one if isinstance(one, Enclosed) else Enclosed(_ball(float(one)), constant)
-                for one in part
-            ]
+            [one if isinstance(one, Enclosed) else Enclosed(_ball(float(one)), constant) for one in part]
             for part in found
         )
         for one, own in zip(shown, each[: self.n], strict=True):

@@ -121,14 +121,10 @@ def _differences(f: Callable[[Vector], Vector], point: Vector) -> Matrix:
 
 def _rounded(values: Matrix) -> Matrix:
     """Return the values with ten significant digits: 1 instead of 0.99999999998."""
-    return np.array([float(f"{value:.{_DIGITS}g}") for value in values.ravel()]).reshape(
-        values.shape
-    )
+    return np.array([float(f"{value:.{_DIGITS}g}") for value in values.ravel()]).reshape(values.shape)
 
 
-def _followed(
-    system_at: SystemAt, x0: Vector, u: Vector, settling: int, ahead: int, step_ns: int
-) -> Matrix:
+def _followed(system_at: SystemAt, x0: Vector, u: Vector, settling: int, ahead: int, step_ns: int) -> Matrix:
     """Return x after the settling, a step later, and at the end, (3, n)."""
     system, met = system_at(x0), []
     for step in range(settling + ahead):
@@ -154,9 +150,7 @@ def _by_motion(
         off = np.zeros(n + m)
         off[i] = _OFF * max(1.0, abs(value))
         plus, minus = (
-            _followed(
-                system_at, at + sign * off[:n], held + sign * off[n:], settling, ahead, step_ns
-            )
+            _followed(system_at, at + sign * off[:n], held + sign * off[n:], settling, ahead, step_ns)
             for sign in (1.0, -1.0)
         )
         before[:n, i], after[:n, i], later[:n, i] = (plus - minus) / (2 * off[i])

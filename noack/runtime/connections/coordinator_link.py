@@ -272,9 +272,13 @@ def coordinator_link(destination: Destination) -> Iterator[str]:
         try:
             # In a session of its own, so that Ctrl-C does not end it before this process.
             program = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL, pass_fds=[listening.fileno()], start_new_session=True,
-            )  # fmt: skip
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                pass_fds=[listening.fileno()],
+                start_new_session=True,
+            )
         except OSError as error:
             raise MachineError(f"cannot start the link to the coordinator: {why(error)}") from None
         assert program.stdin is not None

@@ -41,8 +41,7 @@ def require_package() -> None:
         import prometheus_client  # noqa: F401 - an optional package
     except ImportError:
         raise CallerError(
-            f"{OPTION} needs prometheus_client, which is not installed; pip install "
-            "'noack[metrics]'"
+            f"{OPTION} needs prometheus_client, which is not installed; pip install 'noack[metrics]'"
         ) from None
 
 

@@ -94,9 +94,7 @@ class ReferenceClock:
         """Close the socket."""
         self._client.close()
 
-    def wait_until_known(
-        self, give_up: Callable[[], bool] = lambda: False, wait_s: float = _WAIT_S
-    ) -> None:
+    def wait_until_known(self, give_up: Callable[[], bool] = lambda: False, wait_s: float = _WAIT_S) -> None:
         """Exchange times until the error is small enough to begin.
 
         Raise PeerError if it is not after ``wait_s``, or ``give_up`` is true.
@@ -143,9 +141,7 @@ class ReferenceClock:
             # Both rates together change the error during the poll.
             rate_ppb = self._offset.rate_ppb + self.slew_ppb
             error_ns += -(-rate_ppb * (now_ns - before_ns) // _PPB) + 1
-        largest_ns = (
-            None if error_ns is None or self._error_ns is None else (max(self._error_ns, error_ns))
-        )
+        largest_ns = None if error_ns is None or self._error_ns is None else (max(self._error_ns, error_ns))
         slewed.follow(now_ns)
         self._error_ns = slewed.error_ns(now_ns)
         if self._client.accepted > self._accepted:
@@ -154,9 +150,13 @@ class ReferenceClock:
         since_ns = min([self._since_ns, *(restart.since_ns for restart in restarts)])
         self._since_ns = now_ns
         return ClockReport(
-            since_ns, now_ns, slewed.now_ns(now_ns) - now_ns,
-            None if lost else largest_ns, self._offset.exchanges, lost,
-        )  # fmt: skip
+            since_ns,
+            now_ns,
+            slewed.now_ns(now_ns) - now_ns,
+            None if lost else largest_ns,
+            self._offset.exchanges,
+            lost,
+        )
 
     def counts(self) -> dict[str, object]:
         """Return how many exchanges succeeded, and how often the bound began again."""
@@ -256,7 +256,12 @@ class ClockRecord:
         age_ns = round((report.now_ns - report.since_ns) * self._clock.speed)
         error_ns = LOST_NS if report.error_ns is None else report.error_ns
         row = (
-            number, report.exchanges, now_ns - age_ns, now_ns,
-            report.now_ns, report.offset_ns, error_ns,
-        )  # fmt: skip
+            number,
+            report.exchanges,
+            now_ns - age_ns,
+            now_ns,
+            report.now_ns,
+            report.offset_ns,
+            error_ns,
+        )
         return Record(clock_table(self._role), row)

@@ -104,9 +104,7 @@ class TimeFormat:
         """Return the content of a datagram of this kind, or why it is rejected."""
         if len(datagram) != TIME_BYTES:
             return Rejection.LENGTH
-        magic, version, found, reserved, nonce, clock, received_ns, sent_ns = _CONTENT.unpack_from(
-            datagram
-        )
+        magic, version, found, reserved, nonce, clock, received_ns, sent_ns = _CONTENT.unpack_from(datagram)
         if magic != MAGIC or version != VERSION:
             return Rejection.VERSION
         if found != kind:
@@ -217,9 +215,7 @@ class ArrivalSocket:
         waiting: list[tuple[bytes, Address, int | None, int]] = []
         for _ in range(most):
             try:
-                data, ancillary, _, source = self._endpoint.recvmsg(
-                    self._most_bytes + 1, _ANCILLARY_BYTES
-                )
+                data, ancillary, _, source = self._endpoint.recvmsg(self._most_bytes + 1, _ANCILLARY_BYTES)
             except BlockingIOError:
                 self._known = before
                 break
@@ -256,9 +252,7 @@ class ArrivalSocket:
 _HOST_CLOCKS = HostClocks()
 
 
-def _open_socket(
-    address: Address, use: Callable[[socket.socket, Address], None], what: str
-) -> socket.socket:
+def _open_socket(address: Address, use: Callable[[socket.socket, Address], None], what: str) -> socket.socket:
     endpoint = socket.socket(family_of(address), socket.SOCK_DGRAM)
     try:
         use(endpoint, address)

@@ -74,10 +74,7 @@ class BoxGains(PlantGains):
         if start_s == 0:
             return np.zeros(()), dict.fromkeys(self.outputs, np.zeros(()))
         error, impulse, w = self._started_late(start_s)
-        states = {
-            output: impulse * peaks.impulse + w @ peaks.from_w
-            for output, peaks in self._peaks.items()
-        }
+        states = {output: impulse * peaks.impulse + w @ peaks.from_w for output, peaks in self._peaks.items()}
         states[Output.MISMATCH] += np.linalg.norm(self._scales * w, axis=-1)
         return error, states
 

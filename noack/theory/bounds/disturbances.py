@@ -67,9 +67,7 @@ class NormalBounds(NamedTuple):
 def normal_bounds(resolved: Scenario) -> NormalBounds | None:
     """Return the bounds for a run; None if nothing is normally distributed."""
     timing, plant = resolved.timing, resolved.plant
-    values = sum(
-        int(disturbance.deviations().any(axis=0).sum()) for disturbance in plant.disturbances
-    )
+    values = sum(int(disturbance.deviations().any(axis=0).sum()) for disturbance in plant.disturbances)
     noisy = any(plant.measurement.noise_std or ())
     if not values and not noisy:
         return None

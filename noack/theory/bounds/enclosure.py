@@ -141,9 +141,7 @@ def constant_kernel(value: float | Stack) -> KernelBounds:
     """Return the kernel of a constant response, (…)."""
     tail = np.asarray(value, dtype=np.float64)
     values = tail[..., None]
-    return KernelBounds(
-        np.array([0.0, 1.0]), values, values, tail, np.array(math.inf), np.array(0.0)
-    )
+    return KernelBounds(np.array([0.0, 1.0]), values, values, tail, np.array(math.inf), np.array(0.0))
 
 
 class Outputs(Generic[Name]):
@@ -256,13 +254,17 @@ class ResponseBounds:
         return {
             name: [
                 KernelBounds(
-                    self.edges_s, highest[..., i, j, :], areas[..., i, j, :],
-                    tails[..., i, j], after[..., i, j], rate,
+                    self.edges_s,
+                    highest[..., i, j, :],
+                    areas[..., i, j, :],
+                    tails[..., i, j],
+                    after[..., i, j],
+                    rate,
                 )
                 for j in range(len(columns))
             ]
             for i, name in enumerate(outputs.names)
-        }  # fmt: skip
+        }
 
     def areas_of_columns(self, C: Matrix) -> Stack:
         """Return bounds of Σ_i ∫‖C e^{Gτ} D_i‖ over each cell, for the columns D_i of D."""
@@ -324,14 +326,10 @@ class _Bends:
         return np.asarray(np.minimum(seen * self.least[..., None, :, :], bound))
 
 
-def _bends(
-    generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Groups
-) -> _Bends:
+def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Groups) -> _Bends:
     """Return the factors for the cells that start at the nodes, (…, n, r, k): Taylor's formula."""
     exponents = np.maximum(logarithmic_norm(generator), 0.0)[..., None] * steps_s
-    growth = np.where(
-        exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
-    )
+    growth = np.where(exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf)
     powers, scales = [generator @ generator], [np.ones_like(steps_s)]
     for order in range(1, _TAYLOR_TERMS + 1):
         powers.append(generator @ powers[-1])

@@ -396,9 +396,7 @@ class PlantGains:
         """
         start = response(self.closed_loop, self.start).through_each(self.stacked)
         return {
-            output: Coefficients(
-                start[output].sup() + self.disturbed(C), self.forced[output].integral()
-            )
+            output: Coefficients(start[output].sup() + self.disturbed(C), self.forced[output].integral())
             for output, C in self.outputs.items()
         }
 
@@ -469,9 +467,7 @@ class PlantGains:
         error = self.error
         lost = response_until(error.scaled_H, error.inverse_weight, until_s, cells)
         forced = response_until(self.closed_loop, self.input_matrix, until_s, cells)
-        areas = {
-            output: kernel.area for output, kernel in forced.through_each(self.stacked).items()
-        }
+        areas = {output: kernel.area for output, kernel in forced.through_each(self.stacked).items()}
         return lost.through(error.outputs[Output.GAIN]).highest, areas
 
     @cached_method
@@ -490,9 +486,7 @@ class PlantGains:
         for column in self._forcing.limited.T:
             pushed = response_until(drift, column[:, None], start_s)
             error = error + pushed.through(R).integral_on_grid()
-        return error, {
-            output: error * start_s * self.forced[output].sup() for output in self.outputs
-        }
+        return error, {output: error * start_s * self.forced[output].sup() for output in self.outputs}
 
     @property
     def columns(self) -> Columns:

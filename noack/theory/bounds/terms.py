@@ -57,7 +57,7 @@ class Constants(NamedTuple):
     inter_event_s: float | None
     """δ, lower bound of the inter-event time; None if there is no such bound."""
     loop_gain: float
-    """Loop gain of the errors (small-gain condition); below 1."""
+    """Loop gain of the errors (small-gain condition); below 1, and 0 where the bounds need none."""
     estimation_error: float = 0.0
     """‖x̂ − x‖_W at the measurements. Where it is not 0, e_s and e_c are x_s − x̂ and x_c − x̂."""
     received_input_error: float = 0.0

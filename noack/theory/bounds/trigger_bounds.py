@@ -99,10 +99,7 @@ def _is_definite(Q: Matrix, size: float) -> bool:
 
 _AVERAGED = 2.0 ** np.arange(-6, 5)
 """Times over which an integral is averaged, in time constants of the model."""
-_NONE = (
-    "where the rule does not transmit, e_s may still have any size; "
-    'combine it with policy = "deadline"'
-)
+_NONE = 'where the rule does not transmit, e_s may still have any size; combine it with policy = "deadline"'
 _ACCUMULATE = (
     "events may accumulate, since no threshold keeps them apart; "
     'test the rule at sampling times, or combine it with policy = "dwell"'
@@ -182,18 +179,14 @@ class TriggerBounds:
             return conditions
         grid_s, step_s = self.rule.grid_ns / NS_PER_S, conditions.spacing_s
         if conditions.sampling_s != step_s:
-            raise NoCertificateError(
-                "the rule compares on a grid, and measurements there may be missing"
-            )
+            raise NoCertificateError("the rule compares on a grid, and measurements there may be missing")
         grid_s = spacing_s = _rounded_up(grid_s, step_s)
         due_ns = self.rule.longest_ns
         if self.has_due_time and due_ns % self.rule.grid_ns:  # due between two points of the grid
             spacing_s = step_s or math.gcd(round(self.rule.grid_ns), round(due_ns)) / NS_PER_S
         return conditions._replace(sampling_s=grid_s, spacing_s=spacing_s)
 
-    def bound(
-        self, conditions: NetworkConditions, level: float, reached: float | None
-    ) -> TriggerBound:
+    def bound(self, conditions: NetworkConditions, level: float, reached: float | None) -> TriggerBound:
         """Return all bounds; their unit is the level, or 1 without one.
 
         Args:
@@ -226,9 +219,12 @@ class TriggerBounds:
         if self.is_homogeneous:
             apart_s = max(apart_s, conditions.spacing_s)
         return bounds[0]._replace(
-            unit=level or 1.0, apart_s=apart_s, due_s=due_s, forced_s=forced_s,
+            unit=level or 1.0,
+            apart_s=apart_s,
+            due_s=due_s,
+            forced_s=forced_s,
             also=tuple(bounds[1:]),
-        )  # fmt: skip
+        )
 
     def divided(
         self, conditions: NetworkConditions, apart_s: float
@@ -283,9 +279,7 @@ class TriggerBounds:
         times_s = _AVERAGED / self.fastest_per_s
         if test_s:  # the trapezoidal sum of the last k tests
             tests = sorted({math.ceil(t_s / test_s) for t_s in times_s})
-            return [
-                (k * longest_s, self.area / (k * test_s), least / (k * longest_s)) for k in tests
-            ]
+            return [(k * longest_s, self.area / (k * test_s), least / (k * longest_s)) for k in tests]
         return [(t_s, self.area / t_s, least / t_s) for t_s in times_s.tolist()]
 
     def _between_events(self, conditions: NetworkConditions) -> tuple[float, float, float]:

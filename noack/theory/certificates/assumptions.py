@@ -60,20 +60,15 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
         checked.append(_violated("the input is u = K x_c", "eq:ModCont", why))
     if resolved.protocol.acknowledges:
         what = "the sensor resets x_s at every event; nothing is acknowledged"
-        checked.append(
-            _violated(what, "Section II", f'protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}')
-        )
+        checked.append(_violated(what, "Section II", f'protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'))
     if linear:
         checked.append(_unstable_and_distinct(loop.A))
     checked += [_mansd(resolved), _continuous_time(resolved)]
     if resolved.plant.disturbances:
         kinds = ", ".join(
-            f"{disturbance.kind} at the {disturbance.at}"
-            for disturbance in resolved.plant.disturbances
+            f"{disturbance.kind} at the {disturbance.at}" for disturbance in resolved.plant.disturbances
         )
-        checked.append(
-            _violated("the plant is not disturbed", "eq:plant", f"{kinds}: {_NOT_BY_THEOREMS}")
-        )
+        checked.append(_violated("the plant is not disturbed", "eq:plant", f"{kinds}: {_NOT_BY_THEOREMS}"))
     return checked + _estimated(loop, resolved)
 
 
@@ -140,10 +135,12 @@ def _above_noise(loop: LoopMatrices, least: float, estimation: SteadyState) -> A
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     size = float(np.sqrt(2 * np.trace(weight @ estimation.covariance @ weight.T)))
     return _checked(
-        "the threshold stays above the noise", "trigger", least >= 3 * size,
+        "the threshold stays above the noise",
+        "trigger",
+        least >= 3 * size,
         f"it falls to {least:.3g}; noise alone gives ‖e_s‖ = {size:.3g} (RMS): set "
         f"trigger.floor ≥ {3 * size:.2g}; below that, noise alone triggers",
-    )  # fmt: skip
+    )
 
 
 def _closed_loop(loop: LoopMatrices) -> Assumption:
@@ -160,9 +157,7 @@ def _closed_loop(loop: LoopMatrices) -> Assumption:
 
 def _other_sign(loop: LoopMatrices) -> str:
     """Return a hint if K seems to be the gain of u = −Kx, the convention of most programs."""
-    given, other = (
-        spectral_abscissa(loop.A_model + sign * loop.B_model @ loop.K) for sign in (1.0, -1.0)
-    )
+    given, other = (spectral_abscissa(loop.A_model + sign * loop.B_model @ loop.K) for sign in (1.0, -1.0))
     return "; the loop's u is +Kx, and −K would stabilise it" if other < 0 <= given else ""
 
 
@@ -205,9 +200,7 @@ def _mansd(resolved: Scenario) -> Assumption:
         "first_packet": "the first packet is delivered",
         "known_state": "sensor and controller know x(0)",
     }[network.initial_sync]
-    enforced = (
-        "enforced by the network" if network.enforce_mansd else "not enforced (enforce_mansd)"
-    )
+    enforced = "enforced by the network" if network.enforce_mansd else "not enforced (enforce_mansd)"
     return _checked(
         f"{network.guarantee.meaning} after a first delivery at t_0",
         "Section III",
@@ -311,9 +304,7 @@ def _bounded_causes(resolved: Scenario) -> list[Assumption]:
     return [Assumption(what, source, AssumptionStatus.ASSUMED, why)]
 
 
-def _conditions(
-    conditions: NetworkConditions, resolved: Scenario, kept: float | None
-) -> list[Assumption]:
+def _conditions(conditions: NetworkConditions, resolved: Scenario, kept: float | None) -> list[Assumption]:
     enforced = resolved.network.enforce_mansd
     why = "enforced by the network" if enforced else "not enforced"
     if kept is not None:
@@ -325,9 +316,7 @@ def _conditions(
         AssumptionStatus.HOLDS if enforced else AssumptionStatus.ASSUMED,
         why,
     )
-    sampling = (
-        f"every {1e3 * conditions.sampling_s:g} ms" if conditions.sampling_s else "continuously"
-    )
+    sampling = f"every {1e3 * conditions.sampling_s:g} ms" if conditions.sampling_s else "continuously"
     schedule = (
         f"the trigger is tested {sampling}",
         f"an update reaches the plant within {1e3 * conditions.delay_s:g} ms of its event",

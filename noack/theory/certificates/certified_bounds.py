@@ -191,9 +191,7 @@ def envelope_formula(
         formula += f" {level}" if (level := present.level if in_levels else decay) else ""
         if (late := present.floor_constants) is not None:
             unit = " ε" if in_levels else ""
-            formula += (
-                f", from {present.floor_from_s:.4g} s on ≤ {getattr(late, constant):.4g}{unit}"
-            )
+            formula += f", from {present.floor_from_s:.4g} s on ≤ {getattr(late, constant):.4g}{unit}"
         if (rest := present.persistent_constants) is not None:
             formula += f" + {getattr(rest, constant):.4g}"
         parts.append(formula)
@@ -253,9 +251,7 @@ class KnownStatePart:
         sums = np.append(0.0, np.cumsum(error.kernels[output].sups(ages_s)))
         return np.asarray(none + sums * self._event_error)
 
-    def deviation(
-        self, input_errors: Vector, age_s: Vector, missing: Counts, delay_s: float
-    ) -> Vector:
+    def deviation(self, input_errors: Vector, age_s: Vector, missing: Counts, delay_s: float) -> Vector:
         """Return the scaled bound of the deviation from the prediction, (k,)."""
         known, forced = _entries(input_errors, missing), self._forced
         whole = integral_until(forced, age_s)
@@ -342,10 +338,7 @@ def _together(parts: Sequence[tuple[Vector, float]]) -> list[Vector]:
     """
     count = min(len(by_missing) for by_missing, _ in parts)
     is_smaller = np.all([by_missing[:count] <= most for by_missing, most in parts], axis=0)
-    return [
-        np.append(np.where(is_smaller, by_missing[:count], most), most)
-        for by_missing, most in parts
-    ]
+    return [np.append(np.where(is_smaller, by_missing[:count], most), most) for by_missing, most in parts]
 
 
 def _entries(table: Vector, missing: Counts) -> Vector:
@@ -362,13 +355,13 @@ def integral_until(kernel: KernelBounds, age_s: Vector) -> Vector:
     return np.asarray(np.where(cell < len(kernel.area), part, kernel.integral()))
 
 
-def known_state_bounds(
-    resolved: Scenario, certificate: ScenarioCertificate
-) -> KnownStateBounds | None:
+def known_state_bounds(resolved: Scenario, certificate: ScenarioCertificate) -> KnownStateBounds | None:
     """Return the bounds from the newest event; None without a certificate, or for a box."""
     first, late, rest = (
-        certificate.constants, certificate.floor_constants, certificate.persistent_constants,
-    )  # fmt: skip
+        certificate.constants,
+        certificate.floor_constants,
+        certificate.persistent_constants,
+    )
     if first is None or certificate.scope != OWN_PLANT:
         return None
     loop = loop_of(resolved)
@@ -385,6 +378,8 @@ def known_state_bounds(
     forcing = bound_forcing(resolved, loop.B)
     pushes = np.zeros((loop.n, 0)) if forcing is None else forcing.limited
     return KnownStateBounds(
-        tuple(parts), certificate.conditions.delay_s, pushes,
+        tuple(parts),
+        certificate.conditions.delay_s,
+        pushes,
         None if certificate.other is None else known_state_bounds(resolved, certificate.other),
-    )  # fmt: skip
+    )

@@ -56,9 +56,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     gap_ns = resolved.timing.actuation_gap_ns
     if gap_ns is None:
         gap_ns = resolved.timing.horizon_ns
-    delay_ns, first_ns = (
-        ((t_ns + gap_ns) // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns)
-    )
+    delay_ns, first_ns = (((t_ns + gap_ns) // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
     # With a delay, the newest actuation that has arrived may just be one tick older than that.
     oldest_ns = gap_ns + (newest_ns if gap_ns % tick_ns == 0 else tick_ns)
     predicted_ns = resolved.timing.predicted_ns - tick_ns

@@ -1,4 +1,4 @@
-"""The flow between two deliveries: what x and e_c can be, if inputs are neither delayed nor held.
+"""The flow between two deliveries: what x and e_c can be until the next one.
 
 From one delivery to the next no update reaches the controller. So z = (x, e_c) follows a linear
 system without an input, from (ξ, 0) with the state ξ at the delivery:
@@ -14,7 +14,12 @@ induction at all times: the set ‖Λx‖ ≤ 1 is invariant.
 
 All matrices are in coordinates in which W is the identity. Between two nodes of the grid the bounds
 are those of :mod:`noack.theory.bounds.enclosure`, with s the left node. From the last node T on, x
-+ e_c = e^{Hτ} ξ has decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D.
++ e_c = e^{Hτ} ξ has decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D and
+‖Λx‖ ≤ 1.
+
+**Delayed and held inputs.** This is so if inputs are neither delayed nor held. Otherwise z begins
+with an e_c that is not 0, and the age of inputs drives it; :class:`Disturbed` bounds both. What
+they change is added to the bounds; the flow is followed until it is a share of D.
 
 **After lost events.** Without the flow, each missing event adds its ‖e_s‖_W in full, as if all had
 one direction. But until the next delivery everything follows from z at one time. Let an event be
@@ -28,8 +33,10 @@ With positive weights of sum 1, z is in the ellipsoid of the sum of these forms,
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +49,7 @@ from noack.theory.bounds.contraction import (
     product,
     spectral_norms,
 )
-from noack.theory.bounds.enclosure import KernelBounds
+from noack.theory.bounds.enclosure import KernelBounds, response
 from noack.theory.bounds.gains import Output, PlantGains
 
 _CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
@@ -52,11 +59,22 @@ _ALONE = 40.0
 """λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
 _NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
 _AT_ONCE = 16
-SHARES = np.array([
-    (first, (1 - first) * (1 - last), (1 - first) * last)
-    for first in (0.01, 0.03, 0.1, 0.3) for last in (0.1, 0.3, 0.5, 0.7, 0.9)
-])  # fmt: skip
-"""Of the three conditions that hold after the last node."""
+_SHARES = np.array(
+    [
+        (first, (1 - first) * (1 - last), (1 - first) * last, 0.0)
+        for first in (0.01, 0.03, 0.1, 0.3)
+        for last in (0.1, 0.3, 0.5, 0.7, 0.9)
+    ]
+    + [
+        (0.0, (1 - of_x) * (1 - last), (1 - of_x) * last, of_x)
+        for of_x in (0.5, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.985)
+        for last in (0.4, 0.55, 0.7)
+    ]
+)
+"""Of the four conditions that hold after the last node."""
+_WINDOWS = (1 / 6, 1 / 3, 2 / 3, 1.0)
+"""T' as shares of the last node."""
+_HALVINGS = 12
 _TAYLOR_TERMS = 4
 ROUNDING = 1 + 1e-5
 """Exceeds the error of e^{Fτ}: measured below 1e-12 of its norm, which is up to 1e6; no proof."""
@@ -74,11 +92,36 @@ _ROUNDS, _POWER, _LEAST_WEIGHT, _NEARLY = 40, 0.3, 1e-9, 0.97
 _LATE_TERMS, _CONDITION = 8, 1e-10
 
 
+class Disturbed(NamedTuple):
+    """How much inputs that are held and late change the flow from the moment an update acts."""
+
+    held: float = 0.0
+    """Bound of ‖q‖, p = K e_c + q."""
+    late: float = 0.0
+    """Bound of ‖e_c‖_W when an update acts."""
+    late_s: float = 0.0
+    """The largest time from an event until its update acts."""
+
+    @property
+    def is_none(self) -> bool:
+        """Whether they change nothing."""
+        return self.held == 0 and self.late == 0
+
+    def sizes(self, disturbed: tuple[Vector, Vector]) -> Vector:
+        """Return by how much an output can differ, over each cell, (k,)."""
+        late, pushed = disturbed
+        return self.late * late + self.held * pushed
+
+
+UNDISTURBED = Disturbed()
+"""Inputs are neither delayed nor held."""
+
+
 class DeliveryFlow:
     """e^{Fτ} (ξ, 0) at the nodes of a grid, for a known plant; W is the identity."""
 
     def __init__(self, plant: PlantGains) -> None:
-        error = plant.error
+        self.error = error = plant.error
         self.weight, self.inverse = error.weight, error.inverse_weight
         self.n = len(error.H)
         self.closed_loop = self.turned(plant.closed_loop)
@@ -90,18 +133,48 @@ class DeliveryFlow:
         self.stretch = float(error.kernels[Output.WEIGHTED].sup())
         fastest = max(float(np.abs(np.linalg.eigvals(self.generator)).max()), 1e-9)
         slowest, unstable = -spectral_abscissa(self.H), spectral_abscissa(self.generator)
-        step_s, state = _FIRST_STEP / fastest, np.eye(2 * self.n)[:, : self.n]
+        step_s, state = _FIRST_STEP / fastest, np.eye(2 * self.n)
         leap, t_s = exponential(self.generator * step_s), 0.0
         edges, states = [0.0], [state]
         for cell in range(1, _MOST_CELLS):
             t_s, state = t_s + step_s, leap @ state
             edges.append(t_s)
             states.append(state)
-            if np.linalg.norm(state) > _MOST_GROWTH or math.exp(-slowest * t_s) < _SETTLED:
+            grown = np.linalg.norm(state[:, : self.n])
+            if grown > _MOST_GROWTH or math.exp(-slowest * t_s) < _SETTLED:
                 break
             if cell % _CELLS_PER_STEP == 0 and 2 * step_s * unstable < _MOST_STEP:
                 step_s, leap = 2 * step_s, leap @ leap
-        self.edges_s, self.states = np.array(edges), np.array(states)
+        self.edges_s, self._propagators = np.array(edges), np.array(states)
+        self.states = np.ascontiguousarray(self._propagators[:, :, : self.n])
+        self.input_error = self.weight @ plant.input_matrix
+        self.gain = error.split_K[1] @ self.inverse
+
+    def cell_at(self, time_s: float) -> int:
+        """Return the cell that contains a time."""
+        return max(int(self.edges_s[1:-1].searchsorted(time_s)), 0)
+
+    @cached_property
+    def _entered(self) -> tuple[Stack, Stack, Vector]:
+        """e^{Fτ} (0, I) and e^{Fτ} (BU, −BU) at the nodes, and step²/8 · ‖F‖² e^{‖F‖ step}."""
+        pushed = self._propagators @ np.vstack([self.input_error, -self.input_error])
+        turns = np.diff(self.edges_s) * float(np.linalg.norm(self.generator, 2))
+        return self._propagators[:, :, self.n :], pushed, turns**2 / 8 * np.exp(turns)
+
+    def disturbed(self, C: Matrix) -> tuple[Vector, Vector]:
+        """Bound sup ‖C e^{Fτ} (0, I)‖ over each cell, and ∫₀^τ ‖C e^{Fs} (BU, −BU)‖ ds, (k,)."""
+        late, pushed, bends = self._entered
+        size, found = float(np.linalg.norm(C, 2)), []
+        for stack in (late, pushed):
+            ends = spectral_norms(C @ stack)
+            sags = bends * size * np.linalg.norm(stack[:-1], axis=(1, 2))
+            found.append((np.maximum(ends[1:], ends[:-1]) + sags) * ROUNDING)
+        return found[0], np.cumsum(found[1] * np.diff(self.edges_s))
+
+    @cached_property
+    def of_error(self) -> tuple[Vector, Vector]:
+        """The same for C = (0, I)."""
+        return self.disturbed(np.eye(2 * self.n)[self.n :])
 
     def turned(self, matrix: Matrix) -> Matrix:
         """Return a matrix of the system in the coordinates W x."""
@@ -151,43 +224,32 @@ class Starts:
         return _CellBounds(self, np.hstack([self.shape, np.zeros_like(self.shape)]))
 
     @cached_property
-    def first(self) -> int:
-        """The first cell in which ‖Λx‖ might grow.
-
-        ‖Λx‖ ≤ 1 cannot be left while ‖ΛBK e_c‖ is below the rate at which it contracts.
-        """
-        flow = self.flow
-        rate = -logarithmic_norm(self.shape @ flow.closed_loop @ self.inverse)
-        C = np.hstack([np.zeros_like(flow.BK), self.shape @ flow.BK])
-        driven = _CellBounds(self, C).loose(1.0, np.array([_ALONE]))[:, 0]
-        return int(np.argmax(np.append(driven, np.inf) * ROUNDING >= rate))
+    def model_sups(self) -> Mapping[Output, float]:
+        """The largest ‖C e^{(H+αI)τ} ξ‖ for all τ and all these ξ, of every output C of e_c."""
+        error = self.flow.error
+        followed = response(error.scaled_H, error.inverse_weight @ self.inverse)
+        return {C: float(k.sup()) for C, k in followed.through_each(error.stacked).items()}
 
     @cached_property
-    def late(self) -> tuple[Matrix, float]:
-        """e^{FT'} for some T' before the last node, and a bound of ‖x + e_c‖ from then on."""
-        flow, n = self.flow, self.flow.n
-        node = int(flow.edges_s.searchsorted(5 / 6 * flow.edges_s[-1])) - 1
-        since_s = float(flow.edges_s[-1] - flow.edges_s[node])
-        x_c = flow.states[node, :n] + flow.states[node, n:]
-        return np.asarray(exponential(flow.generator * since_s)), flow.stretch * float(
-            np.linalg.norm(x_c @ self.inverse, 2)
-        )
+    def driven(self) -> tuple[float, Vector, "_CellBounds"]:
+        """The largest ‖p‖ that does not drive ‖Λx‖ beyond 1, ‖K e_c‖ over the cells, its bounds.
 
-    def late_forms(self, limit: float) -> tuple[Stack, Matrix]:
-        """Return three forms of (x + e_c, e_c), at most 1, and what makes z of it after T'.
-
-        They follow from ‖x + e_c‖ ≤ h and ‖e_c‖ ≤ D, T' before, and ‖e_c‖ ≤ D now.
+        On ‖y‖ = 1, y = Λx, d‖y‖/dt ≤ yᵀSy + yᵀΛBU p, and yᵀΛBU p ≤ ‖p‖ (γ/2 + ‖(ΛBU)ᵀy‖²/2γ).
         """
-        n = self.flow.n
-        moved, h = self.late
-        identity, none = np.eye(n), np.zeros((n, n))
-        moved = moved @ np.block([[identity, -identity], [none, identity]])
-        rows = [
-            np.hstack([identity, none]) / h,
-            np.hstack([none, identity]) / limit,
-            moved[n:] / limit,
-        ]
-        return np.array([row.T @ row for row in rows]), moved
+        flow = self.flow
+        S = self.shape @ flow.closed_loop @ self.inverse
+        pushed = self.shape @ flow.input_error
+        squares, largest = pushed @ pushed.T / 2, 0.0
+        size = float(np.linalg.norm(pushed, 2))
+        for gamma in size * np.exp(np.linspace(-4.0, 0.0, 17)) if size else ():
+            low, high = 0.0, -2 * float(logarithmic_norm(S)) / gamma
+            for _ in range(_HALVINGS if high > 0 else 0):
+                middle = (low + high) / 2
+                grown = float(logarithmic_norm(S + middle / gamma * squares)) + middle * gamma / 2
+                low, high = (middle, high) if grown < 0 else (low, middle)
+            largest = max(largest, low)
+        bounds = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
+        return largest, bounds.loose(np.ones(1), np.array([_ALONE]))[:, 0], bounds
 
 
 @dataclass(frozen=True)
@@ -199,28 +261,79 @@ class Reach:
     """c."""
     limit: float
     """D."""
+    by: Disturbed = UNDISTURBED
+    followed: float = 1.0
+    """e_c is followed until delay and hold may have changed it by this share of D."""
 
     def sup(self, C: Matrix) -> float:
         """Bound ‖C z‖ at all times, for C of shape (q, 2n)."""
-        return self._sup(C, _CellBounds(self.starts, C), 0)
+        return self._sup(_CellBounds(self.starts, C), 0)
 
     def is_invariant(self) -> bool:
-        """Return whether ‖Λx‖ ≤ c at a delivery implies the same at all times until the next."""
-        itself = self.starts.itself
-        return self._sup(itself.C, itself, self.starts.first) <= self.size
+        """Return whether ‖Λx‖ ≤ c at a delivery implies the same at all times until the next.
 
-    def _sup(self, C: Matrix, bounds: "_CellBounds", first: int) -> float:
+        It cannot be left while ‖K e_c + q‖ is below :attr:`Starts.driven`.
+        """
+        largest, driven, bounds = self.starts.driven
+        driven = driven + (self._changes(bounds) + self.by.held) / self.size
+        first = int(np.argmax(np.append(driven, np.inf) * ROUNDING >= largest))
+        return self._sup(self.starts.itself, first) <= self.size
+
+    def _changes(self, bounds: "_CellBounds") -> Vector:
+        """Bound what delay and hold change of C z over the cells, (k,)."""
+        return self.by.sizes(bounds.disturbed) if not self.by.is_none else np.zeros(bounds.cells)
+
+    @cached_property
+    def _errors(self) -> Vector:
+        """The same of e_c."""
+        flow = self.starts.flow
+        return self.by.sizes(flow.of_error) if not self.by.is_none else np.zeros(len(flow.edges_s) - 1)
+
+    @cached_property
+    def _cells(self) -> int:
+        """The cells that are followed."""
+        return int(np.argmax(np.append(self._errors, np.inf) > self.followed * self.limit))
+
+    def _sup(self, bounds: "_CellBounds", first: int) -> float:
         # All is in proportion to c, for D/c.
-        limit = self.limit / self.size
-        return self.size * max(bounds.sup(limit, first), self._afterwards(C, limit))
+        limits, changes = self.limit + self._errors, self._changes(bounds)
+        cells = slice(first, self._cells)
+        near = bounds.sup(limits / self.size, changes / self.size, cells)
+        return float(self.size * max(near, self._afterwards(bounds)))
 
-    def _afterwards(self, C: Matrix, limit: float) -> float:
-        """Bound ‖C z‖ after the last node, for c = 1."""
-        grams, moved = self.starts.late_forms(limit)
-        values, V = np.linalg.eigh(np.tensordot(SHARES, grams, axes=1))
+    def _afterwards(self, bounds: "_CellBounds") -> float:
+        """Bound ‖C z‖ after the last node that is followed, for c = 1."""
+        if self.by.is_none:
+            still = np.zeros(bounds.cells)
+            return self._after_window(bounds.C, still, still, _WINDOWS[0])
+        held = self.by._replace(late=0.0)
+        errors, changes = held.sizes(self.starts.flow.of_error), held.sizes(bounds.disturbed)
+        return min(self._after_window(bounds.C, errors, changes, share) for share in _WINDOWS)
+
+    def _after_window(self, C: Matrix, errors: Vector, changes: Vector, share: float) -> float:
+        """The same from ‖x + e_c‖ ≤ h, ‖Λx‖ ≤ 1 and ‖e_c‖ ≤ D, T' before, and ‖e_c‖ ≤ D now."""
+        flow, n = self.starts.flow, self.starts.flow.n
+        last_s = float(flow.edges_s[self._cells])
+        node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
+        since_s = last_s - float(flow.edges_s[node])
+        cell = flow.cell_at(since_s)
+        x_c = flow.states[node, :n] + flow.states[node, n:]
+        h = float(np.linalg.norm(x_c @ self.starts.inverse, 2))
+        h = flow.stretch * (h + float(np.linalg.norm(x_c, 2)) * self.by.late / self.size)
+        identity, none, limit = np.eye(n), np.zeros((n, n)), self.limit / self.size
+        moved = exponential(flow.generator * since_s)
+        moved = moved @ np.block([[identity, -identity], [none, identity]])
+        rows = [
+            np.hstack([identity, none]) / h,
+            np.hstack([none, identity]) / limit,
+            moved[n:] / (limit + errors[cell] / self.size),
+            self.starts.shape @ np.hstack([identity, -identity]),
+        ]
+        grams = np.array([row.T @ row for row in rows])
+        values, V = np.linalg.eigh(np.tensordot(_SHARES, grams, axes=1))
         usable = values[:, 0] > 1e-12 * values[:, -1]  # others are too flat for their rounding
         sizes = spectral_norms(C @ moved @ V[usable] / np.sqrt(values[usable])[:, None])
-        largest = float(sizes.min(initial=math.inf)) * ROUNDING
+        largest = float(sizes.min(initial=math.inf)) * ROUNDING + float(changes[cell]) / self.size
         return largest if math.isfinite(largest) else math.inf
 
 
@@ -228,8 +341,9 @@ class _CellBounds:
     """Bounds of ‖C z‖ over each cell, for ‖Λξ‖ ≤ 1."""
 
     def __init__(self, starts: Starts, C: Matrix) -> None:
-        self.C, self._singular = C, starts.axes[0]
-        cells, n = self._singular.shape
+        self.C, self._singular, self._flow = C, starts.axes[0], starts.flow
+        self.cells, n = self._singular.shape
+        cells = self.cells
         ends, terms, rest = starts.followed
         self._ends = (C @ ends).reshape(len(C), 2, cells, n)
         followed = (C @ terms).reshape(len(C), _TAYLOR_TERMS, cells, n)
@@ -244,13 +358,19 @@ class _CellBounds:
         """(k, n, 7): of both ends, and of the terms that bound ‖C F² e^{Fτ}‖, for each axis."""
         self._sags_s2 = np.diff(starts.flow.edges_s) ** 2 / 8
 
-    def sup(self, limit: float, first: int) -> float:
-        """Bound ‖C z‖ over the cells from the given one on, for this D."""
-        loose = self.loose(limit, _LOGITS)
+    @cached_property
+    def disturbed(self) -> tuple[Vector, Vector]:
+        """See :meth:`DeliveryFlow.disturbed`."""
+        return self._flow.disturbed(self.C)
+
+    def sup(self, limits: Vector, added: Vector, followed: slice) -> float:
+        """Bound ‖C z‖ over some cells, for a D of each cell, with what is added to each, (k,)."""
+        loose = self.loose(limits, _LOGITS)
         if not np.isfinite(loose).all():
             return math.inf
-        highest, logits = loose.min(axis=1), _LOGITS[loose.argmin(axis=1)]
-        highest[:first] = 0.0
+        highest, logits = loose.min(axis=1) + added, _LOGITS[loose.argmin(axis=1)]
+        highest[: followed.start] = 0.0
+        highest[followed.stop :] = 0.0
         rounds = np.zeros(len(highest), dtype=np.int64)
         while True:  # the highest bounds become better, until that of the highest is settled
             cells = np.argsort(highest)[-_AT_ONCE:]
@@ -258,22 +378,24 @@ class _CellBounds:
                 return float(highest[cells[-1]]) * ROUNDING
             cells = cells[rounds[cells] < len(_WIDTHS)]
             tried = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
-            values = self._tight(limit, cells, tried)
+            values = self._tight(limits, cells, tried)
             index = values.argmin(axis=1)
             logits[cells] = tried[np.arange(len(cells)), index]
-            highest[cells] = np.minimum(highest[cells], values.min(axis=1))
+            highest[cells] = np.minimum(highest[cells], values.min(axis=1) + added[cells])
             rounds[cells] += 1
 
-    def loose(self, limit: float, logits: Vector) -> Stack:
+    def loose(self, limits: Vector, logits: Vector) -> Stack:
         """Return bounds in the Frobenius norm, for every λ, (k, j)."""
-        sizes = np.sqrt(_semi_axes(self._singular / limit, logits) ** 2 @ self._squares)
-        return np.asarray(
-            sizes[..., :2].max(axis=2) + self._sags_s2[:, None] * sizes[..., 2:].sum(axis=2)
-        )
+        singular = self._singular / limits[:, None]
+        sizes = np.sqrt(_semi_axes(singular, logits) ** 2 @ self._squares)
+        return np.asarray(sizes[..., :2].max(axis=2) + self._sags_s2[:, None] * sizes[..., 2:].sum(axis=2))
 
-    def _tight(self, limit: float, cells: NDArray[np.int64], logits: Stack) -> Stack:
+    def _tight(self, limits: Vector, cells: NDArray[np.int64], logits: Stack) -> Stack:
         """Return bounds in the spectral norm for some cells, each with its own λ, (k, j)."""
-        ends, d = self._ends[:, :, cells], _semi_axes(self._singular[cells] / limit, logits)
+        ends, d = (
+            self._ends[:, :, cells],
+            _semi_axes(self._singular[cells] / limits[cells, None], logits),
+        )
         grams = np.einsum("qoki,qokj->koij", ends, ends)[:, None]
         scaled = grams * d[:, :, None, :, None] * d[:, :, None, None, :]
         sizes = largest_eigenvalues(scaled.reshape(-1, *scaled.shape[-2:])).clip(min=0.0)
@@ -297,7 +419,7 @@ def errors_after_losses(
     reach: Reach,
     plain: Vector,
     size: float,
-    level: float,
+    level: float | None,
     spacing_s: float,
     kernel: KernelBounds,
     bend: float,
@@ -313,15 +435,15 @@ def errors_after_losses(
         kernel: of ‖e^{(H+αI)τ}‖_W.
         bend: that of e_s, see :func:`bend_of_error`.
     """
-    errors, since_s, flow = plain.copy(), 0.0, reach.starts.flow
+    errors, since_s, flow = plain.copy(), -reach.by.late_s, reach.starts.flow
     most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
     if spacing_s >= most_s or len(plain) == 1:
         return errors
     r_s = _nodes_s(spacing_s, kernel, 2 * most_s)
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
     for lost in range(len(plain)):
-        earlier = float(errors[lost - 1]) if lost else _NOTHING * size
-        stage = _Stage(reach, min(since_s, most_s), earlier, r_s, flows)
+        earlier = float(errors[lost - 1]) if lost else max(_NOTHING * size, reach.by.late)
+        stage = _Stage(reach, min(max(since_s, 0.0), most_s), earlier, r_s, flows, kernel)
         if lost:
             added = size + kernel.sups(r_s) * earlier
             largest = max(stage.largest_error(size, added), float(added[-1]), earlier)
@@ -329,16 +451,23 @@ def errors_after_losses(
             if lost > 1 and errors[lost] > _NEARLY_PLAIN * float(added[0]):
                 break  # later stages gain nothing, either
         if lost + 1 < len(plain):
-            since_s += max(spacing_s, stage.next_event_s(level, bend, _LATEST * spacing_s))
+            # After a delivery e_s is at most ‖e^{(H+αI)r}‖ · late larger than C_r z.
+            most = (level or 0.0) - (0.0 if lost else flow.stretch * reach.by.late)
+            later_s = stage.next_event_s(most, bend, _LATEST * spacing_s) if most > 0 else 0.0
+            since_s += max(spacing_s, later_s)
     return errors
 
 
 def bend_of_error(reach: Reach, level: float) -> float:
     """Bound the second derivative of e_s while ‖e_s‖_W is below a level."""
     flow = reach.starts.flow
+    return reach.sup(bend_rows(flow)) + float(np.linalg.norm(flow.H @ flow.H, 2)) * level
+
+
+def bend_rows(flow: DeliveryFlow) -> Matrix:
+    """Return the matrix of the part of e_s'' that follows from z."""
     n, F, H = flow.n, flow.generator, flow.H
-    bend = reach.sup((F @ F)[n:] - np.hstack([np.zeros((n, n)), H @ H]))
-    return bend + float(np.linalg.norm(H @ H, 2)) * level
+    return np.asarray((F @ F)[n:] - np.hstack([np.zeros((n, n)), H @ H]))
 
 
 def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float) -> Vector:
@@ -353,12 +482,32 @@ class _Stage:
     """What follows an event, a time w or more after the delivery, for times r since it."""
 
     def __init__(
-        self, reach: Reach, window_s: float, earlier: float, r_s: Vector, flows: Stack
+        self,
+        reach: Reach,
+        window_s: float,
+        earlier: float,
+        r_s: Vector,
+        flows: Stack,
+        kernel: KernelBounds,
     ) -> None:
         self._flow, self._r_s, self._earlier = reach.starts.flow, r_s, earlier
         n, identity = self._flow.n, np.eye(2 * self._flow.n)
         half = exponential(self._flow.generator * window_s / 2)
-        rows = [identity[n:] / earlier, half[n:] / earlier, (half @ half)[n:] / earlier]
+        times_s = np.concatenate([[window_s / 2, window_s], window_s + r_s])
+        half_way, at_event, *later = (
+            reach.by.held
+            * self._flow.of_error[1][[self._flow.cell_at(time_s) for time_s in times_s.tolist()]]
+            if reach.by.held
+            else np.zeros(len(times_s))
+        )
+        self._window_s, self._held, sups = window_s, reach.by.held, kernel.sups(r_s) * at_event
+        self._later, self._seen = np.array(later), np.array(later) + sups
+        self._cells = self._later[1:] + sups[:-1]
+        rows = [
+            identity[n:] / earlier,
+            half[n:] / (earlier + half_way),
+            (half @ half)[n:] / (earlier + at_event),
+        ]
         rows.append(reach.starts.shape @ identity[:n] / reach.size)
         forms = np.array([row.T @ row for row in rows])
         self._forms = np.broadcast_to(forms, (len(r_s), *forms.shape))
@@ -370,11 +519,12 @@ class _Stage:
     def largest_error(self, size: float, added: Vector) -> float:
         """Bound ‖e_c‖_W up to the last r, given bounds without the flow for the nodes."""
         n = self._flow.n
-        events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1, None] / size**2
+        sizes = (size + self._seen[:-1]) ** 2
+        events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1, None] / sizes[:, None, None, None]
         forms = np.concatenate([self._forms[:-1], events], axis=1)
         ends, weights = _largest(forms, self._z[1:, n:], float(added[-1]))
         cells = np.maximum(ends, np.append(self._earlier, ends[:-1])) + self._sags(forms, weights)
-        return float(np.minimum(cells, added[:-1]).max())
+        return float(np.minimum(cells + self._later[1:], added[:-1]).max())
 
     def _sags(self, forms: Stack, weights: Stack) -> Vector:
         """Bound how much e_c differs from its chord in each cell of r."""
@@ -392,10 +542,14 @@ class _Stage:
 
     def next_event_s(self, level: float, bend: float, most_s: float) -> float:
         """Return a time before which ‖e_s‖_W does not reach a level."""
-        near = self._r_s <= most_s
+        near, flow = self._r_s <= most_s, self._flow
+        if self._held:  # what is followed differs from e_s
+            pushed = flow.disturbed(bend_rows(flow))[1][flow.cell_at(self._window_s + most_s)]
+            differs = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._cells.max())
+            bend = bend + self._held * float(pushed) + differs
         ends, _ = _largest(self._forms[near], self._e_s[near], 0.9 * level, all_of_them=True)
         sags = np.diff(self._r_s[near]) ** 2 / 8 * bend
-        reached = np.maximum(ends[1:], ends[:-1]) + sags >= level
+        reached = np.maximum(ends[1:], ends[:-1]) + sags + self._cells[near[1:]] >= level
         return float(self._r_s[np.append(reached, True).argmax()])
 
 
@@ -406,9 +560,7 @@ def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
     return rows
 
 
-def _largest(
-    forms: Stack, Y: Stack, enough: float, *, all_of_them: bool = False
-) -> tuple[Vector, Stack]:
+def _largest(forms: Stack, Y: Stack, enough: float, *, all_of_them: bool = False) -> tuple[Vector, Stack]:
     """Bound ‖Y z‖ for all z with forms of at most 1, (j,), by weights, (j, i).
 
     None below ``enough`` is improved, and only the largest ones unless all of them are wanted.
@@ -417,9 +569,7 @@ def _largest(
     active, best = np.arange(len(forms)), weights.copy()
     for _ in range(_ROUNDS):
         some = forms[active]
-        Z = np.linalg.solve(
-            np.einsum("ji,jiab->jab", weights[active], some), Y[active].swapaxes(1, 2)
-        )
+        Z = np.linalg.solve(np.einsum("ji,jiab->jab", weights[active], some), Y[active].swapaxes(1, 2))
         values, vectors = np.linalg.eigh(Y[active] @ Z)
         sizes = np.sqrt(values[:, -1].clip(min=0.0)) * ROUNDING
         better = sizes < bounds[active]

@@ -23,13 +23,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import EstimationError, bound_forcing
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains
-from noack.theory.bounds.terms import (
-    Constants,
-    NetworkConditions,
-    NoCertificateError,
-    Part,
-    TriggerBound,
-)
+from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part, TriggerBound
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.solution import Problem, Search
 
@@ -72,17 +66,19 @@ class DisturbedCertificate:
         if self.resolved.observer is not None and (
             self.start_error or loop_of(self.resolved).setpoint is not None
         ):
-            raise NoCertificateError(
-                "after a change or at a set-point the estimation error is not known"
-            )
+            raise NoCertificateError("after a change or at a set-point the estimation error is not known")
         conditions = self.trigger.tested(conditions)
         structured = self.start_error == 0.0
         if decays and self.resolved.coverage.is_decaying:
             try:
                 two = yield from solve_two_parts(
-                    self._decaying, self._persistent, conditions, self.start_error,
-                    structured=structured, shares=SHARES if longest else (),
-                )  # fmt: skip
+                    self._decaying,
+                    self._persistent,
+                    conditions,
+                    self.start_error,
+                    structured=structured,
+                    shares=SHARES if longest else (),
+                )
                 return [two]
             except NotDecayingError:
                 pass
@@ -98,9 +94,7 @@ class DisturbedCertificate:
             divided = yield from self._of_constant_threshold(conditions, apart_s)
         return divided or [(constants, None)]
 
-    def with_plants(
-        self, first: Constants, rest: Constants | None
-    ) -> Sequence[tuple[PlantGains, Constants]]:
+    def with_plants(self, first: Constants, rest: Constants | None) -> Sequence[tuple[PlantGains, Constants]]:
         """Return constants of :meth:`constants` with the plants of their parts."""
         if rest is None:
             decays = first.rate_per_s > 0
@@ -108,9 +102,7 @@ class DisturbedCertificate:
             return [(plant, first)]
         return [(self._plant(first.rate_per_s), first), (self._persistent.plant, rest)]
 
-    def _of_constant_threshold(
-        self, conditions: NetworkConditions, apart_s: float
-    ) -> Search[list[Added]]:
+    def _of_constant_threshold(self, conditions: NetworkConditions, apart_s: float) -> Search[list[Added]]:
         """Search for the constants of what follows from the start, and of what persists, if any.
 
         There is one pair for each bound of e_s that suffices, that with the smallest ultimate bound
@@ -186,9 +178,7 @@ class DisturbedCertificate:
         models = error_gains(loop, 0.0)
         plant = self.plant_at(models, loop.x0[:, None], 0.0)
         if self.resolved.observer is not None and not plant.is_one_plant:
-            raise NoCertificateError(
-                "an observer's error is bounded for one plant only, not for a box"
-            )
+            raise NoCertificateError("an observer's error is bounded for one plant only, not for a box")
         return EstimationError(self.resolved, plant.A, plant.B, self._forcing(plant))
 
 
@@ -234,9 +224,7 @@ def solve_two_parts(
     return best
 
 
-def choose_rate(
-    solved: Callable[[float], Search[Some]], decay_per_s: float, start: Vector
-) -> Search[Some]:
+def choose_rate(solved: Callable[[float], Search[Some]], decay_per_s: float, start: Vector) -> Search[Some]:
     """Search for the constants for a rate, where none is given.
 
     It is the rate at which the first constants' bound of ‖x‖ falls to ‖x(0)‖/10 first.
@@ -248,7 +236,7 @@ def choose_rate(
 
     Raises: what ``solved`` raises at the smallest rate.
     """
-    size, candidates = float(np.linalg.norm(start)) or 1.0, list[tuple[float, Some]]()
+    candidates = list[tuple[float, Some]]()
     for share in _RATES:
         rate_per_s = share * decay_per_s
         try:
@@ -257,7 +245,11 @@ def choose_rate(
             if not candidates:
                 raise
             break  # larger rates have larger gains
-        candidates.append(
-            (math.log(max(10 * constants[0].state / size, 1.0)) / rate_per_s, constants)
-        )
+        candidates.append((tenth_s(constants[0], start), constants))
     return min(candidates, key=lambda timed: timed[0])[1]
+
+
+def tenth_s(constants: Constants, start: Matrix) -> float:
+    """Return when the bound of ‖x‖ falls to ‖x(0)‖/10."""
+    size = float(np.linalg.norm(start)) or 1.0
+    return math.log(max(10 * constants.state / size, 1.0)) / constants.rate_per_s

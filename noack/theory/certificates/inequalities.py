@@ -30,21 +30,18 @@ misses g by r, adding w max r/(w − F w) is enough.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
 from noack.theory.bounds.terms import Constants, NetworkConditions, Part
-from noack.theory.bounds.trigger_bounds import (
-    COARSE_CELLS,
-    ErrorGrowth,
-    first_passage_s,
-    list_growths,
-)
+from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 from noack.theory.certificates.loss_accumulation import LossAccumulation
 
 _SIGNALS = 6
@@ -150,6 +147,29 @@ class LoopConstants(NamedTuple):
         return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **own)
 
 
+@dataclass
+class KnownBounds:
+    """Bounds of one loop that hold, each of which may be replaced by a smaller one."""
+
+    signals: Vector
+    """Of (q, b, η, π, sup‖R_E x‖, 1), or β̃ for b."""
+    states: dict[str, float]
+    """Of sup‖C x‖."""
+    errors: dict[Output, float]
+    """Of sup‖C e_c‖."""
+    sensor: float = math.inf
+    """Of β̃ = sup‖e_s‖_W."""
+    earlier: float = math.inf
+    """Of the part of ‖u − Kx‖ that does not come from the present e_s."""
+    received: float = math.inf
+    """Of ‖u − Kx‖ while no event is missing."""
+
+    @property
+    def input_error(self) -> float:
+        """π."""
+        return self.errors[Output.GAIN] + float(self.signals[0])
+
+
 class ErrorInequalities:
     """The inequalities of one part, and their solution for assumed spacings of events.
 
@@ -165,12 +185,9 @@ class ErrorInequalities:
         self._start_error, start = plant.start_up(conditions.start_s)
         self._beyond = np.maximum(self._start_error, earlier_error)
         self._states = {
-            output: Coefficients(free + start[output], gain)
-            for output, (free, gain) in plant.states.items()
+            output: Coefficients(free + start[output], gain) for output, (free, gain) in plant.states.items()
         }
-        self._growths = [
-            list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every
-        ]
+        self._growths = [list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every]
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
@@ -297,9 +314,7 @@ class ErrorInequalities:
             driven = self._plant.growths(until_s, COARSE_CELLS)[output].totals
         return _columns(0.0, self._error.now_until(until_s)[output], 0.0, *driven)
 
-    def _missing(
-        self, output: Output, events: Counts, spacing_s: Vector, own: ErrorGrowth | None
-    ) -> Matrix:
+    def _missing(self, output: Output, events: Counts, spacing_s: Vector, own: ErrorGrowth | None) -> Matrix:
         """Return the bound of the part of sup‖C e_c‖ from missing events as a row of the signals.
 
         The part of e_s that has grown since the last test is followed from where it entered.
@@ -314,21 +329,14 @@ class ErrorInequalities:
                 driven[place] = np.minimum(driven[place], followed)
         return _columns(0.0, gain, gain, *driven)
 
-    def _solved(
-        self, signals: "_Signals", growing: ErrorGrowth, own: ErrorGrowth | None
-    ) -> Solution:
+    def _solved(self, signals: "_Signals", growing: ErrorGrowth, own: ErrorGrowth | None) -> Solution:
         """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
-        errors, hold_s, beyond = signals.errors, self._conditions.hold_s, self._beyond
-        held: dict[str, float] = {
-            Output.GAIN_RATE: hold_s,
-            Output.GAIN_CURVATURE: hold_s**2 / 2,
-            Output.WEIGHTED: self._remainder,
-        }
+        errors, beyond, held = signals.errors, self._beyond, self.age_gains
         held_input, _, estimated, *_ = np.eye(_SIGNALS)
         input_error = errors[Output.GAIN] + held_input
 
-        through, free = signals.through(held)
-        from_errors = sum(gain * errors[Output(output)] for output, gain in held.items())
+        through, free = signals.through({str(C): gain for C, gain in held.items()})
+        from_errors = sum(gain * errors[output] for output, gain in held.items())
         of_age = (through + from_errors, free)
         estimation = self._estimation
         through, free = signals.through(estimation.shares)
@@ -350,6 +358,79 @@ class ErrorInequalities:
         rows = _rows(*(row for row, _ in each))
         right = _columns(*(right for _, right in each))
         return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
+
+    def known(self, spacing_s: float) -> KnownBounds:
+        """Return the bounds of one loop with one bound of e_s; infinite without a certificate."""
+        (growths,) = self._growths
+        own = growths[0] if len(growths) == 1 else None
+        solved = [
+            np.max([self._solved(signals, one, own).bound[0] for one in growths], axis=0)
+            for signals in self._each_method(spacing_s)
+        ]
+        states, errors = (
+            dict.fromkeys(self._states, math.inf),
+            dict.fromkeys(self._error.outputs, math.inf),
+        )
+        return KnownBounds(np.min(solved, axis=0), states, errors)
+
+    def insert(self, known: KnownBounds, spacing_s: float) -> None:
+        """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
+        (growths,), v, states, errors = self._growths, known.signals, known.states, known.errors
+        for method in self._each_method(spacing_s):
+            for output, row in method.errors.items():
+                errors[output] = min(errors[output], float(row[0] @ v))
+            known.sensor = min(known.sensor, float(method.sensor @ v))
+            known.received = min(known.received, float(method.received @ v + v[0]))
+        known.earlier = min(known.earlier, float(method.earlier[0] @ v + v[0]))
+        for name, (free, gain) in self._states.items():
+            states[name] = min(states[name], float(free + gain * known.input_error))
+        age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
+        driven = np.array([v[3], v[4], 1.0])
+        tested = []
+        for growth in growths:
+            b = growth.fixed + sum(share * states[C] for C, share in growth.shares.items())
+            grown = growth.stretch * b + float(np.array(growth.driven) @ driven)
+            tested.append(b if len(growths) == 1 else grown)
+        beyond = max(known.input_error, self.start_error)
+        found = [age, max(tested), 0.0, beyond, states[Output.MISMATCH], 1.0]
+        known.signals = np.minimum(v, np.array(found, dtype=np.float64))
+
+    @property
+    def start_error(self) -> float:
+        """sup‖u − Kx‖ of one loop before the first input."""
+        return float(self._beyond)
+
+    @property
+    def age_gains(self) -> Mapping[Output, float]:
+        """The part of ‖u − Kx‖ due to the input's age is at most Σ gain_C sup‖C x_c‖."""
+        hold_s = self._conditions.hold_s
+        return {
+            Output.GAIN_RATE: hold_s,
+            Output.GAIN_CURVATURE: hold_s**2 / 2,
+            Output.WEIGHTED: self._remainder,
+        }
+
+    def next_event_s(self, known: KnownBounds) -> float:
+        """Return the time between two events that follows from bounds; 0 if there is none."""
+        if all(bound.reached is None for bound in self._bound.every):
+            return 0.0
+        still, never = np.zeros(1), np.zeros(1, dtype=bool)
+        events = np.zeros(1, dtype=np.int64)
+        mismatch, earlier = known.signals[4:5], still + known.earlier
+        before, after = (still,) * 6, (still,) * 3
+        constants = LoopConstants(events, *before, mismatch, *after, earlier, ~never)
+        return float(self.inter_event_s(constants, never, ~never)[0])
+
+    @cached_method
+    def _each_method(self, spacing_s: float) -> "list[_Signals]":
+        """Return the signals by each method, the one by missing events last."""
+        conditions, events = self._conditions, np.full(1, self._conditions.dropouts)
+        if conditions.delay_s > 0:
+            events = events + math.ceil(conditions.delay_s / spacing_s)
+        growths = self._growths[0]
+        own = growths[0] if len(growths) == 1 else None
+        spacing = np.array([spacing_s])
+        return [self._signals(method, events, spacing, own) for method in self.methods]
 
     def _missing_gain(self, output: Output, events: Counts, spacing_s: Vector) -> Vector:
         if self._error.decays or math.isinf(self._bound.due_s):

@@ -12,7 +12,8 @@ They are chosen by samples; what they give is checked with all enclosures.
 
 import contextlib
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -21,11 +22,14 @@ import numpy as np
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, solve_lyapunov, spectral_abscissa
 from noack.theory.bounds.contraction import Stack
+from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.gains import Output, PlantGains
 from noack.theory.bounds.terms import MEASURED, Constants, NetworkConditions, Part, TriggerBound
 from noack.theory.certificates.delivery_flow import (
     ROUNDING,
+    UNDISTURBED,
     DeliveryFlow,
+    Disturbed,
     Reach,
     Starts,
     bend_of_error,
@@ -36,6 +40,8 @@ from noack.theory.certificates.delivery_flow import (
 _SHARPER = 0.99
 """Bounds from the flow are computed again if Δ has become smaller by this factor."""
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
+_WIDE_MARGINS = (1.0, 1.15, 1.4, 1.8, 2.5, 3.5)
+_FOLLOWED = (0.1, 0.3, 1.0)
 """Factors of the ellipsoid's computed size that are tried."""
 _STARTS = [(-1.5, -2.0, -7.0), (0.0, -7.0, -7.0), (-1.5, 0.0, -1.0), (-1.5, -7.0, -1.0)]
 """Parameters of the ellipsoid that are tried first."""
@@ -56,20 +62,14 @@ def is_reset_flow(part: Part, conditions: NetworkConditions) -> bool:
     Its constants can be sharpened.
     """
     error, plant, bound, estimation = part
-    is_ideal = conditions == NetworkConditions(
-        conditions.dropouts, constraints=conditions.constraints
-    )
+    is_ideal = conditions == NetworkConditions(conditions.dropouts, constraints=conditions.constraints)
     is_plain = bound == TriggerBound(bound.beta, bound.reached, bound.shares, unit=bound.unit)
     is_known = plant.is_one_plant and plant.forcing is None and estimation == MEASURED
     rates_agree = plant.alpha_per_s == error.alpha_per_s
-    return (
-        is_ideal and is_plain and is_known and rates_agree and spectral_abscissa(error.scaled_H) < 0
-    )
+    return is_ideal and is_plain and is_known and rates_agree and spectral_abscissa(error.scaled_H) < 0
 
 
-def sharpened_constants(
-    constants: Constants, part: Part, conditions: NetworkConditions
-) -> Constants:
+def sharpened_constants(constants: Constants, part: Part, conditions: NetworkConditions) -> Constants:
     """Return the constants with the bounds from the flow between deliveries."""
     error, plant, bound, _ = part
     dropouts, unit = conditions.dropouts, bound.beta if bound.unit is None else bound.unit
@@ -116,6 +116,8 @@ class InvariantEllipsoids:
     plant: PlantGains
     largest: float
     """The largest D, for which Λ is chosen."""
+    age_gains: Mapping[Output, float] = field(default_factory=dict)
+    """gain_C with ‖q‖ ≤ Σ gain_C sup‖C x_c‖, for which Λ is chosen; none if no input is held."""
 
     def sharpened(
         self, known: SharpenedBounds, errors: Vector, level: float | None, size: float
@@ -136,7 +138,7 @@ class InvariantEllipsoids:
         gain = self.plant.error.split_K[1] @ flow.inverse
 
         def of_state(C: Matrix) -> float:
-            return float(np.linalg.norm(C @ inverse, 2)) * ROUNDING
+            return _size(C @ inverse)
 
         sharper = SharpenedBounds(
             min(known.input_error, reach.sup(np.hstack([np.zeros_like(gain), gain]))),
@@ -155,16 +157,36 @@ class InvariantEllipsoids:
         errors = errors_after_losses(reach, errors, size, level, next_s, kernel, bend)
         return sharper._replace(inter_event_s=next_s), errors
 
-    def within(self, limit: float) -> Reach | None:
-        """Return the flow from an ellipsoid for these bounds; None if none is found."""
+    def within(
+        self,
+        limit: float,
+        disturbed: Callable[[Starts, float], Disturbed] | None = None,
+        start_s: float = 0.0,
+    ) -> Reach | None:
+        """Return the flow from an ellipsoid for these bounds; None if none is found.
+
+        Args:
+            limit: D.
+            disturbed: returns by how much delay and hold change the flow as long as ‖ΛWx‖ ≤ c.
+            start_s: until then the input is 0.
+        """
         starts = self._starts
         if starts is None or np.linalg.cond(starts.shape) > _ILL_CONDITIONED:
             return None
         (size,) = self._sizes(starts.inverse[None], limit)
+        if start_s > 0:
+            drift = self.plant.A + self.plant.alpha_per_s * np.eye(self.flow.n)
+            begun = response_until(drift, self.plant.start, start_s)
+            size = max(size, float(begun.through(starts.shape @ self.flow.weight).sup_on_grid()))
         if not math.isfinite(size):
             return None
-        reaches = (Reach(starts, size * margin, limit) for margin in _MARGINS)
-        return next((reach for reach in reaches if reach.is_invariant()), None)
+        for margin in _MARGINS if disturbed is None else _WIDE_MARGINS:
+            by = UNDISTURBED if disturbed is None else disturbed(starts, float(size * margin))
+            for share in (1.0,) if disturbed is None else _FOLLOWED:
+                reach = Reach(starts, size * margin, limit, by, share)
+                if reach.is_invariant():
+                    return reach
+        return None
 
     @cached_property
     def flow(self) -> DeliveryFlow:
@@ -194,8 +216,23 @@ class InvariantEllipsoids:
         if usable.any():
             factors = factors[usable]
             sizes = self._sizes(factors, self.largest)
+            sizes = sizes + self._pushed(factors, sizes)
             merits[usable] = sizes * np.linalg.norm(self.flow.inverse @ factors, 2, axis=(1, 2))
         return merits
+
+    def _pushed(self, factors: Stack, sizes: Vector) -> Vector:
+        """Return about the ‖Λx‖ to which q drives x, (c,)."""
+        if not any(self.age_gains.values()):
+            return np.zeros(len(sizes))
+        shapes = np.linalg.inv(factors)
+        turned = shapes @ self.flow.closed_loop @ factors
+        rates = -np.linalg.eigvalsh(turned + turned.swapaxes(-1, -2))[:, -1] / 2
+        gains = np.linalg.norm(shapes @ self.flow.input_error, 2, axis=(1, 2)) / rates
+        outputs, shares = self.plant.error.outputs, np.zeros(len(sizes))
+        for output, gain in self.age_gains.items():
+            C = outputs[output] @ self.flow.inverse @ factors
+            shares = shares + gains * gain * np.linalg.norm(C, 2, axis=(1, 2))
+        return np.where((rates > 0) & (shares < 1), shares * sizes / (1 - shares), np.inf)
 
     def _factors(self, parameters: Matrix) -> Stack:
         """Return Λ⁻¹ with Λ⁻¹Λ⁻ᵀ = X, (M + νI)X + X(M + νI)ᵀ = −Q, (c, n, n); not finite if none.
@@ -261,6 +298,10 @@ class InvariantEllipsoids:
             squares, _ = _squares(image[last], error[last], best[last, None] * _FINE)
             np.maximum.at(largest, which[last], squares)
         return np.asarray(np.sqrt(largest))
+
+
+def _size(C: Matrix) -> float:
+    return float(np.linalg.norm(C, 2)) * ROUNDING
 
 
 def errors_at_events(errors: Vector) -> Vector:

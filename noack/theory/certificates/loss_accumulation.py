@@ -42,9 +42,7 @@ class LossAccumulation:
     plant: PlantGains
     delay_s: float
 
-    def total(
-        self, output: str, spacing_s: float, windows: Sequence[LossWindow], loop: int = 0
-    ) -> float:
+    def total(self, output: str, spacing_s: float, windows: Sequence[LossWindow], loop: int = 0) -> float:
         """Return the bound of sup‖C x‖ / β̃ from all lost updates; infinite if it is not found."""
         until_s = self._until_s[self._place(self._until_s, loop)]
         bins = math.ceil(until_s / spacing_s) if spacing_s > 0 else _MOST_BINS
@@ -54,9 +52,7 @@ class LossAccumulation:
         highest = _over_bins(effects, spacing_s / (until_s / _CELLS), bins)
         return min(self._total(output, highest, spacing_s, window, loop) for window in windows)
 
-    def _total(
-        self, output: str, highest: Vector, spacing_s: float, window: LossWindow, loop: int
-    ) -> float:
+    def _total(self, output: str, highest: Vector, spacing_s: float, window: LossWindow, loop: int) -> float:
         most, packets = window
         if most == 0:
             return 0.0

@@ -87,7 +87,7 @@ class _Box(CertificateScope):
         Raises: as :meth:`bounded`.
         """
         if not self.is_simple:
-            return (yield from self._constants(conditions, longest=False))
+            return (yield from self._solved(conditions, longest=False))
         trigger = self._trigger
         level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
         tested, reached = trigger.tested(conditions), trigger.floor or None
@@ -113,9 +113,7 @@ class _Box(CertificateScope):
 class RegionScope(_Box):
     """A nonlinear plant within a region; see :class:`CertificateScope`."""
 
-    def __init__(
-        self, resolved: Scenario, start_error: float = 0.0, start: Matrix | None = None
-    ) -> None:
+    def __init__(self, resolved: Scenario, start_error: float = 0.0, start: Matrix | None = None) -> None:
         loop, self._regions = loop_of(resolved), dict[NetworkConditions, Region]()
         # The plants of the model; those of each region take their place.
         model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
@@ -132,9 +130,7 @@ class RegionScope(_Box):
         proven = Assumption(stays, "certificate", AssumptionStatus.HOLDS, why)
         return replace(found, region=region, assumptions=(*found.assumptions, proven))
 
-    def _constants(
-        self, conditions: NetworkConditions, *, longest: bool = True
-    ) -> Search[list[Phases]]:
+    def _constants(self, conditions: NetworkConditions, *, longest: bool = True) -> Search[list[Phases]]:
         widths, where = np.zeros(self._loop.n + self._loop.m), "near 0"
         for _ in range(_ATTEMPTS):
             try:

@@ -6,7 +6,7 @@ searches for the largest sampling period, delay and age of inputs for which a ce
 
 import contextlib
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -25,7 +25,8 @@ from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
-from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate
+from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate, tenth_s
+from noack.theory.certificates.due_deliveries import Deliveries
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 MOST_S = 10.0
@@ -38,6 +39,8 @@ _STEPS = 6
 Points = Sequence[tuple[float, float]]
 """Logarithms of loop gains, and of their times."""
 _SLOWER = 0.9
+_TIMED_RATES = (0.7, 0.4, 0.1)
+"""Rates that are tried where events are due, as shares of the decay rate of A + BK."""
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
 Phases = tuple[Constants, Constants | None, Constants | None]
@@ -189,34 +192,56 @@ class CertificateScope:
         if not self._resolved.network.enforce_mansd:
             kept = kept_probability(self._resolved, conditions.guarantee, unchecked.inter_event_s)
         assumptions = certificate_assumptions(
-            self._resolved, conditions, self._decay, first, void,
+            self._resolved,
+            conditions,
+            self._decay,
+            first,
+            void,
             max((phase.loop_gain for phase in (first, rest) if phase is not None), default=0.0),
-            trigger.text(), kept,
-        )  # fmt: skip
+            trigger.text(),
+            kept,
+        )
         return replace(unchecked, assumptions=tuple(assumptions))
 
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
         # Whether inputs of an earlier run are covered depends on the constants.
         try:
-            search = self._constants(conditions, longest=self._start_error > 0)
+            search = self._solved(conditions, longest=self._start_error > 0)
             constants = completed_alone(search)
         except NoCertificateError as error:
-            return max(error.loop_gain, 1.0)
+            gain = max(error.loop_gain, 1.0)
         except NotDecayingError:
-            return math.inf
-        return max(phase.loop_gain for phase in constants[0] if phase is not None)
+            gain = math.inf
+        else:
+            return max(phase.loop_gain for phase in constants[0] if phase is not None)
+        # The slowest rate asks for least.
+        return next((one.gain for one in self._deliveries(conditions, _TIMED_RATES[-1:])), gain)
 
-    def _constants(
-        self, conditions: NetworkConditions, *, longest: bool = True
-    ) -> Search[list[Phases]]:
+    def _constants(self, conditions: NetworkConditions) -> Search[list[Phases]]:
         """Search for the constants of each bound of the run; all of them hold.
-
-        ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
 
         Raises:
             NoCertificateError: there is no certificate.
             NotDecayingError: a mode of the loop decays too slowly.
+        """
+        timed = self._timed(conditions)
+        try:
+            found = yield from self._solved(conditions, longest=True)
+        except (NoCertificateError, NotDecayingError):
+            if timed is None:
+                raise
+            found = []
+        if timed is None:
+            return found
+        apart_s = max(one.inter_event_s or 0.0 for one in (timed, *(first for first, _, _ in found)))
+        useful = [phases for phases in found if not _is_within(timed, phases[0])]
+        return [(timed._replace(inter_event_s=apart_s), None, None), *useful]
+
+    def _solved(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
+        """Search for the constants that solve the inequalities.
+
+        ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
         """
         try:
             if self.is_simple:
@@ -226,6 +251,28 @@ class CertificateScope:
             return [(first, None, rest) for first, rest in pairs]
         except (OverflowError, np.linalg.LinAlgError):
             raise NoCertificateError(_TOO_LARGE) from None
+
+    def _timed(self, conditions: NetworkConditions) -> Constants | None:
+        """Return constants that follow from the times of deliveries alone, if they exist."""
+        found = [one.constants(self._trigger.beta or 1.0) for one in self._deliveries(conditions)]
+        return min(found, key=lambda one: tenth_s(one, self._start), default=None)
+
+    def _deliveries(
+        self, conditions: NetworkConditions, shares: Sequence[float] = _TIMED_RATES
+    ) -> Iterator[Deliveries]:
+        """Yield what is known of the deliveries where events are due, for each rate that is tried."""
+        trigger, loop = self._trigger, self._loop
+        if not trigger.has_due_time or not self._resolved.coverage.is_undisturbed:
+            return
+        if self._start_error or self._start.shape[1] != 1 or self._resolved.observer is not None:
+            return
+        tested = trigger.tested(conditions)
+        for share in shares if self._decay["A + BK"] > 0 else ():
+            rate = share * self._decay["A + BK"]
+            plant = self._plant_at(error_gains(loop, rate), self._start, rate)
+            if plant.is_one_plant:
+                with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
+                    yield Deliveries(plant, tested, trigger.bound(tested, 0.0, None))
 
     def _phases(
         self, conditions: NetworkConditions, *, longest: bool
@@ -251,13 +298,14 @@ class CertificateScope:
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
         return DisturbedCertificate(
-            self._resolved, self._plant_at, self._trigger, self._start_error,
+            self._resolved,
+            self._plant_at,
+            self._trigger,
+            self._start_error,
             min(self._decay.values()),
-        )  # fmt: skip
+        )
 
-    def _checked(
-        self, first: Constants, other: Constants | None
-    ) -> tuple[Constants, Constants | None]:
+    def _checked(self, first: Constants, other: Constants | None) -> tuple[Constants, Constants | None]:
         """Return the constants.
 
         Raises:
@@ -340,9 +388,11 @@ class CertificateScope:
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
         part = Part(plant.error, plant, self._trigger.bound(conditions, level, reached))
-        return (yield from sharpened(
-            Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
-        ))  # fmt: skip
+        return (
+            yield from sharpened(
+                Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -366,10 +416,30 @@ def _at_floor(first: Constants, share: float) -> Constants:
     times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
     """
     scaled = (
-        "input_error", "start_error", "state", "state_weighted", "mismatch",
+        "input_error",
+        "start_error",
+        "state",
+        "state_weighted",
+        "mismatch",
         "received_input_error",
-    )  # fmt: skip
+    )
     return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
+
+
+def _is_within(ours: Constants, others: Constants) -> bool:
+    """Return whether no bound of the others is below ours at any time."""
+    names = (
+        "delta",
+        "overshoot",
+        "input_error",
+        "state",
+        "state_weighted",
+        "mismatch",
+        "received_input_error",
+    )
+    return ours.rate_per_s >= others.rate_per_s and all(
+        getattr(ours, name) <= getattr(others, name) for name in names
+    )
 
 
 def _is_finite(constants: Constants) -> bool:
@@ -388,9 +458,7 @@ class NetworkLimits(NamedTuple):
 
 def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
     """Return the limits for some plants; 0 means that there is no certificate at any time."""
-    return NetworkLimits(
-        *(network_limit(scope, scheduled, what) for what in ("sampling", "delay", "hold"))
-    )
+    return NetworkLimits(*(network_limit(scope, scheduled, what) for what in ("sampling", "delay", "hold")))
 
 
 _CHANGES: dict[str, Callable[[NetworkConditions, float], NetworkConditions]] = {

@@ -4,7 +4,8 @@ The bounds are the solution of the inequalities of :mod:`noack.theory.certificat
 The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
 assumed δ gives a time of at least δ, it holds by induction over the events; the largest such δ is
 used. Under the paper's conditions the constants are sharpened by the flow between two deliveries
-(:mod:`noack.theory.certificates.invariant_ellipsoids`).
+(:mod:`noack.theory.certificates.invariant_ellipsoids`), and those of a schedule by the flow between
+updates (:mod:`noack.theory.certificates.scheduled_flow`).
 """
 
 import contextlib
@@ -31,6 +32,7 @@ from noack.theory.bounds.terms import (
 from noack.theory.bounds.trigger_bounds import LONGEST_S
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 from noack.theory.certificates.invariant_ellipsoids import is_reset_flow, sharpened_constants
+from noack.theory.certificates.scheduled_flow import is_scheduled_flow, scheduled_constants
 
 _SETTLED = 1e-3
 _ATTEMPTS = 200
@@ -148,9 +150,7 @@ def solve(
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
     part = Part(error, plant, bound, estimation)
-    return completed_alone(
-        sharpened(Problem((part,), conditions, earlier_error, structured, longest))
-    )
+    return completed_alone(sharpened(Problem((part,), conditions, earlier_error, structured, longest)))
 
 
 def sharpened(problem: Problem) -> Search[Constants]:
@@ -164,6 +164,9 @@ def sharpened(problem: Problem) -> Search[Constants]:
     if problem.longest and is_plain and is_reset_flow(part, conditions):
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
             return sharpened_constants(constants, part, conditions)
+    if problem.longest and is_plain and is_scheduled_flow(part, conditions):
+        with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
+            return scheduled_constants(constants, part, conditions)
     return constants
 
 
@@ -185,9 +188,7 @@ def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
             steps[-1].use_windows()
     apart_s = max(part.bound.apart_s for part in first.parts)
     least_s = max(conditions.spacing_s, apart_s)
-    is_separated = all(
-        any(bound.reached is not None for bound in part.bound.every) for part in first.parts
-    )
+    is_separated = all(any(bound.reached is not None for bound in part.bound.every) for part in first.parts)
     searched = np.full(count, is_separated)
     if is_separated and not first.longest:
         searched = ~_smallest(steps, np.full(count, least_s)).exists
@@ -199,9 +200,7 @@ def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
     return [smallest.of_loop(loop, rates, between_s[loop] or None) for loop in range(count)]
 
 
-def _longest_s(
-    steps: Sequence[ErrorInequalities], searched: NDArray[np.bool_], least_s: float
-) -> Vector:
+def _longest_s(steps: Sequence[ErrorInequalities], searched: NDArray[np.bool_], least_s: float) -> Vector:
     """Return the largest spacing of each loop that is consistent with itself, or ``least_s``.
 
     It is ``least_s`` where the loop is not searched, or has no certificate.
@@ -251,9 +250,7 @@ class _Smallest(NamedTuple):
             ]
         gain = float(self.loop_gain[loop])
         if math.isinf(gain) and not self.is_spaced[loop]:
-            return NoCertificateError(
-                "events may be arbitrarily close, so that any number may be in flight"
-            )
+            return NoCertificateError("events may be arbitrarily close, so that any number may be in flight")
         return NoCertificateError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
 
 
@@ -277,9 +274,7 @@ def _smallest(steps: Sequence[ErrorInequalities], spacing_s: Vector) -> _Smalles
                 for one, other in zip(parts, best.parts, strict=True)
             ]
         gain = np.where(is_new | best.exists, best.loop_gain, np.minimum(gain, best.loop_gain))
-        best = best._replace(
-            parts=parts, drifts=drifts, exists=best.exists | exists, loop_gain=gain
-        )
+        best = best._replace(parts=parts, drifts=drifts, exists=best.exists | exists, loop_gain=gain)
         if best.exists.all():
             break
     return best

@@ -65,9 +65,7 @@ def choose_weight(
             weight = _weight(loop.H, alpha_per_s, factor(entries))
             return 2 * _VOID if weight is None else samples.merit(weight, conditions, bound)
 
-        best = minimize(
-            merit, start, method="Nelder-Mead", options={"maxfev": most, "adaptive": True}
-        )
+        best = minimize(merit, start, method="Nelder-Mead", options={"maxfev": most, "adaptive": True})
         return np.asarray(best.x)
 
     def triangular(entries: Vector) -> Matrix:
@@ -115,9 +113,7 @@ class _Samples:
         """Return log X − 3 log δ, or without a certificate a large number and the loop gain."""
         loop = self.loop
         error = _SampledError(loop.H, loop.K, weight, self.alpha_per_s, samples=self)
-        plant = _SampledPlant(
-            error, loop.A, loop.B, loop.x0[:, None], self.alpha_per_s, samples=self
-        )
+        plant = _SampledPlant(error, loop.A, loop.B, loop.x0[:, None], self.alpha_per_s, samples=self)
         try:
             constants = solve(error, plant, conditions, bound, structured=False)
         except NoCertificateError as void:
@@ -133,8 +129,7 @@ class _SampledError(ErrorGains):
     def kernels(self) -> Mapping[Output, KernelBounds]:
         nodes_s, states = self.samples.models
         return {
-            output: _sampled(nodes_s, C @ states @ self.inverse_weight)
-            for output, C in self.outputs.items()
+            output: _sampled(nodes_s, C @ states @ self.inverse_weight) for output, C in self.outputs.items()
         }
 
 
@@ -169,10 +164,7 @@ class _SampledPlant(PlantGains):
     @cached_property
     def forced(self) -> Mapping[str, KernelBounds]:
         nodes_s, states = self.samples.plant
-        return {
-            output: _sampled(nodes_s, product(C, states[:, :, 1:]))
-            for output, C in self.outputs.items()
-        }
+        return {output: _sampled(nodes_s, product(C, states[:, :, 1:])) for output, C in self.outputs.items()}
 
 
 def _thinned(generator: Matrix, D: Matrix) -> tuple[Vector, Stack]:

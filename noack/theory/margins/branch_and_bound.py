@@ -69,9 +69,7 @@ def bound_by_products(
         leaving.setdefault(edge.source, []).append(edge)
     upper, products, before, steps = 0.0, 0, 0, 0
     paths: dict[_Ends, _Paths] = {
-        (node, node): _Paths(
-            IntervalMatrix(np.eye(n)[None], np.zeros((1, n, n))), np.zeros(1), np.zeros(1)
-        )
+        (node, node): _Paths(IntervalMatrix(np.eye(n)[None], np.zeros((1, n, n))), np.zeros(1), np.zeros(1))
         for node, n in system.dimensions.items()
     }
     while paths:

@@ -41,9 +41,7 @@ class IntervalMatrix(NamedTuple):
         """Enclose the products."""
         size, others = np.abs(self.middle), np.abs(other.middle)
         terms = size.shape[-1] + 4
-        radius = size @ (other.radius + terms * _UNIT * others) + self.radius @ (
-            others + other.radius
-        )
+        radius = size @ (other.radius + terms * _UNIT * others) + self.radius @ (others + other.radius)
         return IntervalMatrix(self.middle @ other.middle, radius * _ENLARGED + terms * _UNDERFLOW)
 
     def __sub__(self, other: "IntervalMatrix") -> "IntervalMatrix":
@@ -52,11 +50,9 @@ class IntervalMatrix(NamedTuple):
         radius = self.radius + other.radius + 2 * _UNIT * np.abs(middle)
         return IntervalMatrix(middle, radius * _ENLARGED + _UNDERFLOW)
 
-    def scaled(self, exponent: int) -> "IntervalMatrix":
-        """Return the matrices times 2^exponent."""
-        return IntervalMatrix(
-            np.ldexp(self.middle, exponent), np.ldexp(self.radius, exponent) + _UNDERFLOW
-        )
+    def scaled(self, exponent: int | NDArray[np.int64]) -> "IntervalMatrix":
+        """Return the matrices times 2^exponent, which may differ from entry to entry."""
+        return IntervalMatrix(np.ldexp(self.middle, exponent), np.ldexp(self.radius, exponent) + _UNDERFLOW)
 
     @property
     def magnitude(self) -> Matrix:
@@ -119,9 +115,7 @@ class FixedPointMatrix:
             [[entry / _ONE for entry in row] for row in self.entries.tolist()], dtype=np.float64
         ).reshape(self.entries.shape)
         # A quotient of integers is rounded correctly.
-        return IntervalMatrix(
-            middle, np.abs(middle) * 2.0**-52 + (self.error / _ONE) * (1 + 1e-9) + 1e-290
-        )
+        return IntervalMatrix(middle, np.abs(middle) * 2.0**-52 + (self.error / _ONE) * (1 + 1e-9) + 1e-290)
 
 
 def fixed(matrix: Matrix) -> FixedPointMatrix:

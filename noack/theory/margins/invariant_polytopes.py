@@ -92,9 +92,7 @@ class PolytopeNorm:
         ]
         return Combinations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
-    def _combinations(
-        self, points: Matrix, enough: float, without: NDArray[np.int64]
-    ) -> Combinations:
+    def _combinations(self, points: Matrix, enough: float, without: NDArray[np.int64]) -> Combinations:
         (k, n), V = points.shape, self.vertices
         chosen = np.tile(np.arange(n), (k, 1))
         signs = np.where(points >= 0, 1.0, -1.0) * np.sign(np.diag(V[:n]))

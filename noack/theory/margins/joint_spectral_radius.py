@@ -53,6 +53,8 @@ _REMEMBERED = 3
 """Classes of edges that a node remembers in the second search for quadratic norms."""
 _LEAST_GROWTH = 1e-3
 """Growth of the polytopes if no cycle grows, relative to the largest norm of a matrix."""
+_SMALLEST_POWER = 1e-280
+"""Growths whose power by a duration is smaller are not distinguished from 0."""
 _ROUNDED = 1 + 1e-8
 _WITHIN = 0.1
 """A growth below the threshold by this share of its distance from the lower bound is proven."""
@@ -120,6 +122,7 @@ class _Enclosure:
     """The bounds of a system in which every node can be reached from any other."""
 
     def __init__(self, system: SwitchedSystem, most_vertices: int) -> None:
+        system = system.in_similar_units()
         self._system, self._most_vertices = system, most_vertices
         self.upper, self.vertices = math.inf, 0
         leaving = Counter(edge.source for edge in system.edges)
@@ -195,7 +198,8 @@ class _Enclosure:
         """Bring the bounds together as far as the limits of the work allow."""
         is_first = True
         while self.cycle.growth * (1 + accuracy) < self.upper and accuracy < _COARSEST:
-            least = _LEAST_GROWTH * _largest(self._balanced)
+            longest = max(edge.duration for edge in self._system.edges)
+            least = max(_LEAST_GROWTH * _largest(self._balanced), _SMALLEST_POWER ** (1 / longest))
             growth = max(self.cycle.growth, least) * (1 + accuracy)
             self._prove_by_polytopes(growth, self._most_vertices)
             if self.upper <= growth * _ROUNDED:
@@ -234,7 +238,10 @@ class _Enclosure:
         turned = system.in_coordinates(norms.forms)
         if turned is None:
             return math.inf
-        found = bound_by_products(turned, growth, most, slowest=self.cycle.growth)
+        try:
+            found = bound_by_products(turned, growth, most, slowest=self.cycle.growth)
+        except FloatingPointError:  # an overflow, where the caller has asked for it
+            return math.inf
         self._improve(found.upper)
         return found.needed / most
 

@@ -18,19 +18,10 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
-from noack.impairments.loss_guarantee import (
-    LongestBurst,
-    LossAutomaton,
-    LossGuarantee,
-    outcome_letters,
-)
+from noack.impairments.loss_guarantee import LongestBurst, LossAutomaton, LossGuarantee, outcome_letters
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
-from noack.theory.margins.joint_spectral_radius import (
-    ACCURACY,
-    MOST_VERTICES,
-    joint_spectral_radius,
-)
+from noack.theory.margins.joint_spectral_radius import ACCURACY, MOST_VERTICES, joint_spectral_radius
 from noack.theory.margins.switched_system import Edge
 from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 from noack.trigger.trigger_rule import NEVER_NS
@@ -71,9 +62,7 @@ class Burst(NamedTuple):
         return intervals
 
 
-def list_bursts(
-    guarantee: LossGuarantee, slots: int = 1, times: EventTimes = EVERY_STEP
-) -> list[Burst]:
+def list_bursts(guarantee: LossGuarantee, slots: int = 1, times: EventTimes = EVERY_STEP) -> list[Burst]:
     """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
 
     Different states of the automaton after which the same is allowed are one node.
@@ -145,7 +134,8 @@ class Stability(NamedTuple):
     upper: float
     """No pattern grows by more than this factor per longest interval, in the long run."""
     pattern: tuple[bool, ...]
-    """Whether each update is delivered, in a pattern that repeats; it begins with a delivery."""
+    """Whether each update is delivered, in a pattern that repeats from the first update on; mostly
+    it begins with a delivery."""
     intervals_s: tuple[float, ...]
     """The time from each update of the pattern to the next one."""
     vertices: int
@@ -173,9 +163,7 @@ class Stability(NamedTuple):
         """Return the same, with the lower bound of a guarantee whose patterns are among these."""
         if other.lower <= self.lower:
             return self
-        return self._replace(
-            lower=other.lower, pattern=other.pattern, intervals_s=other.intervals_s
-        )
+        return self._replace(lower=other.lower, pattern=other.pattern, intervals_s=other.intervals_s)
 
     @property
     def is_periodic(self) -> bool:
@@ -225,12 +213,13 @@ class LossMargin:
             self.shortest_ns = longest_ns if same else min(self.shortest_ns, longest_ns)
             self.longest_ns = longest_ns
         is_periodic = self.shortest_ns == self.longest_ns
-        self._unit_ns = unit_ns = (
-            self.longest_ns if is_periodic else resolved.timing.measurement_period_ns
-        )
+        self._unit_ns = unit_ns = self.longest_ns if is_periodic else resolved.timing.measurement_period_ns
         self._times = EventTimes(self.shortest_ns // unit_ns, self.longest_ns // unit_ns)
         times = loop_times(resolved, unit_ns)
         self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
+        # A controller that knows x(0) gets its first update after a period.
+        knows_start = resolved.network.initial_sync == "known_state"
+        self._first_slot = int(knows_start) % self.loop.times.slots
         self.maps = cache(self.loop.map)
         """The loop's maps by slot and number of lost updates."""
 
@@ -264,9 +253,7 @@ class LossMargin:
             ) from None
         return found._replace(took_s=time.process_time() - begun_s)
 
-    def _bounded(
-        self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float
-    ) -> Stability:
+    def _bounded(self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float) -> Stability:
         edges = [
             Edge(burst.source, burst.target, self.maps(burst.slot, burst.steps - 1), burst.steps)
             for burst in bursts
@@ -281,16 +268,25 @@ class LossMargin:
             effort=effort,
         )
         path = [bursts[number] for number in radius.cycle]
+        # In another slot than the first update's the pattern may grow less.
+        slots = [burst.slot for burst in path]
+        first = slots.index(self._first_slot) if self._first_slot in slots else 0
+        path = path[first:] + path[:first]
         pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
+        if path and self._times == EVERY_STEP:
+            first = (self._first_slot - path[0].slot) % self.loop.times.slots
+            pattern = pattern[first:] + pattern[:first]
         intervals_s = (
-            steps * self._unit_ns / NS_PER_S
-            for burst in path
-            for steps in burst.intervals(self._times)
+            steps * self._unit_ns / NS_PER_S for burst in path for steps in burst.intervals(self._times)
         )
         return Stability(
-            radius.lower**self._times.longest, radius.upper**self._times.longest,
-            tuple(pattern), tuple(intervals_s), radius.vertices, radius.needed,
-        )  # fmt: skip
+            radius.lower**self._times.longest,
+            radius.upper**self._times.longest,
+            tuple(pattern),
+            tuple(intervals_s),
+            radius.vertices,
+            radius.needed,
+        )
 
     def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
         """Return coarser bounds, which decide whether all patterns are stable."""

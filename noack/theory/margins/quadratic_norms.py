@@ -72,9 +72,7 @@ class NormSearch:
             self._nodes = dict.fromkeys(dimensions, 0)
         self._edges, self._dimensions = system.edges, dimensions
         if is_common:
-            system = SwitchedSystem(
-                tuple(edge._replace(source=0, target=0) for edge in system.edges)
-            )
+            system = SwitchedSystem(tuple(edge._replace(source=0, target=0) for edge in system.edges))
         coordinates = system.balancing()
         balanced = system.in_coordinates(coordinates)
         if balanced is None:
@@ -113,14 +111,11 @@ class NormSearch:
         return QuadraticNorms(forms, self._bounds(forms))
 
     def _growths(self) -> Vector:
-        return _log_growths(
-            self._squares, self._matrices, self._sources, self._targets, self._durations
-        )
+        return _log_growths(self._squares, self._matrices, self._sources, self._targets, self._durations)
 
     def _forms(self) -> dict[int, Matrix]:
         return {
-            node: np.linalg.cholesky(self._squares[self._nodes[node], :n, :n]).T
-            @ self._coordinates[node]
+            node: np.linalg.cholesky(self._squares[self._nodes[node], :n, :n]).T @ self._coordinates[node]
             for node, n in self._dimensions.items()
         }
 
@@ -236,9 +231,7 @@ class _Centers(NamedTuple):
             return np.asarray(basis.T @ squares.reshape(-1, n * n, n * n) @ basis)
 
         crossed = -products(mixed)
-        blocks = np.concatenate(
-            [products(G), products(steps @ mixed), crossed, crossed.swapaxes(1, 2)]
-        )
+        blocks = np.concatenate([products(G), products(steps @ mixed), crossed, crossed.swapaxes(1, 2)])
         rows = np.concatenate([self.sources, self.targets, self.sources, self.targets]) * size
         columns = np.concatenate([self.sources, self.targets, self.targets, self.sources]) * size
         inner = np.arange(size)
@@ -317,10 +310,13 @@ def remembering(system: SwitchedSystem, classes: int) -> SwitchedSystem:
         for members in ends.values()
         for index, number in enumerate(members)
     }
-    return SwitchedSystem(tuple(
-        Edge(edge.source * classes + kind, edge.target * classes + kinds[number], *edge[2:])
-        for number, edge in enumerate(system.edges) for kind in range(classes)
-    ))  # fmt: skip
+    return SwitchedSystem(
+        tuple(
+            Edge(edge.source * classes + kind, edge.target * classes + kinds[number], *edge[2:])
+            for number, edge in enumerate(system.edges)
+            for kind in range(classes)
+        )
+    )
 
 
 def representatives(system: SwitchedSystem, growths: Vector) -> list[int]:
@@ -352,4 +348,4 @@ def norms_above(matrices: IntervalMatrix) -> Vector:
     size, missed = (matrix.magnitude.sum(axis=2).max(axis=1) for matrix in (square, defect))
     with np.errstate(divide="ignore", invalid="ignore"):
         bounds = np.sqrt(size / (1 - missed)) * _ENLARGED
-    return np.where(missed < 0.5, bounds, np.inf)
+    return np.where((missed < 0.5) & ~np.isnan(bounds), bounds, np.inf)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix
+from noack.core.linear_systems import Matrix, balancing_exponents
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 
 _ITERATIONS = 60
@@ -76,6 +76,20 @@ class SwitchedSystem:
             edges.append(edge._replace(matrix=matrix))
         return SwitchedSystem(tuple(edges))
 
+    def in_similar_units(self) -> "SwitchedSystem":
+        """Return the system with its states times powers of two, the same at every node.
+
+        Otherwise inputs in other units than the states' could leave it undecided.
+        """
+        if len(set(self.dimensions.values())) > 1:
+            return self
+        sizes = np.max([np.abs(edge.matrix.middle) for edge in self.edges], axis=0)
+        if not np.isfinite(sizes).all():
+            return self
+        exponents = balancing_exponents(sizes)
+        shifts = exponents[:, None] - exponents
+        return SwitchedSystem(tuple(edge._replace(matrix=edge.matrix.scaled(shifts)) for edge in self.edges))
+
     def balanced(self) -> "SwitchedSystem":
         """Return the system in the coordinates of :meth:`balancing`, or else itself."""
         return self.in_coordinates(self.balancing()) or self
@@ -102,8 +116,7 @@ class SwitchedSystem:
             }
         try:
             return {
-                node: np.asarray(np.linalg.cholesky(form).T, dtype=np.float64)
-                for node, form in forms.items()
+                node: np.asarray(np.linalg.cholesky(form).T, dtype=np.float64) for node, form in forms.items()
             }
         except np.linalg.LinAlgError:
             return identity
@@ -152,8 +165,9 @@ def spectral_radius_bounds(product: IntervalMatrix) -> tuple[float, float]:
     basis = np.ascontiguousarray(np.where(values.imag >= 0, vectors.real, vectors.imag))
     undone = inverse(basis)
     if undone is not None:
-        turned = undone @ product @ exactly(basis)
-        bounds += [_power_bounds(turned), _normal_bounds(turned, values)]
+        with np.errstate(over="ignore", invalid="ignore"):  # the basis may be nearly singular
+            turned = undone @ product @ exactly(basis)
+            bounds += [_power_bounds(turned), _normal_bounds(turned, values)]
     lower, upper = zip(*bounds, strict=True)
     return max(lower), min(upper)
 
@@ -236,9 +250,7 @@ def find_cycle(system: SwitchedSystem, most_edges: int, beam: int) -> Cycle:
             # A product cannot grow faster than its norm.
             if path.norm <= (growth * (1 + 1e-12)) ** path.duration:
                 continue
-            path_growth = float(np.abs(np.linalg.eigvals(path.product)).max()) ** (
-                1 / path.duration
-            )
+            path_growth = float(np.abs(np.linalg.eigvals(path.product)).max()) ** (1 / path.duration)
             if path_growth > growth * (1 + 1e-12):
                 best, growth = path.edges, path_growth
         scale = growth or 1.0
@@ -273,9 +285,7 @@ def only_cycle(system: SwitchedSystem) -> tuple[int, ...] | None:
 def _joined(path: _Path, step: _Path) -> _Path:
     product = step.product @ path.product
     duration = path.duration + step.duration
-    return _Path(
-        path.edges + step.edges, path.source, step.target, duration, product, _size(product)
-    )
+    return _Path(path.edges + step.edges, path.source, step.target, duration, product, _size(product))
 
 
 def _size(matrix: Matrix) -> float:

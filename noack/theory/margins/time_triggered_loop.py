@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix
+from noack.core.linear_systems import Matrix, balancing_exponents
 from noack.theory.margins.exact_matrices import (
     FixedPointMatrix,
     IntervalMatrix,
@@ -71,6 +71,12 @@ class TimeTriggeredLoop:
 
     def __init__(self, A: Matrix, B: Matrix, K: Matrix, H: Matrix, times: LoopTimes) -> None:
         n, m = B.shape
+        # In similar units, powers of two, products have much smaller errors.
+        couplings = np.block([[np.maximum(abs(A), abs(H)), abs(B)], [abs(K), np.zeros((m, m))]])
+        exponents = balancing_exponents(couplings)
+        of_x, of_u = np.split(exponents[:, None], [n])
+        A, H = np.ldexp(A, of_x - of_x.T), np.ldexp(H, of_x - of_x.T)
+        B, K = np.ldexp(B, of_x - of_u.T), np.ldexp(K, of_u - of_x.T)
         self.times, self._H = times, H
         self._cycle_ns = math.lcm(times.step_ns, times.tick_ns)
         # The state of the loop is (x, x_c, u, w).
@@ -94,6 +100,8 @@ class TimeTriggeredLoop:
         else:
             self._kept = [*range(2 * n if follows else 2 * n + m)]  # x, x_c and perhaps u
         self.dimension = len(self._kept)
+        kept = np.vstack([of_x, of_x, of_u, of_u])[self._kept]
+        self._given_units = kept.T - kept
 
     def map(self, slot: int, losses: int) -> IntervalMatrix:
         """Return the map of z from a delivered update to the next one.
@@ -102,7 +110,7 @@ class TimeTriggeredLoop:
             slot: number of the first update, modulo the number of slots.
             losses: number of lost updates between the two.
         """
-        return self._after(slot, losses).rows(self._kept).interval()
+        return self._after(slot, losses).rows(self._kept).interval().scaled(self._given_units)
 
     def _after(self, slot: int, losses: int) -> FixedPointMatrix:
         period_ns = self.times.period_ns

@@ -141,8 +141,7 @@ class LoopMoments:
     def _sum(self, entries: Vector) -> Vector:
         """Return the sum of what becomes of moments over all cycles of the slots."""
         steps = [
-            second_moments(delivered.matrix, lost.matrix, self._outcomes)
-            for delivered, lost in self._slots
+            second_moments(delivered.matrix, lost.matrix, self._outcomes) for delivered, lost in self._slots
         ]
         return resolved_by(reduce(lambda before, step: step @ before, steps), 1.0, entries)
 
@@ -192,9 +191,7 @@ class LoopMoments:
     def _cycle(self, now: SecondMoments) -> tuple[SecondMoments, Vector]:
         return self.until(now, len(self._slots) * self._periods.times.period_ns)
 
-    def _advance(
-        self, now: SecondMoments, slot: tuple[MomentStep, ...]
-    ) -> tuple[SecondMoments, Vector]:
+    def _advance(self, now: SecondMoments, slot: tuple[MomentStep, ...]) -> tuple[SecondMoments, Vector]:
         """Return the moments after a period, and its mean costs."""
         moments, shares = np.zeros_like(now.moments), np.zeros_like(now.shares)
         costs = np.zeros_like(slot[0].constants)

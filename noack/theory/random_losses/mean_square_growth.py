@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix, Vector, balancing_exponents
 from noack.impairments.loss_prediction import OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.contraction import EPSILON, Stack
@@ -59,9 +59,16 @@ def balanced_maps(maps: Sequence[tuple[Matrix, Matrix]]) -> list[tuple[Matrix, M
 
     In these coordinates no direction grows much more than others, so that the check of
     :func:`bounded_radius` is accurate.
+
+    Raises:
+        NotPredictableError: an entry is infinite.
     """
     stack = np.array(maps)
     size = stack.shape[-1]
+    if not np.isfinite(stack).all():
+        raise NotPredictableError("the loop grows beyond 1e308 within a period")
+    exponents = balancing_exponents(np.abs(stack).max(axis=(0, 1)))
+    stack = np.ldexp(stack, exponents[:, None] - exponents)
     U, singular, _ = np.linalg.svd(stack.transpose(2, 0, 1, 3).reshape(size, -1))
     rank = max(int((singular > 10 * size * EPSILON * singular[0]).sum()), 1)
     stack = U[:, :rank].T @ stack @ U[:, :rank]
@@ -99,9 +106,7 @@ def bounded_radius(operator: "csc_array[np.float64]", size: int) -> float:
     raise NotPredictableError("the second moments could not be bounded numerically")
 
 
-def second_moments(
-    delivered: Matrix, lost: Matrix, outcomes: OutcomeChain
-) -> "csc_array[np.float64]":
+def second_moments(delivered: Matrix, lost: Matrix, outcomes: OutcomeChain) -> "csc_array[np.float64]":
     """Return the operator of one period on the stacked upper triangles of X_j.
 
     Raises:
@@ -151,10 +156,11 @@ def _is_below(operator: "csc_array[np.float64]", bound: float, size: int) -> boo
     entries = operator.shape[0]
     identity = triangles(np.tile(np.eye(size), (2 * entries // (size * (size + 1)), 1, 1)))
     solution = resolved_by(operator, bound, identity)
-    forms, images = (
-        from_triangles(part, size) for part in (solution, np.asarray(operator @ solution))
-    )
+    forms, images = (from_triangles(part, size) for part in (solution, np.asarray(operator @ solution)))
     longest = int(np.diff(operator.tocsr().indptr).max())
-    rounding = 1e-13 * longest * float(np.abs(forms).max()) * max(bound, 1.0)
-    parts = (forms, bound * forms - images)
-    return all(float(np.linalg.eigvalsh(part).min()) > rounding for part in parts)
+    sizes = np.abs(solution)
+    carried = float((abs(operator) @ sizes + bound * sizes).max())
+    return all(
+        float(np.linalg.eigvalsh(part).min()) > 1e-13 * longest * size
+        for part, size in ((forms, float(sizes.max())), (bound * forms - images, carried))
+    )

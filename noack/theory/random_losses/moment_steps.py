@@ -9,7 +9,7 @@ t, ẋ = G x with white noise of intensity R,
     c = ∫₀ᵗ (t − s) trace(R e^{Gᵀs} F e^{Gs}) ds.
 
 Where ‖G‖t ≤ 1, Gauss's formula with 12 nodes has an error below that of rounding; a longer interval
-is composed of its halves.
+is composed of its halves. Whatever the units of the states, e^{Gt} is computed in similar ones.
 """
 
 import math
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector, exponential
+from noack.core.linear_systems import Matrix, Vector, balancing_exponents, exponential
 from noack.theory.bounds.contraction import Stack
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
@@ -69,6 +69,9 @@ def flow(generator: Matrix, intensity: Matrix, forms: Stack, duration_s: float) 
         forms: F of each cost, (K, S, S).
         duration_s: t.
     """
+    units = np.ldexp(1.0, balancing_exponents(np.abs(generator)))
+    per_unit, squares = units[:, None] / units, np.outer(units, units)
+    generator, intensity, forms = generator * per_unit, intensity * squares, forms / squares
     size = float(np.linalg.norm(generator)) * duration_s
     halvings = max(math.ceil(math.log2(size)), 0) if size > 1 else 0
     t_s = duration_s / 2**halvings
@@ -76,9 +79,9 @@ def flow(generator: Matrix, intensity: Matrix, forms: Stack, duration_s: float) 
     E = np.array([exponential(generator * time_s) for time_s in times_s])
     costs = np.einsum("t,tji,kjl,tlm->tkim", weights, E, forms, E, optimize=True)
     short = MomentStep(
-        exponential(generator * t_s),
-        np.einsum("t,tij,jl,tml->im", weights, E, intensity, E, optimize=True),
-        costs.sum(axis=0),
+        exponential(generator * t_s) / per_unit,
+        np.einsum("t,tij,jl,tml->im", weights, E, intensity, E, optimize=True) / squares,
+        costs.sum(axis=0) * squares,
         np.einsum("t,tkij,ij->k", t_s - times_s, costs, intensity),
     )
     return short.repeated(2**halvings)

@@ -4,16 +4,21 @@ Each update is lost with a probability of at most p̄, whatever happened before.
 moment norm, (E‖v‖ʳ)^{1/r}, r = 1 or 2, and ρ = p̄^{1/r}. With all signals scaled by e^{αt}, at
 every fixed time
 
-    |C e_c| ≤ ‖C W⁻¹‖ a + f_C(a, m, π) + ρ ℓ_C(a, m, π)          (I1): in flight, and lost
+    |C e_c| ≤ ‖C W⁻¹‖ a + f_C(a, m, π) + ℓ_C(m, π)            (I1): in flight, and lost
     |C x|   ≤ free_C + gain_C π
     π = |p| ≤ |K e_c| + σ (|KH x| + |KH e_c|) + r(σ) (|x|_W + |e_c|_W)
     a = |e_s|_W ≤ ḡβ + I_E m + I_B π,    m = |R_E x|
 
-A missing event's part of e_c is what E x and B p have added since the event before it. So all lost
-events together contribute at most ρ (∫‖C e^{(H+αI)s} L_E‖ ds m + ∫‖C e^{(H+αI)s} B U‖ ds π). If the
-trigger is tested every h, they contribute at most ρ a Σ_j sup_{τ≥jh} ‖C e^{(H+αI)τ} W⁻¹‖, too. The
-inequalities are linear; their solution bounds every moment if their spectral radius is below 1. It
-is smaller at a rate below the trigger's, whose threshold decays faster than needed then.
+A missing event's part of e_c is what E x and B p have added since the event before it. All that has
+ever been added is D_C = ∫‖C e^{(H+αI)s} L_E‖ ds m + ∫‖C e^{(H+αI)s} B U‖ ds π, so ℓ_C ≤ ρ D_C. But
+an event has no more than c_i = β sup ‖C e^{(H+αI)τ} W⁻¹‖, and what is added to it after the last
+test, if there have been i − 1 more since; and all i are lost with a probability of at most p̄ⁱ. So
+
+    ℓ_C ≤ Σ_i min(c_i, (c_i^{r−1} p̄ⁱ D_C)^{1/r}) + ρ/(1 − ρ) √(h d_C D_C)
+
+d_C the rate at which C e_c can grow; the last term is for r = 2, and 0 without a period h of tests.
+This is concave: any tangent bounds it, and then the inequalities are linear. Without h and delay
+there is a bound for every p̄ < 1.
 
 At an event of the continuous trigger, where ‖e_s‖_W = β, the number of missing events is known in
 distribution, and (I1) gives a bound by itself: :func:`moment_at_events`. Almost surely, x decays at
@@ -21,19 +26,21 @@ every rate below that of the moments. Under the paper's conditions it does so fo
 probability below 1. :func:`unlimited_losses` says all of this of a scenario.
 """
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Vector, spectral_abscissa
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, response, response_until
+from noack.theory.bounds.contraction import Stack
+from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.certificates.assumptions import below
@@ -43,6 +50,7 @@ from noack.theory.certificates.scenario_certificates import CertificateScope
 
 _TERMS = 1024
 _CELLS = 64
+_MOST_LOST, _ROUNDS, _SETTLED, _FIRST = 256, 30, 0.999, 1e6
 _A, _PI, _ONE = np.eye(3)
 """a, π and 1; every other signal is bounded by a combination of them."""
 ORDERS = (1, 2)
@@ -120,109 +128,141 @@ def moments(
         NoCertificateError: the spectral radius of the inequalities is not below 1.
         NotDecayingError: α is not below the decay rate of the models, or of A + BK.
     """
-    share = largest_probability ** (1 / order)
-    ways = (False, True) if conditions.spacing_s > 0 else (False,)
-    solved = [
-        _Inequalities(error, plant, conditions, beta, share, by_tests=by).solve() for by in ways
+    found = [
+        _Inequalities(error, plant, conditions, beta, largest_probability, one).solve()
+        for one in ORDERS[order - 1 :]  # a mean is at most the root mean square
     ]
-    best = min(solved, key=lambda solution: solution.get("state", np.inf))
-    if "state" not in best:
-        gain = min(solution["loop_gain"] for solution in solved)
-        raise NoCertificateError(f"the loop gain of the moments is {gain:.3g}, not below 1")
-    return Moments(order=order, rate_per_s=error.alpha_per_s, **best)
+    if not any(np.isfinite(one.state) for one in found):
+        loop_gain = min(one.loop_gain for one in found)
+        raise NoCertificateError(f"the loop gain of the moments is {loop_gain:.3g}, not below 1")
+    return Moments(order, *map(min, zip(*(one[1:] for one in found), strict=True)))
 
 
 class _Inequalities:
-    """The inequalities; every signal is bounded by a row: multiples of a and π, and a constant.
-
-    ``share`` is ρ. ``by_tests``: count a lost event at every test; else the drive since the last.
-    """
+    """The inequalities; every signal is bounded by a row: multiples of a and π, and a constant."""
 
     def __init__(
-        self, error: ErrorGains, plant: PlantGains, conditions: NetworkConditions, beta: float,
-        share: float, *, by_tests: bool,
-    ) -> None:  # fmt: skip
+        self,
+        error: ErrorGains,
+        plant: PlantGains,
+        conditions: NetworkConditions,
+        beta: float,
+        probability: float,
+        order: int,
+    ) -> None:
+        if not error.scaled_H.any():
+            raise NotDecayingError("a hold does not decay")
         self._error, self._plant, self._conditions = error, plant, conditions
-        self._beta, self._share, self._by_tests = beta, share, by_tests
+        self._beta, self._probability, self._order = beta, probability, order
         self._start_error, self._start = plant.start_up(conditions.start_s)
-        if not by_tests:
-            if not error.scaled_H.any():
-                raise NotDecayingError("a hold does not decay")
-            columns = plant.split_mismatch[0], plant.input_matrix
-            self._all_drive = [response(error.scaled_H, D) for D in columns]
-        if conditions.delay_s > 0:
-            columns = plant.split_mismatch[0], plant.input_matrix
-            self._recent_drive = [
-                response_until(error.scaled_H, D, conditions.delay_s) for D in columns
-            ]
+        columns, delay_s = (plant.split_mismatch[0], plant.input_matrix), conditions.delay_s
+        self._drive = [response(error.scaled_H, D) for D in columns]
+        self._recent = [response_until(error.scaled_H, D, delay_s) for D in columns if delay_s > 0]
+        self._signals = self._state(Output.MISMATCH), _PI + self._start_error * _ONE
+        self._missing = {output: self._missing_events(output) for output in error.outputs}
 
-    def solve(self) -> dict[str, float]:
-        """Return the bounds by the names of ``Moments``; only the loop gain if there are none."""
+    def solve(self) -> Moments:
+        """Return the bounds, infinite ones with a loop gain if there are none.
+
+        Each round bounds the concave terms by their tangents at the bounds that hold already.
+        """
+        rate_per_s, state = self._error.alpha_per_s, self._state(Output.STATE)
+        best = Moments(self._order, rate_per_s, *(np.inf,) * 5)
+        values = np.array([*(_FIRST * self._beta,) * 2, 1.0])
+        for _ in range(_ROUNDS):
+            controller = {output: self._controller_error(output, values) for output in self._missing}
+            rows = self._rows(controller)
+            solution = solve_inequalities(rows[:, :2], rows[:, 2])
+            values = np.append(solution.bound, 1.0)
+            loop_gain = float(solution.loop_gain)
+            if not np.isfinite(values).all():
+                return best._replace(loop_gain=min(best.loop_gain, loop_gain))
+            signals = (_A, controller[Output.WEIGHTED], _PI, state)
+            a, e_c, pi, x = (float(row @ values) for row in signals)
+            found = Moments(self._order, rate_per_s, a, e_c, pi, x, loop_gain)
+            if found.state > _SETTLED * best.state:
+                break
+            best = found
+        return best
+
+    def _rows(self, controller: Mapping[Output, Vector]) -> Matrix:
+        """Return the rows that bound a and π, (2, 3)."""
         conditions, error = self._conditions, self._error
-        remainder = error.hold_remainder(conditions.hold_s)
-        controller = {output: self._controller_error(output) for output in error.outputs}
-        pi = controller[Output.GAIN] + remainder * (
+        pi = controller[Output.GAIN] + error.hold_remainder(conditions.hold_s) * (
             self._state(Output.WEIGHTED) + controller[Output.WEIGHTED]
         )
         pi += conditions.hold_s * (self._state(Output.GAIN_RATE) + controller[Output.GAIN_RATE])
         a = self._beta * error.stretch(conditions.sampling_s) * _ONE
         if conditions.sampling_s > 0:
             growth = self._plant.growth(conditions.sampling_s, _CELLS)
-            a = a + growth.mismatch.integral_on_grid() * self._state(Output.MISMATCH)
-            a += growth.input_error.integral_on_grid() * self._input
-        rows = np.array([a, pi])
-        solution = solve_inequalities(rows[:, :2], rows[:, 2])
-        loop_gain = float(solution.loop_gain)
-        if not np.isfinite(solution.bound).all():
-            return {"loop_gain": loop_gain}
-        values = np.append(solution.bound, 1.0)
-        return {
-            "sensor_error": float(values[0]),
-            "controller_error": float(controller[Output.WEIGHTED] @ values),
-            "input_error": float(values[1]),
-            "state": float(self._state(Output.STATE) @ values),
-            "loop_gain": loop_gain,
-        }
+            areas = growth.mismatch.integral_on_grid(), growth.input_error.integral_on_grid()
+            a = a + self._driven(areas)
+        return np.array([a, pi])
 
-    @property
-    def _input(self) -> Vector:
-        """The bound of |p|, before the first input of the controller, too."""
-        return _PI + self._start_error * _ONE
+    def _driven(self, gains: Iterable[Stack]) -> Vector:
+        """Return the row of what E x and B p do with these gains."""
+        return sum((gain * row for gain, row in zip(gains, self._signals, strict=False)), np.zeros(3))
 
     def _state(self, output: Output) -> Vector:
         free, gain = self._plant.states[output]
         return np.asarray(gain * _PI + (free + self._start[output]) * _ONE)
 
-    def _controller_error(self, output: Output) -> Vector:
-        """The bound of |C e_c|: the present error, updates in flight, lost updates."""
-        error, C, delay_s = self._error, self._error.outputs[output], self._conditions.delay_s
-        drives, bound = (self._state(Output.MISMATCH), self._input), error.now(output) * _A
-        recent = [0.0, 0.0]
+    def _missing_events(self, output: Output) -> "_Missing":
+        """Return what bounds the missing events' part of C e_c, and the present error."""
+        error, C, conditions = self._error, self._error.outputs[output], self._conditions
+        delay_s, kernels = conditions.delay_s, [drive.through(C) for drive in self._drive]
+        ages_s = delay_s + conditions.spacing_s * np.arange(float(_MOST_LOST))
+        ceilings = self._beta * error.kernels[output].sups(ages_s)
+        present = error.now(output) * _A
         if delay_s > 0:
-            recent = [
-                float(drive_response.through(C).integral_on_grid())
-                for drive_response in self._recent_drive
-            ]
-            bound = bound + error.kernels[output].sup(delay_s) * _A
-        for drive, area in zip(drives, recent, strict=True):
-            bound = bound + (1.0 if self._by_tests else 1 - self._share) * area * drive
-        if self._by_tests:
-            sups = _sum_of_sups(error.kernels[output], delay_s, self._conditions.spacing_s)
-            return bound + self._share * sups * _A
-        for drive, kernel in zip(drives, self._all_drive, strict=True):
-            bound = bound + self._share * kernel.through(C).integral() * drive
-        return bound
+            present = present + error.kernels[output].sup(delay_s) * _A
+        return _Missing(
+            present,
+            self._driven(recent.through(C).integral_on_grid() for recent in self._recent),
+            self._driven(kernel.integral() for kernel in kernels),
+            conditions.sampling_s * self._driven(kernel.sup(delay_s) for kernel in kernels),
+            ceilings,
+        )
+
+    def _controller_error(self, output: Output, values: Vector) -> Vector:
+        """The bound of |C e_c|, as tight as can be where the signals have these values."""
+        share = self._probability ** (1 / self._order)
+        missing = self._missing[output]
+        lost = [share * (missing.whole - missing.recent)]
+        whole, overshoot = missing.whole @ values, missing.overshoot @ values
+        if share < 1 and whole > 0 and (self._order > 1 or overshoot == 0):
+            row = missing.burst(self._probability, self._order, float(whole))
+            if overshoot > 0:
+                ratio = np.sqrt(whole / overshoot)
+                row = row + share / (1 - share) / 2 * (ratio * missing.overshoot + missing.whole / ratio)
+            lost.append(row)
+        best = min(lost, key=lambda row: float(row @ values))
+        return np.asarray(missing.present + missing.recent + best)
 
 
-def _sum_of_sups(kernel: KernelBounds, first_s: float, spacing_s: float) -> float:
-    """Bound Σ_{j≥0} sup k(τ) over τ ≥ first + j·spacing."""
-    sups = kernel.sups(first_s + spacing_s * np.arange(_TERMS, dtype=np.float64))
-    last_s = first_s + spacing_s * (_TERMS - 1)
-    if kernel.tail_rate_per_s == 0:
-        return np.inf
-    # The sups fall: from the last one on, their sum is at most their integral over the spacing.
-    longer_s = max(float(kernel.edges_s[-1]) - last_s, 0.0) + 1 / kernel.tail_rate_per_s
-    return float(sups.sum() + sups[-1] * longer_s / spacing_s)
+class _Missing(NamedTuple):
+    """What bounds the part of C e_c that missing events have; rows but for the last."""
+
+    present: Vector
+    """Of e_s, now and when the oldest update in flight was sent."""
+    recent: Vector
+    """What has been added to e_s while updates in flight were sent."""
+    whole: Vector
+    """What has ever been added to e_s."""
+    overshoot: Vector
+    """What is added to e_s between two tests, at most."""
+    ceilings: Vector
+    """What the i-th last event since the last delivery has at most, without the overshoot."""
+
+    def burst(self, probability: float, order: int, whole: float) -> Vector:
+        """Bound Σ_i min(c_i, (c_i^{r−1} p^i D)^{1/r}) by its tangent at a value of the whole, D."""
+        counts = np.arange(1.0, len(self.ceilings) + 1)
+        shares = (self.ceilings ** (order - 1) * whole * probability**counts) ** (1 / order)
+        few = shares < self.ceilings
+        ratio = probability ** (1 / order)
+        total = shares[few].sum() + shares[-1] * ratio / (1 - ratio)
+        constant = self.ceilings[~few].sum() + total * (1 - 1 / order)
+        return np.asarray(total / (order * whole) * self.whole + constant * _ONE)
 
 
 class BurstCertificate(NamedTuple):

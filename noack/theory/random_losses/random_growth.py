@@ -25,11 +25,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.contraction import Stack
 from noack.theory.margins.loss_margin import intervals_ns, loop_times
 from noack.theory.random_losses.loop_moments import LoopMoments, LoopPeriods
-from noack.theory.random_losses.mean_square_growth import (
-    balanced_maps,
-    bounded_radius,
-    second_moments,
-)
+from noack.theory.random_losses.mean_square_growth import balanced_maps, bounded_radius, second_moments
 
 _MEMORIES = ((0, 0), (4, 0), (4, 4))
 """Lengths up to which the present burst and the one before are told apart."""
@@ -70,9 +66,7 @@ def random_growth(resolved: Scenario, losses: LossProcess) -> RandomGrowth:
         raise NotPredictableError("the times between updates are not known")
     loop, times = loop_of(resolved), loop_times(resolved, longest_ns)
     nothing = np.zeros_like(loop.A)
-    periods = LoopPeriods(
-        loop, times, nothing, nothing, np.zeros((0, loop.n + loop.m, loop.n + loop.m))
-    )
+    periods = LoopPeriods(loop, times, nothing, nothing, np.zeros((0, loop.n + loop.m, loop.n + loop.m)))
     outcomes = losses.outcomes(LossGuarantee())
     mean_square = almost_sure = LoopMoments(periods, outcomes).growth
     if times.slots == 1:
@@ -138,9 +132,7 @@ class _Tilts:
         start = np.zeros(len(self._shares))
         # Too many states are refused before the search.
         second_moments(M0, M1, self._tilted(start))
-        s = minimize(
-            self._value, start, jac=True, method="L-BFGS-B", options={"maxiter": _ITERATIONS}
-        ).x
+        s = minimize(self._value, start, jac=True, method="L-BFGS-B", options={"maxiter": _ITERATIONS}).x
         radius = bounded_radius(second_moments(M0, M1, self._tilted(s)), len(M0))
         exponent = float(self._shares @ s) + math.log(max(radius, 1e-300))
         return math.exp(exponent / 2) * (1 + 1e-12)

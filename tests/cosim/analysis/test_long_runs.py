@@ -52,9 +52,7 @@ def results(record: RunRecord) -> dict[str, Any]:
         "claims": [claim.model_dump(mode="json") for claim in claims.judge()],
         "violations": claims.violations(),
         "conditions": claims.conditions,
-        "envelopes": [
-            (one.label, one.t_s.tobytes(), one.values.tobytes()) for one in claims.envelopes()
-        ],
+        "envelopes": [(one.label, one.t_s.tobytes(), one.values.tobytes()) for one in claims.envelopes()],
         "inter_event_s": [
             passed_s
             for part in ClaimEvaluation(record).samples()
@@ -70,9 +68,7 @@ def without_sums(found: Any) -> Any:
     return [without_sums(one) for one in found] if isinstance(found, list) else found
 
 
-def test_the_results_do_not_depend_on_the_parts(
-    record: RunRecord, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_results_do_not_depend_on_the_parts(record: RunRecord, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = results(record)
     monkeypatch.setattr(run_record, "BATCH_ROWS", PART_ROWS)
     monkeypatch.setattr(RunRecord, "slice_columns", 10**6)
@@ -106,9 +102,7 @@ VALUES = arrays(
 
 
 @given(VALUES, st.integers(1, 20), st.integers(0, 5))
-def test_each_column_keeps_its_extremes_and_its_ends(
-    y: np.ndarray, columns: int, step: int
-) -> None:
+def test_each_column_keeps_its_extremes_and_its_ends(y: np.ndarray, columns: int, step: int) -> None:
     """Compared column by column, as plotted on the screen."""
     t = np.cumsum(np.arange(len(y)) % (step + 1) + 0.5)
     keep = decimate(t, y, columns)

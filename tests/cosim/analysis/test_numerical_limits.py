@@ -98,8 +98,7 @@ LOOPS = {
     "stiff": FAST | plant(STIFF, [[1.0]] * 4, [[0.0, 0.0, -0.1, 0.0]]),
     "defective": FAST | plant(-np.eye(3) + np.eye(3, k=1), [[0], [0], [1]], [[0.0, 0.0, 0.0]]),
     "badly scaled": FAST | plant([[-1.0, 1e12], [0.0, -2.0]], [[0], [1e-12]], [[0.0, -1.0]]),
-    "far from normal": FAST
-    | plant(-np.eye(20) + 10 * np.eye(20, k=1), [[0.0]] * 19 + [[1.0]], [[0.0] * 20]),
+    "far from normal": FAST | plant(-np.eye(20) + 10 * np.eye(20, k=1), [[0.0]] * 19 + [[1.0]], [[0.0] * 20]),
     "the longest horizon": SLOW | plant([[-1e-5]], [[1e-5]], [[-0.5]]),
     "huge": of_size(1e300),
     "large": of_size(1e150),

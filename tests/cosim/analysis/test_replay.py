@@ -245,9 +245,7 @@ def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
 ) -> None:
     """Only the rows of the second generation are recorded."""
     content |= {"trigger": {"policy": "periodic", "period_s": 0.002}}
-    resolved = resolve(
-        validate(content | {"network": {"mansd": 0, "loss": {"model": "lossless"}}}, "")
-    )
+    resolved = resolve(validate(content | {"network": {"mansd": 0, "loss": {"model": "lossless"}}}, ""))
     at_ns = 500_000_000 - 300_000  # between ticks, just before an update
     successor = controller_of(resolved, Start(1, at_ns))
     record = simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))

@@ -158,8 +158,7 @@ def test_restarts_and_their_missing_first_rows_are_listed(content: dict[str, Any
     rows["input"][50:80] = GENERATION + 7 + np.arange(30)
     rows["input"][80:] = 3 * GENERATION + np.arange(len(rows) - 80)
     notices = [
-        {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"}
-        for k in (2, 3)
+        {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"} for k in (2, 3)
     ]
     restarted = altered(record, {SENSOR_MEASUREMENT: rows}, notices=notices, reports={})
     found = summarise(restarted, 0, "").to_json()

@@ -149,10 +149,11 @@ class NoStep(Clock):
 
 
 @pytest.mark.parametrize(("env", "network", "given", "why"), [
-    (Clock, {"mansd": 3}, {}, r"^scenario: network.loss: missing"),
-    (Clock, {**HALF, "mansd": -1}, {}, r"^scenario: network.mansd"),
+    (Clock, {"mansd": 3}, {}, r"^LossyChannel: network.loss: missing"),
+    (Clock, {**HALF, "mansd": -1}, {}, r"^LossyChannel: network.mansd"),
+    (Clock, {}, {}, r"^LossyChannel: network.loss: missing .*; network.mansd: missing"),
     (Clock, "no_such_scenario", {}, "no such file, nor a shipped scenario"),
-    (Clock, "shared_channel", {}, "the scenario has loops; the channel needs one without"),
+    (Clock, "shared_channel", {}, "the scenario has loops; outside a run of noack"),
     (Clock, {**HALF, "protocol": "ack"}, {}, 'set protocol = "none"'),
     (Clock, 0.5, {}, "give a table as"),
     (NoStep, HALF, {}, "has no time of a step; give step_s, in seconds"),

@@ -85,9 +85,7 @@ EXAMPLES = [name for name in noack.__all__ if ">>>" in (getattr(noack, name).__d
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_the_examples_of_the_docstrings_run(name: str) -> None:
-    (example,) = doctest.DocTestFinder(recurse=False).find(
-        getattr(noack, name), name, module=False, globs={}
-    )
+    (example,) = doctest.DocTestFinder(recurse=False).find(getattr(noack, name), name, module=False, globs={})
     found = doctest.DocTestRunner().run(example)
     assert found.attempted > 1
     assert found.failed == 0

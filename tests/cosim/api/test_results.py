@@ -1,6 +1,7 @@
 """Campaigns and certificates of the library give what the commands write."""
 
 import json
+import pickle
 from typing import Any
 
 import numpy as np
@@ -49,9 +50,7 @@ def test_the_estimates_are_those_of_the_draws(found: noack.CampaignResult) -> No
 def test_the_page_the_summary_and_the_figures_are_there(found: noack.CampaignResult) -> None:
     assert found.report().is_file()
     written = json.loads((found.folder / "summary.json").read_text())
-    assert [one["axes"] for one in written["points"]] == [
-        one["axes"] for one in found.summary["points"]
-    ]
+    assert [one["axes"] for one in written["points"]] == [one["axes"] for one in found.summary["points"]]
     assert found.plot().axes
     assert "0.8" in repr(found)
     assert "<table>" in found._repr_html_()
@@ -68,6 +67,7 @@ def test_what_is_not_there_is_named(found: noack.CampaignResult) -> None:
 
 def test_a_system_is_certified(scenario: noack.Scenario) -> None:
     found = noack.certify(scenario)
+    assert pickle.loads(pickle.dumps(found)).to_json() == found.to_json()
     for certificate in (found.paper, found.schedule):
         assert certificate.void is None
         assert certificate.constants is not None
@@ -101,8 +101,6 @@ def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:
         ("model_predictive", {}, "u is not K x_c; no certificate covers this"),
     ],
 )
-def test_a_missing_certificate_gives_one_line(
-    name: str, options: dict[str, Any], message: str
-) -> None:
+def test_a_missing_certificate_gives_one_line(name: str, options: dict[str, Any], message: str) -> None:
     with pytest.raises(noack.NoackError, match=message):
         noack.certify(name, **options)

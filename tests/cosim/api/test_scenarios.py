@@ -59,9 +59,7 @@ def test_a_system_becomes_a_scenario_with_the_documented_choices() -> None:
 
 
 def test_a_python_control_system_keeps_its_names_and_may_have_another_plant() -> None:
-    system = control.ss(
-        *SYSTEM, np.eye(2), np.zeros((2, 1)), states=["angle", "rate"], inputs=["torque"]
-    )
+    system = control.ss(*SYSTEM, np.eye(2), np.zeros((2, 1)), states=["angle", "rate"], inputs=["torque"])
     scenario = noack.from_system(
         system, GAIN, np.array([0.2, 0.0]), plant=TRUE, settings={"trigger.beta": 0.01}, name="own"
     )

@@ -16,9 +16,7 @@ from cosim.live import finalize
 from cosim.record.run_directory import SUMMARY_FILE
 
 
-def test_check_prints_the_defaults_that_depend_on_other_keys(
-    tmp_path: Path, content: dict[str, Any]
-) -> None:
+def test_check_prints_the_defaults_that_depend_on_other_keys(tmp_path: Path, content: dict[str, Any]) -> None:
     path = tmp_path / "small.toml"
 
     def message() -> str:
@@ -47,9 +45,7 @@ INTERRUPTED = "noack: stopped by the user (SIGINT)\n"
     "simulate lane_following", "certify lane_following", "adversary lane_following",
     "margin lane_periodic", "design lane_following --settling 14",
 ])  # fmt: skip
-def test_ctrl_c_during_any_command_gives_one_line(
-    line: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_during_any_command_gives_one_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -82,9 +78,7 @@ def test_a_signal_while_a_run_is_finalised_names_the_command_that_completes_it(
         done = CliRunner().invoke(app, ["simulate", *SHORT, "--runs", str(tmp_path)])
     assert done.exit_code == status
     (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
-    assert done.stderr.splitlines()[-1] == (
-        f"noack: {why}; `noack summary {run_dir}` completes its record"
-    )
+    assert done.stderr.splitlines()[-1] == (f"noack: {why}; `noack summary {run_dir}` completes its record")
     assert not (run_dir / SUMMARY_FILE).exists()
     assert CliRunner().invoke(app, ["summary", str(run_dir)]).exit_code == 0
     assert (run_dir / SUMMARY_FILE).is_file()

@@ -1,6 +1,5 @@
 """The help and the completion: examples that work, and the words that fit."""
 
-import json
 import re
 import shlex
 from pathlib import Path
@@ -13,6 +12,7 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.cli.command import examples_of
 from netem.control.emulator_commands import COMMANDS as EMULATOR_COMMANDS
+from tests.approved import compare_lines
 
 PROGRAM: Any = get_command(app)
 COMMANDS: dict[str, Any] = dict(PROGRAM.commands)
@@ -65,46 +65,6 @@ def test_every_example_has_valid_arguments(
     COMMANDS[command].make_context(command, words_of(example)[1:])
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder, with a run in virtual time if needed."""
-    folder = tmp_path_factory.mktemp("examples")
-    words = ["simulate", "lane_following", "--set", "horizon_s=2", "--no-report"]
-    done = CliRunner().invoke(app, [*words, "--runs", str(folder / "runs")])
-    assert done.exit_code == 0, done.output
-    return folder
-
-
-AS_THEY_ARE = (
-    "archive", "check", "export", "schema", "summary", "replay", "fidelity", "report", "scenarios",
-    "measure", "certify", "linearise", "gain",
-)  # fmt: skip
-MORE = dict.fromkeys(AS_THEY_ARE, ()) | {
-    "margin": ("--most", "2", "--no-period"),
-    "simulate": ("--set", "horizon_s=1", "--no-report"),
-    "adversary": ("--nodes", "200", "--beam", "2", "--set", "horizon_s=0.5"),
-}
-"""Commands of which the first and last example (for slow ones the first) are run, shortened."""
-
-
-def run_examples() -> list[str]:
-    found = []
-    for command in MORE:
-        first, *_, last = examples_of(COMMANDS[command])
-        found += [first] if command in ("certify", "margin", "report") else [first, last]
-    return found
-
-
-@pytest.mark.parametrize("example", run_examples())
-def test_examples_work(example: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    words = words_of(example)
-    done = CliRunner().invoke(app, [*words, *MORE[words[0]]])
-    assert done.exit_code == 0, done.output
-    if "--json" in words or words[0] == "schema":
-        json.loads(done.stdout)
-
-
 def completed(line: str) -> list[str]:
     """The completions that bash offers for the last word of a line."""
     place = str(len(line.split(" ")) - 1)
@@ -114,29 +74,11 @@ def completed(line: str) -> list[str]:
     return done.stdout.split()
 
 
-@pytest.mark.parametrize(("line", "offered"), [
-    ("noack ca", ["campaign", "capacity"]),
-    ("noack rep", ["replay", "report", "reproduce"]),
-    ("noack certify lane_f", ["lane_following"]),
-    ("noack doctor quad", ["quadrotor_hover"]),
-    ("noack campaign mb", ["mb_vs_zoh"]),
-    ("noack run lane_following --set trigger.be", ["trigger.beta="]),
-    ("noack run lane_following --set network.mansd", ["network.mansd="]),
-    ("noack view runs/l", ["runs/latest"]),
-    ("noack replay runs/2", ["runs/20260102-000000-b", "runs/20260101-000000-a"]),
-    ("noack run lane_following --set loss", ["loss=", "loss.p="]),
-    ("noack set loss", ["loss", "loss.p"]),
-    ("noack set network.loss", ["network.loss", "network.loss.probability"]),
-    ("noack simulate lane_following --tri", ["--trigger"]),
-    ("noack simulate lane_following --trigger c", ["continuous"]),
-])  # fmt: skip
-def test_words_are_completed(
-    line: str, offered: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_words_are_completed_as_approved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("20260101-000000-a", "20260102-000000-b"):
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "scenario.toml").touch()
     (tmp_path / "runs" / "campaigns").mkdir()
     (tmp_path / "runs" / "latest").symlink_to("20260102-000000-b")
-    assert completed(line) == offered
+    compare_lines(Path(__file__).with_name("completions.txt"), completed)

@@ -32,9 +32,7 @@ def test_a_mistake_gives_the_approved_line(tmp_path: Path, monkeypatch: pytest.M
     assert not [*tmp_path.iterdir()]
 
 
-@pytest.mark.parametrize(
-    "line", ["certfy lane_following", "check nothing", "demo --set", "netem --session"]
-)
+@pytest.mark.parametrize("line", ["certfy lane_following", "check nothing", "demo --set", "netem --session"])
 def test_with_json_a_mistake_is_a_document_too(line: str) -> None:
     expected = noack(line).stderr
     done = noack(f"{line} --json" if line != "demo --set" else "demo --json --set")

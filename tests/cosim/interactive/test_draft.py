@@ -10,15 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.interactive.controls import (
-    Field,
-    by_field,
-    chosen,
-    controls_of,
-    dragged,
-    filled,
-    form_of,
-)
+from cosim.interactive.controls import Field, by_field, chosen, controls_of, dragged, filled, form_of
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, known_scenarios, open_draft
 from cosim.shipped_files import shipped_names
 from noack.core.errors import CallerError
@@ -95,9 +87,7 @@ def test_an_address_cannot_name_code_or_foreign_files(tmp_path: Path) -> None:
     assert draft_of_query("", "lane_following", LANE).base == "lane_following"
 
 
-SCHEMA = json.loads(
-    (Path(__file__).parents[3] / "docs/scenario.schema.json").read_text(encoding="utf-8")
-)
+SCHEMA = json.loads((Path(__file__).parents[3] / "docs/scenario.schema.json").read_text(encoding="utf-8"))
 
 
 def field(key: str, scenario: str = "lane_following") -> Field:

@@ -26,9 +26,7 @@ class Served:
 
     def __init__(self, folder: Path, *arguments: str) -> None:
         self.errors = folder / "errors.txt"
-        command = live.noack_command(
-            "lab", "--no-browser", "--json", "--set", "horizon_s=4", *arguments
-        )
+        command = live.noack_command("lab", "--no-browser", "--json", "--set", "horizon_s=4", *arguments)
         with self.errors.open("w") as errors:
             self._process = subprocess.Popen(
                 command, cwd=folder, stdout=subprocess.PIPE, stderr=errors, text=True
@@ -91,9 +89,7 @@ class Page:
             )  # fmt: skip
 
     def js(self, expression: str) -> Any:
-        found = self.call(
-            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
-        )
+        found = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         return found["result"].get("value")
 
     def wait(self, condition: str) -> None:

@@ -64,9 +64,7 @@ def lose(plane: FakePlane, barrier: Coordinator) -> None:
     token(plane, barrier, zenoh.SampleKind.DELETE)
 
 
-def test_an_invalid_request_is_refused_and_the_others_join(
-    plane: FakePlane, barrier: Coordinator
-) -> None:
+def test_an_invalid_request_is_refused_and_the_others_join(plane: FakePlane, barrier: Coordinator) -> None:
     for junk in JUNK:
         plane.put("progress", Sample("progress", junk))
         assert barrier.progress() is None
@@ -97,9 +95,7 @@ def test_a_process_may_join_again_after_a_lost_connection_unless_another_has_its
     lose(plane, barrier)
     ask(plane, barrier, "admit", "two")
     assert ask(plane, barrier, "join", "two").error is None
-    assert ask(plane, barrier, "join").error == (
-        "cannot join: another sensor is in this run already"
-    )
+    assert ask(plane, barrier, "join").error == ("cannot join: another sensor is in this run already")
 
 
 def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Coordinator) -> None:

@@ -48,9 +48,7 @@ from tests.cosim.summaries import alone
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that is marked as live, with the record of a simulated one and without a summary."""
     folder = tmp_path_factory.mktemp("recorded")
-    record = simulate(
-        resolve(load(find_shipped("double_integrator", "scenarios"), ["horizon_s=1"]))
-    )
+    record = simulate(resolve(load(find_shipped("double_integrator", "scenarios"), ["horizon_s=1"])))
     (folder / SCENARIO_FILE).write_text(dumps(record.scenario))
     write_environment(folder, "live")
     reports = {role: report | {"realtime": {}} for role, report in record.reports.items()}
@@ -159,9 +157,7 @@ def test_a_run_that_cannot_be_replayed_or_whose_directory_is_deleted_fails(
         finalize(RunEnding(run_dir, 1, ExitStatus.FAILED, "it was moved", None))
 
 
-def test_an_interrupted_replay_leaves_a_summary(
-    run_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_replay_leaves_a_summary(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 

@@ -107,9 +107,7 @@ class Case:
 
     def run(self, children: FakeChildren, coordinator: FakeCoordinator, **watch: Any) -> _Run:
         watcher = Watcher(**watch)
-        return _Run(
-            self.ticket, self.run_dir, cast(Any, coordinator), children, watcher, SimpleQueue()
-        )
+        return _Run(self.ticket, self.run_dir, cast(Any, coordinator), children, watcher, SimpleQueue())
 
 
 @pytest.fixture

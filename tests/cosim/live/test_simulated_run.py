@@ -103,7 +103,7 @@ def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
 
 
 def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:
-    late = simulated(tmp_path, "horizon_s=2", "certificate.network_delay_s=0.001")
+    late = simulated(tmp_path, "horizon_s=1", "certificate.late_periods=20")
     claims = [claim for one in json.loads(late.stdout)["loops"] for claim in one["claims"]]
     reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
     shown = invoke("summary", tmp_path / "latest").stdout

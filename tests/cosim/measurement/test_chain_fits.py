@@ -10,13 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.measurement import chain_fits as rule
-from cosim.measurement.chain_fits import (
-    ChainFits,
-    ChainRates,
-    LossLikelihood,
-    find_outages,
-    fit_outages,
-)
+from cosim.measurement.chain_fits import ChainFits, ChainRates, LossLikelihood, find_outages, fit_outages
 from cosim.measurement.loss_bursts import (
     binomial_estimate,
     exponential_estimate,
@@ -54,9 +48,7 @@ def test_the_likelihood_is_that_of_the_forward_algorithm(
 ) -> None:
     bursts = loss_bursts(~np.array(lost))
     assert LossLikelihood(bursts)(one) == pytest.approx(forward(lost, one), abs=1e-9)
-    chosen = data.draw(
-        st.lists(st.booleans(), min_size=len(bursts.length), max_size=len(bursts.length))
-    )
+    chosen = data.draw(st.lists(st.booleans(), min_size=len(bursts.length), max_size=len(bursts.length)))
     left_out, expected, begin = np.array(chosen, bool), 0.0, 0
     for first, end in zip(bursts.first[left_out], bursts.end[left_out], strict=True):
         expected += forward(lost[begin:first], one)
@@ -127,9 +119,7 @@ def test_the_test_of_lengths_rejects_at_its_level_and_wrong_models() -> None:
     assert "too few" in few.tested(few.gilbert).verdict
 
 
-@pytest.mark.parametrize(
-    ("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39)]
-)
+@pytest.mark.parametrize(("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39)])
 def test_poisson_intervals_are_garwoods(count: int, low: float, high: float) -> None:
     """Garwood, Biometrika 28, 1936, and every table since."""
     found = poisson_estimate(count, 2.0)
@@ -169,9 +159,7 @@ def test_the_rural_run_has_one_outage_of_ten_seconds_and_an_m_without_it() -> No
     assert by_hand.is_outage.sum() == 2
 
 
-@pytest.mark.parametrize(
-    "truth", [ChainRates(0.03, 0.25, 0.0, 1.0), ChainRates(0.01, 0.05, 0.02, 0.7)]
-)
+@pytest.mark.parametrize("truth", [ChainRates(0.03, 0.25, 0.0, 1.0), ChainRates(0.01, 0.05, 0.02, 0.7)])
 def test_networks_without_outages_have_none_and_added_ones_are_found(truth: ChainRates) -> None:
     rng = np.random.default_rng(1)
     for seed in range(40):
@@ -220,9 +208,7 @@ def test_the_outage_fit_covers_rate_and_duration() -> None:
 flags = st.lists(st.booleans(), min_size=1, max_size=60)
 
 
-@given(
-    st.lists(st.one_of(st.none(), st.integers(0, 9)), min_size=1, max_size=12), st.integers(0, 9)
-)
+@given(st.lists(st.one_of(st.none(), st.integers(0, 9)), min_size=1, max_size=12), st.integers(0, 9))
 def test_a_packet_is_effective_if_it_arrives_in_time_before_every_later_one(
     delays: list[int | None], deadline: int
 ) -> None:
@@ -250,8 +236,7 @@ def test_bursts_are_the_groups_of_consecutive_losses(effective: list[bool]) -> N
     assert histogram(bursts) == {n: lengths.count(n) for n in sorted(set(lengths))}
     assert bursts.deliveries().sum() == sum(effective)
     assert bursts.complete.tolist() == [
-        first > 0 and end < len(effective)
-        for first, end in zip(bursts.first, bursts.end, strict=True)
+        first > 0 and end < len(effective) for first, end in zip(bursts.first, bursts.end, strict=True)
     ]
 
 
@@ -267,19 +252,13 @@ def test_m_of_a_share_is_the_smallest_that_covers_it(effective: list[bool], shar
     for m, values in of.items():
         for smaller, covered in ((m, True), (m - 1, False)):
             within = sum(value <= smaller - 1 for value in values)
-            assert (smaller < 1) or (within >= share * len(values) - 1e-9) is (
-                covered or not values
-            )
+            assert (smaller < 1) or (within >= share * len(values) - 1e-9) is (covered or not values)
 
 
 @given(flags, st.data())
-def test_most_losses_are_those_of_the_worst_window(
-    effective: list[bool], data: st.DataObject
-) -> None:
+def test_most_losses_are_those_of_the_worst_window(effective: list[bool], data: st.DataObject) -> None:
     bursts = loss_bursts(np.array(effective))
-    chosen = data.draw(
-        st.lists(st.booleans(), min_size=len(bursts.length), max_size=len(bursts.length))
-    )
+    chosen = data.draw(st.lists(st.booleans(), min_size=len(bursts.length), max_size=len(bursts.length)))
     left_out = np.array(chosen, bool)
     skipped = np.zeros(len(effective), bool)
     for first, end in zip(bursts.first[left_out], bursts.end[left_out], strict=True):
@@ -288,11 +267,7 @@ def test_most_losses_are_those_of_the_worst_window(
     expected = {}
     for window in windows:
         starts = range(len(effective) - window + 1)
-        worst = [
-            window - sum(effective[i : i + window])
-            for i in starts
-            if not skipped[i : i + window].any()
-        ]
+        worst = [window - sum(effective[i : i + window]) for i in starts if not skipped[i : i + window].any()]
         if worst:
             expected[window] = max(worst)
     assert most_losses(bursts, windows, left_out) == expected
@@ -308,8 +283,7 @@ def test_confidence_needs_as_many_bursts_as_wilks_says(share: float, fewest: int
         assert (found is None) == (count < fewest)
     rng = np.random.default_rng(1)
     covered = [
-        quantile_m(loss_bursts(_bursts(rng.geometric(0.3, 400))), share).bursts_confident
-        for _ in range(400)
+        quantile_m(loss_bursts(_bursts(rng.geometric(0.3, 400))), share).bursts_confident for _ in range(400)
     ]
     truth = 1 + math.ceil(math.log(1 - share) / math.log(0.7))
     assert np.mean([m is not None and m >= truth for m in covered]) >= 0.93

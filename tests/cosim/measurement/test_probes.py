@@ -50,9 +50,7 @@ def exchange(
     log: list[str] = []
     plan = ProbePlan(PERIOD_NS, count, is_round_trip=round_trip)
     sender = ProbeSender(plan, 77, HOST, 0)
-    receiver = ProbeReceiver(
-        host, offset_ns - 1, SILENCE_NS, log.append, lambda *row: rows.append(row)
-    )
+    receiver = ProbeReceiver(host, offset_ns - 1, SILENCE_NS, log.append, lambda *row: rows.append(row))
     now_ns = sent = answered = 0
     while not sender.is_over(now_ns):
         now_ns = max(now_ns, sender.next_deadline_ns())
@@ -92,9 +90,7 @@ def test_the_trace_has_exactly_the_losses(lost: set[int], offset_ns: int) -> Non
 
 
 @given(st.sets(st.integers(0, 99)), st.sets(st.integers(0, 99)))
-def test_a_round_trip_tells_on_which_way_each_datagram_was_lost(
-    forward: set[int], reverse: set[int]
-) -> None:
+def test_a_round_trip_tells_on_which_way_each_datagram_was_lost(forward: set[int], reverse: set[int]) -> None:
     found = exchange(100, forward.__contains__, reverse.__contains__, round_trip=True)
     result = found.sender.finish(0)
     assert result.trace is not None
@@ -157,8 +153,7 @@ def test_what_is_ignored_is_counted() -> None:
         "ahead of schedule": 1, "impossible": 3,
     }  # fmt: skip
     assert [line for line in log if "another probe" in line] == [
-        "10.0.0.1:5: ignored: another probe is being received; "
-        "a listener receives one probe at a time"
+        "10.0.0.1:5: ignored: another probe is being received; a listener receives one probe at a time"
     ]
     result = receiver.finish(3)
     assert result is not None

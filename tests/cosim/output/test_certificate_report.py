@@ -46,9 +46,7 @@ def weighted() -> Certificates:
     return Certificates(scenario("lane_weighted"), 2)
 
 
-def test_the_documentation_quotes_computed_figures(
-    lane: Certificates, weighted: Certificates
-) -> None:
+def test_the_documentation_quotes_computed_figures(lane: Certificates, weighted: Certificates) -> None:
     assert lane.theorem_2 is not None
     text = (ROOT / "docs/theory.md").read_text().partition("## The adversary")[0]
     rows = {
@@ -88,9 +86,7 @@ def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume() -> No
     np.testing.assert_array_equal(np.array(weighted.scenario.trigger.weight), W)
     turned = W @ (loop_of(weighted.scenario).H + 0.25 * np.eye(2)) @ np.linalg.inv(W)
     assert np.linalg.eigvalsh(turned + turned.T).max() <= 1e-9
-    better, plain = (
-        constants(one.paper) for one in (weighted, certificates_of(loaded, late_periods=0))
-    )
+    better, plain = (constants(one.paper) for one in (weighted, certificates_of(loaded, late_periods=0)))
     assert better.delta <= 5.0
     # In the Euclidean norm: an event's error, at most β in the chosen one, followed by e^{Hτ}.
     found, G = constants(weighted.schedule), loop_of(weighted.scenario).H + 0.25 * np.eye(2)
@@ -151,12 +147,8 @@ def test_a_plant_outside_its_box_is_named() -> None:
         "plant.B=[[0.0],[1.0]]",
     )  # fmt: skip
     message = outside_box(outside)
-    assert message == (
-        "the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3"
-    )
-    claims = [
-        c for c in ClaimEvaluation(simulate(outside)).judge() if c.source == "box certificate"
-    ]
+    assert message == ("the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3")
+    claims = [c for c in ClaimEvaluation(simulate(outside)).judge() if c.source == "box certificate"]
     assert claims
     assert {(c.verdict, c.since_s) for c in claims} == {("void", 0.0)}
 

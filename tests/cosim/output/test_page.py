@@ -154,9 +154,7 @@ def test_user_text_is_escaped(content: dict[str, Any], tmp_path: Path) -> None:
         make_record(scenario),
         tmp_path,
         exit={"status": 1, "reason": HOSTILE},
-        claims=[
-            CLAIM | dict.fromkeys(("what", "source", "bound", "why"), HOSTILE) | {"verdict": "void"}
-        ],
+        claims=[CLAIM | dict.fromkeys(("what", "source", "bound", "why"), HOSTILE) | {"verdict": "void"}],
         assumptions=[dict.fromkeys(("what", "source", "verdict", "why"), HOSTILE)],
         assumption_violations=[dict.fromkeys(("process", "cause", "what"), HOSTILE) | {"t_s": 1.0}],
         fidelity={"reason": HOSTILE},
@@ -187,9 +185,7 @@ def test_the_report_names_what_is_not_explained_or_not_replayed(record: RunRecor
         "The record has gaps",
     ):  # fmt: skip
         assert words in text
-    text = shown(
-        record, fidelity={"reason": "it diverged"}, replay={"bit_exact": None, "error": "KeyError"}
-    )
+    text = shown(record, fidelity={"reason": "it diverged"}, replay={"bit_exact": None, "error": "KeyError"})
     assert "Not compared with the ideal loop: it diverged." in text
     assert "Nothing could be replayed: KeyError." in text
     exact = {"bit_exact": True, "complete": True, "inputs": 10001, "first_difference": None}

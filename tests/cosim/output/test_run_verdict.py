@@ -41,9 +41,7 @@ def printed(outcome: Outcome, *, verbose: bool = False, **changed: Any) -> str:
     """The output on a terminal of 80 columns, colours included."""
     file = io.StringIO()
     console = Console(file=file, width=80, force_terminal=True, color_system="standard")
-    print_outcome(
-        console, replace(outcome, summary=with_values(outcome.summary, **changed)), verbose=verbose
-    )
+    print_outcome(console, replace(outcome, summary=with_values(outcome.summary, **changed)), verbose=verbose)
     return file.getvalue()
 
 
@@ -139,9 +137,7 @@ def test_the_verdict_of_several_loops_counts_them(tmp_path: Path) -> None:
     summary = run.summary
     first, second, _ = verdict(summary)
     assert re.fullmatch(r"completed 2 s: \d of 4 loops (stable|bounded).*", first.text)
-    assert re.fullmatch(
-        r"guarantee kept in all 4 loops: \d+ claims held, none violated", second.text
-    )
+    assert re.fullmatch(r"guarantee kept in all 4 loops: \d+ claims held, none violated", second.text)
     loops = [*summary.loops]
     loops[2] = loops[2].model_copy(update={"claims": [Claim(**claim("violated"))]})
     broken = verdict(summary.model_copy(update={"loops": loops}))[1]

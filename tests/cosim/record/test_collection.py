@@ -45,9 +45,7 @@ def run_dir(whole: RunRecord, tmp_path: Path) -> Path:
     found.mkdir(parents=True)
     run_directory.write_scenario(whole.scenario, found)
     run_directory.write_environment(found, "live", RUN)
-    reports = {
-        role: one | {"process": role, "generation": 0} for role, one in whole.reports.items()
-    }
+    reports = {role: one | {"process": role, "generation": 0} for role, one in whole.reports.items()}
     del reports["controller"]
     (found / run_directory.REPORTS_FILE).write_text(json.dumps(reports))
     joined = {WRITER[role]: {"process": role, "generation": 0} for role in SECRETS}
@@ -96,9 +94,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_kept_rows_complete_the_record_also_twice(
-    run_dir: Path, kept: Kept, whole: RunRecord
-) -> None:
+def test_kept_rows_complete_the_record_also_twice(run_dir: Path, kept: Kept, whole: RunRecord) -> None:
     kept.keep()
     for _ in range(2):
         _, roles = collect(run_dir, str(kept.folder), finish_record)
@@ -245,9 +241,7 @@ def test_a_record_that_cannot_be_completed_changes_nothing(
     assert contents(run_dir.parent) == before
 
 
-def test_what_is_no_kept_folder_of_this_run_is_refused(
-    run_dir: Path, kept: Kept, tmp_path: Path
-) -> None:
+def test_what_is_no_kept_folder_of_this_run_is_refused(run_dir: Path, kept: Kept, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="nothing was kept there"):
         collect(run_dir, str(tmp_path), finish_record)
     kept.keep()

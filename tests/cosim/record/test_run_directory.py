@@ -123,9 +123,7 @@ def test_a_run_of_another_user_is_not_opened(runs: Path, whose: str) -> None:
     if os.geteuid() != 0:
         pytest.skip("only root may give a file to another user")
     point_to_latest(runs / "first")
-    os.chown(
-        runs / (LATEST if whose == "link" else "first"), ANOTHER_UID, -1, follow_symlinks=False
-    )
+    os.chown(runs / (LATEST if whose == "link" else "first"), ANOTHER_UID, -1, follow_symlinks=False)
     for opened in (
         lambda: latest_run(runs),
         lambda: chosen_run(runs / LATEST, Path("elsewhere")),

@@ -71,9 +71,7 @@ def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") ->
     out.close()
 
 
-def same_rows(
-    run_dir: Path, shared: RecordedRun, early: Mapping[str, int] | None = None
-) -> list[str]:
+def same_rows(run_dir: Path, shared: RecordedRun, early: Mapping[str, int] | None = None) -> list[str]:
     """Finish a record and compare its rows; return the tables that were still to be written."""
     written: list[str] = []
 
@@ -97,9 +95,7 @@ def opened(shared: RecordedRun, run_dir: Path) -> Path:
     return run_dir
 
 
-def test_every_row_and_line_reaches_the_record_of_its_loop(
-    shared: RecordedRun, tmp_path: Path
-) -> None:
+def test_every_row_and_line_reaches_the_record_of_its_loop(shared: RecordedRun, tmp_path: Path) -> None:
     run_dir = opened(shared, tmp_path / "run")
     for table, rows in mixed_rows(shared).items():
         spool(run_dir, table, rows)
@@ -190,9 +186,7 @@ def _fail(*_: object) -> None:
     raise OSError(28, "No space left on device")
 
 
-def test_a_loops_reports_count_its_own_rows_and_datagrams(
-    shared: RecordedRun, tmp_path: Path
-) -> None:
+def test_a_loops_reports_count_its_own_rows_and_datagrams(shared: RecordedRun, tmp_path: Path) -> None:
     """A row of the network that is missing is missing in every loop."""
     run_dir = opened(shared, tmp_path / "run")
     rows = dict(mixed_rows(shared))

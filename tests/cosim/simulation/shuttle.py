@@ -104,11 +104,7 @@ class Loops:
 
     def _due(self) -> list[tuple[int, int]]:
         due = (machine.next_deadline_ns() for machine in self._machines)
-        return [
-            (t_ns + self._phases_ns[loop], loop)
-            for loop, t_ns in enumerate(due)
-            if t_ns is not None
-        ]
+        return [(t_ns + self._phases_ns[loop], loop) for loop, t_ns in enumerate(due) if t_ns is not None]
 
     def _numbered(self, loop: int, output: Any) -> Any:
         if isinstance(output, Record):
@@ -173,8 +169,7 @@ class Shuttle:
         """Return the record of a run of one loop."""
         (scenario,) = self.loops
         rows = {
-            table: np.array(self.rows.get(table, []), dtype)
-            for table, dtype in tables_of(scenario).items()
+            table: np.array(self.rows.get(table, []), dtype) for table, dtype in tables_of(scenario).items()
         }
         reports: dict[str, Any] = {}
         for role in LOOP_ROLES:

@@ -60,9 +60,7 @@ def run(content: dict[str, Any], **seeds: int) -> RunRecord:
 def test_the_estimation_error_agrees_with_the_filters_covariance(observed: dict[str, Any]) -> None:
     """Over N runs Σ eᵀP⁻¹e is χ² with 2N degrees of freedom (Bar-Shalom, Li, Kirubarajan 2001)."""
     N, covariance = 80, steady_state(resolved(observed)).covariance
-    ends = np.array(
-        [estimation_error(run(observed, disturbance=s, noise=s + 1000))[-1] for s in range(N)]
-    )
+    ends = np.array([estimation_error(run(observed, disturbance=s, noise=s + 1000))[-1] for s in range(N)])
     distance = float(np.einsum("ki,ij,kj->", ends, np.linalg.inv(covariance), ends))
     low, high = chi2.ppf([5e-4, 1 - 5e-4], 2 * N)
     assert low < distance < high
@@ -136,9 +134,7 @@ def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> 
     assert found["max"] == pytest.approx(norms.max())
     assert found["rms"] == pytest.approx(np.sqrt((norms**2).mean()))
     assert (found["observer"], found["outputs"], found["noise_std"]) == ("kalman", 1, [0.02])
-    assert found["expected_rms"] == pytest.approx(
-        np.sqrt(np.trace(steady_state(record.scenario).covariance))
-    )
+    assert found["expected_rms"] == pytest.approx(np.sqrt(np.trace(steady_state(record.scenario).covariance)))
     assert found["sup_e_c_norm"] > 0
     # Without an observer, noisy measurements are used as x.
     del observed["observer"]

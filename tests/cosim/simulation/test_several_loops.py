@@ -48,9 +48,7 @@ def run(content: Content, *loops: Content) -> RecordedRun:
 
 @pytest.mark.parametrize("protocol", ["none", "ack"])
 @pytest.mark.parametrize("delay", [[], [{"kind": "delay", "delay_s": 0.012, "jitter_s": 0.009}]])
-def test_the_first_loop_is_the_run_without_loops(
-    short: Content, protocol: str, delay: list[Content]
-) -> None:
+def test_the_first_loop_is_the_run_without_loops(short: Content, protocol: str, delay: list[Content]) -> None:
     """Losses and delays are drawn per flow: other loops do not change the first."""
     short["network"] |= {"protocol": protocol, "impairments": delay}
     alone = simulate(resolve(validate(short, "here")))

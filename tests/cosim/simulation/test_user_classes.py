@@ -194,9 +194,7 @@ def simulated(path: Path, horizon_s: float = 1.0) -> Path:
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_an_fmu_moves_like_a_python_class_with_the_same_equations(
-    version: int, tmp_path: Path
-) -> None:
+def test_an_fmu_moves_like_a_python_class_with_the_same_equations(version: int, tmp_path: Path) -> None:
     path = prepared(tmp_path, FMU, "{ mu = 1.0 }")
     build(tmp_path, version).rename(tmp_path / "models" / "oscillator.fmu")
     of_fmu = load_record(simulated(path, 3.0))
@@ -209,17 +207,13 @@ def test_an_fmu_moves_like_a_python_class_with_the_same_equations(
     np.testing.assert_allclose(of_fmu[PLANT_STEP]["z"], energy, rtol=1e-12)
     assert replay(of_fmu).bit_exact
     assert replay(of_class).bit_exact
-    path.write_text(
-        PLANT_SCENARIO.replace("SYSTEM", FMU).replace("PARAMETERS", "{}, initial_variables = []")
-    )
+    path.write_text(PLANT_SCENARIO.replace("SYSTEM", FMU).replace("PARAMETERS", "{}, initial_variables = []"))
     at_rest = resolve(load(path, ["plant.initial_state=[0.0, 0.0]"]))
     assert isinstance(linearisation(at_rest), NoLinearisationPart)
 
 
 @pytest.mark.parametrize("kind", ["fmu", "python"])
-def test_a_run_stores_its_plant_and_is_replayed_without_the_original(
-    kind: str, tmp_path: Path
-) -> None:
+def test_a_run_stores_its_plant_and_is_replayed_without_the_original(kind: str, tmp_path: Path) -> None:
     path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, "{ mu = 2.0 }")
     build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
     run_dir = simulated(path)

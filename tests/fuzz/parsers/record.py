@@ -91,9 +91,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
         for role, report in record.reports.items()
     }
     kind = "live" if live else "simulated"
-    run = alone(
-        RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated")
-    )
+    run = alone(RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated"))
     own = summarise(run.loop(), 0, "finished").to_json()
     own |= {
         "replay": replay(record).verdict().model_dump(),
@@ -237,9 +235,7 @@ def telemetry_input(data: bytes) -> None:
                 queries.append(_report(choices))
                 plane.put("report", queries[-1])
             case 1:
-                plane.put(
-                    "alive", Sample(f"noack/0/alive/{choices.one([*OWNER.values(), ''])}/one")
-                )
+                plane.put("alive", Sample(f"noack/0/alive/{choices.one([*OWNER.values(), ''])}/one"))
             case _:
                 plane.put("telemetry", _batch(choices))
     with redirect_stderr(io.StringIO()) as errors:

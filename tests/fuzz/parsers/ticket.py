@@ -12,12 +12,7 @@ from noack.core.clock import RunClock
 from noack.core.errors import PeerError
 from noack.protocol.topology import ROLES
 from noack.runtime import join_ticket, run_registry
-from noack.runtime.control_messages import (
-    ChangeAnnouncement,
-    ChangeReply,
-    ChangeRequest,
-    parse_message,
-)
+from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.private_folder import open_private
 from noack.scenario.parameter_changes import ChangeSchedule, settings_bytes, settings_of
 from noack.scenario.resolution import resolve
@@ -75,9 +70,7 @@ def barrier_input(data: bytes) -> None:
         role = choices.one([*ROLES, "nobody", ""])
         match choices.below(6):
             case 0:
-                plane.put(
-                    "ended", Sample(f"noack/0/ended/{role}/one", _barrier_bytes(choices, "gone"))
-                )
+                plane.put("ended", Sample(f"noack/0/ended/{role}/one", _barrier_bytes(choices, "gone")))
             case 1:
                 plane.put("progress", Sample("noack/0/progress", _barrier_bytes(choices, PROGRESS)))
                 progress = barrier.progress()
@@ -149,9 +142,7 @@ def changes_input(data: bytes) -> None:
             _announce(_changes_bytes(choices, ANNOUNCED))
         case 2:
             with refusal("not a valid change reply"):
-                assert isinstance(
-                    parse_message(ChangeReply, _changes_bytes(choices, ANSWER)).run_dir, str
-                )
+                assert isinstance(parse_message(ChangeReply, _changes_bytes(choices, ANSWER)).run_dir, str)
         case _:
             _find(_changes_bytes(choices, RUN))
 

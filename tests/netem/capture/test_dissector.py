@@ -133,9 +133,7 @@ def test_the_documented_command_and_the_packet_list(tshark: Tshark, tmp_path: Pa
     (command,) = re.findall(r"^```sh\n(.*?)\n```", (DOCS / "wire.md").read_text(), re.DOTALL | re.M)
     (tmp_path / "docs").symlink_to(DOCS)
     encoder = Encoder(RUN, bytes(32))
-    messages = [
-        Message(Flow(1 + k % 3), k, k * 10**9 - 2, np.array([k - 5.0, 0.5])) for k in range(6)
-    ]
+    messages = [Message(Flow(1 + k % 3), k, k * 10**9 - 2, np.array([k - 5.0, 0.5])) for k in range(6)]
     path = capture_of(tmp_path, *map(encoder.encode, messages))
     done = subprocess.run(
         shlex.split(command), cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60

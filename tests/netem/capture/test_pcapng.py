@@ -100,9 +100,7 @@ def test_the_largest_datagram_fits(family: int, most: int) -> None:
 
 
 @given(events, st.data())
-def test_events_of_any_numbers_are_refused_or_written(
-    described: dict[str, Any], data: st.DataObject
-) -> None:
+def test_events_of_any_numbers_are_refused_or_written(described: dict[str, Any], data: st.DataObject) -> None:
     table, payload = batch({}, described)
     fields = data.draw(st.lists(st.sampled_from(EVENT.names), max_size=3, unique=True))
     for name in fields:

@@ -29,7 +29,7 @@ def specs(arguments: str) -> tuple[LinkSpec, ...]:
     [
         ("", "", "", {}),
         ("'loss 5%' 'mansd 4'", "loss 5% mansd 4", "", {}),
-        ("rate 1mbit -14", "rate 1mbit -14", "", {}),
+        ("rate 1mbit -14 queue 5 --reverse loss 5%", "rate 1mbit -14 queue 5", "loss 5%", {}),
         ("--reverse 'delay 3ms' --seed 3", "", "delay 3ms", {"seed": 3}),
         ("--both loss 5%", "loss 5%", "loss 5%", {}),
         ("loss 5% --seed 7 delay 1ms", "loss 5% delay 1ms", "", {"seed": 7}),
@@ -119,9 +119,7 @@ def explain(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 def test_words_are_explained(explain: Explain) -> None:
     out = " ".join(explain("loss burst 5% 3 mansd 2 first").split())
     assert "the bad state begins with probability 1.75439% per packet" in out
-    assert (
-        "mansd 2 the cap (M − 1): at most 2 consecutive packets of a flow are not delivered" in out
-    )
+    assert "mansd 2 the cap (M − 1): at most 2 consecutive packets of a flow are not delivered" in out
     assert "first the first packet of each flow is always delivered" in out
     assert "expected loss rate: 3.947% (without the guarantee 5%)" in out
     assert "tc qdisc add dev DEVICE root netem limit 16384 loss gemodel" in out

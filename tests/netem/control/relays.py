@@ -53,9 +53,7 @@ class FakeRelay(Relay):
     def __init__(self, *names: str) -> None:
         self.specs: Sequence[LinkSpec] = [spec_of(name) for name in names]
         self.counters = {(name, side): Counters() for name in names for side in DIRECTIONS}
-        self.settings = {
-            (spec.name, side): getattr(spec, side) for spec in self.specs for side in DIRECTIONS
-        }
+        self.settings = {(spec.name, side): getattr(spec, side) for spec in self.specs for side in DIRECTIONS}
         self.unintended: dict[str, int] = {"lost_in_kernel": 0, "send_errors": 0}
         self.delays = times()
         self.lateness = times()

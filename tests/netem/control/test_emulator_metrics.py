@@ -90,9 +90,7 @@ def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(
         values = values_of(reading.result())
     assert threading.active_count() == threads
     assert values["noack_netem_received_datagrams_total,forward,up"] == 4
-    assert (
-        capfd.readouterr().err == f"noack netem: metrics: http://127.0.0.1:{asked[0][1]}/metrics\n"
-    )
+    assert capfd.readouterr().err == f"noack netem: metrics: http://127.0.0.1:{asked[0][1]}/metrics\n"
 
 
 def test_invalid_options_are_refused_before_the_relay_runs(relay: FakeRelay) -> None:
@@ -114,9 +112,7 @@ def test_attachments_end_with_the_relay(relay: FakeRelay, tmp_path: Path) -> Non
     threads = threading.active_count()
     file = tmp_path / "lines"
     interval = sys.getswitchinterval()
-    with attached(
-        relay, options("--control", "lab", "--stats", "0.01", "--stats-file", str(file))
-    ) as side:
+    with attached(relay, options("--control", "lab", "--stats", "0.01", "--stats-file", str(file))) as side:
         assert running() == ["lab"]
         assert sys.getswitchinterval() < interval
         for _ in range(3):
@@ -186,9 +182,7 @@ def test_a_command_fails_at_once_if_the_relay_has_ended(relay: FakeRelay) -> Non
     assert commands.look().links[0].name == "up"
 
 
-def test_a_command_to_a_stuck_relay_times_out(
-    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_command_to_a_stuck_relay_times_out(relay: FakeRelay, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("netem.control.emulator_statistics._PATIENCE_S", 0.01)
     commands = CommandQueue(relay)
     with pytest.raises(PeerError, match="has not answered for"):

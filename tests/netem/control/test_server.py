@@ -94,9 +94,7 @@ def test_a_mistake_gets_the_approved_line_and_changes_nothing(
     compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
     with open_session(EMULATORS, "lab", listen=False) as connection:
         for payload in ("{", "[]", "null", b"\xff\xfe"):
-            replies = connection.get(
-                "netem/lab/change", FifoChannel(4), payload=payload, timeout=60
-            )
+            replies = connection.get("netem/lab/change", FifoChannel(4), payload=payload, timeout=60)
             (error,) = [reply.err for reply in replies if reply.err is not None]
             assert error.payload.to_string() == "a query is a JSON object"
     assert relay.changes == 0
@@ -208,9 +206,7 @@ def test_watch_fails_when_the_emulator_ends(
 
 
 @pytest.mark.usefixtures("server")
-def test_watch_redraws_on_a_terminal_until_q(
-    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_watch_redraws_on_a_terminal_until_q(relay: FakeRelay, monkeypatch: pytest.MonkeyPatch) -> None:
     relay.counters["up", "forward"].received = 7
     with terminal(monkeypatch) as user:
         with ThreadPoolExecutor() as threads:
@@ -252,8 +248,7 @@ def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFi
 
         assert emulator_commands.main(["set", "lab", "loss 5%"]) == ExitStatus.OK
         assert capsys.readouterr().err == (
-            "noack netem set: relay forward no longer has mansd 2; the words replaced "
-            "all settings\n"
+            "noack netem set: relay forward no longer has mansd 2; the words replaced all settings\n"
         )
         emulator.finish()
     assert running() == []

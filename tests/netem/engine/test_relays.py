@@ -63,9 +63,7 @@ def test_both_directions_work_over_both_versions_of_ip(here: int, there: int) ->
             assert all(drain(client) == [] for client in clients)
             report = one.report()
         assert (report.clients, report.clients_ever) == (2, 2)
-        assert {flow.client for flow in report.forward.flows} == {
-            text_of(name_of(one)) for one in clients
-        }
+        assert {flow.client for flow in report.forward.flows} == {text_of(name_of(one)) for one in clients}
 
 
 @IP_VERSIONS
@@ -205,9 +203,7 @@ def test_more_clients_than_allowed_are_refused_and_counted(
 
 
 @pytest.mark.parametrize("return_path", [True, False])
-def test_send_errors_are_counted_by_reason(
-    return_path: bool, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_send_errors_are_counted_by_reason(return_path: bool, capfd: pytest.CaptureFixture[str]) -> None:
     """The kernel refuses broadcasts from a socket without the broadcast option."""
     spec = link(("255.255.255.255", 9), return_path=return_path)
     with endpoints(V4) as (client,), running([spec]) as one:

@@ -31,15 +31,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.machine_parts import Machine
 from tests.netem import any_settings
-from tests.netem.engine.relays import (
-    PATIENCE_S,
-    KeepAll,
-    Received,
-    drain,
-    endpoints,
-    name_of,
-    relayed,
-)
+from tests.netem.engine.relays import PATIENCE_S, KeepAll, Received, drain, endpoints, name_of, relayed
 from tests.oracles.link import Datagram, Link, network_of
 
 NEVER_NS = 2**61
@@ -58,9 +50,7 @@ arrivals = st.lists(
 class Both:
     """Both machines; each input is given to both."""
 
-    def __init__(
-        self, resolved: Any, start: Start, sockets: list[socket.socket], loops: int
-    ) -> None:
+    def __init__(self, resolved: Any, start: Start, sockets: list[socket.socket], loops: int) -> None:
         self.loops = loops
         self.plain: Machine[Datagram] = network_of(resolved, start, loops=self.loops)
         self.compiled: Any = RunNetwork(resolved, start, self.loops)
@@ -118,9 +108,7 @@ def both(resolved: Any, start: Start = BEGINNING, loops: int = 1) -> Iterator[Bo
 def network(forward: LinkSettings, reverse: LinkSettings, *flows: Flow) -> SimpleNamespace:
     """Return what the machines read of a scenario."""
     links = (forward, reverse)
-    network = SimpleNamespace(
-        link=forward, flows=flows, link_of=lambda flow: links[flows.index(flow)]
-    )
+    network = SimpleNamespace(link=forward, flows=flows, link_of=lambda flow: links[flows.index(flow)])
     return SimpleNamespace(network=network, seeds=SimpleNamespace(loss=0))
 
 
@@ -196,9 +184,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
     published: Counter[str] = Counter()
     delay = 'network.impairments=[{kind="delay", delay_s=0.001}]'
     lossless = 'network.loss={model="lossless"}'
-    scenario = resolve(
-        load(find_shipped("lane_following", "scenarios"), ["speed=2.0", lossless, delay])
-    )
+    scenario = resolve(load(find_shipped("lane_following", "scenarios"), ["speed=2.0", lossless, delay]))
     tables = {table: of for table, of in tables_of(scenario).items() if OWNER[table] == "netem"}
     telemetry = TelemetryBuffer(tables, lambda table, _, rows: published.update({table: len(rows)}))
     updates = (Message(Flow.UPDATE, k, 0, np.zeros(2), 0) for k in range(early + later))

@@ -106,9 +106,7 @@ def test_events_beyond_the_queue_limit_are_reported_missing_at_once(
         read_fates(path)
 
 
-def test_the_relay_continues_if_the_file_cannot_grow(
-    path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_relay_continues_if_the_file_cannot_grow(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
@@ -199,8 +197,7 @@ def test_a_missing_or_repeated_packet_or_value_is_refused(tmp_path: Path) -> Non
 
 
 BAD = settings_of(
-    "loss gemodel 20% 40% duplicate 40% corrupt 40% delay 100us 100us rate 50mbit queue 3 "
-    "mansd 3 limit 12"
+    "loss gemodel 20% 40% duplicate 40% corrupt 40% delay 100us 100us rate 50mbit queue 3 mansd 3 limit 12"
 )
 """Every impairment acts, frequently."""
 

@@ -147,9 +147,7 @@ def test_every_bit_is_flipped_with_the_same_probability(
 
 
 @pytest.mark.parametrize("gap", [1, 5])
-def test_reordered_packets_leave_at_once(
-    decide: Any, share_is: Callable[..., None], gap: int
-) -> None:
+def test_reordered_packets_leave_at_once(decide: Any, share_is: Callable[..., None], gap: int) -> None:
     decided = decide(f"delay 10ms reorder 30% gap {gap}", 100_000)
     at_once = decided.delays_ns == 0
     assert set(decided.delays_ns.tolist()) == {0, 10_000_000}

@@ -180,9 +180,7 @@ def test_common_states_at_a_distance_follow_the_powers_of_the_matrix(every: int)
 
 
 @given(st.sets(st.integers(0, 50), min_size=2), st.none() | st.integers(0, 30))
-def test_every_packet_is_lost_from_begin_until_just_before_end(
-    borders: set[int], extra: int | None
-) -> None:
+def test_every_packet_is_lost_from_begin_until_just_before_end(borders: set[int], extra: int | None) -> None:
     ends = sorted(borders)[: len(borders) // 2 * 2]
     intervals = list(zip(ends[::2], ends[1::2], strict=True))
     period = None if extra is None else ends[-1] + extra

@@ -228,9 +228,7 @@ def reference(
     return [leaves_ns[number] for number in range(len(arrivals))]
 
 
-def emulated(
-    arrivals: Sequence[tuple[int, int]], codel: Codel, mansd: int | None = None
-) -> list[int | None]:
+def emulated(arrivals: Sequence[tuple[int, int]], codel: Codel, mansd: int | None = None) -> list[int | None]:
     rate = Rate(rate_bps=RATE_BPS, queue=100_000, overhead_bytes=0, discipline=codel)
     link = Link(LinkSettings(impairments=(rate,), mansd=mansd, limit=1_000_000), 0, "a")
     found = [link.decide(0, size, t).release_ns for t, size in arrivals]

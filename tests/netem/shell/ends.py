@@ -55,9 +55,7 @@ class Client:
                     found = int(numbers, 16)
                     return [k for k in range(found.bit_length()) if found >> k & 1]
 
-    def exchange(
-        self, flow: str, count: int, interrupt: Callable[[int, str], None]
-    ) -> dict[str, object]:
+    def exchange(self, flow: str, count: int, interrupt: Callable[[int, str], None]) -> dict[str, object]:
         """Send numbered datagrams; return the client's port, and what came there and back."""
         back: list[int] = []
         with socket.socket(FAMILIES[flow], socket.SOCK_DGRAM) as endpoint:
@@ -78,9 +76,7 @@ def change_after(last: int, words: str, name: str) -> Callable[[int, str], None]
 
     def interrupt(number: int, port: str) -> None:
         while number == last:
-            shown = subprocess.run(
-                [*netem, "show", name, "--json"], capture_output=True, check=True
-            )
+            shown = subprocess.run([*netem, "show", name, "--json"], capture_output=True, check=True)
             flows = json.loads(shown.stdout)["links"][0]["forward"]["flows"]
             if any(f":{port} " in one["client"] and one["packets"] > number for one in flows):
                 subprocess.run([*netem, "set", name, *words.split()], check=True)

@@ -24,9 +24,7 @@ PATIENCE_S = 120
 
 
 def run(*words: str, **how: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*SHELL, *words], capture_output=True, text=True, timeout=PATIENCE_S, **how
-    )
+    return subprocess.run([*SHELL, *words], capture_output=True, text=True, timeout=PATIENCE_S, **how)
 
 
 @cache
@@ -99,9 +97,7 @@ class Totals:
             if row["direction"] == direction and row["flow"] == found["flow"]
         ]  # fmt: skip
         assert len(rows) == found["packets"]
-        return {row["packet"] for row in rows if row["fate"] == Fate.DROPPED}, found[
-            "longest_loss_burst"
-        ]
+        return {row["packet"] for row in rows if row["fate"] == Fate.DROPPED}, found["longest_loss_burst"]
 
 
 def test_the_ends_miss_exactly_what_the_emulator_drops(tmp_path: Path) -> None:
@@ -170,9 +166,7 @@ def test_shells_nest_and_programs_work(tmp_path: Path) -> None:
     assert min(trips_ms) >= 70
 
 
-@pytest.mark.parametrize(
-    ("command", "status"), [("exit 7", 7), ("kill -9 $$", 128 + 9), ("true", 0)]
-)
+@pytest.mark.parametrize(("command", "status"), [("exit 7", 7), ("kill -9 $$", 128 + 9), ("true", 0)])
 def test_the_status_of_the_command_is_that_of_the_shell(command: str, status: int) -> None:
     assert run("--", "sh", "-c", command).returncode == status
 

@@ -190,9 +190,7 @@ def exchanges(
         yield end_ps, ended
 
 
-def check_run(
-    offset: ClockOffset, random: Random, offset_ns: int, rate_ppb: int, number: int
-) -> None:
+def check_run(offset: ClockOffset, random: Random, offset_ns: int, rate_ppb: int, number: int) -> None:
     """Fail if an interval does not contain the truth, or is wider than the newest exchange."""
     begin_ns = random.randint(0, 10**15)
     truth = TrueOffset(random, begin_ns, offset_ns, rate_ppb)
@@ -216,9 +214,7 @@ def check_contains(interval: OffsetInterval, truth: int) -> None:
 NS_PER_S = 10**9
 CHECKS = 500  # exchanges in each of 25 examples
 seeds = st.integers(0, 2**32)
-offsets_ns = st.sampled_from([0, NS_PER_S, -NS_PER_S, 86_400 * NS_PER_S]) | st.integers(
-    -(10**15), 10**15
-)
+offsets_ns = st.sampled_from([0, NS_PER_S, -NS_PER_S, 86_400 * NS_PER_S]) | st.integers(-(10**15), 10**15)
 rates_ppb = st.sampled_from([0, 1, 200_000, RELATIVE_RATE_PPB, 10**8])
 
 
@@ -247,9 +243,7 @@ def test_the_bound_is_attained(rate_ppb: int, offset_ns: int, ages_ns: list[int]
         drift_ns = rate_ppb * age_ns // 10**9
         assert 0 <= found.upper_ns - (offset_ns + drift_ns) <= 3
         assert 0 <= (offset_ns - drift_ns) - found.lower_ns <= 3
-        assert found.error_ns == max(
-            found.upper_ns - found.midpoint_ns, found.midpoint_ns - found.lower_ns
-        )
+        assert found.error_ns == max(found.upper_ns - found.midpoint_ns, found.midpoint_ns - found.lower_ns)
 
 
 def test_an_exchange_that_contradicts_itself_is_not_used() -> None:

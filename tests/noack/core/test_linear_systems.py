@@ -65,9 +65,7 @@ def test_cached_and_fresh_matrices_are_the_same_bits(A: Matrix, steps: list[int]
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32))
-def test_a_product_rounds_each_term_and_then_each_sum_from_the_left(
-    p: int, n: int, seed: int
-) -> None:
+def test_a_product_rounds_each_term_and_then_each_sum_from_the_left(p: int, n: int, seed: int) -> None:
     random = np.random.default_rng(seed)
     matrix, vector = random.standard_normal((p, n)), random.standard_normal(n)
     by_hand = []

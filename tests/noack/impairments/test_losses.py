@@ -92,9 +92,7 @@ KEPT = [
 
 
 def process(*impairments: dict[str, object], first: bool = False) -> LossProcess:
-    return loss_process(
-        LinkSettings.model_validate({"impairments": impairments, "first_delivered": first})
-    )
+    return loss_process(LinkSettings.model_validate({"impairments": impairments, "first_delivered": first}))
 
 
 def probability(losses: LossProcess, outcomes: tuple[bool, ...]) -> float:
@@ -103,9 +101,7 @@ def probability(losses: LossProcess, outcomes: tuple[bool, ...]) -> float:
     for number, lost in enumerate(outcomes):
         weights = weights @ losses.moves
         forced = number == 0 and losses.first_delivered
-        weights = weights * (
-            float(not lost) if forced else losses.lost if lost else 1 - losses.lost
-        )
+        weights = weights * (float(not lost) if forced else losses.lost if lost else 1 - losses.lost)
     return float(weights.sum())
 
 

@@ -61,9 +61,7 @@ def outputs_of(part: Part, seed: int, rows: int = 1024) -> list[list[Any]]:
 
 
 @given(sizes(), st.sampled_from(["plant", "sensor", "controller"]), st.integers(0, 1000))
-def test_tables_that_are_full_after_each_row_change_nothing(
-    of: Sizes, role: str, number: int
-) -> None:
+def test_tables_that_are_full_after_each_row_change_nothing(of: Sizes, role: str, number: int) -> None:
     expected = outputs_of(part_of(role, number, of), number)
     assert outputs_of(part_of(role, number, of), number, rows=1) == expected
 

@@ -48,9 +48,7 @@ def test_van_der_pol_agrees_with_another_integrator(version: int, tmp_path: Path
     def van_der_pol(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
         return float(z[1]), 2.0 * (1.0 - z[0] ** 2) * z[1] - z[0] + v[0]
 
-    system = FmuSystem(
-        settings(build(tmp_path, version), parameters={"mu": 2}, on_record=("energy",)), X0
-    )
+    system = FmuSystem(settings(build(tmp_path, version), parameters={"mu": 2}, on_record=("energy",)), X0)
     np.testing.assert_allclose(
         motion(system, INPUTS),
         motion(OdeSystem(PlantEquations(van_der_pol), X0), INPUTS),
@@ -111,8 +109,7 @@ def test_settings_that_do_not_fit_the_fmu_are_refused_with_the_approved_line(
 
     def refusal(more: str) -> list[str]:
         given = {
-            key: tuple(value) if isinstance(value, list) else value
-            for key, value in json.loads(more).items()
+            key: tuple(value) if isinstance(value, list) else value for key, value in json.loads(more).items()
         }
         (line,) = lines_of_error(lambda: FmuSystem(settings(fmu, **given), X0))
         for old, new in (("Integer", "Int32"), ("Real", "Float64")):  # types of FMI 2
@@ -168,8 +165,7 @@ def test_only_folders_left_by_killed_processes_are_removed(
     tmp_path: Path, own_folder_for_temporary_files: Path
 ) -> None:
     left, used, other = (
-        own_folder_for_temporary_files / name
-        for name in ("noack-native-left", "noack-native-used", "other")
+        own_folder_for_temporary_files / name for name in ("noack-native-left", "noack-native-used", "other")
     )
     for folder in (left, used, other):
         (folder / "inside").mkdir(parents=True)

@@ -11,13 +11,7 @@ from scipy.linalg import expm, logm
 from noack.core.errors import CallerError
 from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.linear import LinearSystem
-from noack.plants.plant_settings import (
-    OdeSystem,
-    PlantEquations,
-    PlantStart,
-    PlantSystem,
-    SystemFailedError,
-)
+from noack.plants.plant_settings import OdeSystem, PlantEquations, PlantStart, PlantSystem, SystemFailedError
 from noack.plants.systems.linearisation import (
     NO_LOGARITHM,
     NOT_FINITE,
@@ -52,9 +46,7 @@ class Moved:
 def test_a_pendulum_has_its_jacobian_at_any_point(angle: float) -> None:
     found = linearise(system, 2, 1, at=np.array([angle, 0.2]), held=np.array([0.3]))
     sine, cosine = math.sin(angle), math.cos(angle)
-    np.testing.assert_allclose(
-        found.A, [[0, 1], [9.81 * cosine - 0.3 * sine, -0.1]], rtol=1e-9, atol=1e-9
-    )
+    np.testing.assert_allclose(found.A, [[0, 1], [9.81 * cosine - 0.3 * sine, -0.1]], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found.B, [[0], [cosine]], rtol=1e-9)
     np.testing.assert_allclose(found.drift, [0.2, 9.81 * sine - 0.02 + 0.3 * cosine], rtol=1e-12)
     assert found.source == "derivative"
@@ -151,9 +143,7 @@ def test_the_pendulum_of_gymnasium_has_the_logarithm_of_its_step() -> None:
     """ω' = ω + (15 sin θ + 3u) h and θ' = θ + ω' h, with θ = 0 upright, h = 0.05 s."""
     pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
     settings, h = GymnasiumSettings(kind="gymnasium", id="Pendulum-v1"), 0.05
-    found = linearise(
-        lambda x0: settings.system(start()._replace(x0=x0)), 2, 1, step_ns=round(h * 1e9)
-    )
+    found = linearise(lambda x0: settings.system(start()._replace(x0=x0)), 2, 1, step_ns=round(h * 1e9))
     step = np.array([[1 + 15 * h * h, h, 3 * h * h], [15 * h, 1, 3 * h], [0, 0, 1]])
     expected = logm(step) / h
     np.testing.assert_allclose(found.A, expected[:2, :2], atol=1e-6)

@@ -36,9 +36,7 @@ def settings(**given: Any) -> DcMotorSettings:
 def published() -> signal.TransferFunction:
     """θ(s)/V(s) = K/(s((Js + b)(Ls + R) + K²)), University of Michigan, "DC Motor Position"."""
     J, b, K, R, L = 3.2284e-6, 3.5077e-6, 0.0274, 4.0, 2.75e-6
-    return signal.TransferFunction(
-        [K], np.polymul([1, 0], np.polyadd(np.polymul([J, b], [L, R]), [K**2]))
-    )
+    return signal.TransferFunction([K], np.polymul([1, 0], np.polyadd(np.polymul([J, b], [L, R]), [K**2])))
 
 
 def test_the_step_response_is_the_published_transfer_functions() -> None:
@@ -67,9 +65,7 @@ def reference(motor: DcMotorSettings, x: np.ndarray, voltage: float, end_s: floa
             return float(s * z[1] if s else abs(K * z[2]) - T_c)
 
         change.terminal, change.direction = True, -1 if turning else 1  # type: ignore[attr-defined]
-        found = solve_ivp(
-            derivative, (t_s, end_s), x, events=change, method="Radau", rtol=1e-10, atol=1e-13
-        )
+        found = solve_ivp(derivative, (t_s, end_s), x, events=change, method="Radau", rtol=1e-10, atol=1e-13)
         t_s, x = found.t[-1], found.y[:, -1].copy()
         if found.status == 1 and turning:
             x[1] = 0.0

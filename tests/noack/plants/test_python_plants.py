@@ -48,9 +48,7 @@ STEPPING = """
 def settings(folder: Path, code: str, name: str, **more: Any) -> PythonPlantSettings:
     path = folder / "mine.py"
     path.write_text(dedent(code))
-    loaded = located(
-        PythonPlantSettings(kind="python", name=name, file=str(path), **more), Path(), "s.toml"
-    )
+    loaded = located(PythonPlantSettings(kind="python", name=name, file=str(path), **more), Path(), "s.toml")
     assert isinstance(loaded, PythonPlantSettings)
     return loaded
 
@@ -120,9 +118,7 @@ def test_a_plant_is_found_by_entry_point_and_by_module(
     monkeypatch.delitem(sys.modules, "installed_plants", raising=False)
     by_entry = PythonSystem(PythonPlantSettings(kind="python", name="swing"), X0, 1)
     assert by_entry.about == "class installed_plants:Pendulum, installed-plants 1.2"
-    by_module = PythonSystem(
-        PythonPlantSettings(kind="python", name="installed_plants:Pendulum"), X0, 1
-    )
+    by_module = PythonSystem(PythonPlantSettings(kind="python", name="installed_plants:Pendulum"), X0, 1)
     for system in (by_entry, by_module):
         system.advance(np.zeros(1), 0, H_NS)
     assert by_entry.x.tobytes() == by_module.x.tobytes()
@@ -150,9 +146,7 @@ def test_a_plant_is_found_by_entry_point_and_by_module(
          "AttributeError: 'P' object has no attribute 'x'"),
     ],
 )  # fmt: skip
-def test_a_class_that_is_not_a_plant_is_refused_in_one_line(
-    code: str, expected: str, tmp_path: Path
-) -> None:
+def test_a_class_that_is_not_a_plant_is_refused_in_one_line(code: str, expected: str, tmp_path: Path) -> None:
     with np.errstate(all="raise"), pytest.raises(CallerError) as refused:
         made(tmp_path, code, "P")
     assert expected in str(refused.value)

@@ -30,9 +30,7 @@ def parameters(car: str) -> Any:
 
 
 def linearised(chosen: VehicleSettings) -> tuple[np.ndarray, np.ndarray]:
-    found = linearise(
-        lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
-    )
+    found = linearise(lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s)
     return found.A, found.B
 
 
@@ -50,14 +48,9 @@ def test_the_linearised_single_track_model_is_the_textbooks(car: str) -> None:
     np.testing.assert_allclose(B, model.B, rtol=1e-3, atol=2e-3)  # the servo has not fully settled
 
 
-@pytest.mark.parametrize(("model", "library", "atol"), [
-    ("kinematic", "ks", 1e-7), ("single_track", "st", 1e-7), ("drift", "std", 1e-5),
-    ("multi_body", "mb", 1e-4),
-])  # fmt: skip
-def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
-    model: str, library: str, atol: float
-) -> None:
-    """An implicit solver for stiff equations, over a lane change, with the servo written out."""
+@pytest.mark.parametrize(("model", "library"), [("kinematic", "ks"), ("single_track", "st")])
+def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(model: str, library: str) -> None:
+    """Over a lane change, with the servo written out; the larger models' equations are below."""
     chosen, p = settings(model=model, friction=1.0), parameters("bmw_320i")
     system = OdeSystem(chosen.equations(), X0)
     np.testing.assert_allclose(system.x[1:], X0[1:], rtol=1e-12)  # "kinematic" has fewer states
@@ -74,7 +67,7 @@ def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
         motion(system, [angle] * steps)
         z = solve_ivp(whole, (0, steps * H_NS * 1e-9), z, args=(angle,), method="Radau",
                       rtol=1e-9, atol=1e-11).y[:, -1]  # fmt: skip
-    np.testing.assert_allclose(system.z, z, atol=atol * max(1.0, np.abs(z).max()))
+    np.testing.assert_allclose(system.z, z, atol=1e-7 * max(1.0, np.abs(z).max()))
 
 
 @pytest.mark.parametrize(("given", "expected"), [
@@ -83,9 +76,7 @@ def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
     ({"model": "kinematic", "parameters": "truck", "speed_m_per_s": 30.0},
      r"maximum speed of a truck is 22\.22 m/s"),
 ])  # fmt: skip
-def test_settings_that_the_library_does_not_support_are_refused(
-    given: dict[str, Any], expected: str
-) -> None:
+def test_settings_that_the_library_does_not_support_are_refused(given: dict[str, Any], expected: str) -> None:
     with pytest.raises((ValueError, CallerError), match=expected):
         OdeSystem(settings(**given).equations(), np.zeros(4))
 

@@ -14,15 +14,7 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from noack.protocol.wire_format import (
-    Encoder,
-    Flow,
-    Header,
-    Message,
-    Rejection,
-    loop_number,
-    read_header,
-)
+from noack.protocol.wire_format import Encoder, Flow, Header, Message, Rejection, loop_number, read_header
 from tests.wire_decoder import Decoder
 
 PAGE = (Path(__file__).parents[3] / "docs" / "wire.md").read_text(encoding="utf-8")
@@ -74,15 +66,11 @@ def datagram(
     return content + hashlib.blake2b(content, key=key, digest_size=16).digest()
 
 
-def new_decoder(
-    flow: int = 2, dimension: int = 3, run_id: int = RUN, *, encrypted: bool = False
-) -> Decoder:
+def new_decoder(flow: int = 2, dimension: int = 3, run_id: int = RUN, *, encrypted: bool = False) -> Decoder:
     return Decoder(Flow(flow), dimension, run_id, KEY, encrypted=encrypted)
 
 
-def assert_rejected(
-    decoder: Decoder, data: bytes, reason: Rejection, *, from_peer: bool = True
-) -> None:
+def assert_rejected(decoder: Decoder, data: bytes, reason: Rejection, *, from_peer: bool = True) -> None:
     """The datagram is rejected for that reason and counted once; nothing else changes."""
     accepted, rejected = decoder.accepted, dict(decoder.rejected)
     assert decoder.decode(data, from_peer=from_peer) is None
@@ -121,9 +109,7 @@ def test_the_page_has_a_vector_for_every_flow_and_names_its_key() -> None:
     assert f"The key of all vectors is `{KEY.hex()}`" in PAGE
 
 
-@pytest.mark.parametrize(
-    "vector", VECTORS, ids=lambda v: f"v{v.version}-{v.flow}-{v.loop}-{v.sequence}"
-)
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: f"v{v.version}-{v.flow}-{v.loop}-{v.sequence}")
 def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
     version, flow, loop, run_id, sequence, t_ns, values, data = vector
     by_hand = datagram(
@@ -201,9 +187,7 @@ def reason_by_offset(offset: int) -> Rejection:
 
 
 @given(vectors, sequences, times_ns, st.booleans())
-def test_any_flipped_bit_is_rejected(
-    values: list[float], sequence: int, t_ns: int, encrypted: bool
-) -> None:
+def test_any_flipped_bit_is_rejected(values: list[float], sequence: int, t_ns: int, encrypted: bool) -> None:
     decoder = new_decoder(dimension=len(values), encrypted=encrypted)
     data = datagram(values, version=1 + encrypted, sequence=sequence, t_ns=t_ns)
     stride = 1 if len(values) <= 3 else 13  # some bits of the longer ones

@@ -113,9 +113,7 @@ class PageReceiver:
         own = self._own
         if len(data) < 32:
             return "length", {}
-        magic, version, flow, n, loop, run_id, sequence, t_ns = struct.unpack_from(
-            "<2sBBHHQQq", data
-        )
+        magic, version, flow, n, loop, run_id, sequence, t_ns = struct.unpack_from("<2sBBHHQQq", data)
         tests = [
             ("version", magic == b"NA" and version == own["version"]),
             ("length", n == own["dimension"] and len(data) == 48 + 8 * n),

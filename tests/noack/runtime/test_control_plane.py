@@ -98,9 +98,7 @@ except PermissionError:
 
 
 @needs_root
-def test_another_user_can_neither_connect_nor_listen(
-    ticket: Ticket, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_user_can_neither_connect_nor_listen(ticket: Ticket, monkeypatch: pytest.MonkeyPatch) -> None:
     with tempfile.TemporaryDirectory() as short:
         Path(short).chmod(0o777)  # its users may come in, and make files
         monkeypatch.setenv("XDG_RUNTIME_DIR", short)
@@ -115,9 +113,7 @@ def test_another_user_can_neither_connect_nor_listen(
         assert not path.exists()
 
 
-def test_a_process_without_a_coordinator_says_so(
-    ticket: Ticket, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_without_a_coordinator_says_so(ticket: Ticket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(noack.runtime.control_plane, "_CONNECT_MS", 200)
     with pytest.raises(NoAnswerError, match="cannot reach the run's coordinator: Unable"):
         ControlPlane(ticket, "plant")
@@ -130,9 +126,7 @@ def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives
 ) -> None:
     monkeypatch.setattr(noack.runtime.control_plane, "_REQUEST_AGAIN_S", 0.2)
     answer = {"epoch_ns": 7, "addresses": dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5)), "more": [1]}
-    queries = coordinator.plane.session.declare_queryable(
-        coordinator.plane.key("ask", "*"), FifoChannel(4)
-    )
+    queries = coordinator.plane.session.declare_queryable(coordinator.plane.key("ask", "*"), FifoChannel(4))
     unanswered = []
 
     def serve() -> None:

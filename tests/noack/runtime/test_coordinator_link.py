@@ -220,9 +220,7 @@ def echoed(connection: socket.socket, message: bytes = b"hello") -> bytes:
 
 @pytest.mark.parametrize("kind", ["connect", "garbage", "half a proof", "a foreign proof"])
 @pytest.mark.parametrize("addresses", [1, 200])
-def test_a_flood_keeps_nobody_out(
-    monkeypatch: pytest.MonkeyPatch, kind: str, addresses: int
-) -> None:
+def test_a_flood_keeps_nobody_out(monkeypatch: pytest.MonkeyPatch, kind: str, addresses: int) -> None:
     """The flood fills all places between any two steps of one who joins, from his address too."""
     monkeypatch.setattr(connection_gate, "_MOST_WAITING", 64)
     monkeypatch.setattr(connection_gate, "_ROOM", 16)

@@ -78,9 +78,7 @@ def test_datagrams_that_the_kernel_passes_together_are_handled_one_by_one(
             part = b"".join(map(live.encoder.encode, given[first : first + together]))
             live.peer.sendmsg([part + b"short"] if first else [part], head)
         live.drive_until_accepted(len(given))
-        assert live.driver.core.sources[0].received == len(given) + len(
-            range(together, len(given), together)
-        )
+        assert live.driver.core.sources[0].received == len(given) + len(range(together, len(given), together))
         rows = live.rows.tables[SENSOR_MEASUREMENT]
         assert [row[0] for row in rows] == [one.loop for one in given]
 

@@ -13,14 +13,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow
 from noack.runtime import udp_sockets
-from noack.runtime.address import (
-    LOOPBACK,
-    Address,
-    family_of,
-    parse_address,
-    parse_destination,
-    text_of,
-)
+from noack.runtime.address import LOOPBACK, Address, family_of, parse_address, parse_destination, text_of
 from noack.runtime.live_driver import LoopChannel
 from noack.runtime.udp_sockets import SHED, SourceCount, bind, enlarge_buffer, open_beside
 from tests.approved import lines_of_error

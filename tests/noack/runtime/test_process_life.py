@@ -166,9 +166,7 @@ def test_a_file_that_cannot_be_written_leaves_nothing() -> None:
     assert names() == []
 
 
-def test_a_missing_runtime_directory_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_runtime_directory_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "none"))
     with pytest.raises(CallerError, match=r"none: no such folder; set XDG_RUNTIME_DIR"):
         names()

@@ -66,9 +66,7 @@ class Driven:
 
 
 @pytest.mark.parametrize("busy", [False, True])
-def test_a_turn_of_housekeeping_follows_each_drive(
-    busy: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_turn_of_housekeeping_follows_each_drive(busy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     pauses, log = list[float](), Log()
     monkeypatch.setattr(time, "sleep", pauses.append)
     cpu_s = count(0, 10**6 if busy else 0)

@@ -15,13 +15,7 @@ from noack.core.errors import MachineError, NoAnswerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.runtime import telemetry
 from noack.runtime.spool import NOTICES, SpoolWriter, kept_run_name, read_chunks
-from noack.runtime.telemetry import (
-    OwnSpool,
-    ReceivedRows,
-    TelemetryBuffer,
-    deliver_report,
-    first_row,
-)
+from noack.runtime.telemetry import OwnSpool, ReceivedRows, TelemetryBuffer, deliver_report, first_row
 
 ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])
 TABLES = {"one": ROW, "two": ROW}

@@ -250,9 +250,7 @@ def reference_at(stack: ExitStack, port: int = 0) -> TimeReference:
     return stack.enter_context(answering(found))
 
 
-def following(
-    stack: ExitStack, clocks: HostClocks, settings: ClocksSection = ROOMY
-) -> ReferenceClock:
+def following(stack: ExitStack, clocks: HostClocks, settings: ClocksSection = ROOMY) -> ReferenceClock:
     clock = ReferenceClock(reference_at(stack).address, KEY, settings, clocks)
     stack.enter_context(closing(clock))
     clock.wait_until_known()

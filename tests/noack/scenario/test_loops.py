@@ -141,9 +141,7 @@ def test_files_that_the_file_names_are_beside_it(content: dict[str, Any], tmp_pa
         assert len(trigger.sha256) == 64
 
 
-def test_a_mistake_in_a_loops_file_gives_the_approved_lines(
-    content: dict[str, Any], tmp_path: Path
-) -> None:
+def test_a_mistake_in_a_loops_file_gives_the_approved_lines(content: dict[str, Any], tmp_path: Path) -> None:
     def mistake(line: str) -> list[str]:
         name, other = json.loads(line)
         write(tmp_path, "parts/other.toml", OTHER | other)

@@ -95,17 +95,13 @@ def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None
         (b" \n", "is empty; a trace has a 1 for each lost packet"),
     ],
 )
-def test_a_mistake_in_a_trace_gets_one_line(
-    content: bytes | None, says: str, tmp_path: Path
-) -> None:
+def test_a_mistake_in_a_trace_gets_one_line(content: bytes | None, says: str, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / "t").write_bytes(content)
     settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="t")),))
     with pytest.raises(CallerError) as caught:
         read_files(settings, tmp_path, "l.toml: link.0.reverse")
-    assert str(caught.value).startswith(
-        f'l.toml: link.0.reverse.impairments.0.loss.file = "t": {says}'
-    )
+    assert str(caught.value).startswith(f'l.toml: link.0.reverse.impairments.0.loss.file = "t": {says}')
 
 
 def test_a_mistake_in_a_delay_file_gives_the_approved_line(tmp_path: Path) -> None:
@@ -229,6 +225,37 @@ def longest_delay_s(scenario: Scenario, loops: int, seed: int, together: bool) -
         leaves_ns = max(link.decision.release_ns, link.decision.copy_ns)
         longest_ns = max(longest_ns, leaves_ns - now_ns)
     return longest_ns * 1e-9
+
+
+RATE_BPS = BITS / 0.05
+"""Of one loop that transmits every 50 ms."""
+CORRUPT = {"kind": "corrupt", "probability": 1.0}
+DELAYS_NS = [150_000_000, 100_000_000, 50_000_000, 0]
+REPLAY = {"kind": "replay", "sent_ns": [0, 1, 2, 3], "delays_ns": DELAYS_NS}
+TIGHT: list[tuple[list[dict[str, Any]], int, float, float]] = [
+    # Four datagrams reach the queue at once. Then: what finds it full must pass.
+    ([REPLAY, {"kind": "rate", "rate_bps": RATE_BPS}], 1, 0.15 + 0.2, 0.2),
+    ([{"kind": "rate", "rate_bps": 0.7 * RATE_BPS, "queue": 2}, CORRUPT], 19,
+     3 * 0.05 / 0.65, 0.157),
+    # The same in slots, which are taken by datagrams that are lost later; two copies.
+    ([{"kind": "schedule", "order": [1, 0], "slot_s": 0.05, "queue": 1}, CORRUPT], 1, 0.2, 0.12),
+    ([{"kind": "duplicate", "probability": 1.0}, {"kind": "schedule", "order": [1],
+      "slot_s": 0.025}], 1, 0.05, 0.04),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("stages", "mansd", "bound_s", "reached_s"), TIGHT)
+def test_the_bound_of_the_delay_is_in_closed_form_and_nearly_reached(
+    content: dict[str, Any], stages: list[dict[str, Any]], mansd: int, bound_s: float,
+    reached_s: float,
+) -> None:  # fmt: skip
+    loops = {"name": "a", "count": 1, "trigger": PERIODIC}
+    stages = [one | {"rate_bps": round(one["rate_bps"])} if "rate_bps" in one else one
+              for one in stages]  # fmt: skip
+    given = scenario_of(content, 1000, 1, loops, impairments=stages, mansd=mansd)
+    assert update_delay(given).largest_s == pytest.approx(bound_s, rel=1e-3)
+    longest_s = max(longest_delay_s(given, 1, seed, together=False) for seed in range(8))
+    assert reached_s <= longest_s <= bound_s * 1.001
 
 
 def _is_alone_valid(one: Impairment) -> bool:

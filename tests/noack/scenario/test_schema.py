@@ -65,9 +65,7 @@ def test_shipped_scenarios_are_valid(validator: Any, path: Path) -> None:
         'network.loss={model="lossless",probability=0.5}',
     ],
 )
-def test_the_schema_refuses_mistakes(
-    validator: Any, content: dict[str, Any], settings: str
-) -> None:
+def test_the_schema_refuses_mistakes(validator: Any, content: dict[str, Any], settings: str) -> None:
     assert validator.is_valid(content)
     key, _, value = settings.partition("=")
     put(content, key, value_of(value, key), key)
@@ -110,9 +108,7 @@ def cases() -> Iterator[Any]:
             table = example.model_dump(mode="json", exclude_none=True)
             yield pytest.param({"trigger": table}, id=f"trigger-{name}")
     for name, disturbance in DISTURBANCES.items():
-        yield pytest.param(
-            {"plant": {"disturbances": [disturbance.example]}}, id=f"disturbance-{name}"
-        )
+        yield pytest.param({"plant": {"disturbances": [disturbance.example]}}, id=f"disturbance-{name}")
     measurement = {"C": [[1.0, 0.0]], "noise_std": [0.01]}
     for name, observer in OBSERVERS.items():
         sections = {"plant": {"measurement": measurement}, "observer": observer.example}

@@ -107,9 +107,7 @@ def random_disturbed_loop(rng: np.random.Generator, **fixed: Any) -> DisturbedLo
     system = random_system(rng, **fixed)
     n = len(system.A)
     columns = size * rng.uniform(-1, 1, (n, channels))
-    return DisturbedLoop(
-        system, columns, (lasting,) * channels, noise * rng.uniform(0.2, 1.0, n), floor
-    )
+    return DisturbedLoop(system, columns, (lasting,) * channels, noise * rng.uniform(0.2, 1.0, n), floor)
 
 
 def signals(loop: DisturbedLoop, rng: np.random.Generator) -> tuple[Reals, Reals]:
@@ -236,9 +234,7 @@ class Filter:
         both = np.block([[loop.A_model, loop.B_model], [np.zeros((m, n + m))]])
         step = expm(both * system.step_s)
         self._Ad, self._Bd, self._loop, self._noise = step[:n, :n], step[:n, n:], loop, noise
-        integral = expm(
-            np.block([[loop.A_model, np.eye(n)], [np.zeros((n, 2 * n))]]) * system.step_s
-        )[:n, n:]
+        integral = expm(np.block([[loop.A_model, np.eye(n)], [np.zeros((n, 2 * n))]]) * system.step_s)[:n, n:]
         self._Q, self._R = (
             loop.push**2 * integral @ integral.T, loop.noise**2 * np.eye(len(loop.C)),
         )  # fmt: skip
@@ -299,9 +295,7 @@ def worst_shares(
 ) -> dict[str, float]:
     """Simulate with random and adversarial losses, disturbances and noise; the shares reached."""
     system, (p, n) = loop.system, loop.C.shape
-    disturbed = DisturbedLoop(
-        system, loop.push * np.eye(n), (STEPS,) * n, np.full(n, loop.noise), loop.floor
-    )
+    disturbed = DisturbedLoop(system, loop.push * np.eye(n), (STEPS,) * n, np.full(n, loop.noise), loop.floor)
     pushes, noise = signals(disturbed, rng)
     estimate = Filter(loop, np.concatenate([noise, noise], axis=2)[:, :, :p])
     trace: Trace = simulate(

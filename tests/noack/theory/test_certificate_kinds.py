@@ -1,19 +1,18 @@
-"""Certificates of random loops: no bound is exceeded, and those of each broken copy are."""
+"""Certificates of random loops: no bound is exceeded, and those of broken copies are."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from noack.theory.bounds.terms import NetworkConditions
 from tests.noack.theory.certificate_kinds.comparison import KINDS, examine
-from tests.noack.theory.certificate_kinds.continuous import (
-    CONTINUOUS,
-    constants_of,
-    dominated_by_errors,
-)
+from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, constants_of, dominated_by_errors
 
 FEW, MOST = 6, 60
-LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 40, "continuous time": 20}
-BROKEN = [(name, mistake) for name, kind in KINDS.items() for mistake in kind.broken]
+LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 25, "continuous time": 15}
+BROKEN = [(name, next(iter(kind.broken))) for name, kind in KINDS.items() if kind.broken]
+"""One of each kind; `python -m tests.noack.theory.certificate_kinds` tries all."""
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -25,7 +24,7 @@ def test_no_bound_of_a_random_loop_is_exceeded(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "mistake"), BROKEN)
-def test_each_broken_copy_is_detected(name: str, mistake: str) -> None:
+def test_a_broken_copy_of_each_kind_is_detected(name: str, mistake: str) -> None:
     """Within 60 loops in which the mistake matters; true certificates stand in the same loop."""
     kind = KINDS[name]
     broken = kind.broken[mistake]
@@ -47,3 +46,14 @@ def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() ->
     worst = CONTINUOUS.simulate(system, np.random.default_rng(1)).worst
     bounds = constants_of(sharp, system.beta)
     assert {name for name, bound in bounds.items() if worst[name] < 0.6 * bound} == set()
+
+
+def test_the_flow_between_updates_makes_the_bounds_of_a_schedule_smaller() -> None:
+    system = dominated_by_errors(np.ones((4, 2)), far=True)
+    system = replace(system, step_s=0.004, delay_steps=1, hold_steps=1)
+    sharp, plain = system.certify(), system.certify(structured=False)
+    assert sharp.state < 0.6 * plain.state
+    assert sharp.delta < plain.delta
+    assert sharp.inter_event_s is not None
+    assert plain.inter_event_s is not None
+    assert sharp.inter_event_s >= plain.inter_event_s

@@ -11,13 +11,7 @@ from noack.scenario.scenario_file import load
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, NormalForcing, PlantGains
-from noack.theory.bounds.terms import (
-    Constants,
-    NetworkConditions,
-    NoCertificateError,
-    Part,
-    TriggerBound,
-)
+from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part, TriggerBound
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.disturbed import solve_two_parts
@@ -60,8 +54,7 @@ def test_no_plant_of_a_disturbed_box_exceeds_its_bounds(seed: int) -> None:
         break
     system = loop.system
     pool = [
-        tuple(M + half * rng.choice([-1.0, 1.0], M.shape) for M in (system.A, system.B))
-        for _ in range(6)
+        tuple(M + half * rng.choice([-1.0, 1.0], M.shape) for M in (system.A, system.B)) for _ in range(6)
     ]
     which = rng.integers(0, 6, (RUNS, STEPS))
     which[::2] = which[::2, :1]

@@ -78,9 +78,7 @@ def values(C: Matrix, G: Matrix, D: Matrix, t_s: NDArray[np.float64]) -> NDArray
 def times(G: Matrix, end_s: float) -> NDArray[np.float64]:
     """Times that are dense for the fast modes and for the slow ones."""
     fast = float(np.abs(np.linalg.eigvals(G)).max())
-    return np.unique(
-        np.concatenate([np.geomspace(1e-3 / fast, end_s, 250), np.linspace(0.0, end_s, 400)])
-    )
+    return np.unique(np.concatenate([np.geomspace(1e-3 / fast, end_s, 250), np.linspace(0.0, end_s, 400)]))
 
 
 def cell_of(kernel: KernelBounds, t_s: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -100,9 +98,7 @@ ROUNDING = 1 - 1e-10
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=6)
 @given(data=st.data())
-def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(
-    kind: str, data: st.DataObject
-) -> None:
+def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str, data: st.DataObject) -> None:
     """Cell by cell, beyond the grid, and from any time on; the supremum is within 1 %."""
     C, G, D = data.draw(cases(kind))
     kernel = response(G, D).through(C)
@@ -122,9 +118,7 @@ def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=2)
 @given(n=st.integers(2, 5), seed=st.integers(0, 2**32))
-def test_no_integral_is_above_its_enclosure_and_the_enclosure_is_tight(
-    kind: str, n: int, seed: int
-) -> None:
+def test_no_integral_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str, n: int, seed: int) -> None:
     """Cell by cell, against Gauss's formula, which gives ‖C e^{Gτ} d‖ for a vector d to 1e-8."""
     points, weights = np.polynomial.legendre.leggauss(4)
     rng = np.random.default_rng(seed)

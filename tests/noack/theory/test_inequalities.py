@@ -19,8 +19,7 @@ from tests.oracles.lossy_loops import System
 def exact_solution(F: np.ndarray, g: np.ndarray) -> list[Fraction]:
     size = len(g)
     rows = [
-        [Fraction(int(i == j)) - Fraction(float(F[i, j])) for j in range(size)]
-        + [Fraction(float(g[i]))]
+        [Fraction(int(i == j)) - Fraction(float(F[i, j])) for j in range(size)] + [Fraction(float(g[i]))]
         for i in range(size)
     ]
     for k in range(size):

@@ -15,7 +15,7 @@ import pytest
 from noack.core.linear_systems import Matrix
 from noack.theory.margins.branch_and_bound import bound_by_products
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, exponential, inverse
-from noack.theory.margins.invariant_polytopes import InvariantPolytopes
+from noack.theory.margins.invariant_polytopes import InvariantPolytopes, PolytopeNorm
 from noack.theory.margins.joint_spectral_radius import joint_spectral_radius
 from noack.theory.margins.quadratic_norms import NormSearch, remembering
 from noack.theory.margins.switched_system import (
@@ -97,6 +97,12 @@ def test_no_polytopes_prove_too_much(seed: int) -> None:
     assert polytopes.bound() >= value
     polytopes.grow(30)
     assert polytopes.bound() >= value
+
+
+def test_the_norm_of_a_polytope_counts_what_its_combinations_miss() -> None:
+    point = IntervalMatrix(np.array([[0.5, -0.25]]), np.array([[0.1, 0.2]]))
+    (bound,) = PolytopeNorm(np.diag([1.0, 0.5])).bounds(point)
+    assert bound == pytest.approx(0.6 + 0.45 / 0.5)
 
 
 def scaled(edges: list[Edge], factor: float) -> list[Edge]:
@@ -251,6 +257,17 @@ def test_nilpotent_systems_do_not_grow() -> None:
     found = joint_spectral_radius([edge(0, 0, shift), edge(0, 0, 2 * shift)])
     assert found.lower == 0
     assert found.upper < 0.01
+
+
+def test_sizes_beyond_the_range_of_doubles_prove_nothing_false() -> None:
+    zero = joint_spectral_radius([edge(0, 0, [[0.0]]), edge(0, 0, [[0.0]], 3)], threshold=1.0)
+    assert (zero.lower, zero.cycle) == (0, ())
+    assert zero.upper < 1e-90
+    turn = np.array([[0.0, 1e300], [1e-300, 0.0]])
+    with np.errstate(all="ignore"):
+        found = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, 0.9 * np.eye(2))])
+    assert found.lower == pytest.approx(1)
+    assert found.upper >= 1
 
 
 def test_paths_that_end_do_not_count() -> None:

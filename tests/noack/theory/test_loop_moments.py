@@ -190,9 +190,7 @@ def test_the_mean_of_noisy_runs() -> None:
 
 
 def test_the_transient_and_the_stationary_part_are_limits() -> None:
-    quiet = find_mean_cost(
-        scenario(horizon_s=100.0, network={"mansd": 2, "loss": BURSTS})
-    ).with_guarantee
+    quiet = find_mean_cost(scenario(horizon_s=100.0, network={"mansd": 2, "loss": BURSTS})).with_guarantee
     noisy = [find_mean_cost(scenario(horizon_s=t_s, **NOISE)).with_guarantee for t_s in (99, 100)]
     assert isinstance(quiet, CostUnder)
     assert quiet.transient_cost == pytest.approx(quiet.horizon_cost, rel=1e-9)

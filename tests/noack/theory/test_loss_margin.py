@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.theory.margins.loss_margin import LossMargin
+from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
 from tests.approved import compare_lines, lines_of_error
 
 ROOT = Path(__file__).parents[3]
@@ -80,9 +81,7 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
         )
 
 
-def held_loop(
-    resolved: Scenario, pattern: Sequence[bool], intervals_s: Sequence[float] = ()
-) -> Matrix:
+def held_loop(resolved: Scenario, pattern: Sequence[bool], intervals_s: Sequence[float] = ()) -> Matrix:
     """The map of (x, x_c, u) over a pattern, with the controller's ticks half a step later.
 
     It is computed step by step, without :mod:`noack.theory`. By default the updates are 0.1 s
@@ -117,9 +116,7 @@ def admissible(guarantee: LossGuarantee, pattern: Sequence[bool]) -> bool:
 
 @pytest.mark.parametrize("guarantee", GUARANTEES, ids=lambda one: one.meaning)
 def test_no_pattern_grows_faster_than_the_upper_bound(guarantee: LossGuarantee) -> None:
-    resolved = scenario(
-        "unstable_pendulum", "mode=zoh", "plant.rate_hz=100", "controller.rate_hz=100"
-    )
+    resolved = scenario("unstable_pendulum", "mode=zoh", "plant.rate_hz=100", "controller.rate_hz=100")
     found = LossMargin(resolved).stability(guarantee)
     fastest = 0.0
     for length in range(1, 8):
@@ -136,6 +133,44 @@ def test_no_pattern_grows_faster_than_the_upper_bound(guarantee: LossGuarantee) 
         else rule for rule in guarantee.rules
     ))  # fmt: skip
     assert LossMargin(resolved).stability(worse).lower > found.upper
+
+
+@pytest.mark.parametrize("losses", [1, 2])
+def test_a_pattern_repeated_from_the_first_update_grows_as_claimed(losses: int) -> None:
+    """A controller with 80 ms, updates every 0.5 or 0.3 s: in other slots it grows less."""
+    resolved = scenario(
+        "unstable_pendulum", "plant.rate_hz=100", "controller.rate_hz=12.5",
+        f'trigger={{policy="periodic", period_s={0.5 if losses == 1 else 0.3}}}',
+    )  # fmt: skip
+    margin = LossMargin(resolved)
+    guarantee = LossGuarantee((LongestBurst(1) if losses == 1 else LossesInWindow(2, 4),))
+    found, slots = margin.stability(guarantee, 3e-2), margin.loop.times.slots
+
+    def growth(slot: int) -> float:
+        fates = np.roll(found.pattern * (3 * slots), slot)
+        places = np.flatnonzero(fates)
+        maps = [
+            margin.maps(int(one % slots), int(following - one - 1)).middle
+            for one, following in pairwise([*places, places[0] + len(fates)])
+        ]
+        radius = np.abs(np.linalg.eigvals(np.linalg.multi_dot(maps[::-1]))).max()
+        return float(radius ** (1 / len(fates)))
+
+    assert growth(0) == pytest.approx(found.lower, rel=1e-9)
+    assert min(growth(slot) for slot in range(1, slots)) < 0.95 * found.lower
+
+
+def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
+    resolved = scenario("unstable_pendulum", "mode=zoh")
+    loop, margin, guarantee = loop_of(resolved), LossMargin(resolved), GUARANTEES[0]
+    expected = margin.stability(guarantee)
+    for unit in (2.0**40, 1e-12):
+        margin.loop = TimeTriggeredLoop(loop.A, loop.B * unit, loop.K / unit, loop.H, margin.loop.times)
+        margin.maps = margin.loop.map  # type: ignore[assignment]
+        found = margin.stability(guarantee)
+        assert found.pattern == expected.pattern
+        assert found.lower == pytest.approx(expected.lower, rel=1e-9)
+        assert found.upper == pytest.approx(expected.upper, rel=1e-3)
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])

@@ -12,14 +12,7 @@ from scipy.linalg import expm
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.paper import (
-    ErrorMonitor,
-    Interval,
-    Theorem2,
-    longest_interval_s,
-    theorem_1,
-    theorem_2,
-)
+from noack.theory.paper import ErrorMonitor, Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 from noack.trigger.trigger_rule import TriggerRule
 from tests.noack.theory.certificate_kinds.policies import INSTANT
 from tests.oracles.continuous_loops import simulate_continuous_time
@@ -195,9 +188,7 @@ def histories(draw: st.DrawFn) -> History:
     return History(H, weight, moments)
 
 
-def follow(
-    history: History, trigger: TriggerRule, at_once: int = 25
-) -> list[tuple[float, float, Vector]]:
+def follow(history: History, trigger: TriggerRule, at_once: int = 25) -> list[tuple[float, float, Vector]]:
     """Return both bounds, and (I1), at each moment; the monitor takes so many moments at once."""
     monitor, found = ErrorMonitor(history.H, trigger, PERIOD_NS), []
     for first in range(0, len(history.moments), at_once):
@@ -239,9 +230,7 @@ def test_both_bounds_are_the_explicit_sums(
 
 @settings(max_examples=15)
 @given(histories(), st.integers(1, 25))
-def test_the_identity_holds_for_every_trigger_plant_and_network(
-    history: History, at_once: int
-) -> None:
+def test_the_identity_holds_for_every_trigger_plant_and_network(history: History, at_once: int) -> None:
     """It is x_c − x_s, and bounds the error; no assumption on trigger, plant or network."""
     trigger = decaying_rule(1e-3, 1.0, 0.0, history.weight)
     largest = 0.0

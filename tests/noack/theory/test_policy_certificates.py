@@ -18,23 +18,9 @@ from noack.theory.bounds.trigger_bounds import comparison_bound
 from noack.theory.certificates.certified_bounds import known_state_bounds
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.scenario_certificates import certify
-from tests.noack.theory.certificate_kinds.policies import (
-    INSTANT,
-    POLICY_KINDS,
-    exceeded_by,
-    policy_case,
-)
+from tests.noack.theory.certificate_kinds.policies import INSTANT, POLICY_KINDS, exceeded_by, policy_case
 from tests.noack.theory.disturbed_loops import DisturbedLoop, signals
-from tests.oracles.lossy_loops import (
-    ROUNDING,
-    SEARCH,
-    STEPS,
-    System,
-    networks,
-    seeds,
-    simulate,
-    systems,
-)
+from tests.oracles.lossy_loops import ROUNDING, SEARCH, STEPS, System, networks, seeds, simulate, systems
 from tests.trigger_rules import quadratic_rule
 
 SCENARIO = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
@@ -83,9 +69,7 @@ def test_no_e_s_at_which_a_quadratic_rule_is_silent_exceeds_the_bound(seed: int,
 
 
 @pytest.mark.parametrize(("interval_s", "decays"), [(0.02, True), (1.0, False)])
-def test_a_short_deadline_adds_decay_to_a_constant_threshold(
-    interval_s: float, *, decays: bool
-) -> None:
+def test_a_short_deadline_adds_decay_to_a_constant_threshold(interval_s: float, *, decays: bool) -> None:
     rule = '{policy="absolute", delta=0.01}'
     found = []
     for trigger in (rule, f'{{policy="deadline", interval_s={interval_s}, rule={rule}}}'):
@@ -106,9 +90,7 @@ def test_a_short_deadline_adds_decay_to_a_constant_threshold(
 @pytest.mark.parametrize("kind", sorted(POLICY_KINDS.keys() - {"lyapunov"}))
 @settings(SEARCH, max_examples=3)
 @given(systems(**INSTANT), seeds)
-def test_no_bound_of_a_policy_is_exceeded_in_continuous_time(
-    kind: str, system: System, seed: int
-) -> None:
+def test_no_bound_of_a_policy_is_exceeded_in_continuous_time(kind: str, system: System, seed: int) -> None:
     resolved, _, system = policy_case(kind, system, seed)
     certificate = certify(resolved, NetworkConditions(system.mansd))
     if certificate.constants is None:

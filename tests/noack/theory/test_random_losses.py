@@ -8,7 +8,7 @@ import pytest
 
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
-from noack.impairments.markov_chain import Array
+from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.random_losses.mean_square_growth import mean_square_growth
@@ -30,24 +30,30 @@ def scalar(rate: float, gain: float, mismatch: float) -> PlantGains:
 
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("p", [0.1, 0.5, 0.9])
-def test_in_a_contracting_norm_the_moment_at_events_is_the_geometric_series(
-    p: float, order: int
-) -> None:
+def test_in_a_contracting_norm_the_moment_at_events_is_the_geometric_series(p: float, order: int) -> None:
     error = scalar(2.0, 3.0, 0.0).error
     found = moment_at_events(error, independent(p), 0.0, order)
     assert found == pytest.approx(1 / (1 - p ** (1 / order)), rel=1e-6)
     assert moment_at_events(error, independent(p), 0.5, order) < found
 
 
-def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_solved_by_hand() -> None:
-    """a = β, m = e|x|; π = g|e_c|, |e_c| = β + p (m + π)/r, |x| = 1 + π/(r + e)."""
-    rate, gain, mismatch, beta, p = 2.0, 1.5, 0.2, 0.1, 0.2
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("p", [0.01, 0.3, 0.9])
+def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand(
+    p: float, order: int
+) -> None:
+    """π = g|e_c|, |x| = 1 + π/(r + e), |e_c| = β + lost errors, of which all add (e|x| + π)/r."""
+    rate, gain, mismatch, beta = 2.0, 1.5, 0.2, 0.1
     plant = scalar(rate, gain, mismatch)
-    found = moments(plant.error, plant, NetworkConditions(0), beta, p, 1)
-    matrix = np.array([[1.0, -p * mismatch / rate, -p * gain / rate],
-                       [0.0, 1.0, -gain / (rate + mismatch)],
-                       [-1.0, 0.0, 1.0]])  # e_c, x, e_c again as π/g  # fmt: skip
-    e_c, x, _ = np.linalg.solve(matrix, [beta, 1.0, 0.0])
+    found = moments(plant.error, plant, NetworkConditions(0), beta, p, order)
+    e_c, powers = beta, p ** np.arange(1.0, 2000)
+    for _ in range(2000):
+        x = 1.0 + gain * e_c / (rate + mismatch)
+        whole = (mismatch * x + gain * e_c) / rate
+        burst = [
+            np.minimum(beta, (beta ** (r - 1) * powers * whole) ** (1 / r)).sum() for r in range(order, 3)
+        ]
+        e_c = beta + min(p ** (1 / order) * whole, *burst)
     assert found.controller_error == pytest.approx(e_c, rel=0.02)
     assert found.state == pytest.approx(x, rel=0.02)
     assert found.input_error == pytest.approx(gain * e_c, rel=0.02)
@@ -56,7 +62,7 @@ def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_solved_by_hand()
 def test_moments_at_a_lower_rate_than_the_triggers() -> None:
     """Random loops without moments at the trigger's rate, against their runs."""
     share, compared = 1e-3, 0
-    for seed in range(40):
+    for seed in range(160):
         rng = np.random.default_rng(seed)
         loop = draw(rng)
         slower = replace(loop, system=replace(loop.system, alpha=share * loop.system.alpha))
@@ -145,3 +151,31 @@ def test_almost_all_runs_of_random_loops_grow_at_most_by_the_bound(process: Loss
         exceeded += np.log(sure_growth(delivered, lost, fewer)) < grown.mean() - 6 * error
     assert np.median(slack) < 0.04
     assert exceeded
+
+
+def test_growth_does_not_depend_on_units_and_holds_for_fast_modes() -> None:
+    """States in units that differ by 2^60, and maps with eigenvalues from 1e-9 to 1."""
+    rng = np.random.default_rng(5)
+    units, chain = np.ldexp(1.0, [0, 30, -30]), unlimited(independent(0.3))
+    for fastest in (1.0, 1e-9):
+        M0, M1 = (fastest * rng.normal(size=(3, 3)) + 0.5 * np.eye(3)[0] for _ in range(2))
+        turned = [units[:, None] * one / units for one in (M0, M1)]
+        for found, expected in (
+            (mean_square_growth([(turned[0], turned[1])], chain),
+             mean_square_growth([(M0, M1)], chain)),
+            (sure_growth(turned[0], turned[1], chain), sure_growth(M0, M1, chain)),
+        ):  # fmt: skip
+            assert found == pytest.approx(expected, rel=1e-5)
+    with pytest.raises(NotPredictableError, match="beyond 1e308"):
+        mean_square_growth([(np.eye(2), np.full((2, 2), np.inf))], chain)
+
+
+def test_a_spectral_radius_that_was_computed_too_small_is_not_accepted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    maps, chain = [(0.5 * np.eye(2), np.diag([1.4, 0.3]))], unlimited(BURSTY)
+    assert mean_square_growth(maps, chain) > 0
+    values = np.linalg.eigvals
+    monkeypatch.setattr(np.linalg, "eigvals", lambda matrix: 0.999 * values(matrix))
+    with pytest.raises(NotPredictableError, match="bounded numerically"):
+        mean_square_growth(maps, chain)

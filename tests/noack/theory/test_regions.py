@@ -100,9 +100,14 @@ def test_broken_copies_are_refuted(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         phases, reached = yield from bounded(self, conditions)
         return phases, reached * (not self._plants[0.0].halfwidth_A.any())
 
+    def halved(self: Any, conditions: Any) -> Any:
+        phases, reached = yield from bounded(self, conditions)
+        return phases, reached / 2
+
     for power, semi_axes, *broken in (
         (7, (1.3, 0.01), EnclosedMotion, "over", lambda self, r: whole(self, r / 2)),
         (3, (0.01, 4.8), _Box, "bounded", unchecked),  # takes the first region
+        (3, (0.01, 3.0), _Box, "bounded", halved),
     ):
         code = STEEP.replace("7", str(power))
         case = Case("", lambda x, u, p=power: np.stack([x[1], x[0] + x[0] ** p + u[0]]), semi_axes)

@@ -21,11 +21,7 @@ from noack.scenario.scenario_file import load, validate
 from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import (
-    allowed_conditions,
-    ideal_conditions,
-    nominal_conditions,
-)
+from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import (
     MOST_S,
     box,
@@ -36,16 +32,7 @@ from noack.theory.certificates.scenario_certificates import (
 )
 from noack.theory.certificates.solution import completed
 from tests.noack.theory.certificate_kinds.policies import exceeded_by, scenario_with
-from tests.oracles.lossy_loops import (
-    SEARCH,
-    STEPS,
-    System,
-    Trace,
-    networks,
-    seeds,
-    simulate,
-    systems,
-)
+from tests.oracles.lossy_loops import SEARCH, STEPS, System, Trace, networks, seeds, simulate, systems
 
 ROOT = Path(__file__).parents[3]
 
@@ -182,9 +169,7 @@ def leaves(value: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("late_periods", [0, 2])
-def test_the_networks_delay_adds_to_the_delay_of_updates(
-    content: dict[str, Any], late_periods: int
-) -> None:
+def test_the_networks_delay_adds_to_the_delay_of_updates(content: dict[str, Any], late_periods: int) -> None:
     at_once = nominal_conditions(resolve(validate(content, "here")), late_periods)
     content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.02, "jitter_s": 0.01}]
     resolved = resolve(validate(content, "here"))
@@ -232,9 +217,7 @@ def test_all_times_or_none_may_have_a_certificate() -> None:
 def test_events_that_are_due_may_come_as_soon_as_they_are_due() -> None:
     """Where measurements may be missing, the longest time between two events is longer."""
     trigger = 'trigger={policy="deadline", interval_s=0.04, rule={policy="absolute", delta=5.0}}'
-    resolved = resolve(
-        load(ROOT / "scenarios" / "double_integrator.toml", [trigger, "network.mansd=0"])
-    )
+    resolved = resolve(load(ROOT / "scenarios" / "double_integrator.toml", [trigger, "network.mansd=0"]))
     conditions = nominal_conditions(resolved)
     missing = conditions._replace(sampling_s=5 * conditions.spacing_s)
     for one in (conditions, missing):

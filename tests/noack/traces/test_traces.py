@@ -21,13 +21,7 @@ from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from noack.traces.capture_packets import CapturedFlow, captured_packets, find_udp
 from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
 from noack.traces.irtt_trace import read_irtt
-from noack.traces.packet_trace import (
-    MAX_PACKETS,
-    PacketTrace,
-    envelope_slope,
-    packet_trace,
-    relative_delays,
-)
+from noack.traces.packet_trace import MAX_PACKETS, PacketTrace, envelope_slope, packet_trace, relative_delays
 from noack.traces.trace_formats import read_trace
 from tests.approved import compare_lines, lines_of_error
 from tests.oracles.capture_files import LINKS, Sent, pcap_of, pcapng_of
@@ -55,13 +49,9 @@ def test_units_order_and_lost_packets(tmp_path: Path) -> None:
     st.data(),
 )
 def test_any_records_are_read_exactly(records: list[tuple[int, int]], data: st.DataObject) -> None:
-    numbers = sorted(
-        data.draw(st.sets(st.integers(0, 60), min_size=len(records), max_size=len(records)))
-    )
+    numbers = sorted(data.draw(st.sets(st.integers(0, 60), min_size=len(records), max_size=len(records))))
     sent = sorted(time_ns for time_ns, _ in records)
-    received = [
-        -1 if delay < 0 else at + delay for at, (_, delay) in zip(sent, records, strict=True)
-    ]
+    received = [-1 if delay < 0 else at + delay for at, (_, delay) in zip(sent, records, strict=True)]
     order = data.draw(st.permutations(range(len(records))))
     columns = (np.array(column)[list(order)] for column in (sent, received, numbers))
     sent_ns, received_ns, sequence = columns
@@ -89,9 +79,7 @@ def test_a_wrong_file_gives_the_approved_line(tmp_path: Path) -> None:
         file.write_text(content)
         return lines_of_error(lambda: read_trace(file), FILE=file)
 
-    compare_lines(
-        Path(__file__).with_name("wrong_traces.txt"), lambda text: refusal(json.loads(text))
-    )
+    compare_lines(Path(__file__).with_name("wrong_traces.txt"), lambda text: refusal(json.loads(text)))
     for begin, long in (('"', "1\n" * 100_000), ("", "1" * 100_000)):
         (line,) = refusal(f"sent_ms,received_ms\n{begin}{long}")
         assert len(line) < 160
@@ -230,9 +218,7 @@ def network(count: int = 200, seed: int = 1) -> tuple[list[Sent], list[Sent], di
     """Return what is sent and what arrives (lost, reordered, duplicated), and the delays."""
     rng = random.Random(seed)
     sent = [Sent(T_NS + k * CAPTURE_PERIOD_NS, struct.pack(">Q", k)) for k in range(count)]
-    delays = {
-        k: rng.randrange(5 * CAPTURE_PERIOD_NS) + 1 for k in range(count) if rng.random() > 0.3
-    }
+    delays = {k: rng.randrange(5 * CAPTURE_PERIOD_NS) + 1 for k in range(count) if rng.random() > 0.3}
     arrived = [sent[k]._replace(t_ns=sent[k].t_ns + delay) for k, delay in delays.items()]
     arrived += [one._replace(t_ns=one.t_ns + 10**9) for one in arrived[::7]]
     return sent, sorted(arrived), delays
@@ -255,9 +241,7 @@ def test_two_captures_give_the_losses_and_relative_delays(offset_ns: int) -> Non
         assert abs(delay_ns - (delays[k] - smallest)) < 500e-6 * 200 * CAPTURE_PERIOD_NS + 2
     assert any("--flow chooses" in line for line in trace.notes)
     if offset_ns == 0:
-        assert (
-            delays_in(trace_of(pcap_of(*sent), pcapng_of(*shifted), clocks_differ=False)) == delays
-        )
+        assert delays_in(trace_of(pcap_of(*sent), pcapng_of(*shifted), clocks_differ=False)) == delays
 
 
 def test_one_capture_of_both_ends_is_matched_in_the_right_direction() -> None:
@@ -296,9 +280,7 @@ def probes(count: int) -> list[Sent]:
         Sent(
             T_NS + k * CAPTURE_PERIOD_NS + k % 3,
             encode_probe(
-                ProbeDatagram(
-                    ProbeKind.PROBE, 7, 0, k, k * CAPTURE_PERIOD_NS, 0, CAPTURE_PERIOD_NS, count
-                ),
+                ProbeDatagram(ProbeKind.PROBE, 7, 0, k, k * CAPTURE_PERIOD_NS, 0, CAPTURE_PERIOD_NS, count),
                 150,
             ),
         )
@@ -308,9 +290,7 @@ def probes(count: int) -> list[Sent]:
 
 def test_a_probe_captured_at_the_receiver_has_its_sending_times() -> None:
     arrived = [one for k, one in enumerate(probes(100)) if k % 4]
-    end = Sent(
-        T_NS, encode_probe(ProbeDatagram(ProbeKind.END, 7, 0, 100, 0, 0, CAPTURE_PERIOD_NS, 100))
-    )
+    end = Sent(T_NS, encode_probe(ProbeDatagram(ProbeKind.END, 7, 0, 100, 0, 0, CAPTURE_PERIOD_NS, 100)))
     trace = trace_of(pcap_of(end, *arrived, end))
     assert len(trace) == 99
     assert trace.lost.tolist() == [k % 4 == 0 for k in range(1, 100)]

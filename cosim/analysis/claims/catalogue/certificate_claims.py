@@ -117,9 +117,7 @@ def region(
     here, limits = samples.with_x, np.array(certificate.region.x)
     shares = (np.abs(samples.true_x[here]) / limits).max(axis=1)
     names = run.record.loop.state_names
-    formula = ", ".join(
-        f"|{name}| ≤ {limit:.4g}" for name, limit in zip(names, limits, strict=True)
-    )
+    formula = ", ".join(f"|{name}| ≤ {limit:.4g}" for name, limit in zip(names, limits, strict=True))
     return Findings(Bound(formula, samples.t_s[here], shares, run.violation_of(certificate)))
 
 

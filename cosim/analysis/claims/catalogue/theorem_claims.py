@@ -26,8 +26,9 @@ _CAPPED = "at most M − 1 consecutive losses"
 
 @claim(
     "the controller's error is at most the sensor's error plus the missed jumps",
-    "(I1)", _COMPLETE,
-)  # fmt: skip
+    "(I1)",
+    _COMPLETE,
+)
 def i1_controller_error(run: RunEvidence, samples: Samples) -> Findings:
     """The triangle inequality for (I1)."""
     error, values = (
@@ -69,9 +70,11 @@ def _margin(run: RunEvidence) -> float:
 
 
 @claim(
-    "the paper's bound of the controller's error", "eq:LossEv3", _CONTINUOUS,
+    "the paper's bound of the controller's error",
+    "eq:LossEv3",
+    _CONTINUOUS,
     needs_ideal_loop=True,
-)  # fmt: skip
+)
 def paper_error_bound(run: RunEvidence, samples: Samples) -> Findings:
     """(I1) with the threshold in place of e_s at the events."""
     coverage = run.record.scenario.coverage
@@ -83,9 +86,11 @@ def paper_error_bound(run: RunEvidence, samples: Samples) -> Findings:
 
 
 @claim(
-    "the controller's error decays", "Theorem 1 (3 for a hold), Δ from this run's trajectory",
-    f"{_CONTINUOUS}, {_CAPPED}", needs_ideal_loop=True,
-)  # fmt: skip
+    "the controller's error decays",
+    "Theorem 1 (3 for a hold), Δ from this run's trajectory",
+    f"{_CONTINUOUS}, {_CAPPED}",
+    needs_ideal_loop=True,
+)
 def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> Findings:
     """Theorem 1 with the Δ of the trajectory."""
     scenario = run.record.scenario
@@ -107,9 +112,13 @@ def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> Findings:
     if run.theorem_2 is None:
         return Findings()
     found = least_inter_event_time(
-        run, samples, run.theorem_2.inter_event_s, run.paper_violation, "Theorem 2 (eq:tau)",
+        run,
+        samples,
+        run.theorem_2.inter_event_s,
+        run.paper_violation,
+        "Theorem 2 (eq:tau)",
         "printed",
-    )  # fmt: skip
+    )
     knows_state = run.record.scenario.coverage.knows_state
     return found if knows_state else Findings(None, found.envelope)
 

@@ -32,9 +32,7 @@ class LanePicture(draw.Picture):
     kinds = ("vehicle",)
     title = "The car on its lane"
 
-    def __init__(
-        self, lateral: int, yaw: int, *, forward_mps: float = 0.0, vehicle: bool = False
-    ) -> None:
+    def __init__(self, lateral: int, yaw: int, *, forward_mps: float = 0.0, vehicle: bool = False) -> None:
         self._lateral, self._yaw = lateral, yaw
         self._forward_mps, self._vehicle = forward_mps, vehicle
         self._hand = -1.0 if forward_mps < 0 else 1.0
@@ -57,9 +55,7 @@ class LanePicture(draw.Picture):
         marks = np.arange(round(left / _MARKS_EVERY_M), round(right / _MARKS_EVERY_M))
         posts = np.arange(round(left / _POSTS_EVERY_M), round(right / _POSTS_EVERY_M))
         return {
-            "road/edges": draw.lines(
-                [[(left, y), (right, y)] for y in (-edge, edge)], draw.STILL, 0.15
-            ),
+            "road/edges": draw.lines([[(left, y), (right, y)] for y in (-edge, edge)], draw.STILL, 0.15),
             "road/middle": draw.lines([[(left, 0.0), (right, 0.0)]], draw.STILL, 0.03),
             "road/passing": draw.lines(
                 [
@@ -109,9 +105,7 @@ class LanePicture(draw.Picture):
             wheels += [(_AXLE_M, _TRACK_M), (_AXLE_M, -_TRACK_M)]
         else:
             for side in ("left", "right"):
-                steered[f"plant/steered/{side}"] = draw.lines(
-                    [_wheel(0.0, 0.0)], _GLASS, 0.3, order=1.0
-                )
+                steered[f"plant/steered/{side}"] = draw.lines([_wheel(0.0, 0.0)], _GLASS, 0.3, order=1.0)
         round_m = 0.35
         inner, across = half - round_m, _WIDTH_M / 2 - round_m
         panels = [[(-inner, y), (inner, y)] for y in np.linspace(-across, across, 4).tolist()]

@@ -68,17 +68,13 @@ class PendulumPicture(draw.Picture):
         if self._position is None:
             foot = [(-0.16 * scale, -0.1 * scale), (0.0, 0.0), (0.16 * scale, -0.1 * scale)]
             found["pivot"] = draw.lines([foot], draw.STILL, 0.04 * scale)
-            found["upright"] = draw.lines(
-                [[(0.0, 0.0), (0.0, 1.15 * scale)]], draw.STILL, 0.008 * scale
-            )
+            found["upright"] = draw.lines([[(0.0, 0.0), (0.0, 1.15 * scale)]], draw.STILL, 0.008 * scale)
         else:
             ground = -(_CART_HIGH / 2 + 0.03) * scale
             ends = (-2 * self._wide, 2 * self._wide)
             step = 10.0 ** np.floor(np.log10(self._wide))
             ticks = (step * np.arange(-10, 11)).tolist()
-            found["rail"] = draw.lines(
-                [[(ends[0], ground), (ends[1], ground)]], draw.STILL, 0.03 * scale
-            )
+            found["rail"] = draw.lines([[(ends[0], ground), (ends[1], ground)]], draw.STILL, 0.03 * scale)
             found["rail/ticks"] = draw.lines(
                 [[(at, ground), (at, ground - 0.08 * scale)] for at in ticks],
                 draw.STILL,
@@ -119,8 +115,10 @@ class PendulumPicture(draw.Picture):
     def _pole(self, who: str) -> draw.Shape:
         high, width = self._scale, _WIDTHS[who] * self._scale
         pole = [(0.0, 0.0), (0.0, high)]
-        bob = [(0.07 * self._scale * np.cos(a), high + 0.07 * self._scale * np.sin(a))
-               for a in np.linspace(0, 2 * np.pi, 13).tolist()]  # fmt: skip
+        bob = [
+            (0.07 * self._scale * np.cos(a), high + 0.07 * self._scale * np.sin(a))
+            for a in np.linspace(0, 2 * np.pi, 13).tolist()
+        ]
         if who == "controller":
             pieces = [[(0.0, high * a), (0.0, high * (a + 0.06))] for a in np.arange(0, 0.95, 0.1)]
             return draw.body(who, [*pieces, bob], 1.4 * width)

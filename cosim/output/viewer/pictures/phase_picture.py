@@ -45,9 +45,7 @@ class PhasePicture(draw.Picture):
         found: dict[str, draw.Shape] = {
             "axes": draw.lines([*square, [(-1, 0), (1, 0)], [(0, -1), (0, 1)]], draw.STILL, 0.006)
         }
-        ends: list[tuple[str, float, tuple[float, float]]] = [
-            (self._names[0], self._reach[0], (1.0, -1.0))
-        ]
+        ends: list[tuple[str, float, tuple[float, float]]] = [(self._names[0], self._reach[0], (1.0, -1.0))]
         if len(self._names) == 2:
             ends.append((self._names[1], self._reach[1], (0.0, 1.17)))
         for i, (name, reach, at) in enumerate(ends):

@@ -134,9 +134,7 @@ def panel(picture: Picture) -> rrb.Spatial2DView:
         origin=PICTURE,
         name=picture.title,
         visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[-top, -bottom]),
-        overrides={
-            f"{PICTURE}/{entity}": rrb.VisibleTimeRanges([past]) for entity in picture.trails
-        },
+        overrides={f"{PICTURE}/{entity}": rrb.VisibleTimeRanges([past]) for entity in picture.trails},
     )
 
 
@@ -173,9 +171,7 @@ def trail_style(who: str, width: float) -> rr.LineStrips2D:
     return style(WHO[who], width, order=_ORDERS[who] - 2)
 
 
-def label(
-    text: str, at: tuple[float, float], colour: Colour, *, order: float = _FRONT
-) -> rr.Points2D:
+def label(text: str, at: tuple[float, float], colour: Colour, *, order: float = _FRONT) -> rr.Points2D:
     """Return a text below a point."""
     return rr.Points2D(
         upright([at]), radii=0.0, colors=colour, labels=text, show_labels=True, draw_order=order
@@ -215,18 +211,14 @@ def clipped(points: Reals) -> NDArray[np.float32]:
     return np.clip(np.nan_to_num(points, nan=_FAR), -_FAR, _FAR).astype(np.float32)
 
 
-def circle(
-    radius: float, corners: int, centre: tuple[float, float] = (0.0, 0.0)
-) -> list[list[float]]:
+def circle(radius: float, corners: int, centre: tuple[float, float] = (0.0, 0.0)) -> list[list[float]]:
     """Return the corners of a regular polygon."""
     around = np.linspace(0, 2 * np.pi, corners, endpoint=False)
     points = np.column_stack([np.cos(around), np.sin(around)])
     return (radius * points + centre).tolist()  # type: ignore[no-any-return]
 
 
-def outline(
-    corners: Sequence[Sequence[float]], dash: float | None = None
-) -> list[list[list[float]]]:
+def outline(corners: Sequence[Sequence[float]], dash: float | None = None) -> list[list[list[float]]]:
     """Return a closed line through corners, or dashes of a given length along it.
 
     A dashed line can be distinguished from a solid one without colours.
@@ -259,9 +251,7 @@ def picture_of(scenario: Scenario) -> Picture:
     for module in pkgutil.iter_modules(import_module(package).__path__):
         import_module(f"{package}.{module.name}")
     kind = scenario.plant.system.kind
-    for drawing in sorted(
-        Picture.__subclasses__(), key=lambda one: (one.draws_any, kind not in one.kinds)
-    ):
+    for drawing in sorted(Picture.__subclasses__(), key=lambda one: (one.draws_any, kind not in one.kinds)):
         if (picture := drawing.of(plant)) is not None:
             return picture
     raise AssertionError("the phase plot draws any plant")
@@ -272,9 +262,7 @@ def reach_of(loop: LoopMatrices, horizon_ns: int) -> Reals:
 
     It is 1 for a state that stays at 0.
     """
-    step = Propagator(loop.A_model + loop.B_model @ loop.K).transition(
-        max(horizon_ns // _SAMPLES, 1)
-    )
+    step = Propagator(loop.A_model + loop.B_model @ loop.K).transition(max(horizon_ns // _SAMPLES, 1))
     at_rest = np.zeros(loop.n) if loop.setpoint is None else loop.setpoint
     deviation, reach = loop.x0 - at_rest, np.abs(loop.x0)
     with np.errstate(all="ignore"):

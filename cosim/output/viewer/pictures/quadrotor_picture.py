@@ -41,9 +41,11 @@ class QuadrotorPicture(draw.Picture):
         for view, side in (("above", -1), ("side", 1)):
             middle = side * self._apart
             corners = [
-                (middle - edge, -edge), (middle + edge, -edge),
-                (middle + edge, edge), (middle - edge, edge),
-            ]  # fmt: skip
+                (middle - edge, -edge),
+                (middle + edge, -edge),
+                (middle + edge, edge),
+                (middle - edge, edge),
+            ]
             cross = [
                 [(middle - edge, 0.0), (middle + edge, 0.0)],
                 [(middle, -edge), (middle, edge)],

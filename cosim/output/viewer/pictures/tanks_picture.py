@@ -11,8 +11,10 @@ _PLACES = ((-0.9, 0.0), (0.9, 0.0), (-0.9, 2.3), (0.9, 2.3))
 """Lower left corners of the tanks 1 to 4; the upper two are 3 and 4."""
 _HATCH, _TALLEST_CM = 7, 20.0
 _STYLES: Mapping[str, tuple[float, float]] = {
-    "plant": (0.07, 2.0), "sensor": (0.06, 4.0), "controller": (0.09, 3.0),
-}  # fmt: skip
+    "plant": (0.07, 2.0),
+    "sensor": (0.06, 4.0),
+    "controller": (0.09, 3.0),
+}
 
 
 class TanksPicture(draw.Picture):

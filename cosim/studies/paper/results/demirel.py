@@ -9,7 +9,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from cosim.studies.paper.published_result import PublishedResult, Row, number, stored
 from noack.core.linear_systems import Matrix
 
-_WHERE = "README.md, table"
+_WHERE = "authors' README.md"
 _HOW = (
     "stationary second moments of plant, filter and controller together over a period (a discrete "
     "Lyapunov equation), not the formula of the authors' program"
@@ -89,7 +89,7 @@ def _rows() -> list[Row]:
     for schedule, published in stored("demirel")["losses"].items():
         turns = schedule.split(",")
         total = sum(loop.loss([turn == own for turn in turns]) for own, loop in drawn)
-        row = number(f"loss of {schedule}", _WHERE, float(published), total, _HOW, digits=4)
+        row = number(f"loss of {', '.join(turns)}", _WHERE, float(published), total, _HOW, digits=4)
         found.append(row._replace(deviation=_DEVIATION if len(turns) == 7 else ""))
     return found
 

@@ -4,13 +4,7 @@ import numpy as np
 from scipy.integrate import quad
 
 from cosim.simulation.continuous import ContinuousLoop
-from cosim.studies.paper.published_result import (
-    PublishedResult,
-    Row,
-    directions,
-    run_all,
-    shipped_loop,
-)
+from cosim.studies.paper.published_result import PublishedResult, Row, directions, run_all, shipped_loop
 
 _WHERE = "Corollary IV.1"
 _HOW = "shortest inter-event time of exact runs of 2 s; τ is the corollary's integral"
@@ -36,8 +30,8 @@ def _rows() -> list[Row]:
         shortest_s = float(np.nanmin(np.diff(log.event_s, prepend=0.0)))
         least_s = bound_s(loop, sigma)
         agrees = least_s <= shortest_s <= _CLOSE * least_s
-        texts = f"≥ {1e3 * least_s:.3f} ms", f"{1e3 * shortest_s:.3f} ms"
-        found.append(Row(f"shortest interval, σ = {sigma:g}", _WHERE, *texts, _HOW, agrees))
+        texts = f"{1e3 * least_s:.3f} ms", f"{1e3 * shortest_s:.3f} ms"
+        found.append(Row(f"shortest interval, σ = {sigma:g}", _WHERE, "≥", *texts, _HOW, agrees))
     return found
 
 

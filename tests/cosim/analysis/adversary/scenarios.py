@@ -130,9 +130,7 @@ def every_run(resolved: Scenario) -> Iterator[ContinuousRun]:
         prefix = (*decided[: lost[-1]], True)
 
 
-def flow_of(
-    resolved: Scenario, objective: Objective, rate_per_s: float | None = None
-) -> SegmentFlow:
+def flow_of(resolved: Scenario, objective: Objective, rate_per_s: float | None = None) -> SegmentFlow:
     system = continuous_loop_of(resolved)
     known_start = resolved.network.initial_sync == "known_state"
     measure = measure_of(system, objective, rate_per_s)

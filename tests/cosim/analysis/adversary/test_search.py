@@ -44,27 +44,10 @@ def rate_of(resolved: Scenario) -> float | None:
     return None if constants is None else constants.rate_per_s
 
 
-@pytest.mark.parametrize(
-    "guarantee",
-    [
-        {"mansd": 2, "window": (1, 1), "recovery": 0},
-        {"mansd": 3, "window": (2, 4), "recovery": 0},
-        {"mansd": 2, "window": (2, 5), "recovery": 2},
-    ],
-    ids=["cap", "in a window", "with recovery"],
-)
-def test_the_search_finds_the_worst_of_all_patterns(guarantee: dict[str, Any]) -> None:
+@given(resolved=scenarios(5, mansd=2, window=(2, 5), recovery=2))
+@settings(MANY, max_examples=4)
+def test_the_search_finds_the_worst_of_all_patterns(resolved: Scenario) -> None:
     """Also without initial patterns, so that only the tree's own branches can find it."""
-
-    @given(resolved=scenarios(5, **guarantee))
-    @settings(MANY, max_examples=4)
-    def check(resolved: Scenario) -> None:
-        assert_worst_is_found(resolved)
-
-    check()
-
-
-def assert_worst_is_found(resolved: Scenario) -> None:
     runs = list(every_run(resolved))
     for objective in Objective:
         flow = flow_of(resolved, objective, rate_of(resolved))

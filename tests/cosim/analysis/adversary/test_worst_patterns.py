@@ -110,8 +110,10 @@ def value_of(
     return worst
 
 
-@pytest.mark.parametrize("mode", ["model", "zoh"])
-@pytest.mark.parametrize("policy", EXAMPLES)
+@pytest.mark.parametrize(
+    ("policy", "mode"),
+    [*((one, "model") for one in EXAMPLES), ("decaying", "zoh"), ("mixed", "zoh")],
+)
 def test_the_search_finds_the_worst_of_all_patterns(policy: str, mode: str) -> None:
     trigger = EXAMPLES[policy] | OWN.get(policy, {})
     resolved = scenario_of(trigger, mode=mode)
@@ -201,9 +203,7 @@ def test_what_cannot_be_searched_is_refused(scenario: dict[str, Any], message: s
     ],
     ids=["disturbance", "noise", "observer"],
 )
-def test_no_signs_are_worse_than_those_found(
-    sections: dict[str, Any], objective: Objective
-) -> None:
+def test_no_signs_are_worse_than_those_found(sections: dict[str, Any], objective: Objective) -> None:
     """Events every 0.15 s, whatever is measured: so the worst signs are those of the responses."""
     periodic = {"policy": "periodic", "period_s": 0.15}
     resolved = scenario_of(periodic, horizon_s=0.35, network={"mansd": 0}, **sections)

@@ -58,9 +58,7 @@ class OtherClock:
 
 def simulated(scenario: Scenario, clocks: dict[str, tuple[int, int]]) -> RunRecord:
     """Simulate with the offset in ns and the drift in ppb of the clock of each role."""
-    wraps = {
-        role: partial(OtherClock, offset_ns=at, drift_ppb=by) for role, (at, by) in clocks.items()
-    }
+    wraps = {role: partial(OtherClock, offset_ns=at, drift_ppb=by) for role, (at, by) in clocks.items()}
     return shuttled(scenario, wraps=wraps)
 
 
@@ -74,7 +72,7 @@ def test_every_claim_holds_whatever_the_clocks(make: Make, delay_s: float) -> No
     """Offsets of up to 50 ms, drifts of up to 100 ppm; late runs have a certificate for that."""
     impairments = [{"kind": "delay", "delay_s": delay_s}] if delay_s else []
     rng, seen = np.random.default_rng(5), set()
-    for number in range(20):
+    for number in range(10):
         scenario = make(
             horizon_s=3.0, certificate={"late_periods": number % 2 * 3},
             network={"impairments": impairments},

@@ -10,11 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.claims.condition_reader import (
-    AssumptionMonitor,
-    ConditionReader,
-    read_conditions,
-)
+from cosim.analysis.claims.condition_reader import AssumptionMonitor, ConditionReader, read_conditions
 from cosim.analysis.claims.observed_conditions import (
     BEYOND_CERTIFICATE,
     CAUSES,

@@ -217,8 +217,9 @@ def test_what_is_called_at_the_wrong_time_is_an_error(folders: Folders) -> None:
     for wrong in ((put, [99], [1.0]), (put, [1], [1.0]), (put, [5], [1.0]), (get, [14]), (get, [2]),
                   (get, [2], 3)):  # fmt: skip
         assert "value" in channel.refuses(*wrong)
-    with pytest.raises(FMICallException, match="status 3"):
-        slave.getFloat32([0])
+    assert "fmi3GetFloat32 is not a function" in channel.refuses(slave.getFloat32, [0])
+    no_state = (slave.fmi3SetFMUState, slave.component, None)
+    assert "there is no state" in channel.refuses(*no_state)
     channel.step(0.0, H_S)
     kept = channel.state()
     for from_s, step_s in ((0.0, H_S), (H_S, -H_S), (math.nan, H_S), (H_S, math.inf), (0.5, H_S)):
@@ -232,8 +233,12 @@ def test_what_is_called_at_the_wrong_time_is_an_error(folders: Folders) -> None:
     for k in range(40):
         channel.step(k * 1e-4, 1e-4, send=k + 1)
     assert "make shorter steps" in channel.refuses(slave.doStep, 40e-4, 1.0)
-    controller.start().set("arrivals", 9)
-    assert "make shorter steps" in controller.refuses(controller.slave.doStep, 0.0, H_S)
+    for arrivals, arrival_s, line in ((9, 0.0, "make shorter steps"), (-1, 0.0, "not decrease"),
+                                      (1, math.nan, "not a time")):  # fmt: skip
+        controller.start().set("arrivals", arrivals)
+        controller.set("packet_arrival_s", [arrival_s, *[0.0] * 7])
+        assert line in controller.refuses(controller.slave.doStep, 0.0, H_S)
+        controller.slave.reset()
     slave.reset()
     channel.start().slave.terminate()
     assert channel.get("arrivals") == 0
@@ -264,6 +269,7 @@ def test_resources_that_are_damaged_give_one_line(folders: Folders) -> None:
     for wrong, line in (
         (content[:-1], "noack.bin is too short"),
         (content[:40], "noack.bin is too short"),
+        (content + b"?", "noack.bin is too long"),
         (content[:-1] + b"?", "noack.bin is damaged: its check sum is wrong"),
         (content[:16] + b"?" + content[17:], "for another version of noack than the library"),
         ((other / "resources/noack.bin").read_bytes(), "its token is another one"),
@@ -294,9 +300,7 @@ def test_a_scenario_that_an_fmu_cannot_have_is_one_line(
     assert not [*tmp_path.iterdir()]
 
 
-def test_the_command_takes_scenarios_and_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_takes_scenarios_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A scenario gives the same bytes in each process: there is no address in them."""
     monkeypatch.chdir(tmp_path)
     scenario = noack.load("double_integrator", {"network.mansd": 2})
@@ -312,6 +316,12 @@ def test_the_command_takes_scenarios_and_runs(
     loops = noack.simulate(noack.load("different_loops", {"horizon_s": 0.1}))
     with pytest.raises(CallerError, match="the scenario has loops"):
         next(iter(loops.loops.values())).export("d.fmu")
-    refused = invoke("export", str(run.directory), "--format", "csv", "--set", "network.mansd=2")
-    assert refused.exit_code == 2
-    assert "--set: a run has its settings" in refused.stderr
+    for option, kind in ("--set=network.mansd=2", "csv"), ("--no-certificates", "fmu"):
+        refused = invoke("export", str(run.directory), "--format", kind, option)
+        assert refused.exit_code == 2
+        assert f"{option.split('=')[0]}: " in refused.stderr
+    Path("v1.2").mkdir()
+    invoke("export", "double_integrator", "--format", "fmu", "--out", "v1.2")
+    invoke("export", "double_integrator", "--format", "fmu", "--out", "v1.2/v1.2")
+    found = [path.name.removesuffix("_channel.fmu") for path in Path("v1.2").glob("*_channel.fmu")]
+    assert sorted(found) == ["double_integrator", "v1.2"]

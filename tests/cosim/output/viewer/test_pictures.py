@@ -112,9 +112,7 @@ def rows_of(diagram: NetworkDiagram, ends_ns: list[int]) -> dict[str, dict[int, 
     return found
 
 
-def sent(
-    diagram: NetworkDiagram, packets: list[tuple[float, Fate]], delay_s: float = 0.0
-) -> NetworkDiagram:
+def sent(diagram: NetworkDiagram, packets: list[tuple[float, Fate]], delay_s: float = 0.0) -> NetworkDiagram:
     t_ns = np.array([round(t_s * S) for t_s, _ in packets], np.int64)
     fate = np.array([fate for _, fate in packets], np.int64)
     diagram.add(t_ns, t_ns + round(delay_s * S), fate)

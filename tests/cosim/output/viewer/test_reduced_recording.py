@@ -62,9 +62,7 @@ def require_envelope(t_ns: Times, values: Floats, kept_ns: Times, kept: Floats) 
         assert values[row, entry] in kept[kept_ns == t_ns[row], entry]
 
 
-def test_each_envelope_holds_all_samples_of_its_bin(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_envelope_holds_all_samples_of_its_bin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = find_shipped("double_integrator", "scenarios")
     record = with_peaks(simulate(resolve(load(scenario, ["horizon_s=20"]))))
     write_scenario(record.scenario, tmp_path)
@@ -86,14 +84,10 @@ def test_each_envelope_holds_all_samples_of_its_bin(
         require_envelope(measured["t_ns"], after_reset[:, i : i + 1], kept_ns, kept[:, 1:2])
 
 
-def test_no_recording_is_written_on_a_full_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_recording_is_written_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a failed write rerun may wait forever."""
     scenario = resolve(load(find_shipped("lane_following", "scenarios"), ["horizon_s=0.1"]))
-    monkeypatch.setattr(
-        "cosim.output.viewer.run_recording.disk_usage", lambda _: Mock(free=1 << 20)
-    )
+    monkeypatch.setattr("cosim.output.viewer.run_recording.disk_usage", lambda _: Mock(free=1 << 20))
     with pytest.raises(ViewError, match="No space left"):
         write_loop_view(simulate(scenario), tmp_path / RECORDING_FILE)
     assert not [*tmp_path.iterdir()]

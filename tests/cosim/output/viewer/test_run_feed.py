@@ -6,13 +6,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from cosim.analysis.network_summary import (
-    INTERVALS,
-    counts_inside,
-    loops_over_time,
-    quantiles,
-    times_inside,
-)
+from cosim.analysis.network_summary import INTERVALS, counts_inside, loops_over_time, quantiles, times_inside
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.run_feed import RunFeed
 from cosim.output.viewer.run_recording import ERROR, MAP, QUEUE, SHARE, SIZE, open_recording
@@ -70,9 +64,7 @@ def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phas
     horizon_ns = run.network.scenario.timing.horizon_ns
     edges_ns = np.linspace(0, horizon_ns, INTERVALS + 1)
     means, largest = counts_inside(*times_inside(run.network[NETEM_PACKET]), edges_ns)
-    np.testing.assert_allclose(
-        series(found, QUEUE)[1], np.column_stack([largest, means]), atol=1e-6
-    )
+    np.testing.assert_allclose(series(found, QUEUE)[1], np.column_stack([largest, means]), atol=1e-6)
     shares = 100 * expected.shares()[1]
     curves = (shares if count == 3 else quantiles(shares)).T
     np.testing.assert_allclose(series(found, SHARE)[1], curves, rtol=1e-6)

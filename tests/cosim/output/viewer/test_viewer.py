@@ -348,9 +348,7 @@ def test_other_host_names_and_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"", b"<html>"])
-def test_a_file_that_is_not_a_recording_is_not_served(
-    content: bytes | None, tmp_path: Path
-) -> None:
+def test_a_file_that_is_not_a_recording_is_not_served(content: bytes | None, tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     if content is not None:
         path.write_bytes(content)

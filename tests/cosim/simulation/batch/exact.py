@@ -9,14 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from cosim.simulation.continuous import ContinuousLoop, ContinuousRun, simulate_continuous
-from cosim.simulation.exact_simulation import (
-    OK,
-    Events,
-    Population,
-    Setting,
-    run_batch,
-    run_with_events,
-)
+from cosim.simulation.exact_simulation import OK, Events, Population, Setting, run_batch, run_with_events
 from noack.core.linear_systems import Vector
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.corrupt import Corrupt
@@ -65,9 +58,7 @@ def random_setting(rng: np.random.Generator, n: int, m: int) -> Setting:
         link=LinkSettings(
             impairments=tuple(impairments),
             mansd=int(rng.integers(0, 5)) if rng.random() < 0.9 else None,
-            constraints=(AtMost(losses=2, window=int(rng.integers(3, 8))),)
-            if rng.random() < 0.3
-            else (),
+            constraints=(AtMost(losses=2, window=int(rng.integers(3, 8))),) if rng.random() < 0.3 else (),
             first_delivered=bool(not known and rng.random() < 0.8),
         ),
         horizon_s=3.0,
@@ -153,9 +144,7 @@ def check_events(run: ContinuousRun, setting: Setting) -> int:
             return value_of(rule.form, y[: 2 * n]) - used - right * right
 
         start = np.concatenate([*state[1:], [0.0 if rule.integrates else eta]])
-        solved = solve_ivp(
-            flow, (begin_s, end_s), start, "DOP853", rtol=1e-11, atol=1e-14, dense_output=True
-        )
+        solved = solve_ivp(flow, (begin_s, end_s), start, "DOP853", rtol=1e-11, atol=1e-14, dense_output=True)
         from_s = begin_s + max(rule.idle_ns * 1e-9, 0.0)
         if len(rule.form.up) and not rule.grid_ns and from_s < end_s - 1e-6:
             inside = np.linspace(from_s, end_s, 203)[1:-1]

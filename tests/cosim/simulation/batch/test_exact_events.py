@@ -9,13 +9,7 @@ import pytest
 
 from cosim.shipped_files import find_shipped
 from cosim.simulation.continuous import TooManyEventsError, run_continuous
-from cosim.simulation.exact_simulation import (
-    TOO_MANY_EVENTS,
-    Population,
-    Setting,
-    run_batch,
-    setting_of,
-)
+from cosim.simulation.exact_simulation import TOO_MANY_EVENTS, Population, Setting, run_batch, setting_of
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.impairments.kinds.delay import Delay

@@ -17,12 +17,7 @@ from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.campaign_grid import row_type
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario, seeds_of
-from cosim.studies.campaign.sampled_draws import (
-    LOOPS_ROW,
-    SampledWork,
-    SharedNetworkWork,
-    in_virtual_time,
-)
+from cosim.studies.campaign.sampled_draws import LOOPS_ROW, SampledWork, SharedNetworkWork, in_virtual_time
 from noack.core.errors import CallerError, ExitStatus
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss
@@ -162,9 +157,7 @@ def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
 def test_a_loop_that_diverges_costs_an_infinite_amount_and_is_counted() -> None:
     own = "A = [[0.0, 1.0], [900.0, 0.0]], B = [[0.0], [1.0]]"
     wild = f'{{ name = "wild", plant = {{ draw = "given", {own} }} }}'
-    one = shared_work(
-        "horizon_s=30", f'loops=[{{ name = "calm", count = 3 }}, {wild}]', most_events=400
-    )
+    one = shared_work("horizon_s=30", f'loops=[{{ name = "calm", count = 3 }}, {wild}]', most_events=400)
     (row,) = one.run(range(1))
     assert row["loops_failed"] == 0.25
     assert np.isnan(row["cost"])

@@ -33,9 +33,7 @@ def test_the_grid_is_all_combinations_and_the_last_axis_varies_fastest(
     assert points[0].scenario.plant.initial_state_halfwidth == (0.5, 0.5)
 
 
-def test_an_axis_of_a_table_is_applied_before_an_axis_of_its_keys(
-    write: Write, plan: dict[str, Any]
-) -> None:
+def test_an_axis_of_a_table_is_applied_before_an_axis_of_its_keys(write: Write, plan: dict[str, Any]) -> None:
     variants = {"t": {"trigger": {"beta": 2.0, "alpha_per_s": 1.0}}, "f": {"trigger.floor": 0.1}}
     tables = {"name": "trigger", "variants": variants}
     key = {"name": "beta", "key": "trigger.beta", "values": [0.1, 0.1234567, 0.1234568]}
@@ -96,9 +94,7 @@ def test_the_published_campaign_schema_is_up_to_date() -> None:
     assert json.loads(published) == json_schema()
 
 
-def test_too_many_curves_for_one_figure_are_refused_with_a_remedy(
-    write: Write, plan: dict[str, Any]
-) -> None:
+def test_too_many_curves_for_one_figure_are_refused_with_a_remedy(write: Write, plan: dict[str, Any]) -> None:
     plan["axes"][1]["values"] = [i / 10 for i in range(1, 8)]
     with pytest.raises(CallerError, match=r"14 series are too many.* where = "):
         load(write(plan, figures=[{"kind": "distribution", "metric": "cost"}]))

@@ -21,9 +21,7 @@ from tests.cosim.studies.campaign.conftest import Few, Write, few_of
 
 def files(folder: Path) -> dict[str, int]:
     """Parquet files and their modification times."""
-    return {
-        str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*.parquet")
-    }
+    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*.parquet")}
 
 
 def test_every_chunk_contains_its_draws_and_their_axis_values(full: Store, campaign: Few) -> None:

@@ -171,9 +171,7 @@ class Cluster:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._started: list[subprocess.Popen[str]] = []
-        self.scheduler = self._start(
-            "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"
-        )
+        self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
         assert self.scheduler.stderr is not None
         line = next(line for line in self.scheduler.stderr if "Scheduler at:" in line)
         self.address = line.split()[-1]
@@ -232,9 +230,7 @@ def test_a_cluster_from_its_first_worker_to_its_end(
         patched.setattr(campaign_workers, "_LOOK_EVERY_S", 0.1)
         patched.setattr(campaign_workers, "_PATIENCE_S", 0.5)
         with (
-            pytest.raises(
-                PeerError, match=r"the cluster has had no worker for 0\.5 s \(.*\); 0 of 240"
-            ),
+            pytest.raises(PeerError, match=r"the cluster has had no worker for 0\.5 s \(.*\); 0 of 240"),
             cluster(dask.address, lines.append) as runner,
         ):
             run_campaign(there, runner)

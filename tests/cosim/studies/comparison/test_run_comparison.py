@@ -65,9 +65,7 @@ def test_the_distance_is_over_the_common_times(found: RunComparison) -> None:
     assert largest.values[2] == pytest.approx(apart.max())
 
 
-def test_the_command_prints_the_table_and_writes_an_escaped_page(
-    runs: list[Path], tmp_path: Path
-) -> None:
+def test_the_command_prints_the_table_and_writes_an_escaped_page(runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "new" / "overlay.html"
     done = compare(*runs, "--out", out)
     assert done.exit_code == 0, done.output

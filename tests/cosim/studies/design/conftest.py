@@ -47,9 +47,7 @@ def scenario(mass: Path) -> Scenario:
     return load(mass)
 
 
-def designed(
-    scenario: Scenario, limits: DesignLimits, draws: int = 200, seed: int = 3
-) -> DesignResult:
+def designed(scenario: Scenario, limits: DesignLimits, draws: int = 200, seed: int = 3) -> DesignResult:
     families = families_of(scenario, ("identity", "given"), None)
     return design(families, limits, draws=draws, seed=seed)
 

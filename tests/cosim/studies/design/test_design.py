@@ -16,13 +16,7 @@ from click.testing import Result
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.design_search import (
-    DesignLimits,
-    DesignResult,
-    design,
-    measure,
-    require_draws,
-)
+from cosim.studies.design.design_search import DesignLimits, DesignResult, design, measure, require_draws
 from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa

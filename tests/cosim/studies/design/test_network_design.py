@@ -15,21 +15,10 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.design.event_design import (
-    Certified,
-    EventSearch,
-    design_for_network,
-    event_outcome,
-)
+from cosim.studies.design.event_design import Certified, EventSearch, design_for_network, event_outcome
 from cosim.studies.design.loop_growth import PatternGraph
 from cosim.studies.design.network_page import DesignOutcome
-from cosim.studies.design.network_search import (
-    Candidate,
-    NetworkSearch,
-    Reached,
-    Wish,
-    periodic_outcome,
-)
+from cosim.studies.design.network_search import Candidate, NetworkSearch, Reached, Wish, periodic_outcome
 from noack.impairments.loss_guarantee import LossesInWindow, LossGuarantee, LossHistory
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
@@ -93,9 +82,7 @@ def patterns(guarantee: LossGuarantee, length: int) -> Iterator[tuple[bool, ...]
     for losses in product((False, True), repeat=length - 1):
         pattern = (True, *(not lost for lost in losses))
         history = LossHistory(guarantee.rules)
-        kept = all(
-            value <= rule.limit for lost in pattern * 3 for rule, value in history.add(not lost)
-        )
+        kept = all(value <= rule.limit for lost in pattern * 3 for rule, value in history.add(not lost))
         if kept:
             yield pattern
 
@@ -141,9 +128,7 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
         """‖x‖ at the end of a simulated run of the processes under a pattern, repeated."""
         resolved = resolve(more.model_copy(update={"horizon_s": 120.0}))
         numbers = iter(range(100_000))
-        run = simulate(
-            resolved, lambda data, now_ns: 0 if pattern[next(numbers) % len(pattern)] else None
-        )
+        run = simulate(resolved, lambda data, now_ns: 0 if pattern[next(numbers) % len(pattern)] else None)
         return float(np.linalg.norm(run["plant_step"]["x"][-1]))
 
     kept = pole.best.found
@@ -183,9 +168,7 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
 
 def test_the_search_is_deterministic() -> None:
     wish = Wish(period_s=PERIOD_S, effort=60)
-    first, second = (
-        design_for_network(shipped("cart_pole", LINEAR), wish).to_json() for _ in range(2)
-    )
+    first, second = (design_for_network(shipped("cart_pole", LINEAR), wish).to_json() for _ in range(2))
     assert first == second
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from cosim.live.process_pool import process_starts, processes
 from tests.noack.theory.certificate_kinds import Broken, Kind, Tally
-from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS
+from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, SCHEDULED
 from tests.noack.theory.certificate_kinds.decaying import DECAYING
 from tests.noack.theory.certificate_kinds.policies import POLICIES
 from tests.noack.theory.certificate_kinds.random_losses import RANDOM_LOSSES
@@ -22,7 +22,7 @@ from tests.noack.theory.certificate_kinds.shares import DISTURBED, KNOWN_STATE, 
 KINDS: Mapping[str, Kind] = {
     kind.name: kind
     for kind in (
-        DECAYING, CONTINUOUS, DISTURBED, OBSERVED, RANDOM_LOSSES, KNOWN_STATE, *POLICIES,
+        DECAYING, CONTINUOUS, SCHEDULED, DISTURBED, OBSERVED, RANDOM_LOSSES, KNOWN_STATE, *POLICIES,
     )
 }  # fmt: skip
 

@@ -18,10 +18,11 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
 from noack.theory.certificates import invariant_ellipsoids
-from noack.theory.certificates.delivery_flow import DeliveryFlow, Reach
+from noack.theory.certificates.delivery_flow import UNDISTURBED, DeliveryFlow, Reach
 from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
+from noack.theory.certificates.scheduled_flow import _ScheduledFlow
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificate_kinds.decaying import bounds_of, search
+from tests.noack.theory.certificate_kinds.decaying import bounds_of, certified_by, search
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time
 from tests.oracles.lossy_loops import System, random_system
 
@@ -29,11 +30,15 @@ from tests.oracles.lossy_loops import System, random_system
 def only_the_start() -> AbstractContextManager[Any]:
     """The ellipsoid need not contain what errors drive x to."""
 
-    def within(ellipsoids: InvariantEllipsoids, limit: float) -> Reach | None:
+    def within(
+        ellipsoids: InvariantEllipsoids, limit: float, disturbed: Any = None, _: float = 0.0
+    ) -> Reach | None:
         starts = ellipsoids._starts
         if starts is None:
             return None
-        return Reach(starts, float(np.linalg.norm(starts.shape @ ellipsoids.flow.start)), limit)
+        size = float(np.linalg.norm(starts.shape @ ellipsoids.flow.start))
+        by = UNDISTURBED if disturbed is None else disturbed(starts, size)
+        return Reach(starts, size, limit, by)
 
     return patch.object(InvariantEllipsoids, "within", within)
 
@@ -51,6 +56,11 @@ def no_mismatch() -> AbstractContextManager[Any]:
         exact(flow, replace(plant, A=plant.error.H - plant.B @ plant.error.K))
 
     return patch.object(DeliveryFlow, "__init__", without)
+
+
+def no_age_of_inputs() -> AbstractContextManager[Any]:
+    """Inputs that are held and late do not change the flow."""
+    return patch.object(_ScheduledFlow, "_disturbed", lambda *_: UNDISTURBED)
 
 
 BROKEN_FLOWS: Mapping[str, Callable[[], AbstractContextManager[Any]]] = {
@@ -138,5 +148,41 @@ CONTINUOUS = Kind(
     | {
         name: Broken(partial(_broken, mistake), _near_the_example)
         for name, mistake in BROKEN_FLOWS.items()
+    },
+)  # fmt: skip
+
+
+_certified = certified_by(System.certify)
+
+
+def _broken_schedule(mistake: Callable[[], AbstractContextManager[Any]], system: System) -> Bounds | None:
+    with mistake():
+        return _certified(system)
+
+
+def _sampled(rng: np.random.Generator) -> System:
+    near = _near_the_example(rng)
+    return replace(near, step_s=0.02, delay_steps=1, hold_steps=1, known_start=rng.uniform() < 0.5)
+
+
+def _scheduled(rng: np.random.Generator) -> System:
+    """Few steps in a time constant; half of the loops are like the example, with a schedule."""
+    return _sampled(rng) if rng.uniform() < 0.5 else random_system(rng, n=int(rng.integers(1, 5)))
+
+
+_LATE = {"n": 1, "m": 1, "mansd": 0, "delay_steps": 4, "hold_steps": 0, "mismatch": 0.5}
+_HELD = {"n": 1, "m": 1, "mansd": 0, "delay_steps": 0, "hold_steps": 4}
+_LONG = {"beta": 0.01, "step_share": 0.03}
+
+SCHEDULED = Kind(
+    "schedule", _scheduled, _certified, search,
+    {
+        name: Broken(partial(_broken_schedule, mistake), draw)
+        for name, mistake, draw in (
+            ("the ellipsoid holds x(0) only", only_the_start, _sampled),
+            ("no mismatch in the flow", no_mismatch, partial(random_system, **_LATE, **_LONG)),
+            ("no age of inputs in the flow", no_age_of_inputs,
+             partial(random_system, **_HELD, **_LONG)),
+        )
     },
 )  # fmt: skip

@@ -207,9 +207,7 @@ def _lyapunov(system: System, rng: Rng) -> PolicyCase:
     steps = int(rng.integers(1, 4)) * system.sample_steps
     rule = {"policy": "lyapunov", "rate_per_s": 0.3}
     settings = {"policy": "deadline", "rule": rule, "interval_s": steps * system.step_s}
-    return settings, AtLatest(
-        steps, Growing(float(rng.choice([0.9, 2.0, 100.0])), system.sample_steps)
-    )
+    return settings, AtLatest(steps, Growing(float(rng.choice([0.9, 2.0, 100.0])), system.sample_steps))
 
 
 def _self_triggered(system: System, rng: Rng) -> PolicyCase:
@@ -253,9 +251,7 @@ def policy_case(
     return scenario_with(system, settings, push, rate_hz=rate_hz), rule, system
 
 
-def scenario_with(
-    system: System, trigger: dict[str, Any], push: float = 0.0, **plant: float
-) -> Scenario:
+def scenario_with(system: System, trigger: dict[str, Any], push: float = 0.0, **plant: float) -> Scenario:
     """The system's matrices with a trigger; the rates have no effect where conditions are given."""
     mode = "model" if system.H.any() else "zoh"
     model: Matrix = system.H - system.B @ system.K if mode == "model" else system.A
@@ -277,9 +273,7 @@ def scenario_with(
     return resolve(validate(content, "test"))
 
 
-def policy_shares(
-    trace: Trace, certificate: ScenarioCertificate, system: System
-) -> dict[str, float]:
+def policy_shares(trace: Trace, certificate: ScenarioCertificate, system: System) -> dict[str, float]:
     """The largest share of each bound that any run reached."""
     t_s = times_s(system)
     slack = _RELATIVE_ROUNDING * trace.state_weighted
@@ -351,7 +345,11 @@ def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], 
     def broken(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
         true = trigger_bounds(resolved)
         wrong = kind(true.rule, true.weight, true.fastest_per_s)
-        with patch.object(scenario_certificates, "trigger_bounds", lambda resolved: wrong):
+        with (
+            patch.object(scenario_certificates, "trigger_bounds", lambda resolved: wrong),
+            # What follows from times alone uses no bound of e_s.
+            patch.object(scenario_certificates, "_TIMED_RATES", ()),
+        ):
             return certify(resolved, conditions)
 
     return broken
@@ -361,14 +359,41 @@ def without_one_loss(resolved: Scenario, conditions: Conditions) -> ScenarioCert
     return certify(resolved, conditions._replace(dropouts=conditions.dropouts - 1))
 
 
+def without(name: str) -> Callable[[Scenario, Conditions], Any]:
+    """The certificate for conditions in which a time is 0."""
+
+    def broken(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
+        return certify(resolved, conditions._replace(**{name: 0.0}))
+
+    return broken
+
+
 INSTANT = {"delay_steps": 0, "hold_steps": 0, "known_start": True, "window": (1, 1), "recovery": 0}
+LATE = {"n": 2, "m": 1, "known_start": True, "window": (1, 1), "recovery": 0, "lag_steps": 0,
+        "sample_steps": 2, "mansd": 1}  # fmt: skip
 FAR = {"n": 1, "m": 1, "mismatch": 0.5, "step_share": 0.01, "sample_steps": 1, **INSTANT}
 
 BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dict[str, Any]]] = {
     **{
         f"{kind}, one loss less": (kind, without_one_loss, {**FAR, "mansd": 1, "beta": 0.01})
-        for kind in ("absolute", "mixed", "quadratic", "deadline", "self_triggered")
+        for kind in (
+            "absolute", "mixed", "quadratic", "deadline", "self_triggered", "periodic", "lyapunov",
+        )
     },
+    "periodic, no age of the input": (
+        "periodic", without("hold_s"), {
+            **LATE, "delay_steps": 0, "hold_steps": 3, "sample_steps": 3, "mansd": 6,
+            "mismatch": 0.0, "step_share": 0.03,
+        },
+    ),
+    "self_triggered, no late update": (
+        "self_triggered", without("delay_s"), {**LATE, "delay_steps": 2, "hold_steps": 0},
+    ),
+    "lyapunov, no start without an input": (
+        "lyapunov", without("start_s"), {
+            **LATE, "delay_steps": 2, "hold_steps": 0, "mismatch": 0.0, "known_start": False,
+        },
+    ),
     "relative, no share": ("relative", with_trigger(NoShares), {**FAR, "mansd": 0}),
     "mixed, no share": ("mixed", with_trigger(NoShares), {**FAR, "mansd": 0, "beta": 0.01}),
     "quadratic, no cross term": (

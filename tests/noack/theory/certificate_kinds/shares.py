@@ -16,11 +16,7 @@ from scipy.linalg import expm
 
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.terms import NoCertificateError
-from noack.theory.certificates.certified_bounds import (
-    KnownStateBounds,
-    KnownStatePart,
-    ScenarioCertificate,
-)
+from noack.theory.certificates.certified_bounds import KnownStateBounds, KnownStatePart, ScenarioCertificate
 from tests.noack.theory import disturbed_loops
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
@@ -147,9 +143,7 @@ def drawn(draw: Callable[..., Any], where: dict[str, Any]) -> Callable[..., Case
     return lambda rng: Case(draw(rng, **where))
 
 
-def shares_of(
-    names: Iterable[str], certify: Callable[[Case], Any]
-) -> Callable[[Case], Bounds | None]:
+def shares_of(names: Iterable[str], certify: Callable[[Case], Any]) -> Callable[[Case], Bounds | None]:
     """Return what certifies a case; the bound of each share is 1."""
     names = tuple(names)
 
