@@ -187,7 +187,8 @@ class Clause:
         while (word := reader.accept(*options)) is not None:
             keys = {*options[word].keys, *options[word].implied}
             if earlier := [given.get(key, self.word) for key in table.keys() & keys]:
-                reader.wrong(f"{word} is given twice" if word in earlier else f"it excludes {earlier[0]}")
+                other = f"{word} and {earlier[0]} exclude each other"
+                reader.wrong(f"{word} is given twice" if word in earlier else other)
             options[word].read(reader, table)
             given |= dict.fromkeys(keys, word)
         return table
