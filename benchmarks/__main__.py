@@ -146,11 +146,7 @@ def rows_of_figures(rows: Sequence[tuple[str, Row]]) -> list[tuple[str, Row]]:
 
 
 def write_docs(page: Path, figures: Iterable[tuple[str, Row]]) -> None:
-    """Replace the table of a page.
-
-    Raises:
-        MeasurementError: the page has not the two marks.
-    """
+    """Replace the table of a page."""
     before, begin, rest = page.read_text(encoding="utf-8").partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:

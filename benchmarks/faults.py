@@ -67,9 +67,6 @@ def faulted_run(
         name: for messages.
         settings: changes to the scenario.
         fault: called in a thread, with the processes of the run by role.
-
-    Raises:
-        MeasurementError: the run failed.
     """
     scenario = load(find_scenario("lane_following"), ["ports={}", *settings])
     threads: list[threading.Thread] = []
@@ -127,11 +124,7 @@ IMPORT = "Python that imports as much"
 
 
 def faulted(role: str, fault: Callable[[psutil.Process], object]) -> tuple[FaultedRun[float], float]:
-    """Run with a fault of a process; return the run, and the fault's end in time of the run.
-
-    Raises:
-        MeasurementError: the run failed.
-    """
+    """Run with a fault of a process; return the run, and the fault's end in time of the run."""
     say(f"{role}: {fault.__name__}")
 
     def act(processes: Processes) -> float:
@@ -178,19 +171,14 @@ def killed(role: str) -> Figures:
 
 def killed_rows(role: str) -> Iterator[Row]:
     """Kill a process several times; yield the rows."""
-    rounds = Rounds()
-    for _ in range(ROUNDS):
-        rounds.add(role, killed(role))
-        rounds.add(IMPORT, dict.fromkeys(("acted_s", "updated_s"), imported_s(MODULES[role])))
+    rounds, imported = Rounds(), partial(imported_s, MODULES[role])
+    sides = {role: lambda: killed(role), IMPORT: lambda: dict.fromkeys(("acted_s", "updated_s"), imported())}
+    rounds.in_turn(ROUNDS, sides, f"{role} killed, ")
     row = partial(rounds.row, ours=role)
     yield row(f"{role} killed: until another acts in its place", "s", "acted_s", peer=IMPORT)
     yield row(f"{role} killed: until the controller has an update again", "s", "updated_s", peer=IMPORT)
-    yield row(
-        f"{role} killed: age of its last recorded row",
-        "ms",
-        "unwritten_ms",
-        note="rows are handed over every 50 ms",
-    )
+    note = "rows are handed over every 50 ms"
+    yield row(f"{role} killed: age of its last recorded row", "ms", "unwritten_ms", note=note)
 
 
 @benchmark("recovery", "A run whose processes die or stop")
@@ -207,13 +195,8 @@ def recovery(options: argparse.Namespace) -> Iterator[Row]:
     steps = run.record[PLANT_STEP]["sequence"]
     if run.back_s is None or len(steps) != steps[-1] + 1:
         raise MeasurementError("recorder: it was not restarted, or rows are missing")
-    yield Row(
-        "recorder killed: until another records",
-        run.back_s - at_s,
-        "s",
-        Peer(IMPORT, imported_s(MODULES["recorder"])),
-        note="nothing is missing from the record",
-    )
+    peer, note = Peer(IMPORT, imported_s(MODULES["recorder"])), "nothing is missing from the record"
+    yield Row("recorder killed: until another records", run.back_s - at_s, "s", peer, note=note)
     for role in ("plant", "sensor", "netem", "controller", "recorder"):
         runs = [faulted(role, stop) for _ in range(ROUNDS)]
         late_ms = median(1e3 * run_recovery_s(run.record, end_s) for run, end_s in runs)

@@ -21,8 +21,9 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -130,8 +131,6 @@ class Exchange(NamedTuple):
     host: str
     """Address of the reference."""
     bare: bool = False
-    realtime: bool = True
-    """Whether it requests the real-time settings of a run."""
     answer_every_s: float = 0.0
     """The reference answers so often; 0: at once."""
     port: int = 0
@@ -218,7 +217,7 @@ def main() -> None:
     """Run one end of an exchange."""
     _, end, options = sys.argv
     exchange = Exchange(**json.loads(options))
-    with realtime(exchange.realtime, _PRIORITY):
+    with realtime(True, _PRIORITY):
         {"reference": run_reference, "client": run_client}[end](exchange)
 
 
@@ -237,51 +236,27 @@ class Case(NamedTuple):
 
 
 MAIN = Case("20 ms, replies read at once", goal=_DEFAULT_ERROR)
+_LATE = {"period_s": 0.05, "late": True}
 CASES = (
     Case("50 ms, replies read at once", {"period_s": 0.05}),
-    Case("50 ms, replies read 50 ms later", {"period_s": 0.05, "late": True}),
-    Case(
-        "50 ms, replies read 50 ms later, ρ = 201 ppm",
-        {"period_s": 0.05, "late": True, "rate_ppb": 201_000},
-        _DEFAULT_ERROR,
-    ),
+    Case("50 ms, replies read 50 ms later", _LATE),
+    Case("50 ms, replies read 50 ms later, ρ = 201 ppm", _LATE | {"rate_ppb": 201_000}, _DEFAULT_ERROR),
     Case("20 ms, reference answers every 50 ms", {"answer_every_s": 0.05}),
 )
 CLOCKS = [(ahead_s, drift_ppb) for ahead_s in (1, -1) for drift_ppb in (100_000, -100_000)]
 """Seconds by which the client's clock is ahead, and its drift."""
 
 
-def measured(
-    hosts: TwoHosts,
-    ahead_s: int,
-    drift_ppb: int,
-    case: Case,
-    *,
-    bare: bool = False,
-    seconds: float = SECONDS,
-    realtime: bool = True,
-    ip: int = 4,
-) -> Figures:
-    """Run a reference and a client on two hosts; return the client's figures.
-
-    Raises:
-        MeasurementError: one of them failed.
-    """
-    own = (
-        Exchange(
-            hosts.addresses[0][ip == 6],
-            bare,
-            realtime,
-            ahead_ns=-ahead_s * 10**9,
-            drift_ppb=drift_ppb,
-            seconds=seconds,
-        )._asdict()
-        | case.settings
+def measured(hosts: TwoHosts, ahead_s: int, drift_ppb: int, case: Case, *, bare: bool = False) -> Figures:
+    """Run a reference and a client on two hosts; return the client's figures."""
+    own = Exchange(
+        hosts.addresses[0][0], bare, ahead_ns=-ahead_s * 10**9, drift_ppb=drift_ppb, seconds=SECONDS
     )
 
     def command(end: str, port: int = 0) -> list[str]:
-        program = (sys.executable, "-m", "benchmarks.hosts", end, json.dumps(own | {"port": port}))
+        content = json.dumps(own._asdict() | {"port": port, **case.settings})
         is_client = end == "client"
+        program = (sys.executable, "-m", "benchmarks.hosts", end, content)
         return hosts.inside(is_client, *program, monotonic_s=ahead_s * is_client)
 
     with subprocess.Popen(
@@ -335,24 +310,12 @@ def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
 ROUNDS = 3
 ACROSS, ON_LOOPBACK = "noack across a veth link", "noack on loopback"
 _PATIENCE_S = 120.0
-_SETTINGS = (
-    *FREE_PORTS,
-    "--set",
-    "horizon_s=10",
-    "--set",
-    "trigger.beta=1e-9",
-    "--set",
-    'network.loss={model="lossless"}',
-    "--no-report",
-)
+_CHANGES = ("horizon_s=10", "trigger.beta=1e-9", 'network.loss={model="lossless"}')
+_SETTINGS = (*FREE_PORTS, *(word for one in _CHANGES for word in ("--set", one)), "--no-report")
 
 
-def run_by_hand(hosts: TwoHosts | None) -> dict[str, Any]:
-    """Return the summary of a run with the controller on the second host, or all on this one.
-
-    Raises:
-        MeasurementError: a process failed.
-    """
+def run_by_hand(hosts: TwoHosts | None) -> Figures:
+    """Return the latency of a run with the controller on the second host, or all on this one."""
     with tempfile.TemporaryDirectory() as name, starting() as begin:
 
         def start(host: int, *arguments: str) -> subprocess.Popen[str]:
@@ -369,8 +332,8 @@ def run_by_hand(hosts: TwoHosts | None) -> dict[str, Any]:
             stderr += process.communicate(timeout=_PATIENCE_S)[1]
         if any(process.returncode for process in (recording, *joining)):
             raise MeasurementError(stderr.strip().splitlines()[-1])
-        summary: dict[str, Any] = json.loads(stdout)
-        return summary
+    latency_us = json.loads(stdout)["loops"][0]["latency_us"]
+    return {key: latency_us[key] for key in ("p50", "p99", "updates")}
 
 
 @benchmark("hosts", "The loop across two hosts")
@@ -382,12 +345,8 @@ def across_hosts(options: argparse.Namespace) -> Iterator[Row]:
     """
     rounds = Rounds()
     with two_hosts() as hosts:
-        for number in range(ROUNDS):
-            say(f"round {number + 1} of {ROUNDS}")
-            for side, place in ((ON_LOOPBACK, None), (ACROSS, hosts)):
-                (loop,) = run_by_hand(place)["loops"]
-                keys = ("p50", "p99", "updates")
-                rounds.add(side, {key: loop["latency_us"][key] for key in keys})
+        sides = {ON_LOOPBACK: partial(run_by_hand, None), ACROSS: partial(run_by_hand, hosts)}
+        rounds.in_turn(ROUNDS, sides)
     note = f"{sum(rounds.of(ACROSS, 'updates')):.0f} updates"
     for quantile in ("p50", "p99"):
         yield rounds.row(f"event → update, {quantile}", "µs", quantile, ACROSS, ON_LOOPBACK,

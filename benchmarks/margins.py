@@ -25,8 +25,6 @@ from noack.theory.margins.loss_margin import LossMargin, Stability, list_bursts
 from noack.theory.margins.switched_system import Edge, find_cycle, strongly_connected
 
 GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
-NEAREST = 1e-3
-"""Loops whose growth is nearer to 1 need not be decided."""
 MEDIAN_S = 2.0
 
 

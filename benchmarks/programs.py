@@ -59,11 +59,7 @@ def provide() -> None:
 
 
 def compiled(source: str, into: Path, *options: str) -> Path:
-    """Compile a C file of this folder into another folder; return the path.
-
-    Raises:
-        MeasurementError: there is no C compiler, or it fails.
-    """
+    """Compile a C file of this folder into another folder; return the path."""
     target = into / Path(source).stem
     if shutil.which("cc") is None:
         raise MeasurementError(f"{source} is written in C and cc is not installed")
@@ -90,11 +86,7 @@ class Finished(NamedTuple):
 
 
 def execute(command: Sequence[str]) -> Finished:
-    """Run a program to its end, recording the time of each line of its standard error.
-
-    Raises:
-        MeasurementError: it failed.
-    """
+    """Run a program to its end, recording the time of each line of its standard error."""
     with tempfile.TemporaryFile("w+") as stdout:
         begun_s = time.monotonic()
         with subprocess.Popen(
@@ -131,11 +123,7 @@ class NoackRun(NamedTuple):
 
 
 def noack(*arguments: str) -> NoackRun:
-    """Run ``noack ARGUMENTS`` to its end and return its own measurements.
-
-    Raises:
-        MeasurementError: it failed.
-    """
+    """Run ``noack ARGUMENTS`` to its end and return its own measurements."""
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
         finished = execute([*NOACK, *arguments, *FREE_PORTS, "--runs", runs, "--json"])
     return NoackRun(json.loads(finished.stdout), first_step_s(finished.begun_s, finished.lines))
@@ -302,11 +290,7 @@ def _run(command: Sequence[str]) -> None:
 
 @contextmanager
 def two_hosts() -> Iterator[TwoHosts]:
-    """Make the namespaces, and delete them at the end.
-
-    Raises:
-        MeasurementError: the system does not permit it.
-    """
+    """Make the namespaces, and delete them at the end."""
     if shutil.which("ip") is None or shutil.which("unshare") is None:
         raise MeasurementError("ip (iproute2) and unshare (util-linux) are not installed")
     names = (f"noack-{os.getpid()}-reference", f"noack-{os.getpid()}-client")

@@ -16,8 +16,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -85,11 +85,7 @@ class Built(NamedTuple):
 
 @contextmanager
 def built() -> Iterator[Built]:
-    """Compile the load and the C relay; they exist within the context.
-
-    Raises:
-        MeasurementError: there is no C compiler, or it fails.
-    """
+    """Compile the load and the C relay; they exist within the context."""
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         load = compiled("load.c", Path(folder), "-shared", "-fPIC")
         yield Built(_FFI.dlopen(str(load)), compiled("relay.c", Path(folder)))
@@ -218,17 +214,16 @@ def c_relay(built: Built, *words: str) -> Kind:
     return Kind(name, lambda to, _: [str(built.relay), str(to), *words])
 
 
-def socat() -> Kind | str:
-    """Return socat, forward only; or why it is missing."""
-    program = shutil.which("socat")
-    if program is None:
-        return "socat is not installed (Debian: apt-get install socat)"
-    ends = (f"UDP4-RECV:{{}},rcvbuf={4 * 2**20}", f"UDP4-SENDTO:{LOOPBACK}:{{}}")
-    return Kind(
-        "socat",
-        lambda to, port: [program, "-u", "-b", "2048", ends[0].format(port), ends[1].format(to)],
-        says=None,
-    )
+def socat() -> Kind:
+    """Return socat, forward only."""
+
+    def command(to: int, port: int) -> list[str]:
+        if (program := shutil.which("socat")) is None:
+            raise MeasurementError("socat is not installed (Debian: apt-get install socat)")
+        listen = f"UDP4-RECV:{port},rcvbuf={4 * 2**20}"
+        return [program, "-u", "-b", "2048", listen, f"UDP4-SENDTO:{LOOPBACK}:{to}"]
+
+    return Kind("socat", command, says=None)
 
 
 def our_relay(name: str, words: str, *flags: str, reverse: bool = False, lossy: bool = True) -> Kind:
@@ -245,34 +240,14 @@ def our_relay(name: str, words: str, *flags: str, reverse: bool = False, lossy: 
 class Totals(NamedTuple):
     """Our relay's final counts."""
 
-    arrived: int
+    received: int
     forwarded: int
     longest_loss_burst: int
     lost_in_kernel: int
 
-    @classmethod
-    def parse(cls, stdout: str) -> "Totals":
-        """Read the output of the relay with ``--json``.
 
-        Raises:
-            MeasurementError: the output is not as expected.
-        """
-        try:
-            _, _, totals = stdout.partition("\n")  # the first line reports that it is ready
-            forward = json.loads(totals)["links"][0]["forward"]
-            lost_in_kernel = forward["unintended"]["lost_in_kernel"]
-            keys = ("received", "forwarded", "longest_loss_burst")
-            return cls(*(forward[key] for key in keys), lost_in_kernel)
-        except (ValueError, KeyError, TypeError, IndexError) as error:
-            raise MeasurementError(f"our relay's totals cannot be read: {error!r}") from None
-
-
-def figures_of(name: str, burst: Burst, sent: int, slack: int, cpu_s: float) -> Figures:
-    """Return ``per_s``, datagrams received and decided per second, and ``cpu_us`` per datagram.
-
-    Raises:
-        MeasurementError: more datagrams are missing than the relay can have dropped.
-    """
+def figures_of(name: str, burst: Burst, cpu_s: float, sent: int, slack: int = 0) -> Figures:
+    """Return ``per_s``, datagrams received and decided per second, and ``cpu_us`` per datagram."""
     if burst.decided < sent - slack or (slack == 0 and burst.received != sent):
         raise MeasurementError(f"{name}: of a burst of {sent} only {burst.received} arrived")
     return {"per_s": burst.decided / burst.wall_s, "cpu_us": cpu_s / sent * 1e6}
@@ -308,43 +283,37 @@ class Relay:
         before_s, _ = self.scheduled_s()
         found = self.ends.burst(self.pid, self._burst, self._slack, addresses)
         cpu_s = self.scheduled_s()[0] - before_s
-        return figures_of(self.name, found, self._burst, self._slack, cpu_s)
+        return figures_of(self.name, found, cpu_s, self._burst, self._slack)
 
     def totals(self) -> Totals:
         """End our relay as Ctrl-C does; return its totals."""
         self._process.send_signal(signal.SIGINT)
         try:
             stdout, _ = self._process.communicate(timeout=_END_S)
-        except subprocess.TimeoutExpired:
-            raise MeasurementError(f"{self.name} does not end") from None
-        return Totals.parse(stdout)
+            _, _, totals = stdout.partition("\n")  # the first line reports that it is ready
+            forward = json.loads(totals)["links"][0]["forward"]
+            values = forward | forward["unintended"]
+            return Totals(*(values[key] for key in Totals._fields))
+        except (subprocess.TimeoutExpired, ValueError, LookupError, TypeError) as error:
+            raise MeasurementError(f"the totals of {self.name} cannot be read: {error!r}") from None
 
 
 @contextmanager
 def running(kind: Kind, built: Built) -> Iterator[Relay]:
-    """Run a relay on its core, between sender and sink.
-
-    Raises:
-        MeasurementError: it does not start to listen.
-    """
-    ends = Ends(built.load)
+    """Run a relay on its core, between sender and sink."""
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         probe.bind((LOOPBACK, 0))
         chosen = int(probe.getsockname()[1])
-    with on_core(RELAY_CORE):
-        process = subprocess.Popen(
-            kind.command(ends.sink_port, chosen),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-    try:
-        ends.connect(_listening_on(kind, process, chosen))
-        yield Relay(kind, process, ends)
-    finally:
-        process.kill()
-        process.communicate()
-        ends.close()
+    with closing(Ends(built.load)) as ends:
+        command = kind.command(ends.sink_port, chosen)
+        with on_core(RELAY_CORE):
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            ends.connect(_listening_on(kind, process, chosen))
+            yield Relay(kind, process, ends)
+        finally:
+            process.kill()
+            process.communicate()
 
 
 def _listening_on(kind: Kind, process: subprocess.Popen[str], chosen: int) -> int:
@@ -370,45 +339,22 @@ def _listening_on(kind: Kind, process: subprocess.Popen[str], chosen: int) -> in
     raise MeasurementError(f"{kind.name} does not begin to listen, said {why!r}")
 
 
-class Sides:
-    """Relays that run until the context ends, and are measured in turn, and maybe no relay.
-
-    A relay that does not start, or fails, is missing in the rounds from then on.
-    """
-
-    def __init__(self, kinds: Sequence[tuple[str, Kind | str]], built: Built) -> None:
-        self.rounds = Rounds()
-        self._kinds, self._built = kinds, built
-        self._stack = ExitStack()
-        self.relays: list[Relay] = []
-
-    def __enter__(self) -> "Sides":
-        for name, kind in self._kinds:
-            if isinstance(kind, str):
-                self.rounds.add(name, kind)
-                continue
+@contextmanager
+def started(kinds: Iterable[Kind], built: Built) -> Iterator[tuple[Rounds, list[Relay]]]:
+    """Run relays within the context; the rounds say which ones did not start, and why."""
+    rounds, relays = Rounds(), list[Relay]()
+    with ExitStack() as stack:
+        for kind in kinds:
             try:
-                self.relays.append(self._stack.enter_context(running(kind, self._built)))
+                relays.append(stack.enter_context(running(kind, built)))
             except MeasurementError as error:
-                self.rounds.add(name, str(error))
-        return self
+                rounds.add(kind.name, str(error))
+        yield rounds, relays
 
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
 
-    def direct(self) -> Ends:
-        """Return a sender whose datagrams go directly to the sink."""
-        ends = Ends(self._built.load)
-        self._stack.callback(ends.close)
+@contextmanager
+def direct_ends(built: Built) -> Iterator[Ends]:
+    """Give a sender whose datagrams go directly to the sink."""
+    with closing(Ends(built.load)) as ends:
         ends.connect(ends.sink_port)
-        return ends
-
-    def in_turn(self, measure: Callable[[Relay], Mapping[str, Figures]]) -> None:
-        """Measure one round of each relay; the figures are those of one or several sides."""
-        for relay in list(self.relays):
-            try:
-                for side, figures in measure(relay).items():
-                    self.rounds.add(side, figures)
-            except MeasurementError as error:
-                self.rounds.add(relay.name, str(error))
-                self.relays.remove(relay)
+        yield ends

@@ -18,8 +18,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,15 +33,16 @@ from benchmarks.relay_load import (
     Built,
     Nanoseconds,
     Relay,
-    Sides,
     built,
     c_relay,
+    direct_ends,
     figures_of,
     new_soak,
     our_relay,
     running,
     socat,
     sources,
+    started,
 )
 from benchmarks.report import Figures, Goal, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from netem.relay_links import LinkSpec
@@ -66,32 +68,22 @@ COSTS = ((PLAIN, "socat"), (PLAIN, "C relay"), (PLAIN, DIRECT), (SEGMENTS, "C re
 
 @benchmark("relays", "Relays: drained datagrams")
 def drained(options: argparse.Namespace) -> Iterator[Row]:
-    """Send bursts to each relay in turn."""
-    with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
-        kinds = [c_relay(tools, *one) for one in C_MODES] + [
-            our_relay(PLAIN, WORDS),
-            our_relay(SEGMENTS, WORDS, "--segment"),
-        ]
-        named = [("socat", socat()), *((kind.name, kind) for kind in kinds)]
-        with Sides(named, tools) as sides:
-            direct = sides.direct()
-            count = min(BURST, direct.sink_holds)
-            for number in range(ROUNDS):
-                if number % 10 == 0:
-                    say(f"rounds {number + 1} to {number + 10} of {ROUNDS}")
-                sides.in_turn(lambda relay: {relay.name: relay.burst()})
-                with on_core(RELAY_CORE):
-                    found, cpu_s = direct.direct(count)
-                sides.rounds.add(DIRECT, figures_of(DIRECT, found, count, 0, cpu_s))
-    yield from rows_of(sides.rounds)
+    """Send bursts to each relay in turn; yield rates and costs."""
+    with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), direct_ends(tools) as direct:
+        count = min(BURST, direct.sink_holds)
 
+        def directly() -> Figures:
+            with on_core(RELAY_CORE):
+                return figures_of(DIRECT, *direct.direct(count), count)
 
-def rows_of(rounds: Rounds) -> Iterator[Row]:
-    """Yield the rows of rates and costs."""
-    for ours, peer, goal in RATES:
-        yield rounds.row(f"{ours}: drained", "datagrams/s", "per_s", ours, peer, goal, paired=True)
-    for ours, peer in COSTS:
-        yield rounds.row(f"{ours}: cost", "µs CPU each", "cpu_us", ours, peer, paired=True)
+        ours = our_relay(PLAIN, WORDS), our_relay(SEGMENTS, WORDS, "--segment")
+        kinds = socat(), *(c_relay(tools, *modes) for modes in C_MODES), *ours
+        with started(kinds, tools) as (rounds, relays):
+            rounds.in_turn(ROUNDS, {one.name: one.burst for one in relays} | {DIRECT: directly})
+    for side, peer, goal in RATES:
+        yield rounds.row(f"{side}: drained", "datagrams/s", "per_s", side, peer, goal, paired=True)
+    for side, peer in COSTS:
+        yield rounds.row(f"{side}: cost", "µs CPU each", "cpu_us", side, peer, paired=True)
 
 
 FLOW_ROUNDS, FLOWS = 2, 10_000
@@ -107,30 +99,24 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
     does what our relay with the reverse direction does: it also waits for answers at all sockets
     and returns them. (To wait for a socket by epoll costs when sending, too.)
     """
+    one, many = sources(1), sources(FLOWS)
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
-        kinds = [
-            c_relay(tools),
-            c_relay(tools, "paths"),
-            our_relay(PLAIN, WORDS),
-            our_relay(REVERSE, WORDS, reverse=True),
-        ]
-        with Sides([(kind.name, kind) for kind in kinds], tools) as sides:
-            one, many = sources(1), sources(FLOWS)
-
-            def costs(relay: Relay) -> Mapping[str, Figures]:
-                single, all_flows = relay.burst(one), relay.burst(many)
-                return {_single(relay.name): single, _many(relay.name): all_flows}
-
-            def begin(relay: Relay) -> Mapping[str, Figures]:
-                costs(relay)  # makes the states of the flows; not counted
-                return {}
-
-            sides.in_turn(begin)
-            for number in range(FLOW_ROUNDS):
-                if number % 10 == 0:
-                    say(f"rounds {number + 1} to {number + 10} of {FLOW_ROUNDS}")
-                sides.in_turn(costs)
-    yield from flow_rows(sides.rounds)
+        ours = our_relay(PLAIN, WORDS), our_relay(REVERSE, WORDS, reverse=True)
+        with started((c_relay(tools), c_relay(tools, "paths"), *ours), tools) as (rounds, relays):
+            for relay in relays:
+                relay.burst(many)  # makes the states of the flows; not counted
+            loads = (_single, one), (_many, many)
+            sides = {name(relay.name): partial(relay.burst, to) for relay in relays for name, to in loads}
+            rounds.in_turn(FLOW_ROUNDS, sides)
+            for name, reason in list(rounds.missing.items()):
+                rounds.add(_many(name), reason)
+    cases = [
+        (name, _single(name), Goal("<=", 1.3) if name in (PLAIN, REVERSE) else None)
+        for name in (PLAIN, REVERSE, "C relay", PATHS)
+    ]
+    for name, peer, goal in (*cases, (REVERSE, _many(PATHS), Goal("<=", 1))):
+        whole = _many(name)
+        yield rounds.row(f"{whole}: cost", "µs CPU each", "cpu_us", whole, peer, goal, paired=True)
 
 
 def _single(name: str) -> str:
@@ -139,20 +125,6 @@ def _single(name: str) -> str:
 
 def _many(name: str) -> str:
     return f"{name}, {FLOWS:,} flows"
-
-
-def flow_rows(rounds: Rounds) -> Iterator[Row]:
-    """Yield the rows of the relays: the cost of many flows compared with the cost of one."""
-    cases = [
-        (name, _single(name), Goal("<=", 1.3) if name in (PLAIN, REVERSE) else None)
-        for name in (PLAIN, REVERSE, "C relay", PATHS)
-    ]
-    for name, peer, goal in (*cases, (REVERSE, _many(PATHS), Goal("<=", 1))):
-        if name in rounds.missing:
-            rounds.add(_many(name), rounds.missing[name])
-        yield rounds.row(
-            f"{_many(name)}: cost", "µs CPU each", "cpu_us", _many(name), peer, goal, paired=True
-        )
 
 
 PING_ROUNDS, PINGS = 2, 500
@@ -181,16 +153,19 @@ def delay(options: argparse.Namespace) -> Iterator[Row]:
     relay's core.
     """
     with built() as tools:
-        yield from added_rows(_added(tools))
-        yield from lateness_rows(_late(tools))
+        added, late = _added(tools), _late(tools)
+    yield added.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT)
+    for peer in ("socat", "C relay"):
+        for quantile in ("p50", "p99"):
+            name, goal = f"{PLAIN}: added one way, {quantile}", ADDED_GOALS.get((peer, quantile))
+            yield added.row(name, "µs", quantile, PLAIN, peer, goal, paired=True)
+    for quantile, goal in (("p50", None), ("p99", Goal("<=", 2))):
+        name = f"{PLAIN}: lateness behind {DELAY_MS} ms, {quantile}"
+        yield late.row(name, "µs", quantile, PLAIN, KERNEL, goal, paired=True)
 
 
 def quantiles_of(name: str, delays_ns: Nanoseconds, base_us: float = 0.0) -> Figures:
-    """Return quantiles of the delays minus ``base_us``, in µs.
-
-    Raises:
-        MeasurementError: a datagram is missing.
-    """
+    """Return quantiles of the delays minus ``base_us``, in µs."""
     if lost := int((delays_ns < 0).sum()):
         raise MeasurementError(f"{name}: {lost} of {len(delays_ns)} datagrams did not arrive")
     p50_us, p99_us = np.quantile(delays_ns, [0.5, 0.99]) / 1e3 - base_us
@@ -199,55 +174,46 @@ def quantiles_of(name: str, delays_ns: Nanoseconds, base_us: float = 0.0) -> Fig
 
 def _added(tools: Built) -> Rounds:
     ours = our_relay(PLAIN, "loss 5% mansd 0 seed 7", lossy=False)
-    named = [("socat", socat()), ("C relay", c_relay(tools)), (PLAIN, ours)]
-    with scheduled(BEFORE_OTHERS), on_core(RELAY_CORE), Sides(named, tools) as sides:
-        direct = sides.direct()
-        say(f"added delay, {PING_ROUNDS} rounds")
-        for _ in range(PING_ROUNDS):
-            base = quantiles_of(DIRECT, direct.ping(PINGS))
-            sides.rounds.add(DIRECT, base)
-            sides.in_turn(
-                lambda relay, base_us=base["p50"]: {
-                    relay.name: quantiles_of(relay.name, relay.ends.ping(PINGS), base_us)
-                }
-            )
-    return sides.rounds
+    base_us = 0.0
+
+    def added(relay: Relay) -> Figures:
+        return quantiles_of(relay.name, relay.ends.ping(PINGS), base_us)
+
+    def base() -> Figures:
+        nonlocal base_us
+        found = quantiles_of(DIRECT, direct.ping(PINGS))
+        base_us = found["p50"]
+        return found
+
+    with (
+        scheduled(BEFORE_OTHERS),
+        on_core(RELAY_CORE),
+        direct_ends(tools) as direct,
+        started((socat(), c_relay(tools), ours), tools) as (rounds, relays),
+    ):
+        sides = {DIRECT: base} | {relay.name: partial(added, relay) for relay in relays}
+        rounds.in_turn(PING_ROUNDS, sides, "added delay, ")
+    return rounds
 
 
 def _late(tools: Built) -> Rounds:
+    def kernel() -> Figures:
+        if not os.access(_LATENCY, os.W_OK):
+            raise MeasurementError(f"{_LATENCY} cannot be written")
+        return cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE)
+
+    def late(relay: Relay) -> Figures:
+        with scheduled(FIFO_PRIORITY) as permitted:
+            if not permitted:
+                rounds.add(KERNEL, "SCHED_FIFO is refused")
+            delays_ns = relay.ends.pace(LINE_ROUND_S * 1_000_000_000 // PERIOD_NS, PERIOD_NS)
+        return quantiles_of(relay.name, delays_ns, DELAY_MS * 1e3)
+
     delayed = our_relay(PLAIN, f"delay {DELAY_MS}ms", "--realtime", lossy=False)
-
-    def late(relay: Relay) -> Mapping[str, Figures]:
-        delays_ns = relay.ends.pace(LINE_ROUND_S * 1_000_000_000 // PERIOD_NS, PERIOD_NS)
-        return {relay.name: quantiles_of(relay.name, delays_ns, DELAY_MS * 1e3)}
-
-    with on_core(LOAD_CORE), Sides([(PLAIN, delayed)], tools) as sides:
-        for number in range(LINE_ROUNDS):
-            say(f"lateness, round {number + 1} of {LINE_ROUNDS}")
-            sides.rounds.add(KERNEL, cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE))
-            with scheduled(FIFO_PRIORITY) as permitted:
-                if not permitted:
-                    sides.rounds.add(KERNEL, "SCHED_FIFO is refused")
-                elif not os.access(_LATENCY, os.W_OK):
-                    sides.rounds.add(KERNEL, f"{_LATENCY} cannot be written")
-                sides.in_turn(late)
-    return sides.rounds
-
-
-def added_rows(rounds: Rounds) -> Iterator[Row]:
-    """Yield the rows of the added delay; only its median has a goal."""
-    yield rounds.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT)
-    for peer in ("socat", "C relay"):
-        for quantile in ("p50", "p99"):
-            name, goal = f"{PLAIN}: added one way, {quantile}", ADDED_GOALS.get((peer, quantile))
-            yield rounds.row(name, "µs", quantile, PLAIN, peer, goal, paired=True)
-
-
-def lateness_rows(rounds: Rounds) -> Iterator[Row]:
-    """Yield the rows of the lateness; only its 99th percentile has a goal."""
-    for quantile, goal in (("p50", None), ("p99", Goal("<=", 2))):
-        name = f"{PLAIN}: lateness behind {DELAY_MS} ms, {quantile}"
-        yield rounds.row(name, "µs", quantile, PLAIN, KERNEL, goal, paired=True)
+    with on_core(LOAD_CORE), started([delayed], tools) as (rounds, relays):
+        sides = {KERNEL: kernel} | {relay.name: partial(late, relay) for relay in relays}
+        rounds.in_turn(LINE_ROUNDS, sides, "lateness, ")
+    return rounds
 
 
 MANSD = 4
@@ -319,7 +285,7 @@ def _soak_rows(relay: Relay, seconds: int, maximum_per_s: float) -> list[Row]:
     return [
         Row("load", counts.sent / elapsed_s, "datagrams/s",
             Peer("drained maximum", maximum_per_s), note=f"for {elapsed_s:.0f} s"),
-        Row("sent but not counted as arrived", counts.sent - totals.arrived, "datagrams",
+        Row("sent but not counted as arrived", counts.sent - totals.received, "datagrams",
             goal=none),
         Row("forwarded but not received", totals.forwarded - counts.received, "datagrams",
             goal=none),
@@ -338,22 +304,17 @@ _SHELL_ROUNDS = 5
 _PINGS = 500
 _SECONDS = 3
 _PORT = 5209
-_SHELL, _BARE_FORWARDER, _LOSS, _DELAY = (
-    "noack netem shell",
-    "bare forwarder in C",
-    "mm-loss",
-    "mm-delay",
-)
+_SHELL, _BARE_FORWARDER = "noack netem shell", "bare forwarder in C"
 _SHELLS = {
     _SHELL: [sys.executable, "-m", "netem", "shell", "--"],
-    _LOSS: ["mm-loss", "uplink", "0"],
-    _DELAY: ["mm-delay", "0"],
+    "mm-loss": ["mm-loss", "uplink", "0"],
+    "mm-delay": ["mm-delay", "0"],
 }
 _Run = Callable[[str], str]
 """Runs a command line of sh inside, where ``$TO`` is the outside; returns its output."""
 
 
-def _bare(command: str, forwarder: Path) -> str:
+def _bare(forwarder: Path, command: str) -> str:
     link = open_devices(LinkSpec("bare", ("", 0), ("", 0), LinkSettings(), LinkSettings()))
     with ExitStack() as stack:
         stack.callback(link.close)
@@ -367,13 +328,15 @@ def _bare(command: str, forwarder: Path) -> str:
         return inner.communicate()[0]
 
 
-def _in_shell(name: str, command: str) -> str:
+def _in_shell(words: Sequence[str], command: str) -> str:
+    if shutil.which(words[0]) is None:
+        raise MeasurementError(f"there is no {words[0]}")
     script = f"TO=${{NOACK_OUTSIDE:-$MAHIMAHI_BASE}}; {command}"
-    words = [*_SHELLS[name], "sh", "-c", script]
+    words = [*words, "sh", "-c", script]
     return subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True).stdout
 
 
-def _shell_figures(run: _Run) -> dict[str, float] | str:
+def _shell_figures(run: _Run) -> Figures:
     """Measure throughput from inside to outside, and the time to there and back."""
     try:
         end = json.loads(run(f"iperf3 -J -c $TO -p {_PORT} -t {_SECONDS}"))["end"]
@@ -381,7 +344,7 @@ def _shell_figures(run: _Run) -> dict[str, float] | str:
         (trip_ms,) = re.findall(r"= [\d.]+/([\d.]+)/", pings)
         return {"mbit": end["sum_received"]["bits_per_second"] / 1e6, "us": 1e3 * float(trip_ms)}
     except (ValueError, KeyError):
-        return "its programs did not report"
+        raise MeasurementError("its programs did not report") from None
 
 
 @benchmark("shell", "A shell: throughput of TCP, and time to the outside and back")
@@ -391,18 +354,13 @@ def shell(_options: argparse.Namespace) -> Iterator[Row]:
         raise MeasurementError(f"there is no {', '.join(missing)}")
     rounds = Rounds()
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder, ExitStack() as stack:
-        forwarder = compiled("tun.c", Path(folder))
         server = ["iperf3", "-s", "-p", str(_PORT)]
         process = stack.enter_context(subprocess.Popen(server, stdout=subprocess.DEVNULL))
         stack.callback(process.kill)
-        for _ in range(_SHELL_ROUNDS):
-            rounds.add(_BARE_FORWARDER, _shell_figures(lambda command: _bare(command, forwarder)))
-            for name, words in _SHELLS.items():
-                if shutil.which(words[0]) is None:
-                    rounds.add(name, f"there is no {words[0]}")
-                else:
-                    rounds.add(name, _shell_figures(lambda command, one=name: _in_shell(one, command)))
-    for peer in (_BARE_FORWARDER, _LOSS, _DELAY):
+        runs: dict[str, _Run] = {_BARE_FORWARDER: partial(_bare, compiled("tun.c", Path(folder)))}
+        runs |= {name: partial(_in_shell, words) for name, words in _SHELLS.items()}
+        rounds.in_turn(_SHELL_ROUNDS, {name: partial(_shell_figures, one) for name, one in runs.items()})
+    for peer in [name for name in runs if name != _SHELL]:
         goal = Goal(">=", 0.9) if peer == _BARE_FORWARDER else None
         yield rounds.row("TCP", "Mbit/s", "mbit", _SHELL, peer, goal, paired=True)
         yield rounds.row("ping, mean", "µs", "us", _SHELL, peer, paired=True)

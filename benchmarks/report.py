@@ -21,7 +21,10 @@ median = statistics.median
 
 
 class MeasurementError(Exception):
-    """A benchmark could not be measured; the message is the reason, one line."""
+    """A benchmark could not be measured; the message is the reason, one line.
+
+    Whatever measures may raise it.
+    """
 
 
 class Peer(NamedTuple):
@@ -192,6 +195,16 @@ class Rounds:
             self.missing[side] = figures
         else:
             self._figures.setdefault(side, []).append(figures)
+
+    def in_turn(self, count: int, sides: Mapping[str, Callable[[], Figures | str]], what: str = "") -> None:
+        """Measure the sides in turn, in some rounds; one that fails is missing from then on."""
+        for number in range(count):
+            say(f"{what}round {number + 1} of {count}")
+            for side in [side for side in sides if side not in self.missing]:
+                try:
+                    self.add(side, sides[side]())
+                except MeasurementError as error:
+                    self.add(side, str(error))
 
     def of(self, side: str, quantity: str) -> list[float]:
         """Return the rounds of a quantity; empty if the side was not measured."""

@@ -126,11 +126,7 @@ class Measured(NamedTuple):
 
 
 def run(load: Load, folder: Path) -> Measured:
-    """Run the loops as a user does.
-
-    Raises:
-        MeasurementError: the run failed.
-    """
+    """Run the loops as a user does."""
     path = folder / "fleet.toml"
     path.write_text(load.scenario)
     command = [*NOACK, "run", str(path), "--json", "--no-report", "--runs", str(folder)]
@@ -272,9 +268,6 @@ def started() -> Figures:
     Returns:
         ``first_s``, wall seconds from the start of ``noack run`` to the first control step, and
         ``launch_s``, the launch time from the run's summary.
-
-    Raises:
-        MeasurementError: the run failed or printed no progress.
     """
     found = noack("run", "lane_following", "--set", "horizon_s=1")
     if found.first_step_s is None:
@@ -287,14 +280,6 @@ def cpu_s(command: Sequence[str]) -> float:
     before_s = own_cpu_s(children=True)
     execute(command)
     return own_cpu_s(children=True) - before_s
-
-
-def startup_rows(rounds: Rounds) -> Iterator[Row]:
-    """Yield the rows of the start of a run."""
-    note = "upper bound: includes a progress line's way through the recorder"
-    yield rounds.row("noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6), note=note)
-    yield rounds.row("the same, against a bare import", "s", "first_s", OURS, IMPORTS)
-    yield rounds.row("of it, from launch to time 0, as the run says", "s", "launch_s", OURS)
 
 
 def demo_rows(summary: Mapping[str, Any]) -> Iterator[Row]:
@@ -321,11 +306,12 @@ def startup(options: argparse.Namespace) -> Iterator[Row]:
     time.
     """
     rounds = Rounds()
-    for number in range(ROUNDS):
-        say(f"round {number + 1} of {ROUNDS}")
-        rounds.add(OURS, started())
-        rounds.add(IMPORTS, {"first_s": imported_s("numpy, scipy.linalg, pydantic, zenoh")})
-    yield from startup_rows(rounds)
+    libraries = "numpy, scipy.linalg, pydantic, zenoh"
+    rounds.in_turn(ROUNDS, {OURS: started, IMPORTS: lambda: {"first_s": imported_s(libraries)}})
+    note = "upper bound: includes a progress line's way through the recorder"
+    yield rounds.row("noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6), note=note)
+    yield rounds.row("the same, against a bare import", "s", "first_s", OURS, IMPORTS)
+    yield rounds.row("of it, from launch to time 0, as the run says", "s", "launch_s", OURS)
     yield compared(
         "noack certify lane_following, with all limits",
         "CPU s",

@@ -9,7 +9,6 @@ import argparse
 import contextlib
 import subprocess
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -82,17 +81,14 @@ def integrated(
         return error - trigger.level * float(np.exp(-trigger.rate_per_s * t_s))
 
     excess.terminal, excess.direction = True, 1.0  # type: ignore[attr-defined]
+
+    def flow(_: float, z: Vector) -> Vector:
+        return np.asarray(field @ z)
+
     t_s, z, found = 0.0, np.concatenate([x, x, x]), [0.0]
     while True:
-        solution = solve_ivp(
-            lambda _, z: field @ z,
-            (t_s, setting.horizon_s),
-            z,
-            method=method,
-            events=excess,
-            rtol=rtol,
-            atol=1e-2 * rtol,
-        )
+        span, atol = (t_s, setting.horizon_s), 1e-2 * rtol
+        solution = solve_ivp(flow, span, z, method=method, events=excess, rtol=rtol, atol=atol)
         if not len(solution.t_events[0]):
             return found
         t_s, z = float(solution.t_events[0][0]), solution.y_events[0][0].copy()
@@ -303,10 +299,10 @@ def plant_cases() -> Iterator[tuple[str, Scenario]]:
             yield ", ".join((kind, *map(str, variant.values()))), scenario
 
 
-def steps_us(scenario: Scenario, count: int) -> Iterator[float]:
+def steps_us(scenario: Scenario) -> Iterator[float]:
     """Make the steps of a simulated run one by one; yield the CPU time of each, µs."""
     period_ns = scenario.timing.plant_period_ns
-    horizon_s = min(scenario.horizon_s, count * period_ns / NS_PER_S)
+    horizon_s = min(scenario.horizon_s, STEPS * period_ns / NS_PER_S)
     record = simulate(scenario.model_copy(update={"horizon_s": horizon_s}))
     plant = plants_of((scenario,))
     for step, u in enumerate(record[PLANT_STEP]["u"]):
@@ -322,17 +318,15 @@ def steps_us(scenario: Scenario, count: int) -> Iterator[float]:
         yield (time.thread_time_ns() - begun_ns) / 1e3
 
 
-def timed_steps(
-    scenario: Scenario, count: int = STEPS, pace_ns: int = _PACE_NS, *, asked: bool = True
-) -> list[tuple[float, ...]]:
+def timed_steps(scenario: Scenario) -> list[tuple[float, ...]]:
     """Make steps of a scenario and of a linear plant in turn; return the µs of both."""
-    sides = steps_us(scenario, count), steps_us(resolve(load(find_scenario(_LINEAR))), count)
+    sides = steps_us(scenario), steps_us(resolve(load(find_scenario(_LINEAR))))
     found = []
-    with realtime(asked, PRIORITY):
+    with realtime(True, PRIORITY):
         due_ns = time.monotonic_ns()
         for pair in zip(*sides, strict=False):
             found.append(pair)
-            due_ns += pace_ns
+            due_ns += _PACE_NS
             time.sleep(max(due_ns - time.monotonic_ns(), 0) / NS_PER_S)
     return found[1:]  # the first step has length 0
 
@@ -356,7 +350,7 @@ def plants(options: argparse.Namespace) -> Iterator[Row]:
     """
     for name, scenario in plant_cases():
         say(name)
-        yield from plant_rows(name, scenario, timed_steps(scenario, STEPS))
+        yield from plant_rows(name, scenario, timed_steps(scenario))
 
 
 CAMPAIGN = "mb_vs_zoh"
@@ -378,37 +372,21 @@ def runs_per_s(workers: int) -> float:
 
 
 def whole_campaign(draws: int) -> tuple[float, float]:
-    """Return seconds and peak MiB of the command; shared pages count once.
-
-    Raises:
-        MeasurementError: it failed.
-    """
-    peak_mib, ended = 0.0, threading.Event()
-    with tempfile.TemporaryDirectory() as folder:
+    """Return seconds and peak MiB of the command; shared pages count once."""
+    peak_mib, begun_s = 0.0, time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as messages:
         command = [*NOACK, "campaign", CAMPAIGN, "--json", "--draws", str(draws), "--out", folder]
-        begun_s = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-
-        def follow() -> None:
-            nonlocal peak_mib
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=messages) as process:
             first = psutil.Process(process.pid)
-            while not ended.wait(_LOOK_EVERY_S):
-                used = 0
+            while process.poll() is None:
                 with contextlib.suppress(psutil.Error):
-                    for one in (first, *first.children(recursive=True)):
-                        with contextlib.suppress(psutil.Error):
-                            used += one.memory_full_info().pss
-                peak_mib = max(peak_mib, used / 2**20)
-
-        follower = threading.Thread(target=follow, daemon=True)
-        follower.start()
-        said = process.communicate()[1]
-        spent_s = time.perf_counter() - begun_s
-        ended.set()
-        follower.join()
-    if process.returncode != 0:
-        raise MeasurementError(f"noack campaign {CAMPAIGN}: {said.strip().splitlines()[-1:]}")
-    return spent_s, peak_mib
+                    every = first, *first.children(recursive=True)
+                    peak_mib = max(peak_mib, sum(one.memory_full_info().pss for one in every) / 2**20)
+                time.sleep(_LOOK_EVERY_S)
+        messages.seek(0)
+        if process.returncode != 0:
+            raise MeasurementError(f"noack campaign {CAMPAIGN}: {messages.read().strip().splitlines()[-1:]}")
+    return time.perf_counter() - begun_s, peak_mib
 
 
 @benchmark(

@@ -31,7 +31,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -248,17 +248,13 @@ class Result:
         }
 
 
-def soak(path: Path, settings: Sequence[str], runs: Path, report: Callable[[str], None] = say) -> Result:
+def soak(path: Path, settings: Sequence[str], runs: Path) -> Result:
     """Soak a scenario.
 
     Args:
         path: the scenario file.
         settings: values to replace, as after ``--set``.
         runs: folder in which the run directory is made, in its own subfolder.
-        report: called with the progress at intervals.
-
-    Raises:
-        MeasurementError: the run never started.
     """
     runs.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="soak-", dir=runs))
@@ -285,7 +281,7 @@ def soak(path: Path, settings: Sequence[str], runs: Path, report: Callable[[str]
                     raise MeasurementError(f"the run never began: {lines[-1]}")
                 time.sleep(0.05)
             with log.open() as lines_of_run:
-                return _Soak(run, latest.resolve(), processes, lines_of_run, report).watch()
+                return _Soak(run, latest.resolve(), processes, lines_of_run).watch()
         finally:
             if run.poll() is None:
                 processes.kill()
@@ -293,15 +289,9 @@ def soak(path: Path, settings: Sequence[str], runs: Path, report: Callable[[str]
 
 class _Soak:
     def __init__(
-        self,
-        run: "subprocess.Popen[bytes]",
-        run_dir: Path,
-        processes: Processes,
-        log: TextIO,
-        report: Callable[[str], None],
+        self, run: "subprocess.Popen[bytes]", run_dir: Path, processes: Processes, log: TextIO
     ) -> None:
         self._run, self._run_dir, self._processes, self._log = run, run_dir, processes, log
-        self._report = report
         self._scenario = load(run_dir / SCENARIO_FILE)
         self._length_s = self._scenario.horizon_s / self._scenario.speed
         self._looks: dict[str, list[tuple[float, Sample]]] = {}
@@ -372,14 +362,14 @@ class _Soak:
                 latest = {role: looks[-1][1].uss_kib / 1024 for role, looks in self._looks.items()}
                 memory = ", ".join(f"{role} {mib:.1f}" for role, mib in latest.items())
                 horizon = f"{100 * share:.0f} % of {self._scenario.horizon_s:g} s"
-                self._report(f"{horizon}; private memory in MiB: {memory}")
+                say(f"{horizon}; private memory in MiB: {memory}")
             time.sleep(min(_POLL_S, pause_s))
         return min(began_s, time.monotonic()), disk_bytes
 
     def _end(self, patience_s: float) -> Mapping[str, float]:
         """Wait until the launcher ends; return the peak memory meanwhile, by process."""
         deadline_s = time.monotonic() + patience_s
-        self._report("the loop is at its horizon; the run is replayed and judged")
+        say("the loop is at its horizon; the run is replayed and judged")
         peaks: dict[str, float] = {}
         while self._run.poll() is None:
             for role, sample in self._processes.sample().items():

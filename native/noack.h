@@ -321,6 +321,12 @@ void noack_uniforms(
 void noack_product(
     int64_t rows, int64_t columns, const double *matrix, const double *vector, double *result);
 
+/* Each of `count` states, (count, n), becomes M^j times it, with its own j < 2^bits of `steps`, whose
+   bits are followed from the lowest one. powers: M^(2^b), (bits, n, n); scratch: (n). */
+void noack_leaps(
+    int64_t n, int64_t bits, const double *powers, int64_t count, const int64_t *steps,
+    double *states, double *scratch);
+
 /* The Euclidean norm of a vector, without overflow of squares. */
 double noack_norm(int64_t count, const double *vector);
 

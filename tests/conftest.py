@@ -4,6 +4,7 @@ By default, each run tries the same few examples; ``--hypothesis-profile search`
 new examples per test.
 """
 
+import copy
 import os
 import signal
 import sys
@@ -87,6 +88,12 @@ def runs_of_other_workers_are_unknown(
 
 
 @pytest.fixture
+def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finalise runs without a report, whose figures take longer than everything else."""
+    monkeypatch.setattr("cosim.live.finalize._write_report", lambda *_: None)
+
+
+@pytest.fixture
 def usual_signals() -> Iterator[None]:
     """Let signals do what they usually do, also in a process that was started to ignore them."""
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
@@ -98,14 +105,17 @@ def usual_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+CONTENT: dict[str, Any] = {
+    "name": "small",
+    "horizon_s": 1.0,
+    "model": {"name": "double_integrator"},
+    "plant": {"initial_state": [1.0, 0.0]},
+    "trigger": {"beta": 0.5, "alpha_per_s": 0.25},
+    "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
+}
+
+
 @pytest.fixture
 def content() -> dict[str, Any]:
     """A minimal valid scenario of the double integrator, as parsed TOML."""
-    return {
-        "name": "small",
-        "horizon_s": 1.0,
-        "model": {"name": "double_integrator"},
-        "plant": {"initial_state": [1.0, 0.0]},
-        "trigger": {"beta": 0.5, "alpha_per_s": 0.25},
-        "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
-    }
+    return copy.deepcopy(CONTENT)

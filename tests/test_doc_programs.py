@@ -43,14 +43,14 @@ SHORTER = {
     "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
     "design": ("--draws", "80"),
     "capacity": ("--draws", "1", "--loops", "11", "--set", "horizon_s=1"),
-    "margin": ("--no-period",),
+    "margin": ("--no-period", "--most", "2"),
     "doctor": ("--seconds", "0.1"),
 }
 """Arguments added to a command to shorten it; other tests cover reports and long runs."""
 
 
 def shorter(words: list[str]) -> list[str]:
-    more = SHORTER.get(words[0], ())
+    more = ("--effort", "5") if "--effort" in words else SHORTER.get(words[0], ())
     return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
 
 

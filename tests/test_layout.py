@@ -30,13 +30,13 @@ LINES = {
     "noack/protocol": 1235,
     "noack/runtime": 5400,
     "noack/settings": 585,
-    "noack/theory": 10595,
+    "noack/theory": 10605,
     "noack/traces": 1320,
     "noack/trigger": 1070,
     "netem": 6500,
     "cosim/analysis": 8140,
     "cosim/api": 1680,
-    "cosim/cli": 3335,
+    "cosim/cli": 3340,
     "cosim/doctor": 815,
     "cosim/interactive": 1640,
     "cosim/lab": 2120,
@@ -50,8 +50,8 @@ LINES = {
     "sensor_node": 400,
     "controller_node": 415,
     "benchmarks": 4975,
-    "native": 10720,
-    "tests": 46220,
+    "native": 10725,
+    "tests": 46245,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

@@ -1,15 +1,23 @@
-"""The margin of a loop: the largest M, and the longest time between events for its own M."""
+"""The margin of a loop: the largest M, and the longest time between events for its own M.
+
+Other guarantees than the scenario's own one are compared with it, too: their growth, and which of
+them imply others.
+"""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations, permutations
 from typing import NamedTuple
 
-from cosim.analysis.guarantee_comparison import GuaranteeComparison, compare_guarantees, read_guarantee
+from netem.tc_words import guarantee_words, settings_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import duration
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.impairments.constraints import join_guarantee
+from noack.impairments.guarantee_inclusion import Pattern, find_pattern_beyond
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, outcome_letters
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.scenario import Scenario
@@ -19,10 +27,90 @@ from noack.theory.random_losses.random_growth import RandomGrowth, random_growth
 
 MOST_M = 16
 _LARGEST_EFFORT = 1e6
-_NOT_COMPARED = GuaranteeComparison()
 
 MarginProgress = Callable[[str], None]
 """Receives what is examined next."""
+
+
+class ComparedGuarantee(NamedTuple):
+    """A guarantee, and what is known about the loop with it."""
+
+    meaning: str
+    """The guarantee in words."""
+    found: Stability
+
+
+class GuaranteeComparison(NamedTuple):
+    """Some guarantees, the scenario's own one first."""
+
+    guarantees: tuple[ComparedGuarantee, ...] = ()
+    relations: tuple[str, ...] = ()
+    """Sentences; for each two guarantees, which one implies the other."""
+
+
+def read_guarantee(words: str) -> LossGuarantee:
+    """Read a guarantee from words, such as ``mansd 4 atmost 3 in 10``.
+
+    Raises:
+        CallerError: the words are wrong, have other parts, or do not limit consecutive losses.
+    """
+    settings = settings_of(words)
+    if settings != LinkSettings(mansd=settings.mansd, constraints=settings.constraints):
+        raise CallerError(
+            f'guarantee "{words}": expected only mansd, atmost and recover, e.g. '
+            f'"{" ".join(guarantee_words(settings)) or "mansd 4 atmost 3 in 10"}"'
+        )
+    guarantee = join_guarantee(settings.mansd, settings.constraints)
+    if guarantee.longest_burst is None:
+        raise CallerError(f'guarantee "{words}": needs a maximum of losses: mansd or atmost')
+    return guarantee
+
+
+def compare_guarantees(
+    guarantees: Sequence[LossGuarantee], examine: Callable[[LossGuarantee], Stability]
+) -> GuaranteeComparison:
+    """Examine guarantees. One that implies another does not grow faster.
+
+    Raises:
+        CallerError: a guarantee has too many states to be compared.
+    """
+    beyond = {
+        (i, j): find_pattern_beyond(guarantees[i], guarantees[j])
+        for i, j in permutations(range(len(guarantees)), 2)
+    }
+    found = [examine(guarantee) for guarantee in guarantees]
+    for (i, j), pattern in beyond.items():
+        if pattern is None:
+            found[i] = found[i].with_upper_of(found[j])
+            found[j] = found[j].with_lower_of(found[i])
+    meanings = [guarantee.meaning for guarantee in guarantees]
+    relations = tuple(
+        _relation((meanings[i], beyond[i, j]), (meanings[j], beyond[j, i]))
+        for i, j in combinations(range(len(guarantees)), 2)
+    )
+    return GuaranteeComparison(tuple(map(ComparedGuarantee, meanings, found)), relations)
+
+
+def _relation(one: tuple[str, Pattern | None], other: tuple[str, Pattern | None]) -> str:
+    """Return the relation of two guarantees, each with a pattern that the other one forbids."""
+    (meaning, pattern), (other_meaning, other_pattern) = one, other
+    if pattern is None and other_pattern is None:
+        return f"“{meaning}” and “{other_meaning}” allow the same patterns"
+    if pattern is None:
+        return _implication(meaning, other_meaning, other_pattern or ())
+    if other_pattern is None:
+        return _implication(other_meaning, meaning, pattern)
+    return (
+        f"neither of “{meaning}” and “{other_meaning}” implies the other: only the first allows "
+        f"{outcome_letters(pattern)}, only the second {outcome_letters(other_pattern)}"
+    )
+
+
+def _implication(meaning: str, implied: str, beyond: Pattern) -> str:
+    return f"“{meaning}” implies “{implied}”, which also allows {outcome_letters(beyond)}"
+
+
+_NOT_COMPARED = GuaranteeComparison()
 
 
 def undecided_text(found: Stability, effort: float) -> str:

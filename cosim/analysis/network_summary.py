@@ -18,6 +18,7 @@ from cosim.analysis.summary_model import (
     NetworkPart,
     RunSummary,
 )
+from cosim.analysis.value_reduction import quantiles_in
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from noack.core.clock import NS_PER_S
@@ -283,10 +284,11 @@ def places(t_ns: NDArray[np.int64], horizon_ns: int) -> NDArray[np.int64]:
 
 def quantiles(values: Reals) -> Reals:
     """Return the ``QUANTILES`` over the loops of values (L, k), (6, k); NaN where all are."""
-    known = np.where(np.isfinite(values), values, np.nan)
-    found = np.full((len(QUANTILES), values.shape[1]), np.nan)
-    seen = np.isfinite(known).any(axis=0)
-    found[:, seen] = np.nanquantile(known[:, seen], QUANTILES, axis=0)
+    known = np.isfinite(values)
+    found, counts = np.full((len(QUANTILES), values.shape[1]), np.nan), known.sum(axis=0)
+    seen = np.flatnonzero(counts)
+    ordered = np.sort(np.where(known, values, np.inf), axis=0)
+    found[:, seen] = quantiles_in(ordered, counts[seen], np.array(QUANTILES)[:, None], seen)
     return found
 
 

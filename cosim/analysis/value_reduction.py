@@ -61,7 +61,8 @@ class QuantileSketch:
         if not self.count:
             return [None] * len(shares)
         if self._values is not None:
-            return list(_quantiles(np.concatenate(self._values), np.array(shares)).tolist())
+            values = np.sort(np.concatenate(self._values))
+            return list(quantiles_in(values, self.count, np.array(shares)).tolist())
         ranks = self.count - np.array(shares) * (self.count - 1)
         return list(self.largest(ranks).tolist())
 
@@ -78,13 +79,26 @@ class QuantileSketch:
         return np.asarray(np.clip(values, self._low, self._high))
 
 
-def _quantiles(values: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the same as ``np.quantile``, which takes several times as long for few values."""
-    ordered, places = np.sort(values), shares * (len(values) - 1)
+def quantiles_in(
+    ordered: NDArray[np.float64],
+    counts: int | NDArray[np.int64],
+    shares: NDArray[np.float64],
+    *columns: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Return the same as ``np.quantile``, which takes several times as long for few values.
+
+    Args:
+        ordered: ascending values, (k,); or columns of them.
+        counts: how many of them count; of each of the columns, (c,).
+        shares: (s,); for columns, (s, 1).
+        columns: the numbers of c columns.
+    """
+    places = shares * (counts - 1)
     before = np.floor(places).astype(np.intp)
-    low, high = ordered[before], ordered[np.minimum(before + 1, len(values) - 1)]
+    after = np.minimum(before + 1, counts - 1)
+    low, high = ordered[(before, *columns)], ordered[(after, *columns)]
     part, apart = places - before, high - low
-    return np.where(part < 0.5, low + apart * part, high - apart * (1 - part))
+    return np.asarray(np.where(part < 0.5, low + apart * part, high - apart * (1 - part)))
 
 
 def _bins(values: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from ipywidgets import Widget
     from matplotlib.figure import Figure
 
-    from cosim.interactive.ensemble import Ensemble
-    from cosim.interactive.exploration import Exploration
+    from cosim.interactive.exploration import Ensemble, Exploration
     from cosim.interactive.scenario_guarantee import Guarantee, Margin
     from noack.scenario.scenario import Scenario
 

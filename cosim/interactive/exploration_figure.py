@@ -10,8 +10,7 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 
 from cosim.interactive.draft import Draft
-from cosim.interactive.ensemble import Ensemble, explore_ensemble
-from cosim.interactive.exploration import Exploration, run_of, why_not_exact
+from cosim.interactive.exploration import Ensemble, Exploration, explore_ensemble, run_of, why_not_exact
 from cosim.interactive.scenario_guarantee import Guarantee, Margin, certify, margin_of, warning
 from cosim.output.figure_description import (
     DASHED,

@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Self, TypeVar, TypeVarTuple
 
 from cosim.interactive.draft import Draft, DraftError, Mistake, known_scenarios
-from cosim.interactive.ensemble import explore_ensemble
-from cosim.interactive.exploration import Exploration, run_of, why_not_exact
+from cosim.interactive.exploration import Exploration, explore_ensemble, run_of, why_not_exact
 from cosim.interactive.exploration_figure import CERTIFICATE, ENSEMBLE, MARGIN, RUN, DraftResults
 from cosim.interactive.scenario_guarantee import certify, margin_of
 from cosim.lab.live_run import LiveRun
@@ -178,7 +177,7 @@ def _new_pool() -> ProcessPoolExecutor:
 def _prepare() -> None:
     """Yield to others, and load what is needed, so that the first answer is quick."""
     os.nice(_NICE)
-    from cosim.interactive import ensemble, scenario_guarantee  # noqa: F401
+    from cosim.interactive import exploration, scenario_guarantee  # noqa: F401
 
 
 _QUIET_S = 0.15

@@ -1,6 +1,5 @@
 """The end of a run: its record completed, its summary, report and recording written."""
 
-import gc
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -174,15 +173,10 @@ def _judged(
         own = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason)
         return helpers.call(_judged_stored, own, block, helpers.expectations(block))
 
-    with work_bar(f"claims of {loops} loops") as show:
-        gc.freeze()  # what is there stays: it need not be searched again and again
-        try:
-            with helpers.shared(_blocks(run), there, show) as judge:
-                if run.kind == "live" and loops > 1:
-                    replayed = _replay(run.network)
-                found = judge(here)
-        finally:
-            gc.unfreeze()
+    with work_bar(f"claims of {loops} loops") as show, helpers.shared(_blocks(run), there, show) as judge:
+        if run.kind == "live" and loops > 1:
+            replayed = _replay(run.network)
+        found = judge(here)
     judged = [loop for block in sorted(found, key=min) for loop in found[block]]
     summary = _summary(run, ending, [loop.summary for loop in judged])
     if replayed is not None:
@@ -217,12 +211,8 @@ def _blocks(run: RecordedRun) -> Iterator[range]:
         first += width
 
 
-@cache
-def _stored_run(run_dir: Path) -> RecordedRun:
-    """Return the run of a helper, whose objects then live as long as the process."""
-    run = load_run(run_dir)
-    gc.freeze()
-    return run
+_stored_run = cache(load_run)
+"""The run of a helper, whose objects then live as long as the process."""
 
 
 @np.errstate(all="ignore")
@@ -268,10 +258,15 @@ def expectations_of(run_dir: Path, block: range) -> Sequence[Expectations]:
 
 
 def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:
-    certificates: Sequence[Sequence[ScenarioCertificate] | None] = [None] * len(scenarios)
+    """Return what to expect of some loops; equal loops share it."""
+    keys = [one.model_dump_json(exclude={"name", "seeds"}) for one in scenarios]
+    distinct = dict(zip(keys, scenarios, strict=True))
+    certificates: Sequence[Sequence[ScenarioCertificate] | None] = [None] * len(distinct)
     with suppress(Exception):
-        certificates = certificates_together(scenarios)
-    return [*map(Expectations, map(assumptions, scenarios), certificates)]
+        certificates = certificates_together([*distinct.values()])
+    expected = map(Expectations, map(assumptions, distinct.values()), certificates)
+    shared = dict(zip(distinct, expected, strict=True))
+    return [shared[key] for key in keys]
 
 
 class ReplayBeside:

@@ -13,8 +13,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Thread
 
 from cosim.lazy_modules import lazy_modules
 from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
@@ -204,7 +206,7 @@ class _Run:
         ``store`` is called with the result of a run that ends early, before its processes end.
         """
         result: Failure | None = None
-        last_s, started, joined = time.monotonic(), False, 0
+        last_s, started, joined, ends = time.monotonic(), False, 0, False
         while not self._is_over(stopping=result is not None):
             self._coordinator.poll()
             now_s = time.monotonic()
@@ -221,6 +223,9 @@ class _Run:
                 point_to_latest(self._run_dir)
                 self._watcher.started(self._run_dir)
                 self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
+            elif not ends and not self._is_in_loop():
+                ends = True  # while the processes end: the imports take 0.3 s
+                Thread(target=import_module, args=("cosim.live.finalize",), daemon=True).start()
             if len(self._coordinator.joined) > joined:
                 joined = len(self._coordinator.joined)
                 self._write_processes()

@@ -1,5 +1,6 @@
 """Worker processes of this machine."""
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -40,7 +41,7 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     os.environ.update(_ENVIRONMENT)  # inherited by the children
     with process_starts():  # it starts a process for semaphores
-        pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs,))
+        pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs, gc.get_threshold()))
     try:
         yield pool
         pool.shutdown()
@@ -55,8 +56,9 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
                 os.environ[name] = value
 
 
-def _depend_on(parent: Connection) -> None:
-    """End this process when the parent closes its end of the pipe."""
+def _depend_on(parent: Connection, threshold: tuple[int, int, int]) -> None:
+    """End this process when the parent closes its end of the pipe; collect garbage as it does."""
+    gc.set_threshold(*threshold)
 
     def follow() -> None:
         parent.poll(None)

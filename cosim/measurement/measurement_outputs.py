@@ -14,10 +14,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from cosim.live.progress import error_console
-from cosim.measurement.certificate_time import CertificateTime
 from cosim.measurement.chain_fits import ChainFit
 from cosim.measurement.loss_bursts import LEVEL, Estimate, histogram, most_losses
-from cosim.measurement.network_measurement import Measurement
+from cosim.measurement.network_measurement import CertificateTime, Measurement
 from cosim.output import palette
 from cosim.output.figure_description import (
     Axis,

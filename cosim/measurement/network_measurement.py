@@ -1,6 +1,23 @@
-"""The measurement of a network from a packet trace: all statistics, fits and tests."""
+"""The measurement of a network from a packet trace: all statistics, fits and tests.
 
-from collections.abc import Mapping, Sequence
+:func:`certificate_time` says for which share of the trace's time a scenario's certificate would
+have been void, by cause. Each packet of the trace is taken as an update of the scenario, sent when
+it was sent. The conditions are those of the scenario's certificates
+(:func:`noack.theory.certificates.conditions.allowed_conditions`). Losses are counted as the claims
+about a run count them: by the rules of the guarantee, and
+:class:`cosim.analysis.claims.observed_conditions.PacketLosses`. A condition is violated
+
+* by losses: from the sending of the packet whose loss is one too many, until a later packet is
+  received;
+* by a delay: from the end of the longest time that the certificate allows an update in the network,
+  until it is received.
+
+A packet that arrives out of order counts as lost if the newer one arrives after the allowed delay.
+A claim about a run is void from the first violation on, since its bounds depend on all that
+happened before.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -9,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from cosim.measurement.certificate_time import CertificateTime, certificate_time
+from cosim.analysis.claims.observed_conditions import PacketLosses, causes_of
+from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.measurement.chain_fits import (
     MOST_FITTED,
     ChainFit,
@@ -35,9 +53,14 @@ from cosim.measurement.loss_bursts import (
     outcomes,
     quantile_m,
 )
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.conditions import allowed_conditions, network_delay_ns
 from noack.traces.packet_trace import PacketTrace
 
+Times = NDArray[np.int64]
+DELAY, ORDER = "delay", " (out of order)"
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 Reals = NDArray[np.float64]
 SHARES = (0.0, 0.05, 0.5, 0.9, 0.95, 0.99, 0.999, 1.0)
@@ -232,7 +255,7 @@ class Measurement:
         durations_s = self.bursts.times_s(self.trace)[1][which]
         return fit_outages(durations_s, self.bursts.complete[which], self.observed_s)
 
-    def certificate_time(self, scenario: Scenario) -> CertificateTime:
+    def certificate_time(self, scenario: Scenario) -> "CertificateTime":
         """Return for which share of the time a scenario's certificates would have been void."""
         return certificate_time(self.trace, scenario)
 
@@ -315,3 +338,145 @@ _FEW_BURSTS = 20
 
 def _interval(estimate: Estimate | None) -> dict[str, float] | None:
     return None if estimate is None else dict(estimate._asdict())
+
+
+@dataclass(frozen=True)
+class VoidShare:
+    """How long one condition was violated."""
+
+    cause: str
+    """``delay``, or the name of a rule of the guarantee; with ``(out of order)`` if the rule would
+    hold without the packets that arrive out of order."""
+    share: float
+    """Of the trace's time."""
+    first_s: float
+    """When it was first violated, since the first sending."""
+    worst: float
+    """The worst value: losses, or the longest delay in seconds."""
+    text: str
+    """In words, with the allowed value."""
+
+
+@dataclass(frozen=True)
+class CertificateTime:
+    """The result for a scenario."""
+
+    scenario: str
+    certificates: dict[str, str | None]
+    """By the plants that it covers: None, or why there is no certificate."""
+    allowed_losses: int
+    """The most consecutive losses that the guarantee of the scenario allows."""
+    allowed_delay_s: float
+    """In the network."""
+    observed_s: float
+    share: float
+    """Share of the time in which any of the conditions was violated."""
+    causes: tuple[VoidShare, ...]
+    """Those that were violated."""
+    kept: dict[str, str]
+    """Those that were never violated, with the worst value in words."""
+
+    @property
+    def first_s(self) -> float | None:
+        """When a condition was first violated, None if never: a claim is void from then on."""
+        return min((one.first_s for one in self.causes), default=None)
+
+    def to_json(self) -> dict[str, object]:
+        """Return all fields for JSON."""
+        return asdict(self) | {"first_s": self.first_s}
+
+
+def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
+    """Return for which share of the time the certificates of a scenario would have been void."""
+    resolved = resolve(scenario)
+    found: dict[str, str | None] = {}
+    if not causes_of(resolved):
+        found["any plant"] = "a loop with acknowledgements cannot have one"
+    for one in scheduled_certificates(resolved):
+        found[one.scope] = one.void if one.constants is None else None
+    allowed = allowed_conditions(resolved)
+    delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)
+    end_ns = int(max(trace.sent_ns[-1], trace.received_ns.max()))
+    every = list(_violations(trace, allowed, delay_ns, end_ns))
+    spans, whole = [one for one in every if len(one.begin_ns)], max(end_ns, 1)
+    union = (
+        np.concatenate([[], *times])
+        for times in ([one.begin_ns for one in spans], [one.end_ns for one in spans])
+    )
+    return CertificateTime(
+        scenario=resolved.name,
+        certificates=found or {"any plant": "the scenario cannot have one"},
+        allowed_losses=allowed.dropouts,
+        allowed_delay_s=delay_ns * 1e-9,
+        observed_s=end_ns * 1e-9,
+        share=_covered_ns(*union) / whole,
+        causes=tuple(
+            VoidShare(
+                one.cause,
+                _covered_ns(one.begin_ns, one.end_ns) / whole,
+                float(one.begin_ns.min()) * 1e-9,
+                one.worst,
+                one.text,
+            )
+            for one in spans
+        ),
+        kept={
+            one.cause: f"kept: {one.text}" if one.worst else "kept"
+            for one in every
+            if not len(one.begin_ns) and not one.cause.endswith(ORDER)
+        },
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Spans:
+    """The k intervals in which a condition is violated; if there are none, its worst value."""
+
+    cause: str
+    begin_ns: Times
+    """(k,)"""
+    end_ns: Times
+    """(k,) At most the end of the trace."""
+    worst: float
+    text: str
+
+
+def _violations(
+    trace: PacketTrace, allowed: NetworkConditions, delay_ns: int, end_ns: int
+) -> Iterator[_Spans]:
+    """Yield the intervals of each cause."""
+    found, sent_ns, allowed_s = outcomes(trace), trace.sent_ns, delay_ns * 1e-9
+    sent_s, dropped_s = np.asarray(sent_ns * 1e-9), np.where(found.lost, np.inf, 0.0)
+    stale, replaced_s = found.out_of_order, dropped_s.copy()
+    replaced_s[stale] = (found.newer_ns - sent_ns)[stale] * 1e-9
+    # A violation by a lost packet lasts until a newer one is received; else, to the next packet.
+    until_ns = np.where(replaced_s > 0, found.newer_ns, np.append(sent_ns[1:], end_ns))
+    until_ns = np.minimum(until_ns, end_ns)
+    for rule in allowed.guarantee.rules:
+        every, dropped = (
+            PacketLosses(sent_s, times_s).values(rule, allowed_s, rule.start)[0].value
+            for times_s in (replaced_s, dropped_s)
+        )
+        which = dropped > rule.limit
+        for suffix, these in (("", which), (ORDER, (every > rule.limit) & ~which)):
+            values = every if suffix else dropped
+            worst = float((every[these] if these.any() else values).max(initial=0))
+            yield _Spans(rule.name + suffix, sent_ns[these], until_ns[these], worst, rule.violation(worst))
+    delays = trace.received_ns - sent_ns
+    beyond = ~found.lost & ~stale & (delays > delay_ns)
+    worst = float(delays[~found.lost & ~stale].max(initial=0)) * 1e-9
+    yield _Spans(
+        DELAY,
+        sent_ns[beyond] + delay_ns,
+        trace.received_ns[beyond],
+        worst,
+        f"an update was in the network for {worst:.4g} s, {allowed_s:.4g} s allowed",
+    )
+
+
+def _covered_ns(begin_ns: Times, end_ns: Times) -> int:
+    """Return the length of the union of intervals."""
+    order = np.argsort(begin_ns, kind="stable")
+    begin_ns, end_ns = begin_ns[order], end_ns[order]
+    latest_ns = np.append(-1, np.maximum.accumulate(end_ns))[:-1]
+    return int(np.maximum(end_ns - np.maximum(begin_ns, latest_ns), 0).sum())

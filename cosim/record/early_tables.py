@@ -34,7 +34,7 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
     """Write the tables of the loops of a run: at idle priority until it has ended, then the rest.
 
     Returns:
-        By table: the bytes of its spool whose rows the file has.
+        By table: the bytes of its spool whose rows the file has. Without a whole slice, it has none.
 
     Raises:
         ValueError: rows of a loop are not in order, or a table is long.
@@ -47,9 +47,9 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
             thread.submit(_follow, tables, ended).result()
         ended.unlink()
         for one in tables:
-            while one.advance(ended=True):
+            while one.bytes and one.advance(ended=True):
                 pass
-    return {one.table: one.bytes for one in tables}
+    return {one.table: one.bytes for one in tables if one.bytes}
 
 
 def _opened(run_dir: Path, stack: ExitStack) -> "list[_EarlyTable]":

@@ -1,6 +1,7 @@
 /* Products and norms with a fixed order of operations: a sum is formed from the left, and each
    product is rounded before it is added. */
 #include <math.h>
+#include <string.h>
 
 #include "loop.h"
 
@@ -15,6 +16,17 @@ void noack_product(
             total += matrix[k] * vector[k];
         result[i] = total;
     }
+}
+
+void noack_leaps(
+    int64_t n, int64_t bits, const double *powers, int64_t count, const int64_t *steps,
+    double *states, double *scratch) {
+    for (int64_t row = 0; row < count; row++, states += n)
+        for (int64_t bit = 0; bit < bits; bit++)
+            if ((uint64_t)steps[row] >> bit & 1) {
+                noack_product(n, n, powers + bit * n * n, states, scratch);
+                memcpy(states, scratch, (size_t)n * sizeof *states);
+            }
 }
 
 void multiply(

@@ -115,25 +115,22 @@ class Propagator:
         """Return e^{G j dt} of each of k states, (k, n), after its own number j of periods, (k,).
 
         A number of periods is followed bit by bit, so that a row does not depend on the others.
-        Where a state is that of the rows before, and its number the next one, the number without
-        its highest bit is that of an earlier row, whose result is used.
         """
-        if self._static:
-            return np.array(states)
-        found = np.array(states.T)  # long rows: an operation for each of few would take longer
-        highest = np.frexp(counts)[1] - 1
-        earlier = np.arange(len(counts)) - (counts > 0) * (1 << highest.clip(0))
-        is_next = np.diff(counts, prepend=-1) == 1
-        is_next[1:] &= all_entries(found.T[1:] == found.T[:-1])
-        # The run of such rows that a row is in begins with the number 0.
-        begins = np.maximum.accumulate(np.where(is_next, 0, np.arange(len(counts))))
-        in_turn = bool((counts == np.arange(len(counts)) - begins).all())
-        for bit in range(int(counts.max(initial=0)).bit_length()):
-            rows = np.flatnonzero(highest == bit if in_turn else counts >> bit & 1)
-            before = found[:, earlier[rows] if in_turn else rows]
-            for own, entries in zip(found, self.transition(period_ns << bit), strict=True):
-                own[rows] = sum(entry * old for entry, old in zip(entries, before, strict=True))
-        return np.ascontiguousarray(found.T)
+        found = np.array(states, np.float64, order="C")
+        bits = int(counts.max(initial=0)).bit_length()
+        if bits and not self._static:
+            powers = np.array([self.transition(period_ns << bit) for bit in range(bits)])
+            steps, scratch = np.ascontiguousarray(counts, np.int64), np.empty(found.shape[1])
+            core.noack_leaps(
+                found.shape[1],
+                bits,
+                _reals(powers),
+                len(found),
+                pointer_to(steps, "int64_t *"),
+                _reals(found),
+                _reals(scratch),
+            )
+        return found
 
 
 def norm(vector: Vector) -> float:

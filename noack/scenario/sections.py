@@ -343,8 +343,8 @@ class DirectionSection(ScenarioSection):
     @property
     def link(self) -> LinkSettings:
         """The link of this direction."""
-        return LinkSettings(
-            impairments=(LossOf(loss=self.loss), *self.impairments),
+        return LinkSettings.model_construct(  # of checked parts; every loop asks several times
+            impairments=(LossOf.model_construct(loss=self.loss), *self.impairments),
             mansd=self.mansd,
             constraints=self.constraints,
             limit=self.limit,

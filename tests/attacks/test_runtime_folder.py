@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
-from typer.testing import CliRunner
 
 import noack
-from cosim.cli import app
 from cosim.doctor.machine_measures import _runtime_folder
 from cosim.measurement.live.live_measurement import ProbeRows
 from cosim.output.viewer.recording import RecordingFile
@@ -33,6 +31,7 @@ from noack.scenario.matrix_files import write_matrices
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import NOBODY, needs_root
+from tests.command_line import invoke
 from tests.noack.runtime.test_invitation import INVITED
 
 OWN = f"noack-{os.getuid()}"
@@ -180,9 +179,9 @@ PRIVATE = b"mine alone"
 ENDS = ("127.0.0.1", 9000), ("127.0.0.1", 9001)
 SPEC = LinkSpec("link", *ENDS, LinkSettings(), LinkSettings())
 COMMANDS = (
-    "certify lane_weighted --out {out}/cert.mat",
-    "certify lane_weighted --tables {out}/tables",
     "archive {run} --out {out}/a.noack.zip",
+    "certify double_integrator --late 0 --out {out}/cert.mat",
+    "certify double_integrator --late 0 --tables {out}/tables",
     "export {run} --format mat --out {out}/run.mat",
     "export {run} --format mcap --out {out}/run.mcap",
     "compare {run} {run} --out {out}/compare.html",
@@ -254,15 +253,15 @@ def test_a_command_follows_no_planted_name(
 ) -> None:
     (tmp_path / "campaign.toml").write_text(CAMPAIGN)
 
-    def invoke() -> int:
+    def status_of_command() -> int:
         places = {"out": str(common), "run": str(run), "campaign": str(tmp_path / "campaign.toml")}
-        done = CliRunner().invoke(app, [word.format(**places) for word in command.split()])
+        done = invoke(*(word.format(**places) for word in command.split()))
         assert not done.exception or isinstance(done.exception, SystemExit), done.exception
         if done.exit_code:
             assert done.stderr.count("\n") == 1
         return done.exit_code
 
-    assert invoke() == 0
+    assert status_of_command() == 0
     names = [one.relative_to(common) for one in common.rglob("*") if one.is_file()]
     assert names
     # Hard links, FIFOs and folders: one command shows them, and each writer below.
@@ -270,7 +269,7 @@ def test_a_command_follows_no_planted_name(
         shutil.rmtree(common)
         common.mkdir()
         planted(plant, common, names, private)
-        status = invoke()
+        status = status_of_command()
         assert untouched(private), plant
         if status == 0:
             assert not any((common / name).is_symlink() for name in names)
@@ -321,29 +320,37 @@ def test_a_file_that_grows_or_is_locked_follows_no_planted_name(
 def test_a_folder_that_is_another_users_link_is_not_written_to(common: Path, private: Path) -> None:
     (common / "tables").symlink_to(private.parent)
     os.chown(common / "tables", NOBODY, NOBODY, follow_symlinks=False)
-    words = ["certify", "lane_weighted", "--tables", str(common / "tables")]
-    done = CliRunner().invoke(app, words)
+    words = ["certify", "double_integrator", "--late", "0", "--tables", str(common / "tables")]
+    done = invoke(*words)
     assert done.exit_code == 1
     assert done.stderr.endswith(f"{common / 'tables'} is a symbolic link of another user\n")
     assert untouched(private)
     os.chown(common / "tables", os.getuid(), os.getgid(), follow_symlinks=False)
-    assert CliRunner().invoke(app, words).exit_code == 0
+    assert invoke(*words).exit_code == 0
+
+
+@pytest.fixture(scope="module")
+def unfinished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Somebody else's run, with a loop named "private"."""
+    loops = [{"name": "private"}, {"name": "other"}]
+    scenario = noack.load("double_integrator", {"horizon_s": 0.1, "loops": loops})
+    run_dir = noack.simulate(scenario, runs=tmp_path_factory.mktemp("runs")).directory
+    (run_dir / "summary.json").unlink()
+    return run_dir
 
 
 @pytest.mark.parametrize("name", ["loops", RECORD, ENDING_FILE, RECORDING_FILE, SPOOL])
-def test_an_unfinished_run_with_links_is_not_completed(name: str, tmp_path: Path, private: Path) -> None:
-    """Of somebody else's run with a loop named "private", the folder of that name was removed."""
-    scenario = noack.load("shared_bottleneck", {"horizon_s": 0.2})
-    run_dir = noack.simulate(scenario, runs=tmp_path / "runs").directory
-    text = (run_dir / "scenario.toml").read_text()
-    (run_dir / "scenario.toml").write_text(text.replace('name = "loop-1"', 'name = "private"'))
-    (run_dir / "summary.json").unlink()
+def test_an_unfinished_run_with_links_is_not_completed(
+    name: str, unfinished: Path, tmp_path: Path, private: Path
+) -> None:
+    """The folder with the name of a loop was removed."""
+    run_dir = Path(shutil.copytree(unfinished, tmp_path / "run"))
     (run_dir / SPOOL).mkdir(exist_ok=True)
     if (run_dir / name).is_dir():
         shutil.rmtree(run_dir / name)
     (run_dir / name).unlink(missing_ok=True)
     (run_dir / name).symlink_to(tmp_path)
-    done = CliRunner().invoke(app, ["summary", str(run_dir)])
+    done = invoke("summary", run_dir)
     assert done.exit_code == 2
     assert f"{run_dir / name}: is a symbolic link; a run directory has none" in done.stderr
     assert untouched(private)

@@ -81,6 +81,8 @@ def test_only_the_printed_address_serves_the_page(server: RecordingServer) -> No
     assert ask(address + RECORDING)[::2] == (200, CONTENT)
     for path in (address, f"{address}?url=x", address + RECORDING, f"{server.origin}/"):
         assert ask(path)[1]["Referrer-Policy"] == "no-referrer"
+    assert ask(address + RECORDING, "rebound.example:1")[0] == 403
+    assert ask(address + "../recording.rrd")[0] == 404
 
 
 def test_without_the_exact_secret_every_path_is_404(server: RecordingServer) -> None:

@@ -27,11 +27,10 @@ from noack.plants.quadrotor import QuadrotorSettings
 from noack.plants.systems.linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.link_load import require_capacity
-from noack.scenario.resolution import LoopMatrices, loop_of, resolve
-from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load
+from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.theory.certificates.conditions import allowed_conditions
 from tests.extras import skip_without_plant
+from tests.shipped import resolved, shipped
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHARED = (
@@ -46,13 +45,9 @@ the pendulum is balanced from noisy angles; the rural network has an outage of t
 """
 
 
-def shipped(name: str, *settings: str) -> Scenario:
-    return resolve(load(SCENARIOS / f"{name}.toml", list(settings)))
-
-
 @cache
 def run_of(name: str) -> RunRecord:
-    return simulate(shipped(name))
+    return simulate(resolved(name))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -76,7 +71,7 @@ def test_a_shipped_scenario_meets_its_assumptions_and_settles(name: str) -> None
 
 @pytest.mark.parametrize("name", SHARED)
 def test_the_loops_of_a_shipped_network_settle_and_keep_what_is_claimed(name: str) -> None:
-    shared = simulate_loops(load(SCENARIOS / f"{name}.toml"))
+    shared = simulate_loops(shipped(name))
     require_capacity(shared.network.scenario)
     for record in shared.loops:
         summary = summarise(record, 0, "horizon").to_json()
@@ -103,13 +98,13 @@ def test_the_certificates_on_recorded_networks_are_as_the_scenarios_say(
     found = [(one.t_s, one.worst) for one in read_conditions(record).violations(conditions)]
     assert found == [pytest.approx(one) for one in late]
     assert all(one.constants is not None for one in scheduled_certificates(record.scenario))
-    longest = shipped(f"lane_5g_{name}", "certificate={}")
+    longest = resolved(f"lane_5g_{name}", "certificate={}")
     certified = [one.constants is not None for one in scheduled_certificates(longest)]
     assert certified == [not late] * 2
 
 
 def loop(name: str) -> LoopMatrices:
-    return loop_of(shipped(name))
+    return loop_of(resolved(name))
 
 
 def closed(found: LoopMatrices) -> Matrix:
@@ -167,7 +162,7 @@ def test_the_double_integrators_regulator_is_the_textbooks() -> None:
     np.testing.assert_allclose(found.K, -found.B_model.T @ P, atol=1e-9)
     poles = sorted(closed(found), key=lambda pole: pole.imag)
     np.testing.assert_allclose(poles, np.array([-1 - 1j, -1 + 1j]) / math.sqrt(2), atol=1e-9)
-    fine = simulate(shipped("double_integrator", "plant.draw=nominal", "trigger.beta=1e-6",
+    fine = simulate(resolved("double_integrator", "plant.draw=nominal", "trigger.beta=1e-6",
                             "trigger.floor=1e-6", "network.loss={model='lossless'}"))  # fmt: skip
     steps = fine[PLANT_STEP]
     cost = np.sum(steps["x"][:, 0] ** 2 + steps["u"][:, 0] ** 2) * 2e-3
@@ -236,7 +231,7 @@ def test_a_quadrotor_in_free_fall_without_drag_keeps_its_energy_and_its_angular_
 
 
 def test_a_summary_compares_the_cars_linearisation_with_the_model() -> None:
-    found = linearisation(shipped("lane_vehicle"))
+    found = linearisation(resolved("lane_vehicle"))
     assert isinstance(found, LinearisationPart)
     assert found.in_box is True
     assert max(real for real, _ in found.eigenvalues) == pytest.approx(-1.157, abs=2e-3)
@@ -244,15 +239,15 @@ def test_a_summary_compares_the_cars_linearisation_with_the_model() -> None:
     np.testing.assert_allclose(np.array(found.A) - found.off_A, believed.A_model, atol=1e-12)
     np.testing.assert_allclose(np.array(found.B) - found.off_B, believed.B_model, atol=1e-12)
     assert linearisation_rows(found)[1][1].endswith("inside the box")
-    other = linearisation(shipped("lane_vehicle", "plant.system.parameters=vw_vanagon"))
+    other = linearisation(resolved("lane_vehicle", "plant.system.parameters=vw_vanagon"))
     assert isinstance(other, LinearisationPart)
     assert other.in_box is False
     worst = np.abs(np.array(other.off_B)).max()
     assert linearisation_rows(other)[1][1] == f"B[2, 1], by {worst:.3g}, outside the box"
-    without = linearisation(shipped("cart_pole"))
+    without = linearisation(resolved("cart_pole"))
     assert isinstance(without, LinearisationPart)
     assert without.in_box is None
-    assert linearisation(shipped("lane_following")) is None
-    none = linearisation(shipped("lane_vehicle", "plant.system.model=kinematic"))
+    assert linearisation(resolved("lane_following")) is None
+    none = linearisation(resolved("lane_vehicle", "plant.system.model=kinematic"))
     assert isinstance(none, NoLinearisationPart)
     assert linearisation_rows(none)[0][1].startswith("none: x is not its whole state")

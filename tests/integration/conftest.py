@@ -199,11 +199,11 @@ class Running:
         summary = json.loads(stdout)
         return Finished(self.process.returncode, summary, stderr, (self.runs / "latest").resolve())
 
-    def finish_unstarted(self) -> str:
-        """Return the error of a run that never started."""
+    def finish_unstarted(self) -> str | None:
+        """Return the error of a run that never started; None: it started."""
         stdout, _ = self.process.communicate(timeout=PATIENCE_S)
         assert self.process.returncode == 1
-        error: str = json.loads(stdout)["error"]
+        error: str | None = json.loads(stdout).get("error")
         return error
 
     def left_behind(self) -> list[psutil.Process]:

@@ -8,9 +8,11 @@ import stat
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import psutil
+import pytest
 
 from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
@@ -50,6 +52,7 @@ def test_a_wait_for_a_missing_process_can_be_interrupted(
     assert live.private_files(tmp_path) == []
 
 
+@pytest.mark.usefixtures("no_report")
 def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> None:
     """The loop reaches its horizon, and each process stores all of its rows itself."""
     horizon_s = 24.0  # a machine that stalls for seconds does not reach it before the kill
@@ -77,39 +80,6 @@ def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> Non
     assert np.array_equal(steps["sequence"], np.arange(horizon_s * live.RATE_HZ + 1))
 
 
-def test_a_process_may_be_restarted_by_hand(start: Start, by_hand: ByHand) -> None:
-    recording = start(
-        *live.AT_RATE,
-        *live.settings(speed=2.0, horizon_s=1000.0, recovery__rejoin_within_s=60),
-        command=("record", "lane_following"),
-    )
-    processes = {role: by_hand(role) for role in LOOP_ROLES}
-    recording.wait_started()
-    twice = by_hand("sensor")
-    assert twice.wait(live.PATIENCE_S) == 1
-    assert "another sensor is in this run already" in twice.communicate()[1]
-    processes["sensor"].send_signal(signal.SIGINT)
-    assert processes["sensor"].wait(live.PATIENCE_S) == 130
-    again = by_hand("sensor")
-    assert again.stderr is not None
-    message = "replaces a process (sensor ended early: SIGINT)"
-    assert any(message in line for line in iter(again.stderr.readline, ""))
-    processes["plant"].send_signal(signal.SIGINT)  # the run ends without the plant
-    finished = recording.finish()
-    assert finished.status == 1
-    assert finished.summary["exit"]["reason"] == "plant ended early: SIGINT"
-    assert "sensor ended early: SIGINT at " in finished.stderr
-    assert "the run goes on, restart it with: noack sensor" in finished.stderr
-    (restart,) = finished.loop["restarts"]
-    assert restart["what"] == "restarted: sensor ended early: SIGINT"
-    assert finished.loop["replay"]["bit_exact"]
-    assert finished.loop["replay"]["complete"]  # on SIGINT, a process delivers all rows
-    assert finished.loop["missing_samples"] == 0
-    for process in (*processes.values(), again):
-        process.communicate(timeout=live.PATIENCE_S)
-    assert [processes[role].returncode for role in ("plant", "sensor")] == [130, 130]
-
-
 def files(folder: Path) -> dict[str, bytes]:
     found = {}
     for path in folder.rglob("*"):
@@ -131,42 +101,76 @@ def visible_in_processes(recording: live.Running, processes: list[subprocess.Pop
     return {str(path): path.read_bytes() for path in paths}
 
 
-def test_the_key_of_a_run_by_hand_is_visible_in_its_ticket_only(
-    start: Start, by_hand: ByHand, tmp_path: Path
-) -> None:
-    private = tmp_path / f"noack-{os.getuid()}"
-    early = [by_hand(role) for role in LOOP_ROLES[:2]]
-    recording = start(
-        *live.AT_RATE,
-        *live.settings(speed=2.0, horizon_s=400.0),
-        command=("record", "lane_following"),
-    )
-    path = private / "default.json"
-    live.wait_for(path.exists)
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert stat.S_IMODE(private.stat().st_mode) == 0o700
-    key = loads(path.read_text()).key
-    processes = early + [by_hand(role) for role in LOOP_ROLES[2:]]
-    recording.wait_recording()
-    run_dir = (recording.runs / "latest").resolve()
-    seen = visible_in_processes(recording, processes)
-    assert len(seen) == 3 * 7  # with the fork server
-    seen |= files(run_dir) | files(private)
-    del seen[str(path)]  # the ticket contains the key
-    recording.process.send_signal(signal.SIGINT)
-    finished = recording.finish()
-    assert files(private) == {}
-    seen |= files(run_dir) | {"recorder's output": finished.stderr.encode()}
-    for role, process in zip(LOOP_ROLES, processes, strict=True):
-        stdout, stderr = live.ended(process)
-        seen[f"{role}'s output"] = (stdout + stderr).encode()
-        assert process.returncode == 1
-        assert json.loads(stdout)["ended"] == "stopped by the user (SIGINT)"
-    for where, content in seen.items():
-        assert key not in content, where
-        assert key.hex().encode() not in content, where
-    assert finished.status == 130, finished.stderr
-    assert finished.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
-    live.assert_complete(finished.loop)
-    steps = load_record(finished.run_dir)["plant_step"]
-    assert np.array_equal(steps["sequence"], np.arange(len(steps)))
+class ByHandRun(NamedTuple):
+    """A run whose sensor was started twice, ended and restarted, and which the plant's end ended."""
+
+    finished: live.Finished
+    key: bytes
+    seen: dict[str, bytes]
+    """Everything in which the key could be seen, by place."""
+    statuses: dict[str, int | None]
+    """Of the processes that were started first, by role."""
+    refused: str
+    """What the second sensor printed."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> ByHandRun:
+    folder = tmp_path_factory.mktemp("by hand")
+    private = folder / f"noack-{os.getuid()}"
+    with live.begun(folder) as start, live.starting() as begin:
+
+        def by_hand(role: str) -> subprocess.Popen[str]:
+            return begin(role, "--json", runtime=folder)
+
+        early = {role: by_hand(role) for role in LOOP_ROLES[:2]}
+        values = live.settings(speed=2.0, horizon_s=1000.0, recovery__rejoin_within_s=60)
+        recording = start(*live.AT_RATE, *values, command=RECORD)
+        ticket = private / "default.json"
+        live.wait_for(ticket.exists)
+        assert (stat.S_IMODE(ticket.stat().st_mode), stat.S_IMODE(private.stat().st_mode)) == (0o600, 0o700)
+        key = loads(ticket.read_text()).key
+        processes = early | {role: by_hand(role) for role in LOOP_ROLES[2:]}
+        recording.wait_recording()
+        twice = by_hand("sensor")
+        assert twice.wait(live.PATIENCE_S) == 1
+        seen = visible_in_processes(recording, [*processes.values()])
+        assert len(seen) == 3 * 7  # with the fork server
+        run_dir = (recording.runs / "latest").resolve()
+        seen |= files(run_dir) | files(private)
+        del seen[str(ticket)]  # the ticket contains the key
+        processes["sensor"].send_signal(signal.SIGINT)
+        assert processes["sensor"].wait(live.PATIENCE_S) == 130
+        again = by_hand("sensor")
+        assert again.stderr is not None
+        message = "replaces a process (sensor ended early: SIGINT)"
+        assert any(message in line for line in iter(again.stderr.readline, ""))
+        processes["plant"].send_signal(signal.SIGINT)  # the run ends without the plant
+        finished = recording.finish()
+        assert files(private) == {}
+        seen |= files(run_dir) | {"recorder's output": finished.stderr.encode()}
+        for role, process in (*processes.items(), ("sensor again", again)):
+            seen[f"{role}'s output"] = "".join(live.ended(process)).encode()
+        statuses = {role: process.returncode for role, process in processes.items()}
+        return ByHandRun(finished, key, seen, statuses, twice.communicate()[1])
+
+
+def test_a_process_may_be_restarted_by_hand(run: ByHandRun) -> None:
+    finished = run.finished
+    assert "another sensor is in this run already" in run.refused
+    assert finished.status == 1
+    assert finished.summary["exit"]["reason"] == "plant ended early: SIGINT"
+    assert "sensor ended early: SIGINT at " in finished.stderr
+    assert "the run goes on, restart it with: noack sensor" in finished.stderr
+    (restart,) = finished.loop["restarts"]
+    assert restart["what"] == "restarted: sensor ended early: SIGINT"
+    assert finished.loop["replay"]["bit_exact"]
+    assert finished.loop["replay"]["complete"]  # on SIGINT, a process delivers all rows
+    assert finished.loop["missing_samples"] == 0
+    assert [run.statuses[role] for role in ("plant", "sensor")] == [130, 130]
+
+
+def test_the_key_of_a_run_by_hand_is_visible_in_its_ticket_only(run: ByHandRun) -> None:
+    for where, content in run.seen.items():
+        assert run.key not in content, where
+        assert run.key.hex().encode() not in content, where

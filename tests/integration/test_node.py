@@ -15,10 +15,8 @@ import numpy as np
 import psutil
 import pytest
 
-import noack
 from cosim.record.run_record import load_record
 from native.build import NO_COMPILER
-from noack.core.errors import CallerError
 from tests.integration import conftest as live
 from tests.integration.test_restarts import goes_on, spooled
 
@@ -165,25 +163,3 @@ def test_what_a_program_has_started_ends_with_the_run(tmp_path: Path) -> None:
     assert finished.status == 0, finished.stderr
     with suppress(psutil.NoSuchProcess):
         live.wait_for(lambda: live.is_over(psutil.Process(int(number.read_text()))))
-
-
-@pytest.mark.parametrize(
-    ("more", "line"),
-    [
-        ({"network.encrypted": True}, "network.encrypted = true: not with controller.kind"),
-        (
-            {"changes": [{"at_s": 1.0, "set": {"network.mansd": 3}}]},
-            'controller.kind: with "program", nothing can be changed during a run',
-        ),
-        ({"loops": [{"name": "a", "count": 2}]}, "a run of several loops has no controller.kind"),
-        ({"controller": {"runner": [""]}}, "controller.runner"),
-    ],
-)
-def test_what_a_program_cannot_do_is_refused(more: dict[str, object], line: str) -> None:
-    own: dict[str, object] = {"kind": "program", "file": sys.executable}
-    given = more.get("controller")
-    own |= given if isinstance(given, dict) else {}
-    with pytest.raises(CallerError) as caught:
-        noack.load("lane_following", more | {"controller": own})
-    assert line in str(caught.value)
-    assert "\n" not in str(caught.value)

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-CERTIFIED = (["certify", "lane_following"], ["margin", "lane_periodic", "--no-period"])
+CERTIFIED = (["certify", "lane_following"], ["margin", "lane_periodic", "--most", "2", "--no-period"])
 COMMANDS = (
-    ["simulate", "lane_following", "--set", "horizon_s=5"],
+    ["simulate", "lane_following", "--set", "horizon_s=1"],
     ["summary"],
     ["replay"],
     ["fidelity"],

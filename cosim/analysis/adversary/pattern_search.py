@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.adversary.objective import Flags, Pattern, PatternFlow, Segments
+from cosim.analysis.adversary.loop_flows import Flags, Pattern, PatternFlow, Segments
 from cosim.simulation.continuous import TooManyEventsError
 from cosim.simulation.exact_simulation import MAX_EVENTS
 from noack.core.linear_systems import Matrix, Vector

@@ -15,8 +15,17 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from cosim.analysis.adversary.loop_flows import SampledFlow, SampledRun, SegmentFlow, evaluate, run_of
-from cosim.analysis.adversary.objective import Objective, Pattern, measure_of, weight_of
+from cosim.analysis.adversary.loop_flows import (
+    Objective,
+    Pattern,
+    SampledFlow,
+    SampledRun,
+    SegmentFlow,
+    evaluate,
+    measure_of,
+    run_of,
+    weight_of,
+)
 from cosim.analysis.adversary.pattern_search import (
     Ceiling,
     Nodes,

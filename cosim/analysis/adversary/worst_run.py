@@ -16,8 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cosim.analysis.adversary.loop_flows import SampledFlow, SampledRun, Valued
-from cosim.analysis.adversary.objective import Measure, Objective, Pattern
+from cosim.analysis.adversary.loop_flows import Measure, Objective, Pattern, SampledFlow, SampledRun, Valued
 from cosim.simulation.sampled_loop import Numbers, Runs, SampledLoop, Scales, noise_of, pushes_of, through_of
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number

@@ -84,13 +84,13 @@ def void_claim(what: str, source: str, since_s: float, why: str, until_s: float 
 
 
 class ClaimCheck:
-    """Checks a run against a bound, part by part, up to the end of the claim.
+    """Checks a part of a run against a bound, samples by samples, up to the end of the claim.
 
     If the run cannot meet an assumption, ``unmet`` names it.
     """
 
-    def __init__(self, statement: str, source: str, until_s: float = math.inf, unmet: str = "") -> None:
-        self._statement, self._source, self._until_s, self._unmet = (statement, source, until_s, unmet)
+    def __init__(self, statement: str, source: str, part: RunPart, unmet: str = "") -> None:
+        self._statement, self._source, self._part, self._unmet = statement, source, part, unmet
         self._ratio: float | None = None
         self._exceeded_s: float | None = None
         self._bound: Bound | None = None
@@ -118,14 +118,14 @@ class ClaimCheck:
         """The violated assumption that ends the claim early."""
         assert self._bound is not None
         void = self._bound.void
-        return void if void is not None and void.t_s < self._until_s else None
+        return void if void is not None and void.t_s < self._part.until_s else None
 
     @property
     def _end_s(self) -> float:
-        return self._until_s if (void := self._void) is None else void.t_s
+        return self._part.until_s if (void := self._void) is None else void.t_s
 
     def result(self) -> Claim:
-        """Return the claim with its verdict, after the last part."""
+        """Return the claim with its verdict, in the run's time, after the last samples."""
         bound, void, why, ratio = self._bound, self._void, self._unmet, self._ratio
         assert bound is not None
         since_s = self._exceeded_s
@@ -142,17 +142,24 @@ class ClaimCheck:
             if bound.is_lower:
                 observed = constant / ratio if ratio else None
         formula = bound.formula if constant is None else bound.formula.format(constant)
+        from_s = self._part.from_s
         return Claim(
             what=self._statement, source=self._source, bound=formula, certified=constant,
-            observed=observed, ratio=ratio, verdict=verdict, since_s=since_s, why=why, from_s=0.0,
-            until_s=None,
+            observed=observed, ratio=ratio, verdict=verdict,
+            since_s=None if since_s is None else since_s + from_s, why=why, from_s=from_s,
+            until_s=_end_s(self._part),
         )  # fmt: skip
+
+
+def _end_s(part: RunPart) -> float | None:
+    """Return the end of the claims of a part, in the run's time; None for that of the run."""
+    return round(part.from_s + part.until_s, 9) if math.isfinite(part.until_s) else None
 
 
 class _Instance(NamedTuple):
     """A claim about a run, by a certificate or without one."""
 
-    find: Callable[[Samples], Findings]
+    find: Callable[[RunEvidence, Samples], Findings]
     check: ClaimCheck
     curve: list[Envelope]
     """The parts of its curve."""
@@ -160,17 +167,17 @@ class _Instance(NamedTuple):
     outside: str | None = None
     """Why the certificate does not cover the run's plant."""
 
-    def take(self, samples: Samples, columns: int, *, counts: bool) -> None:
+    def take(self, run: RunEvidence, samples: Samples) -> None:
         """Check the next samples, and add to the curve, which is thinned if the run is long."""
-        bound, envelope = self.find(samples)
-        if counts and bound is not None:
+        bound, envelope = self.find(run, samples)
+        if run.facts.any_in_common and bound is not None:
             if self.outside is not None:
                 bound = bound._replace(void=VoidFrom(0.0, self.outside))
             self.check.add(bound)
         if envelope is None or (envelope.quantity == "inter_event" and self.curve):
             return  # the same line in every part
         if envelope.quantity != "inter_event":
-            keep = decimate(envelope.t_s, envelope.values, columns)
+            keep = decimate(envelope.t_s, envelope.values, run.record.slice_columns)
             envelope = envelope._replace(t_s=envelope.t_s[keep], values=envelope.values[keep])
         self.curve.append(envelope)
 
@@ -179,17 +186,18 @@ class ClaimEvaluation(RunEvidence):
     """The claims about one run, or about one part of it."""
 
     def judge(self) -> list[Claim]:
-        """Return every claim with its verdict."""
+        """Return every claim with its verdict, in the run's time."""
         if not self.facts.any_in_common:
             return []
+        void = partial(void_claim, since_s=self.part.from_s, until_s=_end_s(self.part))
         if self.record.scenario.protocol.acknowledges:
             what = "x_c − x_s is the sum of the missed jumps"
-            return [void_claim(what, "(I1)", 0.0, _ACKNOWLEDGED)]
+            return [void(what, "(I1)", why=_ACKNOWLEDGED)]
         found: list[Claim] = []
         for certificate in (None, *self.certificates):
             if certificate is not None and certificate.constants is None:
                 what = f"a certificate for {certificate.scope}"
-                found.append(void_claim(what, certificate.source, 0.0, certificate.void or ""))
+                found.append(void(what, certificate.source, why=certificate.void or ""))
             found += [
                 instance.check.result()
                 for instance in self._checked
@@ -201,28 +209,25 @@ class ClaimEvaluation(RunEvidence):
     def _checked(self) -> list[_Instance]:
         """All claims, checked in one pass over the run."""
         instances = list(self._instances())
-        columns, counts = self.record.slice_columns, self.facts.any_in_common
         for samples in self.samples():
             for instance in instances:
-                instance.take(samples, columns, counts=counts)
+                instance.take(self, samples)
         return instances
 
     def _instances(self) -> Iterator[_Instance]:
         """Yield the claims of each certificate, and those that need none."""
-        until_s, scenario = self.part.until_s, self.record.scenario
+        scenario = self.record.scenario
         for certificate in self.certificates:
             if (constants := certificate.constants) is None:
                 continue
             outside = outside_box(scenario) if certificate.scope == BOX else None
             for one in definitions(CertifiedClaim):
-                check = ClaimCheck(one.statement, certificate.source, until_s)
-                given = {"certificate": certificate, "constants": constants}
-                find = partial(one.find, self, **given)
+                check = ClaimCheck(one.statement, certificate.source, self.part)
+                find = partial(one.find, certificate=certificate, constants=constants)
                 yield _Instance(find, check, [], certificate, outside)
         for claim in definitions(ClaimDefinition):
             unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
-            check = ClaimCheck(claim.statement, claim.source, until_s, unmet)
-            yield _Instance(partial(claim.find, self), check, [])
+            yield _Instance(claim.find, ClaimCheck(claim.statement, claim.source, self.part, unmet), [])
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds; those of a long run are thinned."""
@@ -328,23 +333,7 @@ class RunClaims:
 
     def judge(self) -> list[Claim]:
         """Every claim with its verdict, in the run's time."""
-        found: list[Claim] = []
-        for one in self.parts:
-            if isinstance(one, Claim):
-                found.append(one)
-                continue
-            from_s, until_s = one.part.from_s, one.part.until_s
-            found += [
-                claim.model_copy(
-                    update={
-                        "since_s": None if claim.since_s is None else claim.since_s + from_s,
-                        "from_s": from_s,
-                        "until_s": round(from_s + until_s, 9) if math.isfinite(until_s) else None,
-                    }
-                )
-                for claim in one.judge()
-            ]
-        return found
+        return [claim for one in self.parts for claim in ([one] if isinstance(one, Claim) else one.judge())]
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds, each over its own part of the run."""

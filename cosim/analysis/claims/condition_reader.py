@@ -16,7 +16,7 @@ depends on rows of another process waits for them, and only waiting rows are kep
 
 import math
 from collections import defaultdict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -309,8 +309,9 @@ class _Updates:
         self._newest_packet = NO_SEQUENCE
         self._resolved = NO_SEQUENCE
 
-    def events(self, sequence: Times, t_ns: Times) -> None:
-        self._events.extend(zip(sequence.tolist(), t_ns.tolist(), strict=True))
+    def measurements(self, rows: Rows) -> None:
+        events = rows.compress(rows["event"] != NO_SEQUENCE)
+        self._events.extend(zip(events["event"].tolist(), events["t_ns"].tolist(), strict=True))
 
     def packets(self, rows: Rows) -> None:
         rows, sequences, _ = updates_in(rows)
@@ -397,20 +398,22 @@ class ConditionReader:
         self._ticks = Ticks()
         self._inputs = Inputs(scenario)
         self._updates = _Updates()
-        self._takes: Mapping[str, Callable[[Rows], None]] = {
-            SENSOR_MEASUREMENT: self._measured,
-            PLANT_STEP: self._inputs.steps,
-            PLANT_ACTUATION: self._inputs.actuations,
-            CONTROLLER_STEP: self._ticks.ticks,
-            CONTROLLER_DELIVERY: self._ticks.deliveries,
-            NETEM_PACKET: self._updates.packets,
+        # Methods of its parts: with one of its own, it would refer to itself.
+        self._takes: Mapping[str, Sequence[Callable[[Rows], None]]] = {
+            SENSOR_MEASUREMENT: (self._measurements.add, self._updates.measurements),
+            PLANT_STEP: (self._inputs.steps,),
+            PLANT_ACTUATION: (self._inputs.actuations,),
+            CONTROLLER_STEP: (self._ticks.ticks,),
+            CONTROLLER_DELIVERY: (self._ticks.deliveries,),
+            NETEM_PACKET: (self._updates.packets,),
         }
         self._clocks = None if scenario.clocks is None else Clocks(scenario.clocks)
 
     def take(self, table: str, rows: Rows) -> None:
         """Add rows of a table, in their order."""
         if len(rows) and table in self._takes:
-            self._takes[table](rows)
+            for take in self._takes[table]:
+                take(rows)
         elif len(rows) and self._clocks is not None and table in CLOCK_TABLES:
             self._clocks.add(OWNER[table], rows)
 
@@ -430,11 +433,6 @@ class ConditionReader:
     def waiting(self) -> int:
         """The number of rows that wait for others."""
         return self._inputs.waiting + self._ticks.waiting + self._updates.waiting
-
-    def _measured(self, rows: Rows) -> None:
-        self._measurements.add(rows)
-        events = rows.compress(rows["event"] != NO_SEQUENCE)
-        self._updates.events(events["event"], events["t_ns"])
 
     def _observed(self, end_ns: int | None) -> ObservedConditions:
         ended = end_ns is not None

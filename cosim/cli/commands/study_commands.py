@@ -24,14 +24,7 @@ with lazy_modules():
     from cosim.output import figure_format, result_tables
     from cosim.studies.campaign import campaign_file, campaign_grid, campaign_report
     from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result
-    from cosim.studies.design import (
-        design_page,
-        design_search,
-        design_space,
-        event_design,
-        network_page,
-        network_search,
-    )
+    from cosim.studies.design import design_page, design_search, design_space, event_design, network_search
     from cosim.studies.paper import paper_page, published_result
     from cosim.studies.paper import results as paper_results
     from noack.core import linear_systems
@@ -116,7 +109,10 @@ def paper(
         return ExitStatus.OK
     if name is not None:
         if out is not None or draws is not None:
-            raise CallerError("--out, --draws: are for the page of Section V; this has --tables")
+            raise CallerError(
+                f"--out, --draws: are for `noack paper` without a name; the table of {name} is written "
+                "by --tables FILE"
+            )
         with cli.status("computing"):
             found = paper_results.reproduce(name)
         cli.show(json, found.document, published_result.print_rows, found)
@@ -388,10 +384,10 @@ def _design_for_network(
     with progress.work_bar("trying gains") as bar:
         found = event_design.design_for_network(loaded, wish, seed, bar)
     path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}-network.html"
-    written = network_page.write_page(found, path, figure_files)
+    written = design_page.write_outcome(found, path, figure_files)
     if out is not None and found.is_certified:
         written.append(write_whole(out, found.written()))
-    cli.show_with_files(json, found.to_json(), written, network_page.print_design, found)
+    cli.show_with_files(json, found.to_json(), written, design_page.print_design, found)
     return ExitStatus.OK if found.is_certified else ExitStatus.FAILED
 
 

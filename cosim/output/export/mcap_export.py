@@ -2,25 +2,29 @@
 
 Foxglove, PlotJuggler and the libraries of MCAP read it. The log time of a message is the actual
 time of its row, its publish time the nominal one, both in simulated nanoseconds since the run's
-epoch. Beside it, ``ros2_bag.py`` writes a file with ROS 2 messages, if rosbags is installed.
+epoch.
+
+Beside it, a file of its own has ROS 2 messages (profile ``ros2``, CDR, with ``ros2msg`` schemas), if
+rosbags is installed: rosbags and ``ros2 bag`` read files in which every channel is of ROS 2. Log
+time, publish time and topics are the same; the stamp in a message is its nominal time.
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic_core import to_json
 
-from cosim.output.export import ExportedRun, ros2_bag
+from cosim.output.export import ExportedRun
 from cosim.record.align import aligned_parts
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
-from noack.protocol import ros2_messages
+from noack.protocol import ros2_messages as ros2
 from noack.protocol.record_tables import COMMON, OWNER, TABLES
 
 if TYPE_CHECKING:
@@ -39,6 +43,9 @@ _SCHEMAS = json.loads(Path(__file__).with_name("mcap_schemas.json").read_bytes()
 """Of the messages that are no rows of a table."""
 Message = tuple[int, int, int, bytes]
 """Log time, publish time, sequence, and content."""
+_ROS_SUFFIX = ".ros2.mcap"
+_ROS_LEVELS = {"warning": 30, "restart": 30, "error": 40}
+_INFO = 20
 
 
 def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Path]:
@@ -62,8 +69,8 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
             writer.start(profile="", library="noack")
             _write(writer, run)
             writer.finish()  # type: ignore[no-untyped-call]
-        if ros2_messages.is_installed():
-            return [path, ros2_bag.write(run, path)]
+        if ros2.is_installed():
+            return [path, _write_ros(run, path)]
     except (OSError, ValueError) as error:
         raise MachineError(f"{path}: cannot be written: {why(error)}") from None
     return [path]
@@ -212,3 +219,66 @@ def _type(name: str, field: np.dtype[np.generic]) -> dict[str, object]:
         return dict(one)
     size = field.shape[0]
     return {"type": "array", "items": one, "minItems": size, "maxItems": size}
+
+
+def _write_ros(run: ExportedRun, path: Path) -> Path:
+    """Write the file with ROS 2 messages; return its path. Raise OSError if that fails."""
+    from mcap.writer import CompressionType, Writer  # an extra, whose absence the caller reports
+
+    path = path.with_suffix(_ROS_SUFFIX)
+    with new_file(path) as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="noack")
+        bag = _Bag(writer)
+        loops = run.inner or [run]
+        for loop in loops:
+            bag.write_loop(loop, is_only=len(loops) == 1)
+        bag.write_log(run)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+class _Bag:
+    def __init__(self, writer: "Writer") -> None:
+        self._writer, self._channels, self._schemas = writer, dict[str, int](), dict[str, int]()
+
+    def _channel(self, topic: str, kind: str) -> int:
+        if topic not in self._channels:
+            if kind not in self._schemas:
+                content = ros2.definition(kind).encode()
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", content)
+            profile = {"offered_qos_profiles": ""}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], profile)
+        return self._channels[topic]
+
+    def write_loop(self, run: ExportedRun, *, is_only: bool) -> None:
+        """Write the messages of a loop, each part of its record in the order of the log time."""
+        record = run.record
+        loop, name = record.loop, record.scenario.name
+        prefix = ros2.namespace(run.name or name, is_only=is_only)
+        for part in record.slices(*ros2.TOPICS):
+            found: list[tuple[int, int, str, bytes, int]] = []
+            for table in ros2.TOPICS:
+                rows = part[table]
+                for place, topic, entries in ros2.row_entries(
+                    table, rows, loop.state_names, loop.input_names
+                ):
+                    log_ns = max(int(rows["now_ns"][place]) + run.phase_ns, 0)
+                    stamped = entries._replace(stamp_ns=entries.stamp_ns + run.phase_ns)
+                    number = int(rows["sequence"][place]) & 0xFFFF_FFFF
+                    message = ros2.joint_state(stamped, name)
+                    found.append((log_ns, stamped.stamp_ns, f"{prefix}/{topic}", message, number))
+            self._add(sorted(found, key=lambda message: message[0]))
+
+    def _add(self, found: Iterable[tuple[int, int, str, bytes, int]]) -> None:
+        for log_ns, publish_ns, topic, message, number in found:
+            channel = self._channel(topic, ros2.JOINT_STATE)
+            self._writer.add_message(channel, log_ns, message, max(publish_ns, 0), number)
+
+    def write_log(self, run: ExportedRun) -> None:
+        """Write the lines of the run's log to ``/rosout``."""
+        for number, notice in enumerate(run.record.notices):
+            t_ns, level = max(int(notice["t_ns"]), 0), _ROS_LEVELS.get(notice["level"], _INFO)
+            line = ros2.log_line(t_ns, level, notice["process"], notice["text"])
+            channel = self._channel("/rosout", ros2.LOG)
+            self._writer.add_message(channel, t_ns, line, t_ns, number)

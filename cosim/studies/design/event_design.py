@@ -19,9 +19,9 @@ from cosim.output.figure_description import Axis, FigureDescription, Line, Panel
 from cosim.output.palette import LOST, NETWORK
 from cosim.simulation.exact_simulation import Population, run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
+from cosim.studies.design.design_page import DesignOutcome, figure_of, gain_text
 from cosim.studies.design.design_search import WORDS, bounds_of
 from cosim.studies.design.design_space import lqr_gain
-from cosim.studies.design.network_page import DesignOutcome, figure_of, gain_text
 from cosim.studies.design.network_search import (
     COSTS_OF_INPUT,
     NetworkSearch,

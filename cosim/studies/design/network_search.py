@@ -21,10 +21,10 @@ import numpy as np
 from cosim.analysis.margin_search import stability_document
 from cosim.output import palette
 from cosim.output.figure_description import Axis, FigureDescription, Item, Line, Marks, Panel, Rule
+from cosim.studies.design.design_page import DesignOutcome, figure_of, gain_text
 from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.loop_growth import PatternGraph, QuickLoop
-from cosim.studies.design.network_page import DesignOutcome, figure_of, gain_text
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa

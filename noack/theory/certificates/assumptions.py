@@ -309,7 +309,8 @@ def _conditions(conditions: NetworkConditions, resolved: Scenario, kept: float |
     why = "enforced by the network" if enforced else "not enforced"
     if kept is not None:
         horizon_s = resolved.timing.horizon_ns / NS_PER_S
-        why += f"; a run of {horizon_s:g} s keeps it with probability {kept:.4g} or more"
+        known = f"with probability {kept:.4g} or more" if kept > 0 else "with a probability that may be 0"
+        why += f"; a run of {horizon_s:g} s keeps it {known}"
     losses = Assumption(
         f"{conditions.guarantee.meaning} after a first delivery at t_0",
         "certificate",

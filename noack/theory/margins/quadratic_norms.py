@@ -246,6 +246,8 @@ class _Centers(NamedTuple):
         own_slope = weight - float(sums.sum())
         corner = float(np.einsum("eij,eji->", turned, turned) + 2 * self.durations @ sums)
         corner -= float(border @ across)
+        if not corner > 0:
+            raise np.linalg.LinAlgError
         further = -(own_slope - float(border @ along)) / corner
         change = -along - further * across
         decrement = -float(slope @ change) - own_slope * further

@@ -20,7 +20,7 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix, Vector, balancing_exponents
 from noack.impairments.loss_prediction import OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of
@@ -139,11 +139,18 @@ class LoopMoments:
         """Of √E‖z‖² per period."""
 
     def _sum(self, entries: Vector) -> Vector:
-        """Return the sum of what becomes of moments over all cycles of the slots."""
-        steps = [
-            second_moments(delivered.matrix, lost.matrix, self._outcomes) for delivered, lost in self._slots
-        ]
-        return resolved_by(reduce(lambda before, step: step @ before, steps), 1.0, entries)
+        """Return the sum of what becomes of moments over all cycles of the slots.
+
+        It is computed in units in which no component of z is much larger than others.
+        """
+        maps = [(delivered.matrix, lost.matrix) for delivered, lost in self._slots]
+        exponents = balancing_exponents(np.abs(maps).max(axis=(0, 1)))
+        i, j = np.triu_indices(self._periods.size)
+        units = np.tile(exponents[i] + exponents[j], len(self._outcomes.lost))
+        scaled = np.ldexp(maps, exponents[:, None] - exponents)
+        steps = [second_moments(delivered, lost, self._outcomes) for delivered, lost in scaled]
+        cycle = reduce(lambda before, step: step @ before, steps)
+        return np.ldexp(resolved_by(cycle, 1.0, np.ldexp(entries, units)), -units)
 
     def stationary(self) -> tuple[SecondMoments, Vector] | None:
         """Return the moments at the transmissions of slot 0, and the mean costs per second.

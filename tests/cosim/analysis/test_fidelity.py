@@ -165,9 +165,6 @@ def test_the_summary_has_the_comparison_or_the_reason(
 # --- noack replay and noack fidelity --------------------------------------------------------------
 
 
-COMMANDS = ("replay", "fidelity")
-
-
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
@@ -240,24 +237,3 @@ def test_an_empty_record_and_an_unexplained_difference_fail(runs: Path) -> None:
     done = invoke("replay", "--runs", runs)
     assert done.exit_code == 1
     assert "nothing to compare" in done.stdout
-
-
-STEPS = "record/plant_step.parquet"
-DAMAGE: dict[str, Callable[[Path], object]] = {
-    "no scenario": lambda runs: (runs / "latest/scenario.toml").unlink(),
-    "no record": lambda runs: shutil.rmtree(runs / "latest/record"),
-    "no table": lambda runs: (runs / "latest" / STEPS).unlink(),
-    "no Parquet": lambda runs: (runs / "latest" / STEPS).write_bytes(b"PAR1 no more"),
-    "no column": lambda runs: rewrite(runs, "plant_step", lambda rows: rows.drop_columns(["x_4"])),
-    "no run": lambda runs: (runs / "latest").unlink(),
-}
-
-
-@pytest.mark.parametrize("how", DAMAGE)
-def test_an_invalid_run_directory_gives_one_line(runs: Path, how: str) -> None:
-    DAMAGE[how](runs)
-    for command in COMMANDS:
-        done = invoke(command, "--runs", runs)
-        assert (done.exit_code, done.stdout) == (2, "")
-        assert done.stderr.startswith("noack: ")
-        assert done.stderr.count("\n") == 1

@@ -91,16 +91,3 @@ def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:
     for shown in (repr(found), found._repr_html_()):
         assert "schedule, box" in shown
         assert f"{found.paper_box.constants.delta:.4g}" in shown
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("double_integrator", {"weight": "best"}, "weight: given, identity or chosen, not"),
-        ("double_integrator", {"late": -1}, "late: -1 steps; give 0 to 1000"),
-        ("model_predictive", {}, "u is not K x_c; no certificate covers this"),
-    ],
-)
-def test_a_missing_certificate_gives_one_line(name: str, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(noack.NoackError, match=message):
-        noack.certify(name, **options)

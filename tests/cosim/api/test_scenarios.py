@@ -40,11 +40,6 @@ def test_a_wrong_setting_gives_one_line(settings: Any, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_an_unknown_scenario_name_gives_one_line() -> None:
-    with pytest.raises(noack.NoackError, match=r"lane_folowing: .* did you mean lane_following"):
-        noack.load("lane_folowing")
-
-
 def test_a_system_becomes_a_scenario_with_the_documented_choices() -> None:
     scenario = noack.from_system(SYSTEM, GAIN, [3.0, 4.0])
     decay_per_s = -np.linalg.eigvals(np.add(SYSTEM[0], np.matmul(SYSTEM[1], GAIN))).real.max()

@@ -13,6 +13,7 @@ from cosim.cli import app
 from cosim.cli.command import examples_of
 from netem.control.emulator_commands import COMMANDS as EMULATOR_COMMANDS
 from tests.approved import compare_lines
+from tests.command_line import invoke
 
 PROGRAM: Any = get_command(app)
 COMMANDS: dict[str, Any] = dict(PROGRAM.commands)
@@ -21,7 +22,7 @@ OURS = sorted(COMMANDS.keys() - {"netem"})
 
 
 def help_of(*command: str) -> str:
-    done = CliRunner().invoke(app, [*command, "--help"], prog_name="noack")
+    done = invoke(*command, "--help")
     assert done.exit_code == 0
     return done.stdout
 

@@ -9,14 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from click.testing import Result
 
-from cosim.cli import app
 from tests.approved import compare_lines
+from tests.command_line import invoke
 
 
 def noack(line: str) -> Result:
-    return CliRunner().invoke(app, shlex.split(line), prog_name="noack")
+    return invoke(*shlex.split(line))
 
 
 def test_a_mistake_gives_the_approved_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,9 +8,7 @@ from typing import Any
 
 import pytest
 import tomli_w
-from typer.testing import CliRunner
 
-from cosim.cli import app
 from cosim.cli.commands.run_commands import parsed
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
@@ -21,6 +19,8 @@ from noack.scenario.parameter_changes import changed
 from noack.scenario.resolution import resolve
 from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario_file import load, validate
+from tests.approved import compare_lines, lines_of_error
+from tests.command_line import invoke
 from tests.fuzz.plane import Query
 
 
@@ -71,29 +71,11 @@ def test_both_names_of_a_parameter_work_in_noack_set_in_the_option_and_in_change
     assert found[1:] == found[:-1]
 
 
-@pytest.mark.parametrize(
-    ("name", "near"),
-    [("bta", "beta"), ("lss.p", "loss.p"), ("network.manzd", "network.mansd"),
-     ("alpha_per_s", "trigger.alpha_per_s"), ("speed", None)],
-)  # fmt: skip
-def test_an_unknown_name_gives_one_line_with_a_suggestion(
-    name: str, near: str | None, ticket: Ticket
-) -> None:
-    with pytest.raises(CallerError) as refused:
-        changed(ticket.scenario, parsed([name, "1"]))
-    for words, why in (
-        (["loss.p"], "loss.p: needs a value, e.g."),
-        (["loss.p", "1", "network.loss.probability=2"], "is given twice"),
-    ):
-        with pytest.raises(CallerError, match=why):
-            parsed(words)
-    hint = f"did you mean {near}?" if near else "these can: network.loss, network.mansd, "
-    assert f"{name}: cannot be changed during a run; {hint}" in str(refused.value)
-    if near is None or name.startswith("network."):  # the option has it, or names the section's
-        return
-    done = CliRunner().invoke(app, ["check", "lane_following", "--set", f"{name}=1"])
-    shown = name if "." in name else f"{name} = 1"
-    assert done.stderr == f"noack: --set {shown}: unknown key; did you mean {near}?\n"
+def test_a_mistake_in_the_words_gives_the_approved_line(ticket: Ticket) -> None:
+    compare_lines(
+        Path(__file__).with_name("set_mistakes.txt"),
+        lambda line: lines_of_error(lambda: changed(ticket.scenario, parsed(line.split()))),
+    )
 
 
 def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
@@ -118,7 +100,7 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
 
 
 def test_only_active_runs_can_be_changed(coordinator: Coordinator) -> None:
-    done = CliRunner().invoke(app, ["set", "loss.p", "0.5"])
+    done = invoke("set", "loss.p", "0.5")
     assert done.exit_code == 2
     assert "no run is active" in done.stderr
     change = Query("", b'{"settings": {"network.mansd": 1}}')

@@ -144,10 +144,3 @@ def test_every_check_gives_a_finding_and_a_taken_port_makes_a_run_impossible(
     assert set(measured["granted"]) >= {"sched_fifo", "memory_lock"}
     assert {one["verdict"] for one in document["findings"]} <= {"good", "limited", "bad"}
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("arguments", [("--seconds", "0"), ("no_such_scenario",)])
-def test_invalid_arguments_are_refused(arguments: tuple[str, ...]) -> None:
-    done = doctor(*arguments)
-    assert done.exit_code == 2
-    assert len(done.stderr.splitlines()) == 1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.interactive import ensemble, exploration
+from cosim.interactive import exploration
 from cosim.interactive import scenario_guarantee as guarantee
 from cosim.interactive.exploration_figure import Shown, exploration_figure
 from cosim.lab.comparison import Reference, compare, verdict_of
@@ -56,7 +56,7 @@ def test_a_run_that_diverges_is_drawn_up_to_that_time_and_widens_the_band() -> N
     assert found.diverged_at_s is not None
     assert found.t_s[-1] <= 3000.0
     assert found.numbers[0][1].startswith("diverged at")
-    draws = ensemble.explore_ensemble(scenario, draws=8)
+    draws = exploration.explore_ensemble(scenario, draws=8)
     assert draws.diverged == 8
     assert not math.isfinite(draws.x_norm.high[-1])
 
@@ -86,10 +86,10 @@ def test_a_scenario_without_exact_simulation_is_refused_with_the_reason() -> Non
 def test_trajectories_of_an_ensemble_are_those_of_the_exact_simulator(name: str) -> None:
     scenario = noack.load(name, {"network.initial_sync": "known_state"})
     draws, t_s = 3, np.linspace(0.0, scenario.horizon_s, 41)
-    setting = ensemble.setting_of(resolve(scenario))
-    population = ensemble.box_of(scenario).population(7, range(draws))
-    _, events = ensemble.run_with_events(setting, population)
-    states = ensemble.trajectories(setting, population, events, t_s)
+    setting = exploration.setting_of(resolve(scenario))
+    population = exploration.box_of(scenario).population(7, range(draws))
+    _, events = exploration.run_with_events(setting, population)
+    states = exploration.trajectories(setting, population, events, t_s)
     for draw in range(draws):
         exact = run_continuous(drawn_scenario(scenario, 7, draw)).at(t_s)
         wanted = np.stack(exact[1:], axis=1)

@@ -33,33 +33,29 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import load_record, write_run
 from cosim.record.spool_conversion import finish_record
-from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter
-from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import dumps, load
 from tests.cosim.record.changed_records import changed
 from tests.cosim.summaries import alone
+from tests.shipped import resolved, shipped
+
+pytestmark = pytest.mark.usefixtures("no_report")
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that is marked as live, with the record of a simulated one and without a summary."""
     folder = tmp_path_factory.mktemp("recorded")
-    record = simulate(resolve(load(find_shipped("double_integrator", "scenarios"), ["horizon_s=1"])))
+    record = simulate(resolved("double_integrator", "horizon_s=1"))
     (folder / SCENARIO_FILE).write_text(dumps(record.scenario))
     write_environment(folder, "live")
     reports = {role: report | {"realtime": {}} for role, report in record.reports.items()}
     (folder / REPORTS_FILE).write_text(json.dumps(reports))
     write_run(alone(record), folder)
     return folder
-
-
-@pytest.fixture(autouse=True)
-def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cosim.live.finalize, "_write_report", lambda *_: None)
 
 
 @pytest.fixture
@@ -222,7 +218,7 @@ def many_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run of more loops than are prepared at once, without a summary."""
     monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
     monkeypatch.setattr(end_helpers, "cores", lambda: 2)
-    scenario = load(find_shipped("shared_bottleneck", "scenarios"), ["horizon_s=1"])
+    scenario = shipped("shared_bottleneck", "horizon_s=0.2")
     assert scenario.loops is not None
     loops = (scenario.loops[0].model_copy(update={"count": 17}),)
     return simulate_run(scenario.model_copy(update={"loops": loops}), tmp_path).run_dir

@@ -32,10 +32,11 @@ from noack.runtime.control_messages import RunProgress, parse_message
 from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import dumps, load, validate
-from tests.cosim.live.outage import SCENARIOS, with_outage
+from noack.scenario.scenario_file import dumps, validate
+from tests.cosim.live.outage import with_outage
 from tests.cosim.live.test_coordinator import JUNK
 from tests.fuzz.plane import FakePlane, Query, Sample
+from tests.shipped import resolved
 
 
 class RecordingPlane(FakePlane):
@@ -240,7 +241,7 @@ def test_a_log_on_a_full_disk_does_not_stop_the_record(run: Run, monkeypatch: py
 @pytest.fixture(scope="module")
 def outage() -> RunRecord:
     """The controller stands still from 0.5 s to 0.7 s."""
-    return with_outage(resolve(load(SCENARIOS / "lane_following.toml", ["horizon_s=1"])), 0.5, 0.7)
+    return with_outage(resolved("lane_following", "horizon_s=1"), 0.5, 0.7)
 
 
 @pytest.fixture

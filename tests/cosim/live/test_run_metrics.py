@@ -9,8 +9,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 import noack
 from cosim.live.run_metrics import RunMetrics
 from cosim.live.run_watcher import Watcher, joint_watcher
@@ -94,11 +92,3 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
     assert events["run"]["directory"] == events["end"]["directory"] == str(run_dir)
     assert (events["end"]["status"], events["end"]["reason"]) == (0, "horizon")
     assert events["progress"]["events"] <= summary["loops"][0]["events"]
-
-
-@pytest.mark.parametrize("where", ["x", "127.0.0.1:1:2"])
-def test_a_wrong_address_starts_no_run(where: str, tmp_path: Path) -> None:
-    words = ["run", "lane_following", "--runs", str(tmp_path), "--metrics", where]
-    done = invoke(*words)
-    assert (done.exit_code, list(tmp_path.iterdir())) == (2, [])
-    assert done.stderr.splitlines()[-1].startswith("noack: --metrics: expected HOST:PORT")

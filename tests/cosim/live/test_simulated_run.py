@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,6 +28,8 @@ from tests.command_line import invoke
 
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 LOOPS = 11
+ONE_LOOP = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
+SETTINGS = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigger.beta=0.05")
 
 
 def simulated(folder: Path, *settings: str, options: Sequence[str] = ()) -> Result:
@@ -46,17 +47,18 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_live_run_in_which_no_loop_sent_anything_has_not_failed(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    again = tmp_path / "again"
-    shutil.copytree(run_dir, again)
-    write_environment(again, "live")
+    scenario = load(ONE_LOOP, [*SETTINGS, 'loops=[{ name = "p", count = 2 }]'])
+    run_dir = simulate_run(scenario, tmp_path).run_dir
+    write_environment(run_dir, "live")
 
     def replayed(record: RunRecord, *_: object) -> ReplayPart:
         return ReplayPart(bit_exact=None if record.is_network else True)
 
     monkeypatch.setattr("cosim.live.finalize._replay", replayed)
-    summary = finalize(RunEnding(again, 0, ExitStatus.OK, "horizon"), report=False).summary
+    ending = RunEnding(run_dir, 0, ExitStatus.OK, "horizon")
+    summary = finalize(ending, report=False, view=False).summary
     assert summary.network.replay == ReplayPart(bit_exact=None)
     assert summary.exit.status == ExitStatus.OK
 
@@ -103,7 +105,8 @@ def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
 
 
 def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:
-    late = simulated(tmp_path, "horizon_s=1", "certificate.late_periods=20")
+    settings = ("horizon_s=1", "certificate.late_periods=20", 'loops=[{ name = "p", count = 3 }]')
+    late = simulated(tmp_path, *settings, options=["--no-report"])
     claims = [claim for one in json.loads(late.stdout)["loops"] for claim in one["claims"]]
     reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
     shown = invoke("summary", tmp_path / "latest").stdout
@@ -119,6 +122,7 @@ def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: s
     assert path.read_bytes().startswith(b"RRF")
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     own = "A = [[0.0, 1.0], [50.0, 0.0]], B = [[0.0], [1.0]]"
     wild = f'{{ name = "wild", phase = 0.75, plant = {{ draw = "given", {own} }} }}'
@@ -161,10 +165,6 @@ def test_the_number_in_flight_over_time() -> None:
 
 
 # --- one loop -------------------------------------------------------------------------------------
-
-
-ONE_LOOP = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
-SETTINGS = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigger.beta=0.05")
 
 
 @pytest.fixture(scope="module")

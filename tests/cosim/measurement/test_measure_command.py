@@ -8,20 +8,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from click.testing import Result
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner, Result
 
 import noack
-from cosim.cli import app
-from cosim.measurement.certificate_time import DELAY, certificate_time
 from cosim.measurement.chain_fits import ChainRates
 from cosim.measurement.loss_bursts import histogram
 from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables, trace_csv
 from cosim.measurement.network_measurement import (
+    DELAY,
     Measurement,
     MeasurementOptions,
     autocorrelation,
+    certificate_time,
     normal_scores,
 )
 from cosim.measurement.trace_sources import SourceOptions, read_source, updates_trace
@@ -37,6 +37,7 @@ from noack.scenario.scenario_file import validate
 from noack.scenario.sections import NetworkSection
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 from noack.traces.trace_formats import read_trace
+from tests.command_line import invoke
 from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
 from tests.fuzz.parsers.fates import SPECS, TABLE
 from tests.oracles.link import Link
@@ -45,7 +46,7 @@ RURAL = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g" / "rural_n8_10
 
 
 def measure(*words: object) -> Result:
-    return CliRunner().invoke(app, ["measure", *map(str, words)], prog_name="noack")
+    return invoke("measure", *words)
 
 
 def section(path: Path) -> NetworkSection:

@@ -13,6 +13,7 @@ from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
+from tests.conftest import CONTENT
 from tests.cosim.record.changed_records import changed, copied
 
 HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""
@@ -60,14 +61,6 @@ def lone(*present: str) -> RunRecord:
     return changed(record, rows)
 
 
-CONTENT: dict[str, Any] = {
-    "name": "small",
-    "horizon_s": 1.0,
-    "model": {"name": "double_integrator"},
-    "plant": {"initial_state": [1.0, 0.0]},
-    "trigger": {"beta": 0.5, "alpha_per_s": 0.25},
-    "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
-}
 CASES: dict[str, Callable[[], RunRecord]] = {
     "empty": lone,
     "two steps": lambda: make_record(scenario_of(CONTENT | {"horizon_s": 0.002})),

@@ -14,20 +14,15 @@ from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.impairments.loss_guarantee import LossHistory
-from noack.scenario.resolution import loop_of, resolve
-from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load
+from noack.scenario.resolution import loop_of
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import most_events
 from noack.theory.certificates.scenario_certificates import outside_box
 from tests.command_line import invoke
+from tests.shipped import resolved, shipped
 
 ROOT = Path(__file__).parents[3]
-
-
-def scenario(name: str, *settings: str) -> Scenario:
-    return resolve(load(ROOT / "scenarios" / f"{name}.toml", settings))
 
 
 def constants(certificate: ScenarioCertificate | None) -> Constants:
@@ -38,12 +33,12 @@ def constants(certificate: ScenarioCertificate | None) -> Constants:
 
 @pytest.fixture(scope="module")
 def lane() -> Certificates:
-    return Certificates(scenario("lane_following"), 2)
+    return Certificates(resolved("lane_following"), 2)
 
 
 @pytest.fixture(scope="module")
 def weighted() -> Certificates:
-    return Certificates(scenario("lane_weighted"), 2)
+    return Certificates(resolved("lane_weighted"), 2)
 
 
 def test_the_documentation_quotes_computed_figures(lane: Certificates, weighted: Certificates) -> None:
@@ -76,7 +71,7 @@ def test_the_documentation_quotes_computed_figures(lane: Certificates, weighted:
 
 def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume() -> None:
     settings = ('model={name="double_integrator"}', "plant={initial_state=[1.0,0.0]}")
-    loaded = load(ROOT / "scenarios" / "lane_following.toml", settings)
+    loaded = shipped("lane_following", *settings)
     shares: list[float] = []
     weighted = certificates_of(loaded, "chosen", 0, shares.append)
     W = weighted.weight
@@ -102,10 +97,10 @@ def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume() -> No
 
 def test_no_weight_improves_a_hold_and_identity_removes_the_weight() -> None:
     with pytest.raises(CallerError, match=r"weight chosen: α = 0\.25 /s is not below"):
-        with_weight(scenario("lane_following", 'mode="zoh"'), "chosen")
+        with_weight(resolved("lane_following", 'mode="zoh"'), "chosen")
     with pytest.raises(CallerError, match='given, identity or chosen, not "best"'):
-        with_weight(scenario("lane_following"), "best")
-    plain, W = with_weight(scenario("lane_weighted"), "identity")
+        with_weight(resolved("lane_following"), "best")
+    plain, W = with_weight(resolved("lane_weighted"), "identity")
     assert W is None
     assert plain.trigger.weight is None
 
@@ -122,7 +117,7 @@ def test_no_weight_improves_a_hold_and_identity_removes_the_weight() -> None:
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_numbers_that_overflow_give_no_certificate(settings: list[str]) -> None:
     """No certificate has a constant that is not finite."""
-    loaded = load(ROOT / "scenarios" / "unstable_pendulum.toml", settings)
+    loaded = shipped("unstable_pendulum", *settings)
     for _, certificate in certificates_of(loaded):
         if certificate.constants is None:
             assert certificate.void
@@ -139,10 +134,10 @@ BOXED = (
 
 
 def test_a_plant_outside_its_box_is_named() -> None:
-    inside = scenario("lane_following", *BOXED)
+    inside = resolved("lane_following", *BOXED)
     assert outside_box(inside) is None
-    assert outside_box(scenario("lane_following")) is None
-    outside = scenario(
+    assert outside_box(resolved("lane_following")) is None
+    outside = resolved(
         "lane_following", *BOXED, 'plant.draw="given"', "plant.A=[[0.0,1.0],[2.0,0.0]]",
         "plant.B=[[0.0],[1.0]]",
     )  # fmt: skip
@@ -155,8 +150,8 @@ def test_a_plant_outside_its_box_is_named() -> None:
 
 def test_a_set_point_is_certified_in_its_own_coordinates() -> None:
     """The lane rests at any lateral position; a drawn plant does not rest where its model does."""
-    moved = Certificates(scenario("lane_following", "controller.setpoint=[0.0, 0.0, 0.0, 3.0]"), 2)
-    zero = scenario("lane_following", "plant.initial_state=[0.5, 0.0, 0.1, 0.0]")
+    moved = Certificates(resolved("lane_following", "controller.setpoint=[0.0, 0.0, 0.0, 3.0]"), 2)
+    zero = resolved("lane_following", "plant.initial_state=[0.5, 0.0, 0.1, 0.0]")
     assert constants(moved.schedule) == constants(Certificates(zero, 2).schedule)
     assert moved.to_json()["setpoint"] == (0.0, 0.0, 0.0, 3.0)
     settings = (
@@ -165,14 +160,14 @@ def test_a_set_point_is_certified_in_its_own_coordinates() -> None:
         "plant.B=[[0.0], [1.0]]",
         'plant.draw="given"',
     )
-    tilted = Certificates(scenario("double_integrator", *settings), 2)
+    tilted = Certificates(resolved("double_integrator", *settings), 2)
     loop = loop_of(tilted.scenario)
     x_r, H_of_plant = np.array([0.1, 0.0]), loop.A + loop.B @ loop.K
     rest = -np.linalg.solve(H_of_plant, loop.A @ x_r)
     persistent = tilted.paper.state(np.array([1e3]))[0]
     assert 0 < np.linalg.norm(rest) < persistent < 30 * np.linalg.norm(rest)
     with pytest.raises(CallerError, match="the input is 0 until the first one arrives"):
-        Certificates(scenario("unstable_pendulum", "controller.setpoint=[0.1, 0.0]"), 2)
+        Certificates(resolved("unstable_pendulum", "controller.setpoint=[0.1, 0.0]"), 2)
 
 
 P = 0.05
@@ -180,7 +175,7 @@ LOSSES = f'network.loss={{model="bernoulli", probability={P}}}'
 
 
 def without_a_cap(*settings: str) -> Certificates:
-    weighted = scenario("lane_weighted", "network.enforce_mansd=false", LOSSES, *settings)
+    weighted = resolved("lane_weighted", "network.enforce_mansd=false", LOSSES, *settings)
     return Certificates(weighted, 2)
 
 
@@ -199,7 +194,7 @@ def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_
     """By 4000 sequences of losses that are drawn here."""
     found = without_a_cap("network.mansd=2").schedule
     assert found.inter_event_s is not None
-    packets = most_events(scenario("lane_weighted"), found.inter_event_s)
+    packets = most_events(resolved("lane_weighted"), found.inter_event_s)
     lost = np.random.default_rng(1).uniform(size=(4000, packets)) < P
     lost[:, 0] = False
     kept = 0
@@ -215,7 +210,7 @@ def test_there_is_no_statement_where_losses_depend_on_times_and_the_reason_is_na
     found = without_a_cap("network.impairments=[{kind='rate', rate_bps=1_000_000}]")
     assert found.unlimited is None
     assert found.unpredictable is not None
-    assert Certificates(scenario("lane_weighted"), 2).unlimited is None
+    assert Certificates(resolved("lane_weighted"), 2).unlimited is None
 
 
 WRONG_SIGN = "model.gain=[[15.0, 5.0]]"
@@ -245,9 +240,8 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted() -> None:
     pasted = shown[shown.index("\nweight = [") :].splitlines()[1:]
     rows = "".join(line.strip() for line in pasted)
     weighted = certificates_of(
-        load(ROOT / "scenarios/lane_following.toml",
-             ["plant.rate_hz=62.5", "controller.rate_hz=62.5", f"trigger.{rows}"])
-    )  # fmt: skip
+        shipped("lane_following", "plant.rate_hz=62.5", "controller.rate_hz=62.5", f"trigger.{rows}")
+    )
     assert weighted.schedule.constants is not None
     words = ["certify", "lane_following", *slow, "--json"]
     document = json.loads(invoke(*words).stdout)

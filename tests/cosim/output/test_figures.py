@@ -26,7 +26,8 @@ from cosim.output.figure_description import (
     time_axis,
 )
 from cosim.output.figure_drawing import draw
-from cosim.output.figure_files import inline, save_figure
+from cosim.output.figure_files import inline, save_figure, save_figures
+from cosim.output.figure_format import figure_files
 from cosim.output.run_figures import Trajectory, Transmissions, run_figures, states_figure
 from cosim.output.run_tables import key_numbers
 from cosim.output.timing_figures import later_than
@@ -34,7 +35,6 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
-from tests.command_line import invoke
 from tests.cosim.output.conftest import CASES, HOSTILE, scenario_of
 from tests.cosim.record.changed_records import changed
 from tests.cosim.summaries import summary_of
@@ -193,35 +193,20 @@ def test_the_figure_has_the_bound_the_limit_and_a_cross_where_the_bound_is_lost(
 
 def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: Path) -> None:
     run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}), runs=tmp_path)
-    done = invoke("report", run.directory, "--format", "pdf", "--json")
-    assert done.exit_code == 0, done.output
-    names = {path.stem for path in (run.directory / "report-figures").iterdir()}
+    names = {path.stem for path in run.save_figures("svg")}
     assert names == {"errors", "input", "inter-event", "losses", "state-norm", "states"}
     with pytest.raises(CallerError, match='"eps": a figure is saved as svg, png, pdf'):
         run.save_figures("eps")
     with pytest.raises(CallerError, match=r"figure\.eps: a figure is saved as \.svg"):
         save_figure(norms(line(T_S, T_S)), tmp_path / "figure.eps")
     for width, points in ((None, 252.0), ("page", 515.52), (5, 360.0)):
-        for path in run.save_figures("pdf", width):
-            content = path.read_bytes()
-            box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", content)
-            assert box is not None
-            assert float(box[1]) == pytest.approx(points, abs=0.01)
-            assert b"Cmr10" in content  # the font of LaTeX
-            assert b"/Type3" not in content.replace(b" ", b"")  # refused by publishers
-    drawn = run.save_figures("svg")
-    assert drawn[0].read_text().count('width="720pt"') == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--width", "column"], "--width: is the width of the figures of --format"),
-        (["--format", "pdf", "--width", "wide"], "width wide: expected column, page, or inches"),
-        (["--format", "pdf", "--width", "nan"], "width nan: expected column, page, or inches"),
-    ],
-)
-def test_a_wrong_width_is_refused(words: list[str], message: str) -> None:
-    done = invoke("campaign", "mb_vs_zoh", *words)
-    assert done.exit_code == 2
-    assert message in done.stderr
+        files = figure_files("pdf", width)
+        (path,) = save_figures([norms(line(T_S, T_S))], tmp_path / "page.html", files)
+        content = path.read_bytes()
+        box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", content)
+        assert box is not None
+        assert float(box[1]) == pytest.approx(points, abs=0.01)
+        assert b"Cmr10" in content  # the font of LaTeX
+        assert b"/Type3" not in content.replace(b" ", b"")  # refused by publishers
+    states = run.directory / "report-figures/states.svg"
+    assert states.read_text().count('width="720pt"') == 1

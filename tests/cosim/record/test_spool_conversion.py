@@ -169,7 +169,7 @@ def test_tables_written_during_the_run_have_the_same_rows(
             spool(run_dir, table, found[250:], writer="sensor")
     else:
         early = write_early(run_dir)
-        assert {file.stem for file in (run_dir / SPOOL / EARLY).iterdir()} == early.keys()
+        assert {file.stem for file in (run_dir / SPOOL / EARLY).iterdir()} > early.keys()
     if kind == "rows afterwards":
         for table, found in rows.items():
             spool(run_dir, table, found[350:], writer="frozen")

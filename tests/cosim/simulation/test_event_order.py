@@ -1,7 +1,5 @@
 """The core drives the machines of a run as the plain driver in Python does, bit for bit."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,11 +9,11 @@ from noack.core.core_library import core, ffi
 from noack.protocol.record_tables import OWNER
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import loops_of
-from noack.scenario.scenario_file import load, validate
+from noack.scenario.scenario_file import validate
 from tests.cosim.simulation.shuttle import Shuttle, shuttled
 from tests.oracles.random_scenarios import POLICIES, random_scenario
+from tests.shipped import resolved, shipped
 
-SCENARIOS = Path(__file__).parents[3] / "scenarios"
 IMPAIRMENTS = [
     {"kind": "duplicate", "probability": 0.3},
     {"kind": "corrupt", "probability": 0.3},
@@ -47,23 +45,21 @@ def require_equal(found: RunRecord, expected: RunRecord) -> None:
 @pytest.mark.parametrize("first", range(len(POLICIES)))
 def test_random_loops(first: int) -> None:
     for number in range(first, 2 * len(POLICIES), len(POLICIES)):
-        resolved = resolve(validate(random_scenario(number), "random"))
-        require_equal(simulate(resolved), shuttled(resolved))
+        scenario = resolve(validate(random_scenario(number), "random"))
+        require_equal(simulate(scenario), shuttled(scenario))
 
 
 def test_a_scripted_network() -> None:
-    resolved = resolve(load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=3.0"]))
+    scenario = resolved("unstable_pendulum", "horizon_s=3.0")
 
     def decide(data: bytes, now_ns: int) -> int | None:
         return None if data[16] % 3 == 1 else now_ns % 70_000_000
 
-    require_equal(simulate(resolved, decide), shuttled(resolved, decide))
+    require_equal(simulate(scenario, decide), shuttled(scenario, decide))
 
 
 def test_loops_of_different_sizes_on_one_network() -> None:
-    given = load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=2.0"]).model_dump(
-        mode="json", exclude_none=True
-    )
+    given = shipped("unstable_pendulum", "horizon_s=2.0").model_dump(mode="json", exclude_none=True)
     rate = {"kind": "rate", "rate_bps": 50_000, "queue": 6}
     network = given["network"] | {
         "impairments": [rate, IMPAIRMENTS[1]], "actuation": {"impairments": IMPAIRMENTS},
@@ -86,8 +82,8 @@ def test_loops_of_different_sizes_on_one_network() -> None:
 
 
 def test_numbers_of_no_simulation_are_refused() -> None:
-    resolved = resolve(load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=1.0"]))
-    run = VirtualRun(resolved, (resolved,))
+    scenario = resolved("unstable_pendulum", "horizon_s=1.0")
+    run = VirtualRun(scenario, (scenario,))
     own = run.core
     for name, value in (("loops", 2), ("sent_places", 3), ("sent_count", -1)):
         before = getattr(own, name)

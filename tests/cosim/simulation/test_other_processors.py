@@ -13,7 +13,7 @@ from cosim.simulation.virtual_time import simulate
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 for name in ("lane_following", "f16_lateral", "unstable_pendulum"):
-    record = simulate(resolve(load(find_shipped(name, "scenarios"), ["horizon_s=2"])))
+    record = simulate(resolved(name, "horizon_s=2"))
     for table in sorted(record.tables):
         rows = record[table]
         for column in rows.dtype.names:

@@ -27,6 +27,7 @@ from noack.scenario.scenario_file import load
 from tests.approved import compare_lines, lines_of_error
 from tests.command_line import invoke
 from tests.plant_server.fmus.build import build
+from tests.shipped import resolved
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 EXAMPLES = ("saturated_lqr", "model_predictive")
@@ -116,7 +117,7 @@ def run_of(tmp_path: Path, **methods: str) -> RunRecord:
         f"controller.file={tmp_path / 'law.py'}", "controller.name=Law", "controller.parameters={}",
         "controller.safe_input=[0.25]", "horizon_s=2.0",
     ]  # fmt: skip
-    return simulate(resolve(load(SCENARIOS / "saturated_lqr.toml", settings)))
+    return simulate(resolved("saturated_lqr", *settings))
 
 
 @pytest.mark.parametrize(
@@ -246,7 +247,7 @@ def test_a_failed_plant_stops_moving_and_the_run_is_recorded(
     path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, parameters)
     build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
     ending = simulate_run(load(path), tmp_path / "runs")
-    outcome = finalize(ending)
+    outcome = finalize(ending, report=False, view=False)
     assert outcome.status == 1
     assert outcome.reason == expected
     record = load_record(ending.run_dir)

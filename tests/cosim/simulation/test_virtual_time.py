@@ -30,10 +30,11 @@ from noack.protocol.record_tables import (
 )
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load, validate
+from noack.scenario.scenario_file import validate
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
-from tests.cosim.live.outage import CASES, POLICIES, SCENARIOS, at_the_end, with_outage
+from tests.cosim.live.outage import CASES, POLICIES, at_the_end, with_outage
 from tests.oracles.link import Link
+from tests.shipped import resolved
 
 
 @pytest.fixture
@@ -100,7 +101,7 @@ DOCS = Path(__file__).parents[3] / "docs"
 def run(request: pytest.FixtureRequest) -> RunRecord:
     """The controller stands still from 1 s to 1.4 s; its last tick before that is at 0.999 s."""
     changes = [f"plant.watchdog.policy={request.param}", "horizon_s=2"]
-    return with_outage(resolve(load(SCENARIOS / "lane_following.toml", changes)), 1.0, 1.4)
+    return with_outage(resolved("lane_following", *changes), 1.0, 1.4)
 
 
 def test_the_beginning_and_end_of_a_trip_are_reported_and_replayed(run: RunRecord) -> None:
@@ -139,11 +140,11 @@ COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=6")
 
 
 def acknowledged(*overrides: str) -> Scenario:
-    return resolve(load(SCENARIOS / "lane_acknowledged.toml", [*COARSE, *overrides]))
+    return resolved("lane_acknowledged", *COARSE, *overrides)
 
 
 def plain(*overrides: str) -> Scenario:
-    return resolve(load(SCENARIOS / "lane_following.toml", [*COARSE, *overrides]))
+    return resolved("lane_following", *COARSE, *overrides)
 
 
 @cache

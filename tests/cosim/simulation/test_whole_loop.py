@@ -26,9 +26,9 @@ from tests.oracles.whole_loop import NONE
 from tests.wire_decoder import Decoder
 
 SCENARIOS = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
-RANDOM = 144
-"""Random scenarios: 12 of each trigger policy."""
-LONGEST_S = 8.0
+RANDOM = 96
+"""Random scenarios: 8 of each trigger policy."""
+LONGEST_S = 4.0
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
@@ -60,7 +60,7 @@ def test_random_scenarios(policy: str) -> None:
     first = POLICIES.index(policy)
     found = [compared(number) for number in range(first, RANDOM, len(POLICIES))]
     assert sum(one.tie_ns is not None for one in found) <= 1
-    assert sum((one.rows["sensor_measurement"]["event"] != NONE).sum() for one in found) > 50
+    assert sum((one.rows["sensor_measurement"]["event"] != NONE).sum() for one in found) > 33
 
 
 @pytest.mark.parametrize("policy", POLICIES)
@@ -111,7 +111,7 @@ def test_the_random_scenarios_have_every_feature() -> None:
         }
         counts.update(feature for feature, found in has.items() if found)
     assert len(counts) == 22, counts
-    assert min(counts.values()) >= 6, counts
+    assert min(counts.values()) >= 4, counts
 
 
 def test_a_tie_ends_the_comparison_of_a_run_and_is_no_difference() -> None:

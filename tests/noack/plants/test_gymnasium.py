@@ -16,6 +16,7 @@ from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.plant_settings import PlantStart
 from noack.scenario.resolution import resolve
 from noack.scenario.toml_file import validated
+from tests.approved import compare_lines, lines_of_error
 from tests.command_line import invoke
 from tests.extras import skip_without_plant
 
@@ -81,33 +82,21 @@ def test_an_observation_is_the_state_of_an_environment_that_cannot_be_set() -> N
         cart([0.4, 0.0], **seen)
 
 
-@pytest.mark.parametrize(("given", "why"), [
-    ({}, r"it has no `state` of numbers; plant.system.state names the attributes"),
-    ({"state": ["pos", "name"]}, "it has no `name` of numbers"),
-    ({"state": ["pos"], "entries": [0, 1]}, "entries has 1; its state has entries 0 to 0"),
-    ({"state": ["pos", "body.speed"]}, "it has 3 states and 2 actions; the model has 2 and 1"),
-    (ATTRIBUTES | {"actuation": [[1.0]]}, "it has 2 actions; plant.system.actuation needs as many"),
-    (ATTRIBUTES | {"entries": [0, 1], "step_ns": STEP_NS // 20},
-     "set plant.rate_hz = 10; it cannot make 20 steps of the plant out of its one"),
-    (ATTRIBUTES | {"entries": [0, 1], "step_ns": 5 * STEP_NS},
-     "set plant.rate_hz = 10 and plant.measure_every = 5 to measure as often as now"),
-    (ATTRIBUTES | {"file": "none.xml"}, r'file = "none.xml": cannot be read: No such file'),
-])  # fmt: skip
-def test_a_mistake_in_the_maps_is_one_line(given: Any, why: str) -> None:
-    with pytest.raises(CallerError, match=why) as caught:
-        cart([0.0, 0.0], **given)
-    assert "\n" not in str(caught.value)
+def test_a_mistake_gives_the_approved_line() -> None:
+    """Of a loop with two states and one input, in steps of 0.1 s, unless the line says otherwise."""
 
+    def mistake(line: str) -> list[str]:
+        given = {"id": "noack_tests/Cart-v0"} | json.loads(line)
+        n, m, step_ns = given.pop("n", 2), given.pop("m", 1), given.pop("step_ns", STEP_NS)
+        start = PlantStart(np.zeros(n), np.zeros((n, n)), np.zeros((n, m)), step_ns)
+        settings = settings_of(given.pop("id"), **given)
+        try:
+            settings.check(n, m)
+        except ValueError as error:
+            return [str(error)]
+        return lines_of_error(lambda: settings.system(start))
 
-@pytest.mark.parametrize(("given", "why"), [
-    ({"entries": [0, 0]}, "an entry is there twice"),
-    ({"entries": [0]}, "entries: expected 2 entries"),
-    ({"actuation": [[1.0, 2.0]]}, "actuation: expected 1 x 1"),
-    ({"operating_state": [1.0]}, "operating_state: expected 2 entries"),
-])  # fmt: skip
-def test_maps_of_another_size_than_the_model_are_refused(given: Any, why: str) -> None:
-    with pytest.raises(ValueError, match=why):
-        settings_of("any", **given).check(2, 1)
+    compare_lines(Path(__file__).with_name("gymnasium_mistakes.txt"), mistake)
 
 
 def test_without_mujoco_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

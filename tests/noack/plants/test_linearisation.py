@@ -16,7 +16,6 @@ from noack.plants.systems.linearisation import (
     NO_LOGARITHM,
     NOT_FINITE,
     NOT_REPEATED,
-    STEP_NS,
     largest_errors,
     linearise,
 )
@@ -153,21 +152,6 @@ def test_the_pendulum_of_gymnasium_has_the_logarithm_of_its_step() -> None:
     moved.advance(np.array([0.5]), 0, 50_000_000)
     speed = 0.2 + (15 * math.sin(0.1) + 1.5) * h
     np.testing.assert_allclose(moved.x, [0.1 + speed * h, speed], rtol=1e-12)
-
-
-@pytest.mark.parametrize(("given", "started", "why"), [
-    ({"id": "CartPole-v1"}, start(4), r"its actions are Discrete\(2\), not continuous"),
-    ({"id": "NoSuchThing-v1"}, start(), "NameNotFound: Environment `NoSuchThing` doesn't exist"),
-    ({"id": "MountainCarContinuous-v0"}, start(), "no time of a step; give plant.system.step_s"),
-    ({"id": "Pendulum-v1"}, start(3), "it has 2 states and 1 actions; the model has 3 and 1"),
-    ({"id": "Pendulum-v1"}, start(step_ns=STEP_NS), "its step is 0.05 s; set plant.rate_hz = 20"),
-    ({"id": "Pendulum-v1", "parameters": {"weight": 1.0}}, start(), "unexpected keyword argument"),
-])  # fmt: skip
-def test_an_unsuitable_environment_is_refused(given: Any, started: PlantStart, why: str) -> None:
-    pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
-    with pytest.raises(CallerError, match=why) as caught:
-        GymnasiumSettings(kind="gymnasium", **given).system(started)
-    assert "\n" not in str(caught.value)
 
 
 def test_an_environment_that_fails_stops_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:

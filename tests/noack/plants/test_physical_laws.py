@@ -18,12 +18,11 @@ from noack.plants.plant_settings import OdeSystem, PlantEquations, PlantSettings
 from noack.plants.systems import jump_integrator
 from noack.plants.systems.jump_integrator import DONE, advance, buffers
 from noack.plants.systems.linearisation import linearise
-from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load
 from noack.scenario.sections import PLANTS
 from plant_server.plant import system_of
 from tests.noack.plants.motion import H_NS, motion
+from tests.shipped import resolved
 
 INDUCTANCES = (2.75e-6, 1e-3, 0.5)
 """The last one makes speed and current oscillate."""
@@ -209,25 +208,21 @@ def cases() -> Iterator[Any]:
             yield pytest.param(settings.scenario, overrides, id="-".join([kind, *overrides]))
 
 
-def scenario_of(name: str, overrides: list[str]) -> Scenario:
-    return resolve(load(ROOT / "scenarios" / f"{name}.toml", overrides))
-
-
 def moved(scenario: Scenario, inputs: np.ndarray) -> np.ndarray:
     return motion(system_of(scenario), inputs, scenario.timing.plant_period_ns)
 
 
 @pytest.mark.parametrize(("name", "overrides"), list(cases()))
 def test_the_operating_point_is_an_equilibrium(name: str, overrides: list[str]) -> None:
-    n, m = scenario_of(name, []).model.dimensions
-    at_rest = scenario_of(name, [*overrides, f"plant.initial_state={[0.0] * n}"])
+    n, m = resolved(name).model.dimensions
+    at_rest = resolved(name, *overrides, f"plant.initial_state={[0.0] * n}")
     states = moved(at_rest, np.zeros((STEPS, m)))
     np.testing.assert_allclose(states, 0.0, atol=1e-3)  # the drift model's wheels start to slip
 
 
 @pytest.mark.parametrize(("name", "overrides"), list(cases()))
 def test_the_same_inputs_give_bit_identical_states(name: str, overrides: list[str]) -> None:
-    scenario = scenario_of(name, overrides)
+    scenario = resolved(name, *overrides)
     inputs = 0.01 * np.random.default_rng(1).normal(size=(STEPS, scenario.model.dimensions[1]))
     first = moved(scenario, inputs)
     moved(scenario, -inputs)

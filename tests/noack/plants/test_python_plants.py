@@ -1,5 +1,6 @@
 """User classes as plants, and where compiled code is stored."""
 
+import json
 import math
 import signal
 import sys
@@ -16,6 +17,7 @@ from noack.plants.plant_settings import SystemFailedError
 from noack.plants.python_plant import PythonPlantSettings, PythonSystem
 from noack.plants.systems.code_cache import _one_at_a_time, cache_folder, compiler
 from noack.settings.user_files import located
+from tests.approved import compare_lines
 from tests.noack.plants.motion import H_NS, motion
 
 X0 = np.array([0.3, 0.0])
@@ -126,71 +128,21 @@ def test_a_plant_is_found_by_entry_point_and_by_module(
         PythonSystem(PythonPlantSettings(kind="python", name="swung"), X0, 1)
 
 
-@pytest.mark.parametrize(
-    ("code", "expected"),
-    [
-        ("import nothing_so_named",
-         "ModuleNotFoundError: No module named 'nothing_so_named' (mine.py, line 1)"),
-        ("class P(:", "SyntaxError"),
-        ("raise SystemExit(3)", "SystemExit: 3 (mine.py, line 1)"),
-        ("class P: pass", "it has neither derivative nor advance; one of them is needed"),
-        ("class P:\n def __init__(s, g): pass", "missing 1 required positional argument: 'g'"),
-        ("class P:\n def derivative(s, t, z, u): return z[:1]",
-         "derivative(t_s, z, u) has shape (1,), expected (2,)"),
-        ("class P:\n def derivative(s, t, z, u):\n  return 1 / (u[0] * 0)", "(mine.py, line 3)"),
-        ("class P:\n def state(s, x): return [[1.0]]\n def derivative(s, t, z, u): return z",
-         "state(x0) has shape (1, 1)"),
-        ("class P:\n def output(s, z): return 2 * z\n def derivative(s, t, z, u): return z",
-         "x is [0.6, 0.0] at the start; plant.initial_state is [0.3, 0.0]"),
-        ("class P:\n def start(s, x0): pass\n def advance(s, u, t, h): pass",
-         "AttributeError: 'P' object has no attribute 'x'"),
-    ],
-)  # fmt: skip
-def test_a_class_that_is_not_a_plant_is_refused_in_one_line(code: str, expected: str, tmp_path: Path) -> None:
-    with np.errstate(all="raise"), pytest.raises(CallerError) as refused:
-        made(tmp_path, code, "P")
-    assert expected in str(refused.value)
-    assert str(refused.value).startswith('plant.system.name = "P": ')
-    assert "\n" not in str(refused.value)
+def test_a_mistake_in_a_class_gives_the_approved_line(tmp_path: Path) -> None:
+    """It is refused before the run, or a step fails after ten good ones."""
 
+    def mistake(line: str) -> list[str]:
+        try:
+            system = made(tmp_path, json.loads(line), "P")
+        except CallerError as error:
+            return str(error).splitlines()
+        assert np.isfinite(motion(system, [0.0] * 10)).all()
+        with pytest.raises(SystemFailedError) as failed:
+            motion(system, [0.0] * 20)
+        return [f"during the run: {failed.value}"]
 
-DERIVATIVE = """
-    class P:
-        def derivative(self, t_s, z, u):
-            if t_s > 0.0201:
-                {}
-            return 0 * z
-"""
-ADVANCE = """
-    class P:
-        def start(self, x0):
-            self.x = x0
-
-        def advance(self, u, t_s, dt_s):
-            if t_s > 0.0199:
-                {}
-"""
-
-
-@pytest.mark.parametrize(
-    ("code", "line", "expected"),
-    [
-        (DERIVATIVE, 'raise KeyError("wind")', "KeyError: 'wind' (mine.py, line 5)"),
-        (DERIVATIVE, "z[0] = 7.0", "read-only"),
-        (DERIVATIVE, "return [z[1] + 1e-3j, 0.0]",
-         "TypeError: derivative(t_s, z, u) is not of real numbers"),
-        (ADVANCE, "self.x = [1.0, 2.0, 3.0]", "x has shape (3,), expected (2,)"),
-    ],
-)  # fmt: skip
-def test_a_mistake_in_a_step_is_a_failure_that_names_class_and_line(
-    code: str, line: str, expected: str, tmp_path: Path
-) -> None:
-    system = made(tmp_path, code.format(line), "P")
-    assert np.isfinite(motion(system, [0.0] * 10)).all()
-    with pytest.raises(SystemFailedError) as failed:
-        motion(system, [0.0] * 20)
-    assert str(failed.value).startswith('plant.system.name = "P": ')
-    assert expected in str(failed.value)
+    with np.errstate(all="raise"):
+        compare_lines(Path(__file__).with_name("class_mistakes.txt"), mistake)
 
 
 @pytest.mark.parametrize(

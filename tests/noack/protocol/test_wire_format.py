@@ -208,17 +208,6 @@ def test_a_run_accepts_one_version_only(values: list[float], encrypted: bool) ->
     assert_rejected(decoder, renamed, Rejection.TAG)
 
 
-@pytest.mark.parametrize(("field", "most"), [("sequence", 2**63 - 1), ("t_ns", 2**62 - 1)])
-def test_a_number_beyond_the_records_range_is_rejected(field: str, most: int) -> None:
-    decoder, zeros = new_decoder(), [0.0, 0.0, 0.0]
-    assert_rejected(decoder, datagram(zeros, **{field: most + 1}), Rejection.RANGE)  # type: ignore
-    message = decoder.decode(datagram(zeros, **{field: most}))  # type: ignore[arg-type]
-    assert message is not None
-    assert np.int64(getattr(message, field)) == most
-    # The number does not wrap: everything after the last number is old.
-    assert_rejected(decoder, datagram(zeros), Rejection.STALE)
-
-
 FAULTS = [
     ("version", {"version": 2}),
     ("length", {"dimension": 2}),

@@ -16,7 +16,6 @@ from noack.runtime import udp_sockets
 from noack.runtime.address import LOOPBACK, Address, family_of, parse_address, parse_destination, text_of
 from noack.runtime.live_driver import LoopChannel
 from noack.runtime.udp_sockets import SHED, SourceCount, bind, enlarge_buffer, open_beside
-from tests.approved import lines_of_error
 from tests.noack.runtime.live_loops import Live, measurement, scenario
 
 
@@ -148,20 +147,6 @@ def test_a_missing_host_means_loopback_of_the_same_family(
     text: str, like: Address | None, address: Address
 ) -> None:
     assert parse_address(text, "here", like) == address
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("", "here: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; found ''"),
-        ("host:65536", "expected HOST:PORT"),
-        ("::1:9000", "found '::1:9000'; put an IPv6 address in brackets"),
-        ("[127.0.0.1]:9000", "here: 127.0.0.1: no such host ("),
-    ],
-)
-def test_a_mistake_gets_one_line(text: str, says: str) -> None:
-    (line,) = lines_of_error(lambda: parse_address(text, "here"))
-    assert says in line
 
 
 def test_a_destination_has_a_port() -> None:

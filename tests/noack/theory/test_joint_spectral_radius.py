@@ -259,6 +259,11 @@ def test_nilpotent_systems_do_not_grow() -> None:
     assert found.upper < 0.01
 
 
+def test_maps_that_are_zero_have_norms() -> None:
+    zeros = SwitchedSystem((edge(0, 0, np.zeros((2, 2))), edge(0, 0, np.zeros((2, 2)), 2)))
+    assert NormSearch(zeros).improve(1.0).growths.max() < 1e-70
+
+
 def test_sizes_beyond_the_range_of_doubles_prove_nothing_false() -> None:
     zero = joint_spectral_radius([edge(0, 0, [[0.0]]), edge(0, 0, [[0.0]], 3)], threshold=1.0)
     assert (zero.lower, zero.cycle) == (0, ())

@@ -1,5 +1,6 @@
 """Mean costs: published figures, closed forms, all patterns of losses, simulated runs."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -12,9 +13,10 @@ from cosim.studies.campaign.sampled_draws import SampledWork
 from noack.core.linear_systems import Matrix
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.loss_prediction import loss_process
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.random_losses.loop_moments import LoopMoments, periods_of
+from noack.theory.margins.loss_margin import loop_times
+from noack.theory.random_losses.loop_moments import LoopMoments, LoopPeriods, periods_of
 from noack.theory.random_losses.moment_steps import MomentStep, flow, jump
 from tests.command_line import invoke
 
@@ -136,6 +138,24 @@ def test_without_losses_the_moments_solve_a_lyapunov_equation() -> None:
     assert found is not None
     expected = solve_discrete_lyapunov(period.matrix, period.noise)
     assert found[0].moments.sum(axis=0) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_the_moments_in_other_units_of_the_states() -> None:
+    given = scenario(**NOISE, network={"mansd": 2, "loss": BURSTS}, **{"controller.rate_hz": 16.0})
+    outcomes = loss_process(given.network.link).outcomes(join_guarantee(2, ()))
+    loop, unit = loop_of(given), 2.0 ** np.array([-25, 20])
+    other = replace(
+        loop, A=unit[:, None] * loop.A / unit, B=unit[:, None] * loop.B, K=loop.K / unit,
+        H=unit[:, None] * loop.H / unit,
+    )  # fmt: skip
+    found = []
+    for matrices, units in (loop, np.ones(2)), (other, unit):
+        noise, form = np.diag((0.1 * units) ** 2), np.diag([*units**-2, 1.0])
+        periods = LoopPeriods(matrices, loop_times(given, 250_000_000), noise, 0 * noise, form[None])
+        stationary = LoopMoments(periods, outcomes).stationary()
+        assert stationary is not None
+        found.append(stationary[1][0])
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
 
 
 def patterns(packets: int, longest: int, forced: int) -> dict[tuple[bool, ...], float]:

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from cosim.analysis.adversary.loop_flows import SegmentFlow
-from cosim.analysis.adversary.objective import Objective, Pattern, measure_of
+from cosim.analysis.adversary.loop_flows import Objective, Pattern, SegmentFlow, measure_of
 from cosim.simulation.continuous import ContinuousRun, continuous_loop_of, simulate_continuous
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario

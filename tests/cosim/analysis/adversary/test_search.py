@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from cosim.analysis.adversary import Worst
-from cosim.analysis.adversary.loop_flows import evaluate
-from cosim.analysis.adversary.objective import Objective, measure_of
+from cosim.analysis.adversary.loop_flows import Objective, evaluate, measure_of
 from cosim.analysis.adversary.pattern_search import PatternSearch, search_tree
 from cosim.analysis.adversary.worst_pattern_search import find_worst as find_any
 from noack.core.errors import ExitStatus

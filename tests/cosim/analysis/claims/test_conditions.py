@@ -21,10 +21,8 @@ from cosim.analysis.claims.observed_conditions import (
 )
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.summary_model import ClaimVerdict
-from cosim.output.certificate_report import Certificates
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -431,14 +429,3 @@ def test_no_run_leaves_the_conditions_of_its_schedule_and_some_reach_them(
         assert found[name] <= getattr(allowed, name) + 1e-9, name  # type: ignore[operator]
     if reached and predictions == 1:
         assert found["hold_s"] == pytest.approx(allowed.hold_s, abs=1e-9)
-
-
-def test_what_is_not_covered_is_refused_with_the_reason() -> None:
-    for run, says in (
-        (actuated(RANDOM), "the age of the applied input has no bound"),
-        (actuated("mansd=1", 'plant.watchdog.policy="model"'), "use more controller.predictions"),
-    ):
-        with pytest.raises(CallerError, match=says):
-            Certificates(run, 2)
-    with pytest.raises(CallerError, match=r"network\.actuation"):
-        actuated("mansd=1").coverage.require_exact()

@@ -17,7 +17,6 @@ from cosim.analysis.claims.run_evidence import trajectory_delta
 from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.record.align import AlignedRun, align_tables
 from cosim.record.run_record import RunRecord
-from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -29,10 +28,11 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load, validate
+from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import MS, Make, event_s, without
 from tests.cosim.record.changed_records import changed
 from tests.oracles.random_scenarios import POLICIES, random_scenario
+from tests.shipped import resolved
 
 HELD, VIOLATED, VOID = ClaimVerdict.HELD, ClaimVerdict.VIOLATED, ClaimVerdict.VOID
 
@@ -189,7 +189,7 @@ def test_no_claim_is_violated_at_a_set_point(name: str, settings: list[str]) -> 
     """Triggers compare with x − x_r; rounding is that of x; u is 0 and not u_r at first."""
     x_r = 3.0 if name == "double_integrator" else 0.1
     settings = [f"controller.setpoint=[{x_r}, 0.0]", *settings]
-    record = simulate(resolve(load(find_shipped(name, "scenarios"), settings)))
+    record = simulate(resolved(name, *settings))
     claims = RunClaims(record).judge()
     verdicts = {claim.verdict for claim in claims}
     assert VIOLATED not in verdicts

@@ -284,22 +284,6 @@ def test_resources_that_are_damaged_give_one_line(folders: Folders) -> None:
         assert line in found
 
 
-@pytest.mark.parametrize(("name", "settings", "line"), [
-    ("model_predictive", {}, 'controller.kind = "python": an FMU has the linear law'),
-    ("shared_bottleneck", {}, "the scenario has loops"),
-    ("double_integrator", {"network.protocol": "ack"}, 'set protocol = "none"'),
-    ("lane_actuation_loss", {}, "network.actuation: an FMU's channel"),
-])  # fmt: skip
-def test_a_scenario_that_an_fmu_cannot_have_is_one_line(
-    name: str, settings: Any, line: str, tmp_path: Path
-) -> None:
-    scenario = noack.load(name, settings)
-    with pytest.raises(CallerError, match=re.escape(line)) as raised:
-        export_scenario(scenario, tmp_path / "a.fmu", "fmu")
-    assert "\n" not in str(raised.value)
-    assert not [*tmp_path.iterdir()]
-
-
 def test_the_command_takes_scenarios_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A scenario gives the same bytes in each process: there is no address in them."""
     monkeypatch.chdir(tmp_path)

@@ -1,6 +1,5 @@
 """The pictures of plants and of the network in the recording."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,9 @@ from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
 from noack.core.linear_systems import Propagator
 from noack.protocol.record_tables import Fate
-from noack.scenario.resolution import loop_of, resolve
-from noack.scenario.scenario_file import load
+from noack.scenario.resolution import loop_of
+from tests.shipped import resolved
 
-ROOT = Path(__file__).parents[4]
 S = 1_000_000_000
 PICTURES: dict[str, tuple[Picture, int, int]] = {
     "lane": (LanePicture(3, 2, forward_mps=-12.0), 4, 0),
@@ -80,7 +78,7 @@ def test_every_moving_shape_has_a_position_in_every_frame(name: str) -> None:
 
 def test_the_car_is_drawn_in_its_direction_of_travel() -> None:
     """Without sideslip, the nose points along the path over the ground in the picture."""
-    scenario = resolve(load(ROOT / "scenarios" / "lane_following.toml"))
+    scenario = resolved("lane_following")
     loop, picture = loop_of(scenario), picture_of(scenario)
     t_s = np.arange(600) / 60
     advance = Propagator(loop.A_model + loop.B_model @ loop.K).transition(round(S / 60))

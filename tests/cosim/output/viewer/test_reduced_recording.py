@@ -15,15 +15,13 @@ from cosim.output.viewer.run_recording import write_loop_view
 from cosim.record import run_record
 from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environment, write_scenario
 from cosim.record.run_record import RunRecord, write_run
-from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
 from tests.cosim.output.viewer.test_viewer import read, series
 from tests.cosim.record.changed_records import changed, copied
 from tests.cosim.summaries import alone
+from tests.shipped import resolved
 
 PART_STEPS, COLUMNS = 500, 10
 S = 1_000_000_000
@@ -63,8 +61,7 @@ def require_envelope(t_ns: Times, values: Floats, kept_ns: Times, kept: Floats) 
 
 
 def test_each_envelope_holds_all_samples_of_its_bin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scenario = find_shipped("double_integrator", "scenarios")
-    record = with_peaks(simulate(resolve(load(scenario, ["horizon_s=20"]))))
+    record = with_peaks(simulate(resolved("double_integrator", "horizon_s=20")))
     write_scenario(record.scenario, tmp_path)
     write_environment(tmp_path, "live")
     write_run(alone(record), tmp_path)
@@ -86,7 +83,7 @@ def test_each_envelope_holds_all_samples_of_its_bin(tmp_path: Path, monkeypatch:
 
 def test_no_recording_is_written_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a failed write rerun may wait forever."""
-    scenario = resolve(load(find_shipped("lane_following", "scenarios"), ["horizon_s=0.1"]))
+    scenario = resolved("lane_following", "horizon_s=0.1")
     monkeypatch.setattr("cosim.output.viewer.run_recording.disk_usage", lambda _: Mock(free=1 << 20))
     with pytest.raises(ViewError, match="No space left"):
         write_loop_view(simulate(scenario), tmp_path / RECORDING_FILE)

@@ -13,15 +13,14 @@ from cosim.output.viewer.run_recording import ERROR, MAP, QUEUE, SHARE, SIZE, op
 from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun
-from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NETEM_PACKET, PACKET_HEAD_BYTES, Fate, tables
 from noack.protocol.wire_format import Encoder, Flow, Message
-from noack.scenario.resolution import loop_of, resolve
-from noack.scenario.scenario_file import load
+from noack.scenario.resolution import loop_of
 from tests.cosim.live.test_claim_monitor import live_rows
 from tests.cosim.output.viewer.test_viewer import Chunks, read, series
+from tests.shipped import resolved, shipped
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +33,7 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks, list[str]]:
     """Simulate loops, and pass their rows on as in a live run; read the recording."""
     given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
-    run = simulate_loops(load(find_shipped("shared_bottleneck", "scenarios"), given))
+    run = simulate_loops(shipped("shared_bottleneck", *given))
     scenario, said = run.network.scenario, list[str]()
     with open_recording(scenario, folder, 9, None) as view:
         feed = RunFeed(scenario, view, said.append)
@@ -87,7 +86,7 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
         series(found, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
 
 
-SCENARIO = resolve(load(find_shipped("lane_following", "scenarios")))
+SCENARIO = resolved("lane_following")
 LOOP = loop_of(SCENARIO)
 TYPES = tables(LOOP.n, LOOP.m)
 MS = 1_000_000

@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.shipped_files import find_shipped
 from cosim.simulation.continuous import TooManyEventsError, run_continuous
 from cosim.simulation.exact_simulation import TOO_MANY_EVENTS, Population, Setting, run_batch, setting_of
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.link_settings import LinkSettings
-from noack.scenario.resolution import loop_of, resolve
-from noack.scenario.scenario_file import load
+from noack.scenario.resolution import loop_of
 from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.batch.exact import (
     check_events,
@@ -27,6 +25,7 @@ from tests.cosim.simulation.batch.exact import (
     random_setting,
     reference,
 )
+from tests.shipped import resolved
 from tests.trigger_rules import TABLES, decaying_rule, mixed_rule, quadratic_rule, random_rule
 
 MS = 10**6
@@ -122,11 +121,11 @@ def test_very_short_crossings_are_found(depth: float, omega: float, alpha_omega:
 def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(mode: str) -> None:
     seed, delay = 2**40 + 3, 'network.impairments=[{kind="delay", delay_s=0.1}]'
     settings = [f"mode={mode}", "horizon_s=8", f"seeds.loss={seed}", delay]
-    resolved = resolve(load(find_shipped("lane_following", "scenarios"), settings))
-    loop = loop_of(resolved)
+    scenario = resolved("lane_following", *settings)
+    loop = loop_of(scenario)
     draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.array([seed], np.uint64))
-    found = events_of(setting_of(resolved), draw)
-    run = run_continuous(resolved)
+    found = events_of(setting_of(scenario), draw)
+    run = run_continuous(scenario)
     assert len(run.event_s) >= (1 if mode == "model" else 5)
     np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
     assert found.delivered.tolist() == run.delivered.tolist()

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from click.testing import Result
 
 import noack
-from cosim.cli import app
 from cosim.studies.run_comparison import KeyNumber, RunComparison, compare_runs
 from noack.protocol.record_tables import PLANT_STEP
+from tests.command_line import invoke
 
 SETTINGS: list[dict[str, Any]] = [
     {"horizon_s": 3.0},
@@ -33,7 +33,7 @@ def found(runs: list[Path]) -> RunComparison:
 
 
 def compare(*words: object) -> Result:
-    return CliRunner().invoke(app, ["compare", *map(str, words)], prog_name="noack")
+    return invoke("compare", *words)
 
 
 def number(found: RunComparison, name: str) -> KeyNumber:

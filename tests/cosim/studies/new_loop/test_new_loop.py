@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import Result
 from scipy.linalg import solve_continuous_are
-from typer.testing import CliRunner, Result
 
 import noack
-from cosim.cli import app
 from cosim.studies.new_loop.linear_model import controllable_states
 from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of, resolve
 from tests.approved import compare_lines
+from tests.command_line import invoke
 from tests.plant_server.fmus.build import build
 
 POLE = '''
@@ -74,7 +74,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def command(*words: str, ok: bool = True) -> Result:
-    done = CliRunner().invoke(app, list(words), prog_name="noack")
+    done = invoke(*words)
     assert (done.exit_code == 0) == ok, done.output
     return done
 
@@ -128,7 +128,7 @@ def test_a_scenario_for_each_plant_that_comes_with_noack(name: str) -> None:
 
 
 def test_every_key_of_the_file_that_is_chosen_has_a_comment() -> None:
-    lines = noack.new("four_tank", "tanks.toml").text.splitlines()
+    lines = noack.new("double_integrator", "mass.toml").text.splitlines()
     for key in ("horizon_s", "gain", "initial_state", "beta", "alpha_per_s", "floor", "mansd"):
         (before,) = {one for one, line in pairwise(lines) if line.startswith(f"{key} = ")}
         assert before.startswith("# "), key
@@ -242,7 +242,7 @@ def test_the_lines_about_mistakes_are_those_that_were_approved() -> None:
     pytest.importorskip("fmpy")
 
     def mistake(line: str) -> list[str]:
-        done = CliRunner().invoke(app, line.split(), prog_name="noack")
+        done = invoke(*line.split())
         assert done.exit_code in (1, 2), done.output
         assert done.stderr.count("\n") == 1
         assert done.stdout == ""

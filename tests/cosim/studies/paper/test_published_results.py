@@ -33,21 +33,6 @@ def test_a_value_that_differs_fails_the_command(monkeypatch: pytest.MonkeyPatch)
     assert {row["verdict"] for row in json.loads(result.stdout)["rows"]} == {"differs"}
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["selivanow"], "no published result of this name; did you mean selivanov_fridman?"),
-        (["umsonst"], f"no published result of this name; there are {', '.join(NAMES)}"),
-        (["tabuada", "--draws", "3"], "--out, --draws: are for the page of Section V"),
-    ],
-)
-def test_a_mistake_is_one_line(words: list[str], says: str) -> None:
-    result = invoke("paper", *words)
-    assert (result.exit_code, result.stdout) == (ExitStatus.CALLER, "")
-    assert says in result.stderr
-    assert result.stderr.count("\n") == 1
-
-
 def test_the_list_has_every_result() -> None:
     result = invoke("paper", "--list", "--json")
     assert result.exit_code == ExitStatus.OK
