@@ -70,15 +70,20 @@ static void release(
     if (bit >= 0 && bit < 8 * NOACK_HEAD_BYTES)
         kept->datagram.head[bit / 8] ^= (uint8_t)(1 << (bit % 8));
     channel->put++;
-    if (!kept->delayed && !is_behind(channel, direction, release_ns)) {
+    if (!decision->waits && !kept->delayed && !is_behind(channel, direction, release_ns)) {
         leave(channel, kept);
         copy_datagram(&channel->leaving[channel->leaving_count++], &kept->datagram);
         return;
     }
-    noack_heap_entry entry = {
-        release_ns, departure_order(direction, channel->put), channel->free_place};
+    int64_t place = channel->free_place, order = departure_order(direction, channel->put);
     channel->free_place = kept->next;
-    heap_push(channel->heap, &channel->heap_count, entry);
+    if (decision->waits)
+        wait_for_link(
+            channel->links[direction], datagram->flow % channel->loops, channel->waiting, place,
+            order, decision);
+    else
+        heap_push(
+            channel->heap, &channel->heap_count, (noack_heap_entry){release_ns, order, place});
 }
 
 int64_t noack_channel_handle(
@@ -92,7 +97,7 @@ int64_t noack_channel_handle(
         return NOACK_ASK_CHANGE;
     if (channel->packet_count == channel->row_places)
         return NOACK_ROWS_FULL;
-    if (channel->heap_count + 2 > channel->places)
+    if (channel->free_place < 0 || channel->delayed[channel->free_place].next < 0)
         return NOACK_ASK_PLACES;
     if (asks && !channel->answered) {
         copy_datagram(&channel->asked, datagram);
@@ -101,6 +106,7 @@ int64_t noack_channel_handle(
     }
     channel->answered = 0;
     channel->reached_ns = now_ns;
+    serve(link, channel->waiting, now_ns, channel->heap, &channel->heap_count);
     if (asks)
         link_repeat(link, row, datagram->size_bytes, now_ns, &channel->outcome, &decision);
     else
@@ -112,6 +118,7 @@ int64_t noack_channel_handle(
         release(channel, datagram, &decision, 0);
     if (decision.copy_ns != NOACK_NEVER_NS)
         release(channel, datagram, &decision, 1);
+    serve(link, channel->waiting, now_ns, channel->heap, &channel->heap_count);
     return NOACK_DONE;
 }
 
@@ -134,10 +141,16 @@ int64_t noack_channel_release(noack_channel *channel, int64_t now_ns) {
     copy_datagram(&channel->leaving[channel->leaving_count++], &leaving->datagram);
     leaving->next = channel->free_place;
     channel->free_place = due.slot;
+    serve(
+        channel->links[leaving->datagram.flow / channel->loops], channel->waiting, due.release_ns,
+        channel->heap, &channel->heap_count);
     return NOACK_DONE;
 }
 
-void noack_channel_latest(const noack_channel *channel, int64_t direction, int64_t *latest_ns) {
+void noack_channel_latest(noack_channel *channel, int64_t direction, int64_t *latest_ns) {
+    serve(
+        channel->links[direction], channel->waiting, INT64_MAX, channel->heap,
+        &channel->heap_count);
     for (int64_t i = 0; i < channel->heap_count; i++) {
         const noack_datagram *one = &channel->delayed[channel->heap[i].slot].datagram;
         int64_t row = one->flow % channel->loops;

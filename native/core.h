@@ -49,7 +49,8 @@ typedef void stage_function(packet *packet, const noack_stage *stage, noack_stag
    depend on other stages. */
 stage_function apply_bernoulli, apply_four_state, apply_gilbert_elliott, apply_periodic,
     apply_scripted, apply_worst_case, apply_tail_drop, apply_blackout, apply_corrupt, apply_delay,
-    apply_duplicate, apply_opportunities, apply_reorder, apply_replay, apply_schedule;
+    apply_duplicate, apply_earliest_deadline, apply_opportunities, apply_priority, apply_reorder,
+    apply_replay, apply_schedule;
 
 /* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. */
 static inline void refuse(noack_decision *decision, int64_t fate) {
@@ -125,6 +126,27 @@ int64_t departure_order(int64_t direction, int64_t put);
 void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
 /* Remove the first entry. */
 void heap_pop(noack_heap_entry *heap, int64_t *count);
+
+/* Whether the queue of a stage chooses when its link is free (waiting.c). */
+static inline int is_scheduler(const noack_stage *stage) {
+    return stage->kind == NOACK_PRIORITY || stage->kind == NOACK_EARLIEST_DEADLINE;
+}
+
+/* waiting.c: the number of a packet's flow in the table of a stage. */
+int64_t flow_number(const packet *packet, const noack_stage *stage);
+/* Let a packet enter the queue of its stage; the packets with the smallest key + time leave first,
+   of which those with the same leave in order of arrival. */
+void enter_queue(packet *packet, int64_t key, int is_time);
+/* Complete the decision for a packet that has entered, when all stages have seen it. */
+void leave_queue(noack_decision *decision);
+/* Let a stored datagram, of whose link the decision is, wait until the link is free. */
+void wait_for_link(
+    noack_link *link, int64_t row, noack_waiting *waiting, int64_t place, int64_t order,
+    const noack_decision *decision);
+/* Begin to send what can begin until now_ns, and put it into the heap of departures. */
+void serve(
+    noack_link *link, noack_waiting *waiting, int64_t now_ns, noack_heap_entry *heap,
+    int64_t *count);
 
 /* Copy what a message has: it may have few entries. */
 static inline void copy_message(noack_message *to, const noack_message *from) {

@@ -82,6 +82,8 @@ int64_t noack_hold_back_until(
     const int64_t *losses = link->losses + row * link->loss_width;
     int64_t mask = link->recent_width - 1, oldest = max_of(packet - link->mansd - 1, 0);
     int64_t release_ns = max_of(desired_ns, link->flows[row].first_release_ns);
+    if (link->scheduler >= 0) /* each flow leaves in its order; see waiting.c */
+        return release_ns;
     int64_t delivered = newest_below(recent_ns, mask, oldest, packet);
     while (delivered >= oldest && recent_ns[delivered & mask] > release_ns)
         delivered = newest_below(recent_ns, mask, oldest, delivered);

@@ -16,7 +16,9 @@ static stage_function *const APPLY[NOACK_STAGE_KINDS] = {
     [NOACK_CORRUPT] = apply_corrupt,
     [NOACK_DELAY] = apply_delay,
     [NOACK_DUPLICATE] = apply_duplicate,
+    [NOACK_EARLIEST_DEADLINE] = apply_earliest_deadline,
     [NOACK_OPPORTUNITIES] = apply_opportunities,
+    [NOACK_PRIORITY] = apply_priority,
     [NOACK_REORDER] = apply_reorder,
     [NOACK_REPLAY] = apply_replay,
     [NOACK_SCHEDULE] = apply_schedule,
@@ -137,6 +139,9 @@ void link_repeat(
         .size_bytes = size_bytes,
         .must_pass = noack_must_pass(link, row),
         .spared = 0,
+        .waits = 0,
+        .key = 0,
+        .after_ns = 0,
     };
     flow->packets++;
     link->counters.received++;
@@ -150,6 +155,8 @@ void link_repeat(
             const noack_stage *stage = &link->stages[own.stage];
             APPLY[stage->kind](&own, stage, &memory[own.stage]);
         }
+        if (decision->waits)
+            leave_queue(decision);
         keep_limit(link->limit - link->in_flight, decision);
     }
     noack_settle(link, row, decision);
@@ -180,7 +187,10 @@ static int64_t hold_back(
             decision->copy_ns = max_of(decision->copy_ns, needed_ns);
         link->counters.held_back++;
     }
-    decision->makes_stale = make_stale(link, row, decision->packet, needed_ns);
+    if (link->scheduler < 0)
+        decision->makes_stale = make_stale(link, row, decision->packet, needed_ns);
+    else if (!decision->waits)
+        link->flows[row].first_release_ns = needed_ns; /* of what waits, see waiting.c */
     return needed_ns;
 }
 

@@ -9,7 +9,7 @@
 #include "core.h"
 
 static int is_bottleneck(const noack_stage *stage) {
-    return stage->kind == NOACK_CODEL || stage->kind == NOACK_TAIL_DROP;
+    return stage->kind == NOACK_CODEL || stage->kind == NOACK_TAIL_DROP || is_scheduler(stage);
 }
 
 /* The place of the stage with this random stream and the same kind, or also a bottleneck; -1: none.
@@ -104,7 +104,8 @@ static int is_same_guarantee(const noack_link *a, const noack_link *b) {
 }
 
 /* Transfer the release times that the guarantee needs. If the guarantee differs (or there is none
-   any more), later packets leave only after the packets that are in flight at the change. */
+   any more), or a queue chooses before or after the change, later packets leave only after the
+   packets that are in flight at the change. */
 static void change_releases(
     const noack_link *before, const noack_link *after, int64_t row, int64_t latest_ns) {
     noack_flow *flow = &after->flows[row];
@@ -117,7 +118,7 @@ static void change_releases(
             for (int64_t number = max_of(flow->packets - kept, 0); number < flow->packets; number++)
                 times_ns[number & mask] = older_ns[number & (before->recent_width - 1)];
         }
-        if (!is_same_guarantee(before, after))
+        if (!is_same_guarantee(before, after) || before->scheduler >= 0 || after->scheduler >= 0)
             flow->first_release_ns = max_of(flow->first_release_ns, latest_ns);
     } else if (after->mansd >= 0) {
         int64_t delivered = flow->packets - 1 - flow->consecutive_losses;

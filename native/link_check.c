@@ -41,6 +41,19 @@ static const char *check_bottleneck(const noack_stage *stage) {
     return stage->queue_places < 1 ? "a bottleneck has no queue" : NULL;
 }
 
+static const char *check_scheduler(const noack_link *link, const noack_stage *stage) {
+    const noack_bottleneck *own = &stage->bottleneck;
+    if (link->scheduler != stage - link->stages)
+        return "a queue that chooses when the link is free is not that of the link";
+    if (!is_between(1, own->flows, link->integer_count)
+        || !is_between(0, own->begin, link->integer_count - own->flows))
+        return "the numbers of flows are outside the table of integers";
+    for (int64_t i = 0; i < own->flows; i++)
+        if (!is_between(0, link->integers[own->begin + i], LONGEST_DELAY_NS))
+            return "the number of a flow is below 0, or a deadline of more than 11.6 days";
+    return check_bottleneck(stage);
+}
+
 static const char *check_opportunities(const noack_link *link, const noack_stage *stage) {
     const noack_opportunities *own = &stage->opportunities;
     if (!in_range(own->begin, own->end, link->integer_count) || own->begin == own->end)
@@ -134,6 +147,9 @@ static const char *check_stage(const noack_link *link, const noack_stage *stage)
     case NOACK_CODEL:
     case NOACK_TAIL_DROP:
         return check_bottleneck(stage);
+    case NOACK_EARLIEST_DEADLINE:
+    case NOACK_PRIORITY:
+        return check_scheduler(link, stage);
     case NOACK_OPPORTUNITIES:
         return check_opportunities(link, stage);
     case NOACK_REPLAY:
@@ -198,5 +214,8 @@ const char *noack_link_check(const noack_link *link) {
         wrong = check_guarantee(link);
     for (int64_t i = 0; wrong == NULL && i < link->stage_count; i++)
         wrong = check_stage(link, &link->stages[i]);
+    if (wrong == NULL && link->scheduler >= 0
+        && (link->scheduler >= link->stage_count || !is_scheduler(&link->stages[link->scheduler])))
+        wrong = "the link has no queue that chooses when it is free";
     return wrong;
 }

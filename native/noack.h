@@ -35,6 +35,11 @@ typedef struct { /* the decision for a packet; the stages modify it one after th
     int64_t size_bytes; /* of the payload */
     int64_t must_pass;  /* 1: the guarantee requires its delivery */
     int64_t spared;     /* 1: it must pass, and a stage would have lost it */
+    int64_t waits;      /* 1: it waits in a queue that chooses when the link is free, so that its
+                           departure is not known: release_ns is the earliest time */
+    int64_t key;        /* what waits: the smallest key leaves first */
+    int64_t after_ns;   /* what waits: the time from the end of its transmission to its departure;
+                           before the last stage: minus the earliest begin of its transmission */
 } noack_decision;
 
 typedef struct { /* a recorded decision, which a flow repeats */
@@ -60,7 +65,9 @@ enum noack_stage_kind { /* native/impairments has a file for each */
     NOACK_CORRUPT,
     NOACK_DELAY,
     NOACK_DUPLICATE,
+    NOACK_EARLIEST_DEADLINE,
     NOACK_OPPORTUNITIES,
+    NOACK_PRIORITY,
     NOACK_REORDER,
     NOACK_REPLAY,
     NOACK_SCHEDULE,
@@ -105,6 +112,8 @@ typedef struct { /* a rate limit; the stage's queue_places is the size of the qu
     int64_t target_ns; /* CoDel */
     int64_t interval_ns;
     int64_t mtu_ns; /* transmission time of one MTU */
+    int64_t begin, flows; /* priority, earliest deadline: the number of each flow, a range of the
+                             table of integers; the last is that of all further flows, too */
 } noack_bottleneck;
 
 typedef struct { /* a range of the table of integers: all begins, then all ends, ascending */
@@ -183,7 +192,9 @@ typedef struct { /* a link's state of a flow */
     int64_t forced_first;       /* 1: the first packet is still to come, and must be delivered */
     int64_t packets;            /* packets that have arrived */
     int64_t consecutive_losses; /* up to the last packet */
-    int64_t first_release_ns;   /* departure time of the first packet, if it had to be delivered */
+    int64_t first_release_ns;   /* no packet leaves before: departure time of the first one, if it had
+                                   to be delivered; in a queue that chooses, of the last one; of the
+                                   last one in flight at a change */
     double score;               /* normal score of the link's state for the last packet */
     int64_t newest;             /* greatest number among the packets that have left intact */
     int64_t since;              /* number of the first packet under the present settings */
@@ -202,6 +213,8 @@ typedef struct { /* a stage's state that all flows share; departure times lie in
     int64_t used, left_bytes;  /* opportunities: which of those at busy_until_ns, from 1; its rest */
     int64_t total_bytes;       /* all bytes that were put into the queue */
     int64_t phase, step;       /* Gilbert-Elliott, common to all flows: state, and number of its step */
+    int64_t waiting, waits;    /* packets that wait until the link is free: the place + 1 of the first
+                                  one, 0: none; how many */
 } noack_queue;
 
 typedef struct {
@@ -233,6 +246,7 @@ typedef struct { /* one direction of a link */
     int64_t mansd;    /* maximum of consecutive losses, M - 1; -1: none */
     int64_t limit;    /* maximum number of packets delayed at once */
     int64_t tracks;   /* 1: packets can be delivered out of order */
+    int64_t scheduler; /* the stage whose queue chooses when the link is free; -1: none */
     /* state */
     int64_t rows;               /* flows that have room */
     int64_t recent_width;       /* a power of 2, of mansd + 1 at least if it tracks */
@@ -279,7 +293,8 @@ int64_t noack_link_leave(
 int64_t noack_link_touch(const noack_link *link, int64_t row);
 
 /* Transfer the state of a link to one with other settings, which has as many rows and shares the
-   array of flows. latest_ns: (rows,) last departure time of the packets in flight; -1: none. */
+   array of flows. Nothing waits in a queue that chooses. latest_ns: (rows,) last departure time of
+   the packets in flight; -1: none. */
 void noack_link_change(const noack_link *before, noack_link *after, const int64_t *latest_ns);
 
 /* Begin the flow of row 0 again, with other keys, (stage_count, 2): another run of a batch. */
@@ -868,6 +883,11 @@ typedef struct { /* an entry of the heap of delayed datagrams */
     int64_t release_ns, number, slot;
 } noack_heap_entry;
 
+typedef struct { /* a stored datagram that waits until the link is free; see native/waiting.c */
+    int64_t key, order, row, size_bytes, after_ns, earliest_ns;
+    int64_t left, right; /* the heap: places + 1; 0: none */
+} noack_waiting;
+
 typedef struct {    /* a datagram that arrives or departs; a tap receives it */
     int64_t t_ns;   /* Unix time */
     int64_t flow;   /* number of the flow within the link */
@@ -936,6 +956,7 @@ typedef struct { /* times are simulated and count from the relay's start, unless
     noack_direction *directions; /* (2 links,) forward and reverse direction of each link */
     noack_heap_entry *heap;      /* (slot_count,) */
     noack_slot *slots;
+    noack_waiting *waiting;      /* (slot_count,) */
     uint8_t **chunks;    /* chunks of blocks */
     int32_t *block_next; /* (block_count,) */
     noack_event *events;
@@ -973,7 +994,7 @@ const uint8_t *noack_relay_sender(const noack_relay *relay);
 int64_t noack_relay_receiver(const noack_relay *relay);
 
 /* Last departure time of each flow's packets in flight, (rows,); the caller fills it with -1. */
-void noack_relay_latest(const noack_relay *relay, int64_t direction, int64_t *latest_ns);
+void noack_relay_latest(noack_relay *relay, int64_t direction, int64_t *latest_ns);
 
 /* The table of clients: find the row of a name (-1: none), insert a row, remove it. */
 int64_t noack_client_find(const noack_relay *relay, const uint8_t name[40], int64_t link);
@@ -1071,6 +1092,7 @@ typedef struct { /* both directions of the network of a run; each flow has the r
     int64_t heap_count, places, free_place; /* free_place: -1: none */
     noack_heap_entry *heap; /* (places,) */
     noack_delayed *delayed; /* (places,) */
+    noack_waiting *waiting; /* (places,) */
     int64_t row_places, packet_count, release_count;
     noack_packet_row *packets;   /* (row_places,) */
     noack_release_row *releases; /* (row_places,) */
@@ -1094,7 +1116,7 @@ int64_t noack_channel_handle(
 int64_t noack_channel_release(noack_channel *channel, int64_t now_ns);
 
 /* Last departure time of each flow of a direction, (loops,); the caller fills it with -1. */
-void noack_channel_latest(const noack_channel *channel, int64_t direction, int64_t *latest_ns);
+void noack_channel_latest(noack_channel *channel, int64_t direction, int64_t *latest_ns);
 
 /* ---- Simulation in virtual time ----------------------------------------------------------------- */
 

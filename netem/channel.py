@@ -107,6 +107,7 @@ class Channel:
         self.core.releases = pointer_to(self._releases, "noack_release_row *")
         self._heap: Rows = np.zeros(0, dtype_of("noack_heap_entry"))
         self._delayed: CData = ffi.new("noack_delayed[]", 0)
+        self._waiting: Rows = np.zeros(0, dtype_of("noack_waiting"))
         self._taken: list[tuple[str, Rows]] = []
         self._add_places(_PLACES)
         if (wrong := core.noack_channel_check(self.core)) != ffi.NULL:
@@ -218,6 +219,10 @@ class Channel:
         ffi.memmove(delayed, self._delayed, before * ffi.sizeof("noack_delayed"))
         self._heap, self._delayed = heap, delayed
         channel.heap, channel.delayed = pointer_to(heap, "noack_heap_entry *"), delayed
+        waiting: Rows = np.zeros(before + count, dtype_of("noack_waiting"))
+        waiting[:before] = self._waiting
+        self._waiting = waiting
+        channel.waiting = pointer_to(waiting, "noack_waiting *")
         channel.places = before + count
         core.noack_channel_add_places(channel, before)
 

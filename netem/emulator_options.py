@@ -6,6 +6,7 @@
 import argparse
 import difflib
 import json
+import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -199,7 +200,9 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
         CallerError: a word begins with dashes, or --session is combined with other options.
     """
     require_no_dashes(arguments)
-    options = parser.parse_intermixed_args(arguments)
+    # With a space before it, argparse takes -1,2 for a word, not for an option.
+    words = [f" {one}" if re.match(r"-[0-9.]", one) else one for one in arguments]
+    options = parser.parse_intermixed_args(words)
     if any(argument.partition("=")[0] == "--session" for argument in arguments):
         raise CallerError(
             "--session joins a run and allows only --json beside it; words and all other options "

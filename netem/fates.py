@@ -108,12 +108,18 @@ class FateRecorder:
         max_waiting: maximum number of queued rows.
 
     Raises:
-        CallerError: the file cannot be written, or is not a Parquet file.
+        CallerError: the file cannot be written, is not a Parquet file, or delays are not known.
     """
 
     wants_data = False
 
     def __init__(self, path: Path, specs: Sequence[LinkSpec], max_waiting: int = _MAX_WAITING) -> None:
+        for spec in specs:
+            if spec.forward.chooses or spec.reverse.chooses:
+                raise CallerError(
+                    f"--record-fates {path}: link {spec.name} has a rate that chooses what it sends: "
+                    "no delay is known at the arrival; capture the packets instead"
+                )
         self._path = path
         self._specs = specs
         self._names = (pa.array([spec.name for spec in specs]), pa.array(DIRECTIONS))

@@ -174,6 +174,7 @@ class LinkState:
                 "tracks": tracks or any(one.delays for one in settings.impairments),
                 "rows": rows,
                 "departure_places": places,
+                "scheduler": next((place for place, (stage, *_) in enumerate(named) if stage.schedules), -1),
             },
         )
         link.recent_width = 1 << link.mansd.bit_length() if link.tracks and link.mansd >= 0 else 1

@@ -58,6 +58,7 @@ class RelayMemory:
         self.core.scratch = pointer_to(self._scratch, "void *")
         self._set_clients(zeros_in_lines(_CLIENTS, CLIENT), np.zeros(2 * links + _CLIENTS, SOCKET))
         self.clients["number"] = self.sockets["fd"] = -1
+        self._waiting: Rows = np.zeros(0, dtype_of("noack_waiting"))
         self._set_slots(np.zeros(_SLOTS, ENTRY), np.zeros(_SLOTS, SLOT), 0)
         self._block_next = np.zeros(0, np.int32)
         self._add_chunk()
@@ -98,7 +99,9 @@ class RelayMemory:
     def add_room(self) -> None:
         """Make room for one more delayed datagram and its copy, if there is memory."""
         relay = self.core
-        relay.no_memory = not has_headroom(2 * (self._heap.nbytes + self._slots.nbytes))
+        relay.no_memory = not has_headroom(
+            2 * (self._heap.nbytes + self._slots.nbytes + self._waiting.nbytes)
+        )
         if relay.no_memory:
             return
         if relay.free_slots < 2:
@@ -159,6 +162,10 @@ class RelayMemory:
         self._heap, self._slots = heap, slots
         relay.heap = pointer_to(heap, "noack_heap_entry *")
         relay.slots = pointer_to(slots, "noack_slot *")
+        waiting: Rows = np.zeros(count, dtype_of("noack_waiting"))
+        waiting[:begin] = self._waiting[:begin]
+        self._waiting = waiting
+        relay.waiting = pointer_to(waiting, "noack_waiting *")
 
     def _add_chunk(self) -> None:
         relay, blocks = self.core, core.NOACK_CHUNK_BLOCKS

@@ -17,41 +17,41 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 425
+MOST_MODULES = 428
 LINES = {
-    "noack/scenario": 3915,
+    "noack/scenario": 4040,
     "noack/controllers": 270,
     "noack/core": 1580,
     "noack/disturbances": 220,
-    "noack/impairments": 4155,
+    "noack/impairments": 4320,
     "noack/machines": 400,
     "noack/observers": 385,
     "noack/plants": 3225,
-    "noack/protocol": 1235,
+    "noack/protocol": 1240,
     "noack/runtime": 5400,
     "noack/settings": 585,
     "noack/theory": 10670,
     "noack/traces": 1320,
     "noack/trigger": 1070,
-    "netem": 6500,
-    "cosim/analysis": 8135,
+    "netem": 6525,
+    "cosim/analysis": 8140,
     "cosim/api": 1680,
-    "cosim/cli": 3320,
+    "cosim/cli": 3325,
     "cosim/doctor": 815,
     "cosim/interactive": 1625,
-    "cosim/lab": 2120,
+    "cosim/lab": 2115,
     "cosim/live": 3975,
     "cosim/measurement": 2855,
     "cosim/output": 8500,
-    "cosim/record": 3495,
+    "cosim/record": 3525,
     "cosim/simulation": 1895,
     "cosim/studies": 8860,
     "plant_server": 425,
     "sensor_node": 400,
     "controller_node": 415,
-    "benchmarks": 4715,
-    "native": 10740,
-    "tests": 45815,
+    "benchmarks": 4710,
+    "native": 10970,
+    "tests": 46130,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

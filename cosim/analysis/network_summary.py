@@ -33,7 +33,7 @@ from noack.scenario.scenario import Scenario, phases_ns
 
 _BINS = 200
 _MOST_NAMED = 3
-_COLUMNS = ("now_ns", "flow", "fate", "release_ns", "copy_ns", "size_bytes")
+_COLUMNS = ("sequence", "now_ns", "flow", "fate", "release_ns", "copy_ns", "size_bytes")
 
 
 def summarise_run(
@@ -51,6 +51,7 @@ def summarise_run(
     packets = network.columns(
         NETEM_PACKET, *_COLUMNS, where=lambda rows: rows["flow"] < len(loops)
     )  # the others are of the other direction
+    packets = network.with_departures(packets)
     forwarded_bytes = np.bincount(
         packets["flow"], np.where(packets["release_ns"] >= 0, packets["size_bytes"], 0), len(loops)
     )

@@ -188,12 +188,14 @@ def _delays_s(record: RunRecord) -> Vector:
     """The times of the effectively delivered updates in the network."""
     packets = record.columns(
         NETEM_PACKET,
+        "sequence",
         "now_ns",
         "release_ns",
         "flow",
         "fate",
         where=lambda rows: (rows["flow"] == UPDATES) & effective(rows["fate"]),
     )
+    packets = record.with_departures(packets)
     return np.asarray((packets["release_ns"] - packets["now_ns"]) / NS_PER_S)
 
 

@@ -190,7 +190,7 @@ def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcom
     """Return the outcomes of a flow's datagrams that reached the network emulator."""
     released = _released(record, flow)
     batches = [*record.source.batches(NETEM_PACKET)] or [np.zeros(0, record.tables[NETEM_PACKET])]
-    parts = [_outcomes(rows, flow, *released) for rows in batches]
+    parts = [_outcomes(record.with_departures(rows), flow, *released) for rows in batches]
     return PacketOutcome(*map(np.concatenate, zip(*parts, strict=True)))
 
 

@@ -50,6 +50,7 @@ from noack.protocol.machine_interface import RESTART
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     LOOP,
+    NETEM_RELEASE,
     NO_SEQUENCE,
     OWNER,
     PLANT_STEP,
@@ -148,6 +149,35 @@ class RunRecord:
     def is_short(self) -> bool:
         """Whether the whole record is one part, which is kept in memory."""
         return not any(self.count(table) > BATCH_ROWS for table in self.tables)
+
+    def with_departures(self, packets: Rows) -> Rows:
+        """Return rows of ``netem_packet`` whose ``release_ns`` is when they left.
+
+        In a queue that chooses what it sends, this is not known at their arrival. A packet that has
+        not left gets the time of the last departure, if that is later. Copies keep their times.
+        """
+        network = self.scenario.network
+        if not any(network.link_of(flow).chooses for flow in network.flows):
+            return packets
+        left = self.columns(
+            NETEM_RELEASE,
+            "sequence",
+            "flow",
+            "copy",
+            "t_ns",
+            where=lambda rows: rows["copy"] == 0,
+        )
+        count = max(left["flow"].max(initial=0), packets["flow"].max(initial=0)) + 1
+        numbers = left["sequence"] * count + left["flow"]
+        order = np.argsort(numbers)
+        wanted, known = packets["sequence"] * count + packets["flow"], numbers[order]
+        place = np.searchsorted(known, wanted)
+        has_left = np.append(known, -1)[place] == wanted
+        waits = ~has_left & (packets["release_ns"] > packets["now_ns"])
+        packets = packets.copy()
+        packets["release_ns"][has_left] = left["t_ns"][order][place[has_left]]
+        packets["release_ns"][waits] = np.maximum(packets["release_ns"][waits], left["t_ns"].max(initial=-1))
+        return packets
 
     def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:
         """Yield consecutive parts of some tables, or of all, each up to the same time.

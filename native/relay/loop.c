@@ -124,6 +124,9 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
             .delayed = 1,
         };
         line_up(relay);
+        serve(
+            relay->directions[slot->direction].link, relay->waiting, entry.release_ns, relay->heap,
+            &relay->heap_length);
         if (relay->records)
             record_release(relay, leaving, until_ns);
     }
@@ -221,8 +224,13 @@ static void release(
     }
     relay->put++;
     int64_t order = departure_order(direction & 1, relay->put);
-    heap_push(
-        relay->heap, &relay->heap_length, (noack_heap_entry){release_ns, order, leaving->slot});
+    if (decision->waits)
+        wait_for_link(
+            relay->directions[direction].link, relay->clients[client].place, relay->waiting,
+            leaving->slot, order, decision);
+    else
+        heap_push(
+            relay->heap, &relay->heap_length, (noack_heap_entry){release_ns, order, leaving->slot});
     relay->clients[client].in_flight++;
 }
 
@@ -231,11 +239,13 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
     relay_scratch *own = scratch_of(relay);
     noack_client *client = &relay->clients[row];
     const uint8_t *data = own->buffers[own->batch_next];
+    noack_link *link = relay->directions[number].link;
     noack_decision decision;
     client->last_ns = relay->now_ns;
+    serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
     noack_link_decide(
-        relay->directions[number].link, client->place, max_of(size_bytes - headers_bytes(relay), 0),
-        relay->now_ns, &decision);
+        link, client->place, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,
+        &decision);
     if (relay->taps)
         report_arrival(relay, number, row, data, size_bytes, &decision);
     if (relay->records)
@@ -244,6 +254,7 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
         release(relay, number, row, &decision, 0);
     if (decision.copy_ns != NOACK_NEVER_NS)
         release(relay, number, row, &decision, 1);
+    serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
 }
 
 /* Decide for the datagrams received from one socket; return CARRY_ON, or why this ended. */

@@ -64,7 +64,10 @@ void free_payload(noack_relay *relay, int64_t number) {
     relay->free_slots++;
 }
 
-void noack_relay_latest(const noack_relay *relay, int64_t direction, int64_t *latest_ns) {
+void noack_relay_latest(noack_relay *relay, int64_t direction, int64_t *latest_ns) {
+    serve(
+        relay->directions[direction].link, relay->waiting, INT64_MAX, relay->heap,
+        &relay->heap_length);
     for (int64_t i = 0; i < relay->heap_length; i++) {
         const noack_slot *slot = &relay->slots[relay->heap[i].slot];
         if (slot->direction == direction) {

@@ -183,11 +183,14 @@ class Clause:
                 share = table[part.keys[0]]
                 assert isinstance(share, float)
                 table[self._values[1].keys[0]] = 1 - share
-        options = {part.word: part for part in self._options}
+        options, given = {part.word: part for part in self._options}, dict[str, str]()
         while (word := reader.accept(*options)) is not None:
-            if not table.keys().isdisjoint({*options[word].keys, *options[word].implied}):
-                reader.wrong("there is one already")
+            keys = {*options[word].keys, *options[word].implied}
+            if earlier := [given.get(key, self.word) for key in table.keys() & keys]:
+                other = f"{word} and {earlier[0]} exclude each other"
+                reader.wrong(f"{word} is given twice" if word in earlier else other)
             options[word].read(reader, table)
+            given |= dict.fromkeys(keys, word)
         return table
 
     def writes(self, settings: BaseModel) -> bool:

@@ -31,8 +31,11 @@ from noack.settings.user_files import NamedFile
 T = TypeVar("T")
 Offset = Annotated[FiniteFloat, Field(ge=0, le=1e9)] | Literal["random"]
 """In seconds after the trace's first packet."""
+MOST_FLOWS = 65_535
+"""Maximum number of flows that settings name one by one."""
 LONGEST_NS = 10**18
 """Longest trace: 31 years."""
+_MOST_SHOWN = 12
 TC_CORRELATION = "its correlation changes the probability, or the spread, of what it is given"
 """What ``tc netem`` does differently."""
 
@@ -48,6 +51,8 @@ class Stage(NamedTuple):
     """The field of ``noack_stage`` that has this structure; empty: it is ``kind``."""
     queue_places: int = 0
     """Maximum number of packets in its queue; 0: no queue."""
+    schedules: bool = False
+    """Its queue chooses when the link is free (native/waiting.c)."""
 
 
 class StageTables:
@@ -102,8 +107,41 @@ class QueueDiscipline(Feature):
     kind: str
 
     @abstractmethod
-    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int) -> Stage:
+    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables) -> Stage:
         """Return the settings as numbers, with those of the bottleneck."""
+
+
+class Scheduler(QueueDiscipline):
+    """Base class of disciplines that choose, when the link is free, what it sends next.
+
+    Each flow has a number; the last number is that of all further flows, too.
+    """
+
+    @property
+    @abstractmethod
+    def numbers(self) -> Sequence[int]:
+        """Return the number of each flow, from which the key of its packets follows."""
+
+    @abstractmethod
+    def yields_ns(self, flow: int, other: int) -> float:
+        """Return how long after a packet of a flow one of another flow may arrive, to go first.
+
+        It is negative if that must arrive before; infinite if it always, or never, goes first.
+        """
+
+    def shown(self, numbers: Sequence[str]) -> str:
+        """Return the numbers of the flows in words."""
+        more = ",..." if len(numbers) > _MOST_SHOWN else ""
+        return f"{','.join(numbers[:_MOST_SHOWN])}{more}"
+
+    def number(self, flow: int) -> int:
+        """Return the number of a flow; flows count from 0."""
+        return self.numbers[min(flow, len(self.numbers) - 1)]
+
+    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables) -> Stage:
+        begin, _ = add_numbers(tables.integers, self.numbers)
+        numbers = {**bottleneck, "begin": begin, "flows": len(self.numbers)}
+        return Stage(self.kind, numbers, "bottleneck", queue_places, schedules=True)
 
 
 class StageFeature(Feature):

@@ -15,7 +15,11 @@ from noack.core.core_library import core
 from noack.impairments.constraints import AnyConstraint, find_longest_burst, require_consistent
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.blackout import Blackout
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
 from noack.settings.section import ScenarioSection
 
 NEVER_NS: int = core.NOACK_NEVER_NS
@@ -52,6 +56,11 @@ class LinkSettings(ScenarioSection):
         return all(impairment.is_bounded for impairment in self.impairments)
 
     @property
+    def chooses(self) -> bool:
+        """Whether the queue of a rate chooses what it sends when the link is free."""
+        return any(isinstance(one, Rate) and one.scheduler for one in self.impairments)
+
+    @property
     def longest_burst(self) -> int | None:
         """Maximum number of consecutive losses that the guarantee allows; None: no maximum."""
         return find_longest_burst(self.mansd, self.constraints)
@@ -60,6 +69,7 @@ class LinkSettings(ScenarioSection):
     def _check(self) -> Self:
         require_consistent(self.mansd, self.constraints)
         require_scores(self.impairments)
+        require_order(self.impairments)
         return self
 
 
@@ -77,6 +87,27 @@ def require_scores(impairments: Iterable[AnyImpairment], loss: LossModel | None 
                 f"impairments.{number}.loss_correlation: needs a loss before it, "
                 "by model bernoulli or gilbert_elliott"
             )
+
+
+def require_order(impairments: Sequence[AnyImpairment]) -> None:
+    """Check what stands beside a rate that chooses what it sends when the link is free.
+
+    Raises:
+        ValueError: its effect would depend on the order; the message begins with the key.
+    """
+    rates = [(place, one) for place, one in enumerate(impairments) if isinstance(one, Rate) and one.scheduler]
+    for place, rate in rates[:1]:
+        for number, other in enumerate(impairments):
+            where = "before" if number < place else "after"
+            least_s, largest_s = other.delay_range_s(0.0, 0.0)
+            fits = number == place or isinstance(other, Corrupt)
+            fits = fits or (isinstance(other, Delay) and least_s == largest_s)
+            if not fits and not (where == "before" and isinstance(other, LossOf | Blackout)):
+                raise ValueError(
+                    f"impairments.{number}: {other.kind} cannot stand {where} a rate with "
+                    f"{rate.discipline.kind}; losses and blackouts can stand before such a rate, "
+                    "constant delays and corruption before or after it"
+                )
 
 
 class RecordedDecision(NamedTuple):

@@ -237,7 +237,8 @@ TABLES = (
         Column("fate", "", ", ".join(f"{fate.value} {fate.name.lower()}" for fate in Fate)),
         Column("consecutive_losses", "", "consecutive datagrams up to this one that were not "
                "effectively delivered, as known then"),
-        Column("release_ns", "ns", "time at which it is to leave, −1 never"),
+        Column("release_ns", "ns", "time at which it is to leave, −1 never; if a queue chooses "
+               "what it sends, the earliest time"),
         Column("copy_ns", "ns", "time at which its copy is to leave, −1 never"),
         Column("bit", "", "number of the flipped bit, −1 none"),
         Column("size_bytes", "bytes", "size of the datagram"),

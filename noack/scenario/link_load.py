@@ -10,12 +10,15 @@ From d, M, the queue and what is before it follow bounds of the delay in a tail-
 the slots of a static schedule (docs/derivations.md, "The delay on a link"). J is by how much the
 delays before it can differ, and W(n) the longest time until n of a loop's slots have begun.
 
+A rate that chooses what it sends has a bound for each loop: noack/scenario/response_times.py.
+
 The delay in the network is at most the sum L of the bounds of its impairments. A datagram that is
 held back for the guarantee leaves with an earlier one of its loop, which leaves within L of its own
 transmission: so L bounds this delay, too. A live run adds the lateness of its processes.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -23,12 +26,14 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.disciplines.tail_drop import TailDrop
+from noack.impairments.feature import Scheduler
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.scenario.resolution import policy_of, resolve
+from noack.scenario.response_times import Sender, response_ns
 from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
 from noack.scenario.scenario_checks import with_settings
 from noack.scenario.sections import DirectionSection
@@ -70,6 +75,8 @@ class LinkLoad(NamedTuple):
     """The same, if each loop transmits as rarely as it can."""
     delay_bound_s: float | None
     """Bound of a datagram's delay in this queue, in the whole run; None: there is none."""
+    loop_bounds_s: tuple[tuple[str, float], ...] = ()
+    """The bounds of the loops that have one each, infinite if there is none: which loops, bound."""
 
 
 class DelayBound(NamedTuple):
@@ -140,13 +147,14 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
         return found
     delays, _ = _largest_delays(stages)
     for place, one in enumerate(stages[0].direction.impairments):
+        key = f"{path}.impairments.{place}"
         if isinstance(one, Schedule):
-            key = f"{path}.impairments.{place}"
             found += _slot_loads(one, stages, (key, flow), delays[place])
         if not isinstance(one, Rate | Opportunities):
             continue
         before: LinkLoad | None = None
         delay_s = _known(delays[place])
+        by_loops = tuple(_by_loops(delays[place])) if len(delays[place]) > 1 else ()
         for begin, direction, loops in stages:
             window = _window(direction)
             bits = [int(one.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
@@ -155,12 +163,25 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
                 sum(b / loop.largest_s for b, loop in zip(bits, loops, strict=True)),
             )
             at_most_bps, at_least_bps = (_share(window) * bps for bps in needed_bps)
-            key = f"{path}.impairments.{place}"
-            load = LinkLoad(begin, key, flow, window, one.rate_bps, at_most_bps, at_least_bps, delay_s)
+            load = LinkLoad(
+                begin, key, flow, window, one.rate_bps, at_most_bps, at_least_bps, delay_s, by_loops
+            )
             if before is None or load._replace(begin=before.begin) != before:
                 found.append(load)
             before = load
     return found
+
+
+def _by_loops(delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
+    """Yield each bound of a delay, with the loops that have it, such as ``loops 1, 3 to 5``."""
+    for delay_s in dict.fromkeys(delays_s):
+        loops = {loop for loop, own_s in enumerate(delays_s, 1) if own_s == delay_s}
+        begins, ends = (
+            sorted(loops - {loop + 1 for loop in loops}),
+            sorted(loops - {loop - 1 for loop in loops}),
+        )
+        spans = (str(a) if a == b else f"{a} to {b}" for a, b in zip(begins, ends, strict=True))
+        yield f"loop{'s' * (len(loops) > 1)} {', '.join(spans)}", delay_s
 
 
 def _known(delays_s: Sequence[float]) -> float | None:
@@ -213,7 +234,8 @@ def _share(window: LossWindow) -> float:
 def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], float]:
     """Return the bounds of the delay in each impairment, and the bound in all of them, in seconds.
 
-    A schedule has a bound for each loop, another impairment one for all; infinite: there is none.
+    A schedule, and a rate that chooses what it sends, have a bound for each loop; another
+    impairment has one for all; infinite: there is none.
     """
     least_s = largest_s = 0.0
     found, copied = list[list[float]](), False
@@ -221,6 +243,9 @@ def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], float]
         spread_s = largest_s - least_s
         if isinstance(one, Schedule):
             found.append(_slot_delays_s(one, stages, spread_s, copied=copied))
+            largest_s += max(found[-1])
+        elif isinstance(one, Rate) and one.scheduler is not None:
+            found.append(_chosen_delays_s(one, one.scheduler, stages))
             largest_s += max(found[-1])
         elif isinstance(one, Rate):
             found.append([_queue_delay_s(one, stages, spread_s, copied=copied)])
@@ -257,6 +282,35 @@ def _slot_delays_s(one: Schedule, stages: Sequence[_Stage], spread_s: float, *, 
             bounds.append(max(t_ns - n * least_ns / share for n, t_ns in enumerate(waits_ns)))
         found.append(min(bounds) / NS_PER_S + spread_s)
     return found
+
+
+def _chosen_delays_s(one: Rate, chooses: Scheduler, stages: Sequence[_Stage]) -> list[float]:
+    """Return the bounds for each loop of a rate that chooses what it sends.
+
+    A change of the direction's settings makes the order of what waits final, so that any may go first.
+    """
+    sections = range(len(stages[0].loops))
+    loops = [entry for entry in sections for _ in range(stages[0].loops[entry].loops)]
+    changes = any(stage.direction.link != stages[0].direction.link for stage in stages)
+    least_ns = [round(min(stage.loops[entry].least_s for stage in stages) * NS_PER_S) for entry in sections]
+    sent_ns = [
+        max(-(-int(one.line_bits(demand.payload_bytes)) * NS_PER_S // one.rate_bps), 1)
+        for demand in stages[0].loops
+    ]
+    found: dict[tuple[int, int], float] = {}
+    for loop, entry in enumerate(loops):
+        kind = entry, chooses.number(loop)
+        if kind not in found:
+            own = Sender(least_ns[entry], sent_ns[entry])
+            others = Counter(
+                Sender(
+                    least_ns[other], sent_ns[other], math.inf if changes else chooses.yields_ns(loop, number)
+                )
+                for number, other in enumerate(loops)
+                if number != loop
+            )
+            found[kind] = response_ns(own, others) / NS_PER_S
+    return [found[entry, chooses.number(loop)] for loop, entry in enumerate(loops)]
 
 
 def _queue_delay_s(one: Rate, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> float:

@@ -16,7 +16,7 @@ from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
 from noack.impairments.constraints import join_guarantee, require_consistent
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_scores
+from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_order, require_scores
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
@@ -337,6 +337,7 @@ class DirectionSection(ScenarioSection):
     def _check_direction(self) -> Self:
         require_consistent(self.mansd, self.constraints)
         require_scores(self.impairments, self.loss)
+        require_order(self.impairments)
         return self
 
     @property

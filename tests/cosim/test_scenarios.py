@@ -33,7 +33,10 @@ from tests.extras import skip_without_plant
 from tests.shipped import resolved, shipped
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
-SHARED = ("different_loops", "scheduled_channel", "shared_bottleneck", "shared_channel")
+SHARED = (
+    "different_loops", "priority_channel", "scheduled_channel", "shared_bottleneck",
+    "shared_channel",
+)  # fmt: skip
 """Several loops on one network."""
 NAMES = sorted({path.stem for path in SCENARIOS.glob("*.toml")} - {*SHARED})
 ENDS_BELOW = {"f16_lateral": 0.5, "pendulum_observed": 0.5, "lane_5g_rural": 0.5}

@@ -10,9 +10,10 @@ from pydantic.fields import FieldInfo
 from noack.impairments.constraints import CONSTRAINTS, require_consistent
 from noack.impairments.feature import Feature, Impairment
 from noack.impairments.kinds import IMPAIRMENTS
-from noack.impairments.kinds.delay import SHAPES
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import SHAPES, Delay
 from noack.impairments.kinds.reorder import Reorder
-from noack.impairments.link_settings import LinkSettings, require_scores
+from noack.impairments.link_settings import LinkSettings, require_order, require_scores
 from tests.netem.feature_examples import EXAMPLES, IMPAIRED, keeps_loss, names_file
 
 _TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).filter(
@@ -65,9 +66,10 @@ def varied(draw: st.DrawFn, feature: type[Feature]) -> Any:
 
 
 def _goes_together(chain: list[Impairment]) -> bool:
-    """Whether each delay with a loss correlation comes after a loss."""
+    """Whether each delay with a loss correlation comes after a loss, and so on."""
     try:
         require_scores(chain)
+        require_order(chain)
     except ValueError:
         return False
     return True
@@ -85,8 +87,12 @@ constraints = st.lists(st.one_of([varied(kind) for kind in CONSTRAINTS]), max_si
 
 
 def _settings(impairments: st.SearchStrategy[Impairment], most: int = 5) -> st.SearchStrategy[LinkSettings]:
+    return _chained(st.lists(impairments, max_size=5), most)
+
+
+def _chained(chains: st.SearchStrategy[list[Impairment]], most: int = 5) -> st.SearchStrategy[LinkSettings]:
     return st.fixed_dictionaries({
-        "impairments": st.lists(impairments, max_size=5).filter(_goes_together).map(tuple),
+        "impairments": chains.filter(_goes_together).map(tuple),
         "mansd": st.none() | st.sampled_from([0, 1, 2, 5]) | st.integers(0, most),
         "constraints": constraints,
         "first_delivered": st.booleans(),
@@ -102,7 +108,13 @@ _ANY = st.one_of([varied(kind) for kind in IMPAIRMENTS])
 settings = _settings(_ANY, most=1_000_000)
 """All valid settings, including names of files."""
 computable = _settings(_ANY.filter(_is_computable))
-harsh = _settings(st.sampled_from([one for one in IMPAIRED if _is_computable(one)]))
+_choosing = st.tuples(
+    st.none() | st.sampled_from([one for one in IMPAIRED if one.kind in ("loss", "blackout")]),
+    st.sampled_from([one for one in IMPAIRED if getattr(one, "scheduler", None)]),
+    st.none() | st.sampled_from([*EXAMPLES[Corrupt], Delay(delay_s=0.004)]),
+).map(lambda chain: [one for one in chain if one and _is_computable(one)])
+"""Impairments with a queue that chooses what it sends."""
+harsh = _settings(st.sampled_from([one for one in IMPAIRED if _is_computable(one)])) | _chained(_choosing)
 """Examples of the features in any order, with short times."""
 capped = harsh.filter(lambda one: one.impairments and one.mansd is not None).map(
     lambda one: one.model_copy(update={"first_delivered": True})

@@ -30,6 +30,8 @@ WORDS = f"""
     blackout 0s-10ms,20ms-30ms every 50ms; blackout 1ms-20ms; outages 'my outages.txt' every 60s
     rate 5mbit queue 1; rate 5mbit queue 1 codel; rate 5mbit queue 50; rate 5mbit queue 50 codel
     rate 5mbit queue 50 codel target 10us interval 100us mtu 0
+    rate 5mbit queue 3 priority 2,1; rate 5mbit queue 50 priority 1,0,1
+    rate 5mbit queue 3 earliest_deadline 1ms,0s; rate 5mbit queue 50 48 48 5 earliest_deadline 0s,300us,100us
     rate 100mbit queue 5; rate 100mbit queue 5 codel; rate 1gbit -10 48 5
     rate 100mbit queue 5 codel target 10us interval 100us mtu 0
     opportunities at 0,0,1,2,2,2,5 queue 2

@@ -5,13 +5,19 @@ once more, for native/channel.c: rows, copies, flipped bits, and the order of de
 """
 
 import heapq
+import math
 from collections.abc import Sequence
+from fractions import Fraction
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, link_name
 from netem.link_state import LinkState
+from noack.core.core_library import core
+from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
+from noack.impairments.disciplines.priority import Priority
+from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
@@ -31,6 +37,17 @@ class _InFlight(NamedTuple):
     """Whether it is the datagram's first intact copy."""
     delayed: bool
     datagram: Datagram
+
+
+class _Waiting(NamedTuple):
+    """A datagram that waits until the link is free; the smallest leaves first."""
+
+    key: int
+    number: int
+    entry_ns: int
+    after_ns: int
+    """The constant delays."""
+    leaving: _InFlight
 
 
 T = TypeVar("T", bound=Any)
@@ -69,6 +86,8 @@ class Link:
         self._rows: dict[int, int] = {}
         self._in_flight: list[_InFlight] = []
         self._put_in_flight = 0
+        self._waiting: list[_Waiting] = []
+        self._free = Fraction(0)
         self._inputs = self._first_number = first_number
 
     @property
@@ -93,11 +112,15 @@ class Link:
 
     def change(self, settings: LinkSettings) -> None:
         """Apply other settings; see native/link_change.c."""
+        self._serve(math.inf)
         latest_ns = np.full(self._state.rows, NEVER_NS, np.int64)
         for leaving in self._in_flight:
             row = self._rows[leaving.datagram.flow]
             latest_ns[row] = max(latest_ns[row], leaving.release_ns)
         self._state.change(settings, latest_ns)
+        if (rate := _scheduler(settings)) is not None:
+            queue = self._queue
+            self._free = queue.busy_until_ns + Fraction(queue.carry, rate.rate_bps)
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Accept a change; it applies from the first datagram that arrives at or after its time T.
@@ -123,11 +146,13 @@ class Link:
             due.datagram.flow, int(due.copy), int(stale),
         )  # fmt: skip
         self._inputs += 1
+        self._serve(due.release_ns)
         return (due.datagram, Record(NETEM_RELEASE, row))
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Process a datagram; return it if it is neither lost nor delayed."""
         self.reach(now_ns)
+        self._serve(now_ns)
         decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
@@ -142,6 +167,7 @@ class Link:
         leaving = self._release(message, decision.release_ns, decision.bit, copy=False)
         if decision.copy_ns != NEVER_NS:
             leaving += self._release(message, decision.copy_ns, decision.copy_bit, copy=True)
+        self._serve(now_ns)
         return (*leaving, record)
 
     def reach(self, now_ns: int) -> None:
@@ -170,6 +196,19 @@ class Link:
             release_ns, self._put_in_flight, decision.packet, copy, counts,
             release_ns > decision.arrival_ns, message,
         )  # fmt: skip
+        if decision.waits:
+            rate, row, entry_ns = (
+                _scheduler(self._state.settings),
+                self._rows[message.flow],
+                self._queue.entry_ns,
+            )
+            assert rate is not None
+            key = rate.discipline.numbers[min(row, len(rate.discipline.numbers) - 1)]
+            if isinstance(rate.discipline, EarliestDeadline):
+                key += entry_ns
+            self._waiting.append(_Waiting(key, leaving.number, entry_ns, decision.after_ns, leaving))
+            self._queue.waits = len(self._waiting)
+            return ()
         # Overdue datagrams leave first, even if ``on_timer`` has not been called for them yet.
         overdue = bool(self._in_flight) and self._in_flight[0].release_ns <= release_ns
         if leaving.delayed or overdue:
@@ -178,11 +217,43 @@ class Link:
         self._leave(leaving)
         return (message,)
 
+    def _serve(self, until_ns: float) -> None:
+        """Begin to send what can begin until then: of what waits, the smallest."""
+        while self._waiting and (int(self._free) <= until_ns or len(self._waiting) == self.in_flight):
+            first = min(self._waiting)
+            self._waiting.remove(first)
+            rate = _scheduler(self._state.settings)
+            assert rate is not None
+            begin = self._free if int(self._free) >= first.entry_ns else Fraction(first.entry_ns)
+            flow, size_bytes = first.leaving.datagram.flow, len(first.leaving.datagram.data)
+            bits = int(rate.line_bits(size_bytes))
+            self._free = begin + Fraction(bits * 10**9, rate.rate_bps)
+            link = self._state.core  # it knows how many wait, and until when the link is busy
+            self._queue.waits = len(self._waiting)
+            assert core.noack_queue_serve(link, link.scheduler, size_bytes) == int(self._free)
+            leaves_ns = max(
+                int(self._free) + first.after_ns, first.leaving.release_ns, self.flow(flow).first_release_ns
+            )
+            self.flow(flow).first_release_ns = leaves_ns
+            heapq.heappush(self._in_flight, first.leaving._replace(release_ns=leaves_ns))
+
+    @property
+    def _queue(self) -> Any:
+        """The state of the queue that chooses, a ``noack_queue``."""
+        return self._state.core.queues[self._state.core.scheduler]
+
     def _leave(self, leaving: _InFlight) -> bool:
         row, size_bytes = self._rows[leaving.datagram.flow], len(leaving.datagram.data)
         return self._state.leave(
             row, leaving.packet, size_bytes, delayed=leaving.delayed, counts=leaving.counts
         )
+
+
+def _scheduler(settings: LinkSettings) -> Any:
+    """The rate that chooses what it sends; None: there is none."""
+    rates = [one for one in settings.impairments if isinstance(one, Rate)]
+    chosen = [one for one in rates if isinstance(one.discipline, Priority | EarliestDeadline)]
+    return chosen[0] if chosen else None
 
 
 def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> Link:

@@ -156,20 +156,25 @@ def _check_loops(loaded: "scenario.Scenario", *, json: bool) -> None:
         print(f"{_COMMENT}{loop.name}: begins at {phase_ns / NS_PER_S:.6f} s, x(0) = ({x0})")
     for load in loads:
         delay = load.delay_bound_s
+        by_loops = "; ".join(f"{loops}: {_bound(own_s)}" for loops, own_s in load.loop_bounds_s)
         print(
             f"{_COMMENT}{load.key}: {load.begin}{load.rate_bps:.0f} bit/s; "
             f"datagrams that must pass: {load.mandatory_at_least_bps:.0f} to "
             f"{load.mandatory_at_most_bps:.0f} bit/s; delay: "
-            + ("no bound" if delay is None else f"at most {delay:.4g} s in virtual time")
+            + ("no bound" if delay is None else f"{_bound(delay)} in virtual time")
+            + (f" ({by_loops})" if by_loops else "")
         )
     updates = link_load.update_delay(loaded)
     print(
-        f"{_COMMENT}delay of updates in the network: "
-        + (f"at most {updates.largest_s:.4g} s" if math.isfinite(updates.largest_s) else "no bound")
-        + f" in virtual time; the certificates cover {updates.certified_s:.4g} s"
+        f"{_COMMENT}delay of updates in the network: {_bound(updates.largest_s)} in virtual time; "
+        f"the certificates cover {updates.certified_s:.4g} s"
     )
     for line in link_load.load_warnings(loads, loaded):
         print(f"{_COMMENT}warning: {line}")
+
+
+def _bound(delay_s: float) -> str:
+    return f"at most {delay_s:.4g} s" if math.isfinite(delay_s) else "no bound"
 
 
 def _print_plant(console: "Console", resolved: "scenario.Scenario") -> None:

@@ -263,7 +263,8 @@ def _add_channel(image: _Image, resolved: Scenario) -> int:
     of_link |= {"recent_ns": link.recent_width, "losses": link.loss_width}
     of_link |= {"departures_ns": link.departure_places}
     link_at = image.add_structure(link, of_link)
-    of_channel = {"heap": places, "delayed": places, "packets": 1, "releases": 1}
+    of_channel = {"heap": places, "delayed": places, "waiting": places}
+    of_channel |= {"packets": 1, "releases": 1}
     return image.add_structure(channel.core, of_channel, {"links.0": link_at})
 
 

@@ -261,7 +261,7 @@ def cost_of(entry: str) -> str:
 
 
 def _updates(record: RunRecord, from_s: float) -> Rows:
-    packets = record[NETEM_PACKET]
+    packets = record.with_departures(record[NETEM_PACKET])
     counted: Rows = packets[(packets["flow"] == 0) & (packets["now_ns"] >= from_s * NS_PER_S)]
     return counted
 

@@ -7,7 +7,7 @@ from pydantic import Field, FiniteFloat
 
 from noack.core.clock import NS_PER_S
 from noack.impairments.clauses import Clause, Part
-from noack.impairments.feature import QueueDiscipline, Stage
+from noack.impairments.feature import QueueDiscipline, Stage, StageTables
 from noack.impairments.words import COUNT, OWN_TIME_S, time_text
 
 _TimeS = Annotated[FiniteFloat, Field(ge=1e-6, le=3600)]
@@ -48,7 +48,7 @@ class Codel(QueueDiscipline):
             f"{time_text(self.target_s)} for {time_text(self.interval_s)} or longer"
         )
 
-    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int) -> Stage:
+    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables) -> Stage:
         numbers = {
             **bottleneck,
             "target_ns": round(self.target_s * NS_PER_S),

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Literal
 
-from noack.impairments.feature import QueueDiscipline, Stage
+from noack.impairments.feature import QueueDiscipline, Stage, StageTables
 
 
 class TailDrop(QueueDiscipline):
@@ -14,5 +14,5 @@ class TailDrop(QueueDiscipline):
     def meaning(self) -> str:
         return "more are dropped"
 
-    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int) -> Stage:
+    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables) -> Stage:
         return Stage(self.kind, bottleneck, "bottleneck", queue_places)

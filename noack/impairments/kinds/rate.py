@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field, model_validator
 from noack.impairments.clauses import Clause, Part, Word
 from noack.impairments.disciplines import DISCIPLINES, Discipline
 from noack.impairments.disciplines.tail_drop import TailDrop
-from noack.impairments.feature import Impairment, Stage, StageTables
+from noack.impairments.feature import Impairment, Scheduler, Stage, StageTables
 from noack.impairments.words import COUNT, RATE_BPS, SIGNED_COUNT, WordReader, rate_text
 from noack.settings.section import Table
 
@@ -105,6 +105,11 @@ class Rate(Impairment):
         return 8 * line_bytes
 
     @property
+    def scheduler(self) -> Scheduler | None:
+        """The discipline, if it chooses what is sent next when the link is free."""
+        return self.discipline if isinstance(self.discipline, Scheduler) else None
+
+    @property
     def longest_s(self) -> float:
         """Transmission time of a full queue of packets of 1,500 bytes, in seconds."""
         return self.queue * 8 * 1500 / self.rate_bps
@@ -132,7 +137,7 @@ class Rate(Impairment):
 
     def stage(self, tables: StageTables) -> Stage:
         names = {"rate_bps", "overhead_bytes", "cell_bytes", "cell_overhead_bytes"}
-        return self.discipline.queue_stage(self.model_dump(include=names), self.queue)
+        return self.discipline.queue_stage(self.model_dump(include=names), self.queue, tables)
 
     def tc_text(self) -> str:
         cells = (self.cell_bytes, self.cell_overhead_bytes)

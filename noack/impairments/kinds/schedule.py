@@ -9,10 +9,9 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.impairments.clauses import Clause, Part
-from noack.impairments.feature import Impairment, Stage, StageTables, add_numbers
+from noack.impairments.feature import MOST_FLOWS, Impairment, Stage, StageTables, add_numbers
 from noack.impairments.words import COUNT, OWN_TIME_S, list_of, time_text
 
-MOST_FLOWS = 65_535
 _EXAMPLE = "schedule 1,2,1,3 slot 5ms"
 _MOST_SHOWN = 12
 

@@ -71,8 +71,10 @@ def _decide(link: Any, choices: Choices) -> None:
 def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
     """Return a link of numbers that the core accepts, and the arrays that it has; or None."""
     recorded = _RECORDED if choices.below(4) == 1 else ()
+    chain = [choices.one(_COMPUTABLE) for _ in range(choices.below(4))]
+    chosen = [one for one in chain if getattr(one, "scheduler", None)][1:]  # a link has one at most
     settings = LinkSettings.model_construct(
-        impairments=tuple(choices.one(_COMPUTABLE) for _ in range(choices.below(4))),
+        impairments=tuple(one for one in chain if one not in chosen),
         constraints=tuple(choices.one(CONSTRAINED) for _ in range(choices.below(3))),
         mansd=choices.one((None, 0, 1, 5)),
     )

@@ -29,7 +29,7 @@ def specs(arguments: str) -> tuple[LinkSpec, ...]:
     [
         ("", "", "", {}),
         ("'loss 5%' 'mansd 4'", "loss 5% mansd 4", "", {}),
-        ("rate 1mbit -14", "rate 1mbit -14", "", {}),
+        ("rate 1mbit -14 queue 5 --reverse loss 5%", "rate 1mbit -14 queue 5", "loss 5%", {}),
         ("--reverse 'delay 3ms' --seed 3", "", "delay 3ms", {"seed": 3}),
         ("--both loss 5%", "loss 5%", "loss 5%", {}),
         ("loss 5% --seed 7 delay 1ms", "loss 5% delay 1ms", "", {"seed": 7}),

@@ -24,7 +24,7 @@ from noack.core.errors import CallerError
 from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.protocol.record_tables import Fate
 from tests.fuzz.parsers.fates import DOCUMENT, TABLE
-from tests.netem.any_settings import harsh as settings
+from tests.netem.any_settings import harsh
 from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record, spec_of
 from tests.oracles.link import Link
 
@@ -219,7 +219,7 @@ def seen(run: Run) -> list[tuple[int, ...]]:
     return list(map(observable, run.decisions))
 
 
-@given(settings, arrivals, st.booleans())
+@given(harsh.filter(lambda link: not link.chooses), arrivals, st.booleans())
 def test_the_same_arrivals_have_the_same_fates(
     folder: Path, link: LinkSettings, came: list[Arrival], capped: bool
 ) -> None:
@@ -232,7 +232,7 @@ def test_the_same_arrivals_have_the_same_fates(
         assert again.departures == before.departures
 
 
-@given(settings, arrivals, st.data())
+@given(harsh.filter(lambda link: not link.chooses), arrivals, st.data())
 def test_at_other_times_the_delays_are_the_same(
     folder: Path, link: LinkSettings, came: list[Arrival], data: st.DataObject
 ) -> None:

@@ -1,7 +1,7 @@
 """Queues: rates in fractions, CoDel by RFC 8289, mahimahi's opportunities, slots one by one."""
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -12,10 +12,14 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from netem.channel import Channel
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import core
 from noack.impairments.disciplines.codel import Codel
+from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
+from noack.impairments.disciplines.priority import Priority
+from noack.impairments.feature import Scheduler
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.schedule import Schedule
@@ -412,3 +416,96 @@ def test_copies_take_slots_and_a_changed_schedule_goes_on_after_those_that_are_t
     assert decisions == [(0, 0, 2), (0, 4, 6), (0, 8, -1)]
     link.change(settings_of("duplicate 0% schedule 2,1 slot 3ms queue 9"))
     assert link.decide(0, 100, 1).release_ns == 9 * MS
+
+
+def chosen(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[list[int], list[int]]:
+    """Return the departures in ns, and the consecutive losses up to each packet, one by one."""
+    scheduler, free = rate.discipline, Fraction(0)
+    assert isinstance(scheduler, Scheduler)
+    waiting: list[tuple[int, int]] = []
+    found, losses, burst = [-1] * len(arrivals), [], Counter[int]()
+
+    def serve(now_ns: int) -> None:
+        nonlocal free
+        while waiting and int(free) <= now_ns:
+            _, first = waiting.pop(waiting.index(min(waiting)))
+            arrival_ns, _, size = arrivals[first]
+            free = max(free, Fraction(arrival_ns)) + Fraction(bits(rate, size) * NS, rate.rate_bps)
+            found[first] = int(free)
+
+    for number, (now_ns, flow, _) in enumerate(arrivals):
+        serve(now_ns)
+        passes = burst[flow] == mansd or len(waiting) + (int(free) > now_ns) < rate.queue
+        burst[flow] = 0 if passes else burst[flow] + 1
+        losses.append(burst[flow])
+        if passes:
+            key = scheduler.numbers[min(flow, len(scheduler.numbers) - 1)]
+            key += now_ns if isinstance(scheduler, EarliestDeadline) else 0
+            waiting.append((key, number))
+        serve(now_ns)
+    serve(2**60)
+    return found, losses
+
+
+def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
+    """The same of the core."""
+    link = LinkState(settings, 0, "a", rows=4)
+    channel = Channel([link], loops=4)
+    numbers: dict[tuple[int, int], int] = {}
+    found, losses = [-1] * len(arrivals), []
+    for number, (now_ns, flow, size) in enumerate([*arrivals, (2**60, 0, 0)]):
+        while (due_ns := channel.due_ns) <= now_ns:
+            for one in channel.release(due_ns):
+                found[numbers[one.flow, one.number]] = due_ns
+        if number < len(arrivals):
+            numbers[flow, number] = number
+            channel.send(flow, number, size, now_ns)
+            losses.append(link.flow(flow).consecutive_losses)
+    assert link.core.in_flight == 0
+    assert link.counters.delivered_out_of_order == 0
+    return found, losses
+
+
+@given(
+    st.sampled_from([1000, 9_600, 1_000_003, 10**9]),
+    st.integers(1, 6),
+    st.lists(st.integers(0, 3), min_size=1, max_size=4).map(tuple),
+    st.booleans(),
+    st.lists(
+        st.tuples(
+            st.sampled_from([0, 0, 1, 1000, MS, 100 * MS, NS]),
+            st.integers(0, 3),
+            st.sampled_from([0, 72, 1472]),
+        ),
+        max_size=60,
+    ),
+    st.sampled_from([None, 0, 1, 3]),
+)
+def test_the_first_of_what_waits_is_sent_when_the_link_is_free(
+    rate_bps: int, queue: int, numbers: Any, times: bool, steps: Any, mansd: int | None
+) -> None:
+    """Of each flow in order of arrival; at most mansd successive packets of a flow are lost."""
+    discipline: Scheduler = Priority(levels=numbers)
+    if times:
+        discipline = EarliestDeadline(deadlines_s=tuple(number * 0.05 for number in numbers))
+    rate = Rate(rate_bps=rate_bps, queue=queue, discipline=discipline)
+    now = np.cumsum([0, *(gap for gap, *_ in steps)])[1:].tolist()
+    arrivals = [(t, flow, size) for t, (_, flow, size) in zip(now, steps, strict=True)]
+    found = left(LinkSettings(impairments=(rate,), mansd=mansd), arrivals)
+    assert found == chosen(rate, mansd, arrivals)
+    for flow in range(4):
+        of_flow = [t for t, one in zip(found[0], arrivals, strict=True) if one[1] == flow and t > 0]
+        assert of_flow == sorted(of_flow)
+
+
+def test_a_change_makes_the_order_of_what_waits_final() -> None:
+    link = LinkState(settings_of("rate 8mbit 0 queue 9 priority 3,2,1"), 0, "a", rows=3)
+    channel, found = Channel([link], loops=3), []
+    for flow in (0, 0, 1):
+        channel.send(flow, 0, 1000, 0)
+    channel.change(settings_of("rate 4mbit 0 queue 9 priority 3,2,1 delay 10ms"))
+    channel.send(2, 0, 1000, 1)
+    while channel.due_ns < 2**60:
+        due_ns = channel.due_ns
+        found += [(one.flow, due_ns // MS) for one in channel.release(due_ns)]
+    assert found == [(0, 1), (1, 2), (0, 3), (2, 15)]

@@ -1,0 +1,8 @@
+/* Earliest deadline first: whenever the link is free, it sends the waiting packet whose deadline is
+   the earliest. A packet's deadline is a time of its flow after its arrival. */
+#include "../core.h"
+
+void apply_earliest_deadline(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
+    (void)memory;
+    enter_queue(packet, flow_number(packet, stage), 1);
+}

@@ -1,0 +1,109 @@
+/* A bottleneck that chooses, whenever its link is free, which of the waiting packets it sends next:
+   that with the smallest key. So a departure depends on later arrivals.
+
+   Whether a packet is lost is decided at its arrival all the same, and so is the earliest time at
+   which it can leave. What is not lost waits in a heap (a skew heap: Sleator and Tarjan, 1986),
+   whose nodes the relay or the channel has, one for each place of a stored datagram. The packet
+   that is being sent has left the heap; its departure is known. At its departure, and at each
+   arrival, what could begin until then begins (serve). This is soon enough: what begins at a time
+   depends on earlier arrivals only; and no packet leaves before it has been sent, so that while
+   packets wait, there will be a departure. (If a clock ran backward, so that there is none, the
+   next one begins at once.) Constant delays before and after the queue have the same effect, and
+   are added to the departure.
+
+   The guarantee needs none of these times, only an order: a flow's packets leave in the order of
+   their arrival. Their keys do not decrease, so they begin in this order, and none is given a
+   departure before that of an earlier one (first_release_ns, the last departure of the flow). So no
+   packet is ever stale, whatever the other stages do: the losses are those that are decided at the
+   arrivals, which noack_must_pass allows, and no packet needs to be held back for others. */
+#include "core.h"
+
+static int is_before(const noack_waiting *a, const noack_waiting *b) {
+    return a->key < b->key || (a->key == b->key && a->order < b->order);
+}
+
+/* Merge two heaps, each given by its first place + 1; 0: an empty one. */
+static int64_t merge(noack_waiting *waiting, int64_t a, int64_t b) {
+    int64_t root = 0, *end = &root;
+    while (a != 0 && b != 0) {
+        if (is_before(&waiting[b - 1], &waiting[a - 1])) {
+            int64_t other = a;
+            a = b;
+            b = other;
+        }
+        noack_waiting *first = &waiting[a - 1];
+        *end = a;
+        a = first->right;
+        first->right = first->left;
+        end = &first->left;
+    }
+    *end = a != 0 ? a : b;
+    return root;
+}
+
+int64_t flow_number(const packet *packet, const noack_stage *stage) {
+    int64_t row = packet->flow - packet->link->flows, last = stage->bottleneck.flows - 1;
+    return packet->link->integers[stage->bottleneck.begin + min_of(row, last)];
+}
+
+void enter_queue(packet *packet, int64_t key, int is_time) {
+    noack_decision *decision = packet->decision;
+    noack_link *link = packet->link;
+    noack_queue *queue = &link->queues[packet->stage];
+    if (decision->fate != NOACK_DELIVERED)
+        return;
+    noack_queue_enters(link, packet->stage, decision->arrival_ns);
+    if (queue->count + queue->waits >= link->stages[packet->stage].queue_places)
+        refuse(decision, NOACK_OVERFLOWED);
+    if (decision->fate != NOACK_DELIVERED)
+        return;
+    int64_t begin_ns = max_of(queue->entry_ns, queue->busy_until_ns);
+    decision->waits = 1;
+    decision->key = key + (is_time ? queue->entry_ns : 0);
+    decision->after_ns = -(begin_ns + 1);
+    decision->release_ns += begin_ns + 1 - decision->arrival_ns;
+}
+
+void leave_queue(noack_decision *decision) {
+    int64_t least_ns = -decision->after_ns;
+    decision->release_ns = max_of(decision->release_ns, least_ns);
+    decision->after_ns = decision->release_ns - least_ns;
+    if (decision->copy_ns != NOACK_NEVER_NS)
+        decision->copy_ns = max_of(decision->copy_ns, least_ns);
+}
+
+void wait_for_link(
+    noack_link *link, int64_t row, noack_waiting *waiting, int64_t place, int64_t order,
+    const noack_decision *decision) {
+    noack_queue *queue = &link->queues[link->scheduler];
+    waiting[place] = (noack_waiting){
+        .key = decision->key,
+        .order = order,
+        .row = row,
+        .size_bytes = decision->size_bytes,
+        .after_ns = decision->after_ns,
+        .earliest_ns = decision->release_ns,
+    };
+    queue->waiting = merge(waiting, queue->waiting, place + 1);
+    queue->waits++;
+}
+
+void serve(
+    noack_link *link, noack_waiting *waiting, int64_t now_ns, noack_heap_entry *heap,
+    int64_t *count) {
+    if (link->scheduler < 0)
+        return;
+    noack_queue *queue = &link->queues[link->scheduler];
+    while (queue->waiting != 0
+           && (queue->busy_until_ns <= now_ns || link->in_flight == queue->waits)) {
+        int64_t place = queue->waiting - 1;
+        const noack_waiting *next = &waiting[place];
+        noack_flow *flow = &link->flows[next->row];
+        queue->waiting = merge(waiting, next->left, next->right);
+        queue->waits--;
+        int64_t end_ns = noack_queue_serve(link, link->scheduler, next->size_bytes);
+        int64_t leaves_ns = max_of(end_ns + next->after_ns, next->earliest_ns);
+        flow->first_release_ns = max_of(flow->first_release_ns, leaves_ns);
+        heap_push(heap, count, (noack_heap_entry){flow->first_release_ns, next->order, place});
+    }
+}

@@ -1,0 +1,43 @@
+"""Earliest deadline first; see native/impairments/earliest_deadline.c."""
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, FiniteFloat
+
+from noack.core.clock import NS_PER_S
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import MOST_FLOWS, Scheduler
+from noack.impairments.words import OWN_TIME_S, list_of, time_text
+
+
+class EarliestDeadline(Scheduler):
+    """Sends first what has the earliest deadline: its arrival plus a time of its flow."""
+
+    kind: Literal["earliest_deadline"] = "earliest_deadline"
+    deadlines_s: Annotated[
+        tuple[Annotated[FiniteFloat, Field(ge=0, le=3600)], ...],
+        Field(min_length=1, max_length=MOST_FLOWS),
+    ]
+    """The time of each flow from arrival to deadline; the last is that of all further flows. In a
+    run: of each loop. What misses its deadline is sent all the same."""
+
+    clauses: ClassVar = (
+        Clause(
+            "earliest_deadline",
+            "rate 1mbit queue 20 earliest_deadline 10ms,50ms",
+            Part("deadlines_s", list_of(OWN_TIME_S, "times, e.g. 10ms,50ms"), "T,T,..."),
+            implied={"kind": "earliest_deadline"},
+        ),
+    )
+    tc_missing: ClassVar = "the discipline earliest_deadline"
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        return tuple(round(deadline_s * NS_PER_S) for deadline_s in self.deadlines_s)
+
+    def yields_ns(self, flow: int, other: int) -> float:
+        return self.number(flow) - self.number(other)
+
+    def meaning(self) -> str:
+        times = self.shown([time_text(deadline_s) for deadline_s in self.deadlines_s])
+        return f"more are dropped; it sends first what has the earliest deadline, {times} by flow"

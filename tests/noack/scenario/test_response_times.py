@@ -1,0 +1,131 @@
+"""The bounds of a link that chooses what it sends, against a published example and arrivals."""
+
+import math
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from netem.channel import Channel
+from netem.link_state import LinkState
+from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
+from noack.impairments.disciplines.priority import Priority
+from noack.impairments.feature import Scheduler
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_settings import LinkSettings
+from noack.scenario.link_load import link_loads
+from noack.scenario.response_times import Sender, response_ns
+from noack.scenario.scenario_file import load
+
+US = 1000
+LOWER, HIGHER = -math.inf, math.inf
+
+
+@pytest.mark.parametrize(
+    ("own", "others", "expected_us"),
+    [
+        ((2500, 0), {(3500, LOWER): 2}, 2000),
+        ((3500, 0), {(2500, HIGHER): 1, (3500, LOWER): 1}, 3000),
+        ((3500, 0), {(2500, HIGHER): 1, (3500, HIGHER): 1}, 3500),
+    ],
+)
+def test_the_published_response_times(own: Any, others: Any, expected_us: int) -> None:
+    """Messages A, B and C of 1 ms: Davis, Burns, Bril and Lukkien 2007; C's second one is worst."""
+    senders = {Sender(d * US, 1000 * US, after): n for (d, after), n in others.items()}
+    assert response_ns(Sender(own[0] * US, 1000 * US), senders) == expected_us * US
+
+
+def longest_ns(scheduler: Scheduler, sizes: Any, arrivals: Any) -> list[int]:
+    """Return the longest delay of each flow's packets on a link that sends a byte in 1 us.
+
+    Of arrivals at the same time, in us, those with the least second number come first.
+    """
+    rate = Rate(rate_bps=8_000_000, overhead_bytes=0, discipline=scheduler)
+    link = LinkState(LinkSettings(impairments=(rate,)), 0, "x", rows=len(sizes))
+    channel, longest = Channel([link], loops=len(sizes)), [0] * len(sizes)
+    sent_ns: list[list[int]] = [[] for _ in sizes]
+
+    def let_out(until_ns: int) -> None:
+        while (due_ns := channel.due_ns) <= until_ns:
+            for one in channel.release(due_ns):
+                own_ns = due_ns - sent_ns[one.flow][one.number]
+                longest[one.flow] = max(longest[one.flow], own_ns)
+
+    for t_us, _, flow in sorted(arrivals):
+        let_out(t_us * US)
+        sent_ns[flow].append(t_us * US)
+        channel.send(flow, len(sent_ns[flow]) - 1, sizes[flow], t_us * US)
+    let_out(2**60)
+    return longest
+
+
+def bounds_ns(scheduler: Scheduler, sizes: Any, least_us: Any) -> list[float]:
+    flows = range(len(sizes))
+    found = []
+    for flow in flows:
+        kinds: dict[Sender, int] = {}
+        for one in flows:
+            kind = Sender(least_us[one] * US, sizes[one] * US, scheduler.yields_ns(flow, one))
+            kinds[kind] = kinds.get(kind, 0) + (one != flow)
+        others = {kind: count for kind, count in kinds.items() if count}
+        found.append(response_ns(Sender(least_us[flow] * US, sizes[flow] * US), others))
+    return found
+
+
+def scheduler_of(numbers: Any, times: bool) -> Scheduler:
+    if times:
+        return EarliestDeadline(deadlines_s=tuple(number * 40e-6 for number in numbers))
+    return Priority(levels=tuple(numbers))
+
+
+@settings(max_examples=150)
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 40), st.integers(60, 200), st.integers(0, 3)),
+        min_size=1,
+        max_size=5,
+    ),
+    st.booleans(),
+    st.data(),
+)
+def test_no_arrivals_exceed_the_bound(loops: Any, times: bool, data: st.DataObject) -> None:
+    sizes, least_us, numbers = zip(*loops, strict=True)
+    scheduler = scheduler_of(numbers, times)
+    arrivals = []
+    for flow, least in enumerate(least_us):
+        gap_us = st.sampled_from([0, 0, 0, 1, 7]) | st.integers(0, 100)
+        now_us = data.draw(gap_us)
+        for late_us in data.draw(st.lists(gap_us, min_size=1, max_size=12)):
+            arrivals.append((now_us, data.draw(st.integers(0, 9)), flow))
+            now_us += least + late_us
+    longest = longest_ns(scheduler, sizes, arrivals)
+    for own_ns, bound_ns in zip(longest, bounds_ns(scheduler, sizes, least_us), strict=True):
+        assert own_ns <= bound_ns
+
+
+def test_the_loops_of_each_bound_are_named() -> None:
+    """Updates take 2.5 ms each, 10 ms apart; loops 1 to 3 need three quarters of the rate."""
+    file = Path(__file__).parents[3] / "scenarios" / "priority_channel.toml"
+    levels = "network.impairments.0.discipline.levels=[1,2,1,3]"
+    (found,) = link_loads(load(file, [levels, "loops=[{name='p',count=5}]"]))
+    bounds = (("loops 1, 3", 0.0075), ("loop 2", 0.01), ("loops 4 to 5", math.inf))
+    assert found.loop_bounds_s == bounds
+    assert found.delay_bound_s is None
+
+
+@pytest.mark.parametrize("times", [False, True])
+def test_the_bound_is_reached_for_distinct_numbers(times: bool) -> None:
+    """Of 800 starts of three periodic flows, the worst one reaches each bound."""
+    sizes, least_us, scheduler = (30, 20, 50), (131, 173, 307), scheduler_of((1, 3, 5), times)
+    worst = [0, 0, 0]
+    for (second, third), order in product(product(range(0, 200, 10), repeat=2), (1, -1)):
+        starts = (0, second, third)
+        arrivals = [
+            (starts[flow] + k * least_us[flow], order * flow, flow)
+            for flow in range(3) for k in range(4)
+        ]  # fmt: skip
+        worst = [*map(max, worst, longest_ns(scheduler, sizes, arrivals))]
+    assert worst == bounds_ns(scheduler, sizes, least_us) == [80 * US, 100 * US, 100 * US]
