@@ -42,16 +42,16 @@ window.STROKES = [];
 let movedAt = 0;
 const NOTE = event => { movedAt = event.timeStamp; };
 addEventListener("pointermove", NOTE, true);
+const notePainted = at => requestAnimationFrame(() => {
+  const painted = new MessageChannel();  // a message follows when the frame has been painted
+  painted.port1.onmessage = () => STROKES.push(performance.now() - at);
+  painted.port2.postMessage(0);
+});
 const show = LabFigure.prototype.show;
 LabFigure.prototype.show = function (content) {
   show.call(this, content);
-  const at = movedAt;
+  if (movedAt) notePainted(movedAt);
   movedAt = 0;
-  if (at) requestAnimationFrame(() => {  // a message follows when the frame has been painted
-    const painted = new MessageChannel();
-    painted.port1.onmessage = () => STROKES.push(performance.now() - at);
-    painted.port2.postMessage(0);
-  });
 };
 0
 """
@@ -75,11 +75,7 @@ addEventListener("pointermove", event => {
     pen.stroke();
   });
   moved++;
-  requestAnimationFrame(() => {
-    const painted = new MessageChannel();
-    painted.port1.onmessage = () => STROKES.push(performance.now() - event.timeStamp);
-    painted.port2.postMessage(0);
-  });
+  notePainted(event.timeStamp);
 });
 0
 """
@@ -128,15 +124,8 @@ def _strokes_ms(page: Page, prepared: str, x: float, y: float, width: float) -> 
     page.js(prepared)
 
     def mouse(kind: str, share: float) -> None:
-        page.call(
-            "Input.dispatchMouseEvent",
-            type=kind,
-            x=x + share * width,
-            y=y,
-            button="left",
-            buttons=1,
-            clickCount=1,
-        )
+        at = x + share * width
+        page.call("Input.dispatchMouseEvent", type=kind, x=at, y=y, button="left", buttons=1, clickCount=1)
 
     mouse("mousePressed", 0.5)
     time.sleep(1)  # the curve of this place is drawn

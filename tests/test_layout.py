@@ -17,11 +17,11 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 432
+MOST_MODULES = 425
 LINES = {
     "noack/scenario": 3915,
     "noack/controllers": 270,
-    "noack/core": 1585,
+    "noack/core": 1580,
     "noack/disturbances": 220,
     "noack/impairments": 4155,
     "noack/machines": 400,
@@ -30,28 +30,28 @@ LINES = {
     "noack/protocol": 1235,
     "noack/runtime": 5400,
     "noack/settings": 585,
-    "noack/theory": 10605,
+    "noack/theory": 10670,
     "noack/traces": 1320,
     "noack/trigger": 1070,
     "netem": 6500,
-    "cosim/analysis": 8140,
+    "cosim/analysis": 8135,
     "cosim/api": 1680,
-    "cosim/cli": 3340,
+    "cosim/cli": 3320,
     "cosim/doctor": 815,
-    "cosim/interactive": 1640,
+    "cosim/interactive": 1625,
     "cosim/lab": 2120,
     "cosim/live": 3975,
-    "cosim/measurement": 2870,
-    "cosim/output": 8515,
+    "cosim/measurement": 2855,
+    "cosim/output": 8500,
     "cosim/record": 3495,
     "cosim/simulation": 1895,
-    "cosim/studies": 8870,
+    "cosim/studies": 8860,
     "plant_server": 425,
     "sensor_node": 400,
     "controller_node": 415,
-    "benchmarks": 4975,
-    "native": 10725,
-    "tests": 46245,
+    "benchmarks": 4715,
+    "native": 10740,
+    "tests": 45815,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
@@ -60,7 +60,7 @@ says why.
 """
 
 MARKS = {
-    "benchmarks": (39, 9, 0),
+    "benchmarks": (36, 9, 0),
     "cosim": (2, 0, 0),
     "cosim/analysis": (8, 5, 0),
     "cosim/cli": (14, 0, 0),

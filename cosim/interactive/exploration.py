@@ -19,7 +19,7 @@ from cosim.analysis.run_summary import summarise
 from cosim.analysis.value_reduction import decimate_all
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
-from cosim.simulation.continuous import ContinuousRun, LoopState, TooManyEventsError, run_continuous, summary
+from cosim.simulation.continuous import ContinuousRun, LoopState, TooManyEventsError, run_continuous
 from cosim.simulation.exact_simulation import (
     DIVERGED,
     OK,
@@ -189,10 +189,10 @@ def _of_exact(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
     t_s, x, e_s, e_c = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(t_s, kind="stable")
     t_s, x, e_s, e_c = t_s[order], x[order], e_s[order], e_c[order]
-    diverged_at_s = summary(run, resolved).diverged_at_s
+    diverged = run.divergence(even, resolved)
     return Exploration(
         resolved, EXACT, t_s, x, x + e_s, x + e_c, run.system.norms(e_s), run.system.norms(e_c),
-        threshold_at(resolved, t_s), run.event_s, run.delivered, diverged_at_s, cut,
+        threshold_at(resolved, t_s), run.event_s, run.delivered, diverged and diverged.at_s, cut,
     )  # fmt: skip
 
 

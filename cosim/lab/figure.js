@@ -232,7 +232,8 @@ class LabFigure {
   }
 
   show({panels, lengths, numbers, description}) {
-    const bytes = Uint8Array.from(atob(numbers), letter => letter.charCodeAt(0));
+    const text = atob(numbers), bytes = new Uint8Array(text.length);
+    for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
     const columns = [];
     let begin = 0;
     for (const length of lengths) {

@@ -199,7 +199,7 @@ class _Page:
         shown, live = self._shown(), self._source == LIVE
         with suppress(DraftError):  # the mistakes are shown; the sliders stay
             self._controls = controls_of(self._session.draft)
-        parts = self._drawing(shown)
+        parts = self._drawing(shown) | {"note": self._note(shown), "verdict": self._verdict()}
         if self._controls is not None:
             wrong = {one.key for one in self._session.mistakes}
             parts["controls"] = controls_part(self._controls, wrong, live=self._live.is_running)
@@ -208,6 +208,8 @@ class _Page:
             facts: Mapping[str, Sequence[tuple[str, str]]] = {f"this run ({run.kind})": run.numbers}
             if self._source == EXPLORE and self._session.results is not None:
                 facts = self._session.results.facts
+            reference = self._reference()
+            parts["compare"] = reference and compare(reference, run)._asdict()
             parts["facts"] = [[heading, [*map(list, rows)]] for heading, rows in facts.items()]
             parts["states"] = {"names": run.state_names, "chosen": shown.state}
         name = self._live.report if live else self._recorded.chosen * (self._source == RECORDED)
@@ -220,17 +222,10 @@ class _Page:
         )
 
     def _drawing(self, shown: Shown | None) -> dict[str, object]:
-        """Return what is shown anew while a slider is dragged; ``slider`` is its new value."""
-        parts: dict[str, object] = {
-            "source": self._source,
-            "stale": shown is None,
-            "note": self._note(shown),
-            "verdict": self._verdict(),
-        }
+        """Return what is shown anew while a slider is dragged."""
+        parts: dict[str, object] = {"source": self._source, "stale": shown is None}
         if shown is not None:
             parts["figure"] = figure_part(exploration_figure(shown))
-            reference = self._reference()
-            parts["compare"] = reference and compare(reference, shown.run)._asdict()
         return parts
 
     def _note(self, shown: Shown | None) -> str:
@@ -300,7 +295,7 @@ class _Page:
             await self._show()
 
     async def _drawn(self) -> None:
-        """Show a new run at once: the figure, and what is said of it in a few words."""
+        """Show the figure of a new run at once; what is said of it follows when the settings rest."""
         shown = self._shown()
         if self._source != EXPLORE or shown is None:
             await self._show()

@@ -50,7 +50,8 @@ class Stage:
             return
         self._shown |= new
         try:
-            code = f"return labShow({json.dumps(new, ensure_ascii=False)})"
+            # An expression: code with "return" is compiled twice, since it is a function's body.
+            code = f"labShow({json.dumps(new, ensure_ascii=False)})"
             await self._client.run_javascript(code, timeout=_DRAWN_S)
         except TimeoutError:  # a busy browser, or a page that was closed
             self._shown.clear()

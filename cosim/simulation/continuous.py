@@ -226,6 +226,12 @@ class ContinuousRun:
             raise ValueError("times must be in ascending order")
         return self.system.follow(np.array([0.0, *self.event_s]), self.starts, t_s)
 
+    def divergence(self, samples: Samples, resolved: Scenario) -> Divergence | None:
+        """Return how the run diverged, by samples at evenly spaced times; None if it did not."""
+        if self.diverged_at_s is not None:
+            return Divergence(self.diverged_at_s, f"diverged at {self.diverged_at_s:g} s")
+        return divergence([(samples.t_s, samples.x)], len(samples.t_s), [resolved])
+
     def e_s_norm(self, samples: Samples) -> Vector:
         """‖W e_s‖ of samples, (k,)."""
         return self.system.norms(samples.e_s)
@@ -431,7 +437,7 @@ class ContinuousSummary(NamedTuple):
 def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
     """Return the run's numbers."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
-    diverged = _divergence(run, samples, resolved)
+    diverged = run.divergence(samples, resolved)
     arrived = np.flatnonzero(run.delivered)
     drop_runs = np.diff(arrived, prepend=-1, append=len(run.delivered)) - 1
     return ContinuousSummary(
@@ -454,12 +460,6 @@ def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
         exit_status=ExitStatus.OK if diverged is None else ExitStatus.FAILED,
         reason="horizon" if diverged is None else diverged.text,
     )
-
-
-def _divergence(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Divergence | None:
-    if run.diverged_at_s is not None:
-        return Divergence(run.diverged_at_s, f"diverged at {run.diverged_at_s:g} s")
-    return divergence([(samples.t_s, samples.x)], len(samples.t_s), [resolved])
 
 
 def _or_none(statistic: Callable[[Vector], SupportsFloat], values: Vector) -> float | None:

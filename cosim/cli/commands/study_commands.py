@@ -109,10 +109,7 @@ def paper(
         return ExitStatus.OK
     if name is not None:
         if out is not None or draws is not None:
-            raise CallerError(
-                f"--out, --draws: are for `noack paper` without a name; the table of {name} is written "
-                "by --tables FILE"
-            )
+            raise CallerError("--out, --draws: are for `noack paper` without a name; this has --tables FILE")
         with cli.status("computing"):
             found = paper_results.reproduce(name)
         cli.show(json, found.document, published_result.print_rows, found)

@@ -303,11 +303,10 @@ class Reach:
 
     def _afterwards(self, bounds: "_CellBounds") -> float:
         """Bound ‖C z‖ after the last node that is followed, for c = 1."""
-        if self.by.is_none:
-            still = np.zeros(bounds.cells)
-            return self._after_window(bounds.C, still, still, _WINDOWS[0])
-        held = self.by._replace(late=0.0)
-        errors, changes = held.sizes(self.starts.flow.of_error), held.sizes(bounds.disturbed)
+        errors = changes = np.zeros(bounds.cells)
+        if not self.by.is_none:
+            held = self.by._replace(late=0.0)
+            errors, changes = held.sizes(self.starts.flow.of_error), held.sizes(bounds.disturbed)
         return min(self._after_window(bounds.C, errors, changes, share) for share in _WINDOWS)
 
     def _after_window(self, C: Matrix, errors: Vector, changes: Vector, share: float) -> float:

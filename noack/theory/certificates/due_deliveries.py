@@ -20,7 +20,7 @@ cells of time are enclosed (:mod:`noack.theory.bounds.enclosure`).
 import contextlib
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -55,6 +55,8 @@ class Gaps(NamedTuple):
     """All of them are multiples of it."""
     counts: NDArray[np.int64]
     """(k,)"""
+    least_s: float
+    """The shortest one."""
 
     @classmethod
     def of(cls, conditions: NetworkConditions, bound: TriggerBound) -> "Gaps":
@@ -67,15 +69,13 @@ class Gaps(NamedTuple):
         least_s = max(bound.apart_s, step_s)
         if step_s == 0 or not math.isfinite(bound.due_s):
             raise NoCertificateError("events are not due at sampling times")
-        if max(conditions.delay_s, conditions.start_s) > least_s * _ROUNDING:
-            raise NoCertificateError("an update may take effect after the next event")
         least, due = (math.floor(one / step_s + 1e-9) for one in (least_s, bound.due_s))
         if least == due:
-            return cls(least * step_s, np.arange(1, most + 1))
+            return cls(least * step_s, np.arange(1, most + 1), least * step_s)
         if most * due > _MOST_GAPS:
             raise NoCertificateError("too many times between deliveries")
         counts = {n for j in range(1, most + 1) for n in range(j * least, j * due + 1)}
-        return cls(step_s, np.array(sorted(counts)))
+        return cls(step_s, np.array(sorted(counts)), least * step_s)
 
 
 class _Norm(NamedTuple):
@@ -96,12 +96,15 @@ class _Norm(NamedTuple):
     late_aged: Matrix
     """The part of J of the next event that a w of 1 in each cell causes."""
     pulse: Vector
-    """‖Λξ‖ after a gap, and J of the next event, for J = 1."""
+    """‖Λξ‖ after a gap, J of the next event, and what is left of S, for S = 1."""
     late_pulse: Vector
+    left: Vector
+    both: Vector
+    """‖Λξ‖/θ + S after a gap for S = 1."""
     theta: float
     """θ"""
     gain: float
-    """‖Λξ‖ + θJ after a gap, at most, if it was 1."""
+    """‖Λξ‖ + θS after a gap, at most, if it was 1."""
 
 
 class _Loop:
@@ -116,6 +119,10 @@ class _Loop:
         self.BK = np.vstack([BK, -BK])
         fastest = float(np.abs(np.linalg.eigvals(self.F)).max())
         d, longest = conditions.delay_s, int(gaps.counts[-1])
+        self.starts_late = conditions.start_s > gaps.least_s * _ROUNDING
+        if self.starts_late:  # what is delivered before the first input stays in flight until then
+            d = max(d, conditions.start_s)
+        self.delay_s = d
         per_step = math.ceil(gaps.step_s / min(_CELL / fastest, d or math.inf) - 1e-9)
         per_step = max(min(per_step, _MOST_CELLS // (longest + 1)), 1)
         self.cell_s = gaps.step_s / per_step
@@ -125,6 +132,12 @@ class _Loop:
         self.until_s = self.cells * self.cell_s
         self.flows = self._powers(self.F)[:, :, : self.n]
         """e^{Fr} (I; 0) at all nodes, (cells + 1, 2n, n)."""
+        after = np.arange(0, self.late_cells or 1, per_step)
+        after = after[(after == 0) | (after >= gaps.least_s / self.cell_s - 1e-9)]
+        self.windows = self.late_cells - after
+        """Cells for which updates may still be in flight, by times at which their events can have been."""
+        self.shares = self.windows / self.late_cells if self.late_cells else np.ones(1)
+        """What J of these events counts in S."""
         none, still = np.zeros((self.n, self.n)), np.zeros_like(self.R)
         self.outputs = {
             _ERROR: np.hstack([none, plant.error.weight]),
@@ -154,7 +167,7 @@ class _Loop:
 
         C_i = e^{αd} R e^{Hu} at nodes of u from −σ to d + σ.
         """
-        d, s, H = self.conditions.delay_s, self.conditions.hold_s, self.H
+        d, s, H = self.delay_s, self.conditions.hold_s, self.H
         grown = math.exp(self.plant.alpha_per_s * d)
         nodes_s = np.linspace(-s, d + s, 4 * _AGES + 1)
         curvature = 0.0
@@ -191,6 +204,11 @@ class _Loop:
         places = self.ends[:, None] - 1 - np.arange(self.cells)
         return np.asarray(np.where(places >= 0, areas[places.clip(min=0)], 0.0))
 
+    def within_windows(self, areas: Stack) -> Stack:
+        """Sum (…, cells) over the cells of each window, (…, windows)."""
+        sums = np.cumsum(areas, axis=-1)
+        return np.where(self.windows > 0, sums[..., self.windows - 1], 0.0)
+
     @cached_property
     def driven(self) -> Stack:
         """∫‖C e^{F(s−r)} (B; −B) U‖ over r in each cell, for s in each, (outputs, s, r)."""
@@ -216,13 +234,16 @@ class _Loop:
         late = late * _ROUNDING + late_aged @ ages
         aged = self.at_ends(self._response.through(np.hstack([shape, 0 * shape])).area)
         stretch = self._stretch(shape, inverse) + aged @ curved
-        pulse, late_pulse = (one[:, : self.late_cells].sum(axis=1) for one in (aged, late_aged))
-        least = float((pulse / (1 - late_pulse).clip(min=1e-9)).max()) * _ROUNDING or _LEAST
-        thetas = least * _THETAS[:, None]
-        gains = np.maximum(stretch + thetas * late, pulse / thetas + late_pulse).max(axis=1)
+        pulses, late_pulses = (self.within_windows(one) / self.shares for one in (aged, late_aged))
+        left = (self.windows - self.ends[:, None]).clip(min=0) / (self.late_cells or 1) / self.shares
+        least = pulses / (1 - late_pulses - left).clip(min=1e-9)
+        thetas = (float(least.max()) * _ROUNDING or _LEAST) * _THETAS[:, None]
+        both = (pulses / thetas[..., None] + late_pulses + left).max(axis=-1)
+        gains = np.maximum(stretch + thetas * late, both).max(axis=1)
         best = int(gains.argmin())
         return _Norm(
-            shape, bends, ages, stretch, aged, late, late_aged, pulse, late_pulse,
+            shape, bends, ages, stretch, aged, late, late_aged,
+            pulses.max(axis=1), late_pulses.max(axis=1), left.max(axis=1), both[best],
             float(thetas[best, 0]), float(gains[best]),
         )  # fmt: skip
 
@@ -313,6 +334,11 @@ class Deliveries:
                 f"in a norm the loop grows from delivery to delivery: {gain:.3g}, not below 1", gain
             )
         self._x0 = loop.plant.start[:, 0]
+        self._started = 0.0
+        """‖w‖ from the start, which goes on after the next events; 0 if it ends before."""
+        if loop.starts_late:
+            begun = response_until(loop.scaled_H, plant.start, conditions.start_s)
+            self._started = float(begun.through(loop.R).sup_on_grid()) * _ROUNDING
         at_rest = np.vstack([np.linalg.inv(self._norm.shape), np.zeros((n, n))])
         followed = response_until(loop.F, at_rest, loop.until_s, loop.cells)
         C = loop.outputs
@@ -321,10 +347,14 @@ class Deliveries:
         curved = {name: one @ loop.F @ loop.F for name, one in C.items()}
         sags = _highest(followed.through_each(Outputs(curved)))
         self._sags = loop.cell_s**2 / 8 * sags
-        late = loop.driven[..., : loop.late_cells].sum(axis=-1)
-        self._of_late = late
+        self._of_late = (loop.within_windows(loop.driven) / loop.shares).max(axis=-1)
         self._ages_seen = np.zeros_like(self._of_ball)
         self._ages_seen[[*C].index(_INPUT)] = 1.0
+
+    @property
+    def rate_per_s(self) -> float:
+        """The rate at which all bounds decay."""
+        return self._loop.plant.alpha_per_s
 
     @property
     def gain(self) -> float:
@@ -357,34 +387,39 @@ class Deliveries:
     def _sizes(self) -> Vector:
         """Return the bounds of all outputs, (outputs,)."""
         counts, places = self._loop.gaps.counts, int(self._loop.gaps.counts[-1]) + 1
-        highest, first = self._start()
+        # Before, what the start causes is not among the balls yet.
+        settled = max(places, math.ceil(self._loop.conditions.start_s / self._loop.gaps.step_s))
+        highest, of_start = self._start()
         # What follows from the balls of the last times, by their time modulo the longest gap + 1.
-        after = [np.zeros((places, *part.shape)) for part in first]
+        after = [np.zeros((places, *part.shape)) for part in of_start]
         known, gaps = np.zeros(places, dtype=bool), np.arange(len(counts))
-        self._keep(after, known, 0, first)
-        balls, unseen = dict[int, _Ball](), list[_Ball]()
-        for k in range(1, _MOST_TIMES):
-            known[k % places] = False
-            before = (k - counts) % places
-            here = known[before]
-            if not here.any():
-                continue
-            ball = balls[k] = self._enclosing(*(part[before[here], gaps[here]] for part in after))
-            unseen.append(ball)
-            self._keep(after, known, k, self._after(ball))
-            if len(unseen) == _AT_ONCE or k == _MOST_TIMES - 1:
+        _keep(after, known, [0], of_start)
+        balls, unseen, tail = dict[int, _Ball](), list[_Ball](), np.full_like(highest, np.inf)
+        width = int(counts[0])  # so many successive times do not depend on each other
+        for first in range(1, _MOST_TIMES, width):
+            new = list[_Ball]()
+            for k in range(first, first + width):
+                before = (k - counts) % places
+                here = known[before]
+                if here.any():
+                    ball = self._enclosing(*(part[before[here], gaps[here]] for part in after))
+                    new.append(ball._replace(time=k))
+            known[np.arange(first, first + width) % places] = False
+            if new:
+                _keep(after, known, [ball.time for ball in new], self._after(new))
+                balls |= {ball.time: ball for ball in new}
+                unseen += new
+            is_last = first + width >= _MOST_TIMES
+            if len(unseen) >= _AT_ONCE or is_last:
                 highest = np.maximum(highest, self._seen(unseen))
                 unseen.clear()
-                tail = self._tail([balls[s] for s in range(k - places + 1, k + 1) if s in balls])
+                now = first + width - 1
+                if now < settled:
+                    continue
+                tail = self._tail([balls[s] for s in range(now - places + 1, now + 1) if s in balls])
                 if (tail <= highest).all():
                     break
         return np.asarray(np.maximum(tail, highest) * _ROUNDING)
-
-    @staticmethod
-    def _keep(after: list[Stack], known: NDArray[np.bool_], k: int, balls: "_Balls") -> None:
-        for kept, part in zip(after, balls, strict=True):
-            kept[k % len(known)] = part
-        known[k % len(known)] = True
 
     def _enclosing(self, c: Matrix, rho: Vector, J: Vector, both: Vector) -> "_Ball":
         """Return a small ball around balls."""
@@ -397,24 +432,28 @@ class Deliveries:
         most, most_of_both = (float((away + one).max()) * _ROUNDING for one in (rho, both))
         return _Ball(middle, most, float(J.max()), most_of_both, self._norm.theta)
 
-    def _after(self, ball: "_Ball") -> "_Balls":
-        """Return what follows from a ball after each gap."""
-        loop, norm = self._loop, self._norm
-        moved, ages = loop.flows[loop.ends] @ ball.c, self._ages_of(ball.c[None])[0]
-        late = loop.late_sizes(moved[:, loop.n :]) + norm.late_aged @ ages
-        rho, J = ball.corners
-        rho, J = (
-            norm.stretch[:, None] * rho + norm.pulse[:, None] * J + (norm.aged @ ages)[:, None],
-            norm.late[:, None] * rho + norm.late_pulse[:, None] * J + late[:, None],
+    def _after(self, balls: Sequence["_Ball"]) -> "_Balls":
+        """Return what follows from balls after each gap, (k, gaps)."""
+        loop, norm, n = self._loop, self._norm, self._loop.n
+        points, ages = np.array([ball.c for ball in balls]), self._driving(balls)
+        moved = np.einsum("gan,kn->kga", loop.flows[loop.ends], points)
+        late = loop.late_sizes(moved[..., n:].reshape(-1, n)).reshape(moved.shape[:2])
+        late, aged = (late + ages @ norm.late_aged.T)[..., None], (ages @ norm.aged.T)[..., None]
+        corners = np.array([ball.corners for ball in balls])  # (k, 2, corners)
+        rho, J = corners[:, None, 0], corners[:, None, 1]
+        stretch, of_rho, carried = (
+            one[:, None] for one in (norm.stretch, norm.late, norm.late_pulse + norm.left)
         )
-        both = (rho + norm.theta * J).max(axis=1)
-        return _Balls(moved[:, : loop.n], rho.max(axis=1), J.max(axis=1), both)
+        both = stretch * rho + aged + norm.theta * (of_rho * rho + norm.both[:, None] * J + late)
+        rho, J = stretch * rho + norm.pulse[:, None] * J + aged, of_rho * rho + carried * J + late
+        return _Balls(moved[..., :n], rho.max(axis=-1), J.max(axis=-1), both.max(axis=-1))
 
     def _tail(self, balls: "list[_Ball]") -> Vector:
         """Bound all outputs from now on, given the balls within a longest gap."""
         norm, loop = self._norm, self._loop
         size = max(float(np.linalg.norm(norm.shape @ ball.c)) + ball.both for ball in balls)
-        J = float(norm.late.max()) * size / (1 - float(norm.late_pulse.max()))
+        left = 1 - float((norm.late_pulse + norm.left).max())
+        J = float(norm.late.max()) * size / left if left > 0 else math.inf
         J = min(max(J, *(ball.J for ball in balls)), size / norm.theta)
         seen = self._of_ball + self._ages_seen * norm.ages + loop.driven @ norm.ages
         return np.asarray((seen * size + self._of_late * J).max(axis=1))
@@ -426,13 +465,20 @@ class Deliveries:
         weighted = np.linalg.norm(points @ self._norm.shape.T, axis=-1)
         return np.asarray((sizes + self._norm.age_bends * weighted[:, None]) * _ROUNDING)
 
+    def _driving(self, balls: Sequence["_Ball"]) -> Matrix:
+        """Bound ‖w‖ over each cell for ξ = c of each ball, without J, (k, cells)."""
+        loop, times = self._loop, np.array([ball.time for ball in balls])[:, None]
+        cells_s = times * loop.gaps.step_s + loop.cell_s * np.arange(loop.cells)
+        ages = self._ages_of(np.array([ball.c for ball in balls]))
+        return np.asarray(ages + self._started * (cells_s < loop.conditions.start_s))
+
     def _seen(self, balls: "list[_Ball]") -> Vector:
         """Bound all outputs from events with these balls until the next delivery."""
         loop, norm = self._loop, self._norm
         points = np.array([ball.c for ball in balls])
         corners = np.array([ball.corners for ball in balls])[..., None]
         nodes = np.einsum("ran,kn->kra", loop.flows, points)
-        ages = self._ages_of(points)
+        ages, driving = self._ages_of(points), self._driving(balls)
         sizes = np.linalg.norm(points @ norm.shape.T, axis=-1)
         highest = []
         for number, C in enumerate(loop.outputs.values()):
@@ -441,7 +487,7 @@ class Deliveries:
             corner = (of_ball * corners[:, 0] + self._of_late[number] * corners[:, 1]).max(axis=1)
             cells = _of_cells(np.linalg.norm(nodes @ C.T, axis=-1))
             cells = cells + self._sags[number] * sizes[:, None] + corner
-            highest.append((cells + ages @ pushed.T + seen * ages).max())
+            highest.append((cells + driving @ pushed.T + seen * ages).max())
         return np.array(highest)
 
     def _start(self) -> tuple[Vector, "_Balls"]:
@@ -451,14 +497,17 @@ class Deliveries:
         function of this time, is close to a line from 0 to ``added``.
         """
         loop, norm, x0, T = self._loop, self._norm, self._x0, self._loop.conditions.start_s
+        if loop.starts_late:
+            begun = _Ball(x0, 0.0, 0.0, 0.0, norm.theta)
+            return self._seen([begun]), _Balls(*(part[0] for part in self._after([begun])))
         n, alpha = loop.n, loop.plant.alpha_per_s
         free, models = (
             exponential(one * T) @ x0 for one in (loop.plant.A + alpha * np.eye(n), loop.scaled_H)
         )
         first = math.ceil(T / loop.cell_s - 1e-9)
-        begun = np.append(free, models - free) - exponential(loop.F * T)[:, :n] @ x0
+        pushed = np.append(free, models - free) - exponential(loop.F * T)[:, :n] @ x0
         step = exponential(loop.F * loop.cell_s)
-        added = [exponential(loop.F * max(first * loop.cell_s - T, 0.0)) @ begun]
+        added = [exponential(loop.F * max(first * loop.cell_s - T, 0.0)) @ pushed]
         for _ in range(loop.cells - first):
             added.append(step @ added[-1])
         F, BK = loop.F, loop.BK
@@ -509,6 +558,7 @@ class _Ball(NamedTuple):
     J: float
     both: float
     theta: float
+    time: int = 0
 
     @property
     def corners(self) -> Matrix:
@@ -541,6 +591,14 @@ def _shapes(plant: PlantGains) -> Iterator[Matrix]:
         form = solve_continuous_lyapunov(shifted.T, -right)
         with contextlib.suppress(np.linalg.LinAlgError):
             yield np.linalg.cholesky(0.5 * (form + form.T)).T
+
+
+def _keep(after: list[Stack], known: NDArray[np.bool_], times: list[int], balls: _Balls) -> None:
+    """Remember what follows from the balls of some times."""
+    places = np.array(times) % len(known)
+    for kept, part in zip(after, balls, strict=True):
+        kept[places] = part
+    known[places] = True
 
 
 def _highest(kernels: dict[str, KernelBounds]) -> Matrix:

@@ -45,6 +45,9 @@ from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_
 from noack.theory.certificates.loss_accumulation import LossAccumulation
 
 _SIGNALS = 6
+_HELD, _INPUT, _ONE = (np.eye(_SIGNALS)[place] for place in (0, 3, 5))
+_MOST_STAGES = 16
+"""With more missing events π is used for all of them."""
 _EPSILON = float(np.finfo(float).eps)
 
 
@@ -262,7 +265,13 @@ class ErrorInequalities:
         return self._bound.beta if self._bound.unit is None else self._bound.unit
 
     def _signals(
-        self, method: BoundMethod, events: Counts, spacing_s: Vector, own: ErrorGrowth | None
+        self,
+        method: BoundMethod,
+        events: Counts,
+        spacing_s: Vector,
+        own: ErrorGrowth | None,
+        *,
+        staged: bool = True,
     ) -> "_Signals":
         """Return how all outputs depend on (q, b, η, π, sup‖R_E x‖, 1).
 
@@ -273,23 +282,20 @@ class ErrorInequalities:
         sensor = test if own is None else _columns(0.0, own.stretch, 0.0, *own.driven)
         present = {output: self._present(output, own) for output in self._error.outputs}
         received, dropouts = present[Output.GAIN], np.full_like(events, self._conditions.dropouts)
-
-        def missing(output: Output, count: Counts) -> Matrix:
-            return self._missing(output, count, spacing_s, own)
-
-        if method is BoundMethod.DRIFTING:
-            # d ago, e_c consisted of e_s and of the errors of events that are lost.
+        drifts = method is BoundMethod.DRIFTING
+        if drifts:  # d ago, e_c consisted of e_s and of the errors of events that are lost.
             delay_s = self._conditions.delay_s
             present = {output: self._present(output, own, delay_s) for output in present}
-            errors = {output: row + missing(output, dropouts) for output, row in present.items()}
-            earlier, near = errors[Output.GAIN], present[Output.GAIN]
-        else:
-            gone = {output: missing(output, events) for output in present}
-            errors = {output: row + gone[output] for output, row in present.items()}
-            earlier = gone[Output.GAIN]
-            near = received + missing(Output.GAIN, events - dropouts)
+        counted = dropouts if drifts else events
+        stages = self._stages(present[Output.GAIN], counted, spacing_s, own) if staged else None
+        gone = {output: self._missing(output, counted, spacing_s, own, stages) for output in present}
+        errors = {output: row + gone[output] for output, row in present.items()}
         whole = errors[Output.GAIN]
-        lost = whole[..., 1] - near[..., 1]
+        earlier, near = (whole, present[Output.GAIN]) if drifts else (gone[Output.GAIN], received)
+        lost = self._missing_gain(Output.GAIN, counted, spacing_s)
+        if not drifts:
+            near = near + self._missing(Output.GAIN, events - dropouts, spacing_s, own)
+            lost = lost - self._missing_gain(Output.GAIN, events - dropouts, spacing_s)
         alone = self._alone(lost, spacing_s)
         states = []
         for name, (_, gain) in self._states.items():
@@ -314,7 +320,14 @@ class ErrorInequalities:
             driven = self._plant.growths(until_s, COARSE_CELLS)[output].totals
         return _columns(0.0, self._error.now_until(until_s)[output], 0.0, *driven)
 
-    def _missing(self, output: Output, events: Counts, spacing_s: Vector, own: ErrorGrowth | None) -> Matrix:
+    def _missing(
+        self,
+        output: Output,
+        events: Counts,
+        spacing_s: Vector,
+        own: ErrorGrowth | None,
+        stages: "_Stages | None" = None,
+    ) -> Matrix:
         """Return the bound of the part of sup‖C e_c‖ from missing events as a row of the signals.
 
         The part of e_s that has grown since the last test is followed from where it entered.
@@ -327,7 +340,54 @@ class ErrorInequalities:
             for place, kernel in enumerate(self._plant.driven[output]):
                 followed = own.longest_s * sum_of_sups(kernel, events, spacing_s)
                 driven[place] = np.minimum(driven[place], followed)
-        return _columns(0.0, gain, gain, *driven)
+        row = _columns(0.0, gain, gain, *driven)
+        if stages is not None:
+            row[..., 3] = 0.0
+            row = row + stages.entered(*self._entered(output, len(stages.inputs), spacing_s, own), events)
+        return row
+
+    def _entered(
+        self, output: Output, count: int, spacing_s: Vector, own: ErrorGrowth
+    ) -> tuple[Matrix, Matrix]:
+        """Bound how inputs before missing events move C e_c, from the newest event on.
+
+        Returns:
+            Of the inputs since the test before the event, for ‖p‖ ≤ 1, and of those of one second,
+            (count, loops) each.
+        """
+        ages_s = spacing_s[:, None] * np.arange(count)
+        sups = np.broadcast_to(self._plant.driven[output][0].sups(ages_s), ages_s.shape).T
+        gains = self._error.kernels[output].sups(ages_s).T
+        return np.minimum(gains * own.driven[0], own.longest_s * sups), sups
+
+    def _stages(
+        self, present: Matrix, events: Counts, spacing_s: Vector, own: ErrorGrowth | None
+    ) -> "_Stages | None":
+        """Bound ‖p‖ while at most 0, 1, … events are missing; None where π is used instead.
+
+        p since the test before a missing event was caused by fewer missing events, except before an
+        update that was received has taken effect. ``present`` is the part of sup‖K e_c‖ that is not
+        from missing events.
+        """
+        count, delay_s = int(events.max(initial=0)), self._conditions.delay_s
+        if own is None or own.longest_s == 0 or not 0 < count <= _MOST_STAGES or not spacing_s.all():
+            return None
+        sizes, sups = self._entered(Output.GAIN, count, spacing_s, own)
+        shape = len(spacing_s), _SIGNALS
+        late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own.longest_s)
+        still, highest = np.zeros(shape), float(np.max(self._plant.driven[Output.GAIN][0].sup()))
+        stages = _Stages(np.zeros((0, *shape)), late_s)
+        beyond = np.broadcast_to(self._beyond, spacing_s.shape)[:, None] * _ONE
+        for number in range(count):
+            counts = np.full_like(events, number)
+            row = present + _HELD + beyond + self._missing(Output.GAIN, counts, spacing_s, own)
+            late = np.minimum(present[..., 3], highest * (delay_s - number * spacing_s).clip(min=0.0))
+            row[..., 3] = late
+            row = row + (stages.entered(sizes, sups, counts) if number else still)
+            left = 1 - (present[..., 3] - late)[..., None]
+            row = np.where(left > 0, row / np.where(left > 0, left, 1.0), _INPUT)
+            stages = stages._replace(inputs=np.concatenate([stages.inputs, row[None]]))
+        return stages
 
     def _solved(self, signals: "_Signals", growing: ErrorGrowth, own: ErrorGrowth | None) -> Solution:
         """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
@@ -430,7 +490,11 @@ class ErrorInequalities:
         growths = self._growths[0]
         own = growths[0] if len(growths) == 1 else None
         spacing = np.array([spacing_s])
-        return [self._signals(method, events, spacing, own) for method in self.methods]
+        return [
+            self._signals(method, events, spacing, own, staged=staged)
+            for method in self.methods
+            for staged in (False, True)
+        ]
 
     def _missing_gain(self, output: Output, events: Counts, spacing_s: Vector) -> Vector:
         if self._error.decays or math.isinf(self._bound.due_s):
@@ -495,6 +559,29 @@ class ErrorInequalities:
         if (grid_s := self._conditions.spacing_s) == 0:
             return np.asarray(found_s)
         return np.asarray(grid_s * np.maximum(np.ceil(found_s / grid_s - 1e-9), 1.0))
+
+
+class _Stages(NamedTuple):
+    """What bounds ‖p‖ while few events are missing."""
+
+    inputs: Matrix
+    """Of (q, b, η, π, sup‖R_E x‖, 1), while 0, 1, … events are missing, (count, loops, 6)."""
+    late_s: Matrix
+    """For how long after the test before the first, second, … missing event an earlier update may
+    not have taken effect yet, (count, loops)."""
+
+    def entered(self, sizes: Matrix, sups: Matrix, events: Counts) -> Matrix:
+        """Bound what has entered e_c before up to so many missing events, (loops, 6).
+
+        ``sizes`` and ``sups`` are those of :meth:`ErrorInequalities._entered`.
+        """
+        largest = np.zeros(self.inputs.shape[1:])
+        for count in range(1, len(self.inputs) + 1):
+            late = np.minimum(sizes[:count], self.late_s[count - 1 :: -1] * sups[:count])
+            row = np.einsum("kl,klj->lj", sizes[:count] - late, self.inputs[count - 1 :: -1])
+            row[:, 3] += late.sum(axis=0)
+            largest = np.where((count <= events)[:, None], np.maximum(largest, row), largest)
+        return largest
 
 
 class _Signals(NamedTuple):

@@ -1,21 +1,16 @@
-"""An ellipsoid that x never leaves, and what it sharpens in the constants of a certificate.
+"""An ellipsoid that x never leaves.
 
-For the paper's conditions. Given ‖e_c‖_W ≤ D at all times, an ellipsoid ‖Λx‖ ≤ 1 is found that x
-never leaves, by the flow between two deliveries (:mod:`noack.theory.certificates.delivery_flow`).
-It bounds x and E x, and the flow from it bounds K e_c. After an event e_s begins at 0; after r it
-is C_r z(t_k), C_r = (0, I) e^{Fr} − e^{(H+αI)r} (0, I), as long as no update is received. At the
-event z(t_k) is (ξ, 0), or up to it ‖e_c‖_W ≤ D', since one event less is missing than may be. So
-the next event comes later than certified without the flow, and D is smaller with this longer time.
-Every step uses bounds that hold already. Λ comes from a Lyapunov equation with three parameters.
-They are chosen by samples; what they give is checked with all enclosures.
+Given ‖e_c‖_W ≤ D at all times, an ellipsoid ‖Λx‖ ≤ 1 is found that x never leaves, by the flow
+between two deliveries (:mod:`noack.theory.certificates.delivery_flow`). It bounds x and E x, and the
+flow from it bounds K e_c. Λ comes from a Lyapunov equation with three parameters. They are chosen by
+samples; what they give is checked with all enclosures.
 """
 
 import contextlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +19,6 @@ from noack.core.linear_systems import Matrix, Vector, solve_lyapunov, spectral_a
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.terms import MEASURED, Constants, NetworkConditions, Part, TriggerBound
 from noack.theory.certificates.delivery_flow import (
     ROUNDING,
     UNDISTURBED,
@@ -32,13 +26,8 @@ from noack.theory.certificates.delivery_flow import (
     Disturbed,
     Reach,
     Starts,
-    bend_of_error,
-    error_after,
-    errors_after_losses,
 )
 
-_SHARPER = 0.99
-"""Bounds from the flow are computed again if Δ has become smaller by this factor."""
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 _WIDE_MARGINS = (1.0, 1.15, 1.4, 1.8, 2.5, 3.5)
 _FOLLOWED = (0.1, 0.3, 1.0)
@@ -51,62 +40,7 @@ _WIDTHS = (1.5, 1.5, 1.5, 0.8, 0.8, 0.4, 0.4, 0.2)
 _COARSE, _FINE = np.exp(np.arange(-9.0, 13.0, 3.0)), np.exp(np.linspace(-2.0, 2.0, 9))
 """Multipliers μ: all of them, and around the best one."""
 _NODES, _CRITICAL = 16, 4
-_SHORT, _MOST_STEPS = 0.005, 16
 _ILL_CONDITIONED = 1e8
-_LEAST_SHARE = 1e-6
-
-
-def is_reset_flow(part: Part, conditions: NetworkConditions) -> bool:
-    """Return whether a loop without inputs follows each delivery, and a test at every time.
-
-    Its constants can be sharpened.
-    """
-    error, plant, bound, estimation = part
-    is_ideal = conditions == NetworkConditions(conditions.dropouts, constraints=conditions.constraints)
-    is_plain = bound == TriggerBound(bound.beta, bound.reached, bound.shares, unit=bound.unit)
-    is_known = plant.is_one_plant and plant.forcing is None and estimation == MEASURED
-    rates_agree = plant.alpha_per_s == error.alpha_per_s
-    return is_ideal and is_plain and is_known and rates_agree and spectral_abscissa(error.scaled_H) < 0
-
-
-def sharpened_constants(constants: Constants, part: Part, conditions: NetworkConditions) -> Constants:
-    """Return the constants with the bounds from the flow between deliveries."""
-    error, plant, bound, _ = part
-    dropouts, unit = conditions.dropouts, bound.beta if bound.unit is None else bound.unit
-    size = constants.overshoot * unit
-
-    def plain(spacing_s: float | None) -> Vector:
-        """Bound ‖e_c‖_W while at most 0, 1, … events are missing."""
-        missing = [error.missing(Output.WEIGHTED, j, spacing_s or 0.0) for j in range(dropouts + 1)]
-        return (1 + np.array(missing)) * size
-
-    errors = plain(constants.inter_event_s)
-    ellipsoids = InvariantEllipsoids(plant, float(errors[-1]))
-    while True:
-        before = constants
-        known = SharpenedBounds(
-            constants.input_error,
-            constants.state,
-            constants.state_weighted,
-            constants.mismatch,
-            constants.inter_event_s,
-        )
-        known, errors = ellipsoids.sharpened(known, errors, bound.reached, size)
-        errors = np.minimum(errors, plain(known.inter_event_s))
-        delta = float(errors[-1]) / unit
-        constants = constants._replace(**known._asdict(), delta=min(delta, constants.delta))
-        if not constants.delta < _SHARPER * before.delta:
-            return constants
-
-
-class SharpenedBounds(NamedTuple):
-    """Bounds of all times; see :class:`noack.theory.bounds.terms.Constants`."""
-
-    input_error: float
-    state: float
-    state_weighted: float
-    mismatch: float
-    inter_event_s: float | None
 
 
 @dataclass(frozen=True)
@@ -118,44 +52,6 @@ class InvariantEllipsoids:
     """The largest D, for which Λ is chosen."""
     age_gains: Mapping[Output, float] = field(default_factory=dict)
     """gain_C with ‖q‖ ≤ Σ gain_C sup‖C x_c‖, for which Λ is chosen; none if no input is held."""
-
-    def sharpened(
-        self, known: SharpenedBounds, errors: Vector, level: float | None, size: float
-    ) -> tuple[SharpenedBounds, Vector]:
-        """Return the smaller of the known bounds and those from the flow.
-
-        Args:
-            known: bounds that hold.
-            errors: bounds of ‖e_c‖_W while at most 0, 1, … events have been lost.
-            level: ‖e_s‖_W at an event, at least; None if it may be arbitrarily small.
-            size: bound of ‖e_s‖_W.
-        """
-        limit = float(errors[-1])
-        reach = self.within(limit)
-        if reach is None:
-            return known, errors
-        flow, inverse = self.flow, reach.size * reach.starts.inverse
-        gain = self.plant.error.split_K[1] @ flow.inverse
-
-        def of_state(C: Matrix) -> float:
-            return _size(C @ inverse)
-
-        sharper = SharpenedBounds(
-            min(known.input_error, reach.sup(np.hstack([np.zeros_like(gain), gain]))),
-            min(known.state, of_state(flow.inverse)),
-            min(known.state_weighted, of_state(np.eye(flow.n))),
-            min(known.mismatch, of_state(flow.mismatch)),
-            known.inter_event_s,
-        )
-        if level is None or not known.inter_event_s:
-            return sharper, errors
-        at_event = max(float(errors_at_events(errors)[-1]), _LEAST_SHARE * limit)
-        bend = bend_of_error(reach, level)
-        at_events = replace(reach, limit=at_event)
-        next_s = _next_event_s(at_events, level, known.inter_event_s, bend)
-        kernel = self.plant.error.kernels[Output.WEIGHTED]
-        errors = errors_after_losses(reach, errors, size, level, next_s, kernel, bend)
-        return sharper._replace(inter_event_s=next_s), errors
 
     def within(
         self,
@@ -298,42 +194,6 @@ class InvariantEllipsoids:
             squares, _ = _squares(image[last], error[last], best[last, None] * _FINE)
             np.maximum.at(largest, which[last], squares)
         return np.asarray(np.sqrt(largest))
-
-
-def _size(C: Matrix) -> float:
-    return float(np.linalg.norm(C, 2)) * ROUNDING
-
-
-def errors_at_events(errors: Vector) -> Vector:
-    """Bound ‖e_c‖_W after each event: 0 if it is received; a lost one was not missing before."""
-    return np.append(0.0, errors[:-1])
-
-
-def _next_event_s(at_events: Reach, level: float, known_s: float, bend: float) -> float:
-    """Return a time before which ‖e_s‖_W cannot reach ``level`` after an event.
-
-    It is at least the known one. Over a step s, e_s differs from its chord by at most s²/8 times a
-    bound of its second derivative, which holds as long as ‖e_s‖_W is below the level.
-    """
-    flow, found_s = at_events.starts.flow, known_s
-    if not (0 < known_s < math.inf and 0 < bend < math.inf):
-        return known_s
-    size, tries = at_events.sup(error_after(flow, found_s)), 0
-    slope = size / found_s
-    while size < level:
-        step_s = min(math.sqrt(4 * (level - size) / bend), found_s)
-        if slope * step_s > 0.99 * (level - size):
-            step_s = 0.99 * (level - size) / slope
-        while tries < _MOST_STEPS and step_s > _SHORT * found_s:
-            later, tries = at_events.sup(error_after(flow, found_s + step_s)), tries + 1
-            if max(size, later) + step_s**2 / 8 * bend < level:
-                break
-            step_s *= 0.6
-        else:
-            return found_s
-        slope = (later - size) / step_s
-        found_s, size = found_s + step_s, later
-    return found_s
 
 
 def _squares(image: Stack, error: Stack, multipliers: Matrix) -> tuple[Vector, Vector]:

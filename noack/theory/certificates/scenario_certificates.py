@@ -225,16 +225,17 @@ class CertificateScope:
             NoCertificateError: there is no certificate.
             NotDecayingError: a mode of the loop decays too slowly.
         """
-        timed = self._timed(conditions)
         try:
             found = yield from self._solved(conditions, longest=True)
-        except (NoCertificateError, NotDecayingError):
-            if timed is None:
-                raise
-            found = []
+        except (NoCertificateError, NotDecayingError) as error:
+            found, void = [], error
+        apart_s = max((first.inter_event_s or 0.0 for first, _, _ in found), default=0.0)
+        timed = self._timed(conditions, apart_s)
         if timed is None:
+            if not found:
+                raise void
             return found
-        apart_s = max(one.inter_event_s or 0.0 for one in (timed, *(first for first, _, _ in found)))
+        apart_s = max(apart_s, timed.inter_event_s or 0.0)
         useful = [phases for phases in found if not _is_within(timed, phases[0])]
         return [(timed._replace(inter_event_s=apart_s), None, None), *useful]
 
@@ -252,13 +253,22 @@ class CertificateScope:
         except (OverflowError, np.linalg.LinAlgError):
             raise NoCertificateError(_TOO_LARGE) from None
 
-    def _timed(self, conditions: NetworkConditions) -> Constants | None:
-        """Return constants that follow from the times of deliveries alone, if they exist."""
-        found = [one.constants(self._trigger.beta or 1.0) for one in self._deliveries(conditions)]
-        return min(found, key=lambda one: tenth_s(one, self._start), default=None)
+    def _timed(self, conditions: NetworkConditions, apart_s: float) -> Constants | None:
+        """Return constants that follow from the times of deliveries alone, if they exist.
+
+        ``apart_s``: events are known to be that far apart.
+        """
+        found, soonest_s = None, math.inf
+        for one in self._deliveries(conditions, apart_s=apart_s):
+            if math.log(10) / one.rate_per_s >= soonest_s:
+                break  # a slower rate needs longer, since no bound of ‖x‖ is below ‖x(0)‖
+            constants = one.constants(self._trigger.beta or 1.0)
+            if (later_s := tenth_s(constants, self._start)) < soonest_s:
+                found, soonest_s = constants, later_s
+        return found
 
     def _deliveries(
-        self, conditions: NetworkConditions, shares: Sequence[float] = _TIMED_RATES
+        self, conditions: NetworkConditions, shares: Sequence[float] = _TIMED_RATES, apart_s: float = 0.0
     ) -> Iterator[Deliveries]:
         """Yield what is known of the deliveries where events are due, for each rate that is tried."""
         trigger, loop = self._trigger, self._loop
@@ -272,7 +282,9 @@ class CertificateScope:
             plant = self._plant_at(error_gains(loop, rate), self._start, rate)
             if plant.is_one_plant:
                 with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
-                    yield Deliveries(plant, tested, trigger.bound(tested, 0.0, None))
+                    bound = trigger.bound(tested, 0.0, None)
+                    bound = bound._replace(apart_s=max(bound.apart_s, apart_s))
+                    yield Deliveries(plant, tested, bound)
 
     def _phases(
         self, conditions: NetworkConditions, *, longest: bool

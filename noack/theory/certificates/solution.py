@@ -3,9 +3,8 @@
 The bounds are the solution of the inequalities of :mod:`noack.theory.certificates.inequalities`.
 The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
 assumed δ gives a time of at least δ, it holds by induction over the events; the largest such δ is
-used. Under the paper's conditions the constants are sharpened by the flow between two deliveries
-(:mod:`noack.theory.certificates.invariant_ellipsoids`), and those of a schedule by the flow between
-updates (:mod:`noack.theory.certificates.scheduled_flow`).
+used. The constants are sharpened by the flow between two updates
+(:mod:`noack.theory.certificates.scheduled_flow`).
 """
 
 import contextlib
@@ -31,7 +30,6 @@ from noack.theory.bounds.terms import (
 )
 from noack.theory.bounds.trigger_bounds import LONGEST_S
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
-from noack.theory.certificates.invariant_ellipsoids import is_reset_flow, sharpened_constants
 from noack.theory.certificates.scheduled_flow import is_scheduled_flow, scheduled_constants
 
 _SETTLED = 1e-3
@@ -161,9 +159,6 @@ def sharpened(problem: Problem) -> Search[Constants]:
     (constants,) = yield problem
     (part,), conditions, *_ = problem
     is_plain = problem.structured and problem.earlier_error == 0.0
-    if problem.longest and is_plain and is_reset_flow(part, conditions):
-        with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
-            return sharpened_constants(constants, part, conditions)
     if problem.longest and is_plain and is_scheduled_flow(part, conditions):
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
             return scheduled_constants(constants, part, conditions)

@@ -17,7 +17,7 @@ from noack.core.linear_systems import Matrix
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
-from noack.theory.certificates import invariant_ellipsoids
+from noack.theory.certificates import scheduled_flow
 from noack.theory.certificates.delivery_flow import UNDISTURBED, DeliveryFlow, Reach
 from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
 from noack.theory.certificates.scheduled_flow import _ScheduledFlow
@@ -45,7 +45,7 @@ def only_the_start() -> AbstractContextManager[Any]:
 
 def no_lost_updates() -> AbstractContextManager[Any]:
     """At an event e_c is 0."""
-    return patch.object(invariant_ellipsoids, "errors_at_events", np.zeros_like)
+    return patch.object(scheduled_flow, "errors_at_events", np.zeros_like)
 
 
 def no_mismatch() -> AbstractContextManager[Any]:

@@ -10,12 +10,14 @@ from collections.abc import Callable
 from functools import partial
 from itertools import product
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, constant_kernel
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.bounds.terms import Constants, NoCertificateError
+from noack.theory.certificates.inequalities import ErrorInequalities
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.oracles.lossy_loops import (
     Flags,
@@ -67,6 +69,29 @@ class NoGrowthOfMissing(PlantGains):
     def driven(self) -> dict[Output, tuple[KernelBounds, KernelBounds]]:  # type: ignore[override]
         none = constant_kernel(0.0)
         return dict.fromkeys(self.error.outputs, (none, none))
+
+
+def inputs_of_no_missing_event(system: System) -> Constants:
+    """Bounds what enters before every missing event as while no event is missing."""
+    true = ErrorInequalities._stages
+
+    def wrong(*args: Any) -> Any:
+        found = true(*args)
+        return found and found._replace(inputs=np.broadcast_to(found.inputs[:1], found.inputs.shape))
+
+    with patch.object(ErrorInequalities, "_stages", wrong):
+        return system.certify()
+
+
+def _grown_by_losses(rng: np.random.Generator) -> System:
+    """One state; each lost update lets the next error grow faster."""
+    near = rng.uniform(0.97, 1.03, 3)
+    gain = 12.0 * near[0]
+    return System(
+        A=np.array([[gain - 1.98]]), B=np.eye(1), K=np.array([[-gain]]), H=np.array([[-2.0]]),
+        weight=np.eye(1), x0=near[1:2], alpha=0.3, beta=0.01, known_start=True, mansd=6,
+        step_s=0.04 / 3 * near[2], sample_steps=3, delay_steps=0, hold_steps=0, lag_steps=0,
+    )  # fmt: skip
 
 
 class NoCurvature(ErrorGains):
@@ -225,5 +250,10 @@ DECAYING = Kind(
     {
         name: Broken(certified_by(certify), partial(random_system, **where))
         for name, (certify, where) in MUTANTS.items()
+    }
+    | {
+        "what enters is that of no missing event": Broken(
+            certified_by(inputs_of_no_missing_event), _grown_by_losses
+        )
     },
 )  # fmt: skip

@@ -389,6 +389,11 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
     "self_triggered, no late update": (
         "self_triggered", without("delay_s"), {**LATE, "delay_steps": 2, "hold_steps": 0},
     ),
+    "self_triggered, no updates in flight at the next events": (
+        "self_triggered", without("delay_s"), {
+            **LATE, "sample_steps": 1, "delay_steps": 6, "hold_steps": 0, "step_share": 0.03,
+        },
+    ),
     "lyapunov, no start without an input": (
         "lyapunov", without("start_s"), {
             **LATE, "delay_steps": 2, "hold_steps": 0, "mismatch": 0.0, "known_start": False,
