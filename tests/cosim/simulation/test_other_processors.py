@@ -8,10 +8,8 @@ import pytest
 
 _PRINT_DIGESTS = """
 import hashlib
-from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
+from tests.shipped import resolved
 for name in ("lane_following", "f16_lateral", "unstable_pendulum"):
     record = simulate(resolved(name, "horizon_s=2"))
     for table in sorted(record.tables):

@@ -2,7 +2,6 @@
 
 import math
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,7 +17,7 @@ from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario.link_load import link_loads
 from noack.scenario.response_times import Sender, response_ns
-from noack.scenario.scenario_file import load
+from tests.shipped import shipped
 
 US = 1000
 LOWER, HIGHER = -math.inf, math.inf
@@ -108,9 +107,8 @@ def test_no_arrivals_exceed_the_bound(loops: Any, times: bool, data: st.DataObje
 
 def test_the_loops_of_each_bound_are_named() -> None:
     """Updates take 2.5 ms each, 10 ms apart; loops 1 to 3 need three quarters of the rate."""
-    file = Path(__file__).parents[3] / "scenarios" / "priority_channel.toml"
     levels = "network.impairments.0.discipline.levels=[1,2,1,3]"
-    (found,) = link_loads(load(file, [levels, "loops=[{name='p',count=5}]"]))
+    (found,) = link_loads(shipped("priority_channel", levels, "loops=[{name='p',count=5}]"))
     bounds = (("loops 1, 3", 0.0075), ("loop 2", 0.01), ("loops 4 to 5", math.inf))
     assert found.loop_bounds_s == bounds
     assert found.delay_bound_s is None
