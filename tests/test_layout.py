@@ -51,7 +51,7 @@ LINES = {
     "controller_node": 415,
     "benchmarks": 4710,
     "native": 10970,
-    "tests": 46130,
+    "tests": 46125,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
