@@ -111,7 +111,7 @@ class QuickLoop:
         whole = self._periods[0][1]
         for _, delivered in self._periods[1:]:
             whole = delivered.after(whole)
-        if not np.isfinite(whole.M).all() or not _radius(whole.M) < 1 - 1e-9:
+        if not np.isfinite([whole.M, whole.C]).all() or not _radius(whole.M) < 1 - 1e-9:
             return np.inf
         z0 = np.concatenate([x0, x0, np.zeros(2 * self._m)])
         return float(z0 @ solve_discrete_lyapunov(whole.M.T, whole.C) @ z0)

@@ -111,7 +111,7 @@ class Reached(NamedTuple):
     found: Stability | None
     """The certificate there; None: there is none."""
     beyond: Stability | None
-    """What is known about the next rung; None: there is none, or it was not examined."""
+    """What is known about the next rung; None: there is none, or its cost is above the limit."""
     cost: float
     """Without losses; infinite: the loop is unstable then."""
 
@@ -300,13 +300,16 @@ class NetworkSearch:
         return self.completed(self.given, top)
 
     def completed(self, candidate: Candidate, most: int) -> Reached:
-        """Return a loop with refined bounds on its rung and on the next one."""
+        """Return a loop with refined bounds on its rung and on the next one.
+
+        A designed loop stays on a rung beyond which its cost would exceed the limit.
+        """
         rung = most
         found = None
         while rung >= 0 and (found := self.judge(candidate, rung)).verdict != "stable":
             rung, found = rung - 1, None
-        beyond = None
-        while rung + 1 < len(self.ladder):
+        beyond, limit = None, math.inf if candidate == self.given else self.limit
+        while rung + 1 < len(self.ladder) and self.cost(candidate, rung + 1) <= limit:
             beyond = self.judge(candidate, rung + 1)
             if beyond.verdict != "stable":
                 break
@@ -469,8 +472,10 @@ def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> De
 
 
 def _beyond(ladder: Sequence[Rung], one: Reached) -> str:
-    if one.beyond is None:
+    if one.rung + 1 == len(ladder):
         return "not examined"
+    if one.beyond is None:
+        return f"{ladder[one.rung + 1].name}: costs too much"
     destabilised = one.beyond.verdict == "destabilised"
     what = f"{one.beyond.text} destabilises" if destabilised else "undecided"
     return f"{ladder[one.rung + 1].name}: {what}"

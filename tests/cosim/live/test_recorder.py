@@ -254,7 +254,7 @@ def test_a_violation_is_reported_once_and_recorded(outage: RunRecord, late: Run)
         late.send_until(outage, until_ns)
         late.recorder.show()
     cause = "an input was 0.101 s old, 0.007 s allowed"
-    line = f"later than allowed from 0.506 s on: {cause}; there are certificates for up to 0.06439 s"
+    line = f"later than allowed from 0.506 s on: {cause}; there are certificates for up to 0.06441 s"
     assert late.warnings == [[]] * 5 + [[line]] * 6
     notices = late.finished().notices
     assert notices == [{"t_ns": 506_000_000, "level": "late", "text": line, "process": "recorder"}]

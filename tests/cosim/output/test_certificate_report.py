@@ -66,7 +66,7 @@ def test_the_documentation_quotes_computed_figures(lane: Certificates, weighted:
     message = f"Δ = {live.delta:.3g}, X = {live.state:.3g} and δ = {least_ms:.0f} ms"
     assert message in " ".join(text.split())
     limits = weighted.limits
-    assert f"sampling periods up to {1e3 * limits.sampling_s:.0f} ms" in text
+    assert f"sampling periods up to {1e3 * limits.sampling_s:.3g} ms" in text
 
 
 def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume() -> None:
