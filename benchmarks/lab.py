@@ -176,7 +176,7 @@ def stroke(options: argparse.Namespace) -> Iterator[Row]:
     for name, processes, goal_ms in (("idle", 0, 60), (f"{_BUSY} busy processes", _BUSY, 120)):
         say(name)
         with (
-            tempfile.TemporaryDirectory(prefix="noack-bench-") as folder,
+            tempfile.TemporaryDirectory(prefix="noack-bench-", ignore_cleanup_errors=True) as folder,
             _opened(Path(folder), "--set", "horizon_s=20") as page,
             _busy(processes),
         ):
@@ -198,7 +198,7 @@ def lab(options: argparse.Namespace) -> Iterator[Row]:
     rounds, sides, roles = Rounds(), (ALONE, OPEN, DRAGGED, VIEWED), ("plant", "controller")
     for i, side in itertools.product(range(ROUNDS), sides):
         say(f"round {i + 1} of {ROUNDS}: {side}")
-        with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
+        with tempfile.TemporaryDirectory(prefix="noack-bench-", ignore_cleanup_errors=True) as folder:
             summary = summary_of(side, Path(folder))
         if summary["exit"]["status"] != 0:
             raise MeasurementError(f"the run ended: {summary['exit']['reason']}")
