@@ -45,7 +45,7 @@ LINES = {
     "cosim/output": 8500,
     "cosim/record": 3525,
     "cosim/simulation": 1895,
-    "cosim/studies": 8860,
+    "cosim/studies": 8865,
     "plant_server": 425,
     "sensor_node": 400,
     "controller_node": 415,
