@@ -20,7 +20,7 @@ from typing import Any
 from benchmarks.programs import FREE_PORTS, noack
 from benchmarks.report import Goal, MeasurementError, Rounds, Row, benchmark, median, say
 from tests.cosim.lab.conftest import TEXT, Page, Served
-from tools.screenshot_recording import BROWSERS, Browser
+from tools.screenshot_recording import BROWSERS, EMULATED_CARD, Browser
 
 ROUNDS = 1
 HORIZON_S = 10.0
@@ -83,12 +83,12 @@ addEventListener("pointermove", event => {
 
 
 @contextmanager
-def _opened(folder: Path, *settings: str) -> Iterator[Page]:
+def _opened(folder: Path, *settings: str, card: tuple[str, ...] = EMULATED_CARD) -> Iterator[Page]:
     """Show the lab page in a headless browser."""
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
         raise MeasurementError("no Chromium or Chrome")
-    browser = Browser(program, str(folder / "profile"))
+    browser = Browser(program, str(folder / "profile"), card)
     try:
         with closing(browser), Served(folder, "lane_following", *settings, *FREE_PORTS) as server:
             page = Page(browser, server.address)
@@ -170,14 +170,15 @@ def _busy(processes: int) -> Iterator[None]:
 def stroke(options: argparse.Namespace) -> Iterator[Row]:
     """Measure the median time from a move of a dragged slider until its curve is painted.
 
-    A frame of the browser is 17 ms. It draws by the processor, without a graphics card. Beside it,
-    the time of a page that has only the same canvases, draws a curve in each and asks nobody.
+    A frame of the browser is 17 ms. It draws by the processor, as it does without a graphics card;
+    none is emulated, as the viewer would need. Beside it, the time of a page that has only the same
+    canvases, draws a curve in each and asks nobody.
     """
     for name, processes, goal_ms in (("idle", 0, 60), (f"{_BUSY} busy processes", _BUSY, 120)):
         say(name)
         with (
             tempfile.TemporaryDirectory(prefix="noack-bench-", ignore_cleanup_errors=True) as folder,
-            _opened(Path(folder), "--set", "horizon_s=20") as page,
+            _opened(Path(folder), "--set", "horizon_s=20", card=()) as page,
             _busy(processes),
         ):
             place = page.js(_BOX)

@@ -34,11 +34,10 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
     "--hide-scrollbars",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
     "--remote-debugging-pipe",
 )
+EMULATED_CARD = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""The viewer needs a graphics card. An emulated one also draws every page, at a high cost."""
 # The browser reads its commands from descriptor 3 and writes its answers to descriptor 4.
 PLACE_PIPES = """
 import fcntl, os, sys
@@ -53,12 +52,12 @@ POLL_S, SETTLE_S, LIMIT_S = 0.5, 2.5, 300.0
 class Browser:
     """A headless browser, controlled by messages of the Chrome DevTools Protocol."""
 
-    def __init__(self, program: str, profile: str) -> None:
+    def __init__(self, program: str, profile: str, card: tuple[str, ...] = EMULATED_CARD) -> None:
         from_us, to_browser = os.pipe()
         from_browser, to_us = os.pipe()
         ends = [str(from_us), str(to_us)]
         self.process = subprocess.Popen(
-            python_command("-c", PLACE_PIPES, *ends, program, *FLAGS, f"--user-data-dir={profile}"),
+            python_command("-c", PLACE_PIPES, *ends, program, *FLAGS, *card, f"--user-data-dir={profile}"),
             pass_fds=(from_us, to_us),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
