@@ -30,7 +30,7 @@ LINES = {
     "noack/protocol": 1240,
     "noack/runtime": 5400,
     "noack/settings": 585,
-    "noack/theory": 10670,
+    "noack/theory": 10675,
     "noack/traces": 1320,
     "noack/trigger": 1070,
     "netem": 6525,

@@ -155,7 +155,10 @@ def _is_below(operator: "csc_array[np.float64]", bound: float, size: int) -> boo
     """Return whether X_j > 0 with operator(X) < bound X prove that a bound is one, to rounding."""
     entries = operator.shape[0]
     identity = triangles(np.tile(np.eye(size), (2 * entries // (size * (size + 1)), 1, 1)))
-    solution = resolved_by(operator, bound, identity)
+    try:
+        solution = resolved_by(operator, bound, identity)
+    except RuntimeError:  # singular by rounding
+        return False
     forms, images = (from_triangles(part, size) for part in (solution, np.asarray(operator @ solution)))
     longest = int(np.diff(operator.tocsr().indptr).max())
     sizes = np.abs(solution)
