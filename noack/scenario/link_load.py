@@ -176,10 +176,8 @@ def _by_loops(delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
     """Yield each bound of a delay, with the loops that have it, such as ``loops 1, 3 to 5``."""
     for delay_s in dict.fromkeys(delays_s):
         loops = {loop for loop, own_s in enumerate(delays_s, 1) if own_s == delay_s}
-        begins, ends = (
-            sorted(loops - {loop + 1 for loop in loops}),
-            sorted(loops - {loop - 1 for loop in loops}),
-        )
+        begins = sorted(loops - {loop + 1 for loop in loops})
+        ends = sorted(loops - {loop - 1 for loop in loops})
         spans = (str(a) if a == b else f"{a} to {b}" for a, b in zip(begins, ends, strict=True))
         yield f"loop{'s' * (len(loops) > 1)} {', '.join(spans)}", delay_s
 
