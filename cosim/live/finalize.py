@@ -29,6 +29,7 @@ from cosim.analysis.summary_model import (
 from cosim.live.end_helpers import EndHelpers, PreparedEnding
 from cosim.live.progress import work_bar
 from cosim.output.viewer.rerun_program import is_installed, require_viewer
+from cosim.record.align import align_together
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
@@ -233,6 +234,7 @@ def _judged_loops(
 ) -> list[_Judged]:
     """Judge some loops, of which expectations may be known; ``beside`` replays the only one."""
     records = run.together(block)
+    align_together(records)
     expected = known or _expectations([one.scenario for one in records])
     shared = SharedMachines(records if len(block) > 1 else ())
     judged, claims = [], [*map(claims_of, records)]

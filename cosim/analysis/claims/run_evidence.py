@@ -28,16 +28,8 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
-from cosim.analysis.loop_statistics import SampleFacts, SampleFactsReader, shares_update, signal_statistics
-from cosim.record.align import (
-    UNKNOWN,
-    AlignedRun,
-    EventFollower,
-    SinceEvent,
-    aligned_parts,
-    bounded_parts,
-    identity_residual,
-)
+from cosim.analysis.loop_statistics import SampleFacts, SampleFactsReader, signal_statistics
+from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Matrix, Propagator, all_entries, row_norms, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
@@ -128,17 +120,14 @@ class RunEvidence:
         """Yield all measurements in order, part by part."""
         scenario = self.record.scenario
         last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
-        for part, bounds in bounded_parts(self.record):
+        for part, shared, both, residual, known in bounded_parts(self.record):
             rows, joined = part.rows, part.aligned
-            common = shares_update(scenario, joined)
-            both = (np.where(common, one, np.nan) for one in (bounds.identity, bounds.printed))
-            residual = identity_residual(scenario, joined, bounds.missed)
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
             true_x = joined.x if part.true_x is None else part.true_x
-            since = follower.take(rows, joined)
-            yield Samples(joined, common, tuple(both), residual, true_x, passed, since)
+            since = known or follower.take(rows, joined)
+            yield Samples(joined, shared, both, residual, true_x, passed, since)
 
     @cached_property
     def lost_in_rounding(self) -> VoidFrom | None:
