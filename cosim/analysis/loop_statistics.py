@@ -138,7 +138,8 @@ VIOLATION = "violation"
 def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
     """Return the number of lost updates by cause, without causes of no losses."""
     fates = outcomes.fate
-    causes = {one.name.lower(): int((fates == one).sum()) for one in Fate if not one.effective}
+    counts = Counter(fates.tolist())
+    causes = {one.name.lower(): counts[one] for one in Fate if not one.effective}
     causes["delivered_out_of_order"] = int((effective(fates) & outcomes.lost).sum())
     return {cause: n for cause, n in causes.items() if n}
 

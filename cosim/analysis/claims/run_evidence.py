@@ -176,10 +176,11 @@ class RunEvidence:
         generator is sent the certificates of each, and returns those of the latest time. A
         certificate holds for every run that meets its conditions, whenever they were chosen.
         """
-        whole, allowed, until_s = self.part.whole or self.record, self._allowed, self.part.until_s
+        whole, until_s = self.part.whole or self.record, self.part.until_s
         # Rows that are missing may be later.
         if not all(map(whole.is_complete, LOOP_ROLES)) or not any(map(_exists, self._scheduled)):
             return None
+        allowed = self.allowed
         times_s = [t_s for t_s in self.observed.later_times(allowed) if t_s < until_s]
         widest = self.observed.widened(allowed, until_s)
         if not times_s or widest == allowed:
@@ -257,9 +258,9 @@ class RunEvidence:
         """The assumptions that the run violated, the guarantee included, each at the first time."""
         scenario = self.record.scenario
         rules = {*guarantee_causes(scenario)}
-        found = self.observed.violations(self._allowed, {*causes_of(scenario)} - rules)
+        found = self.observed.violations(self.allowed, {*causes_of(scenario)} - rules)
         # An update that a newer one replaced within the certified delay is not lost.
-        found += self.observed.violations(self.certified_for or self._allowed, rules)
+        found += self.observed.violations(self.certified_for or self.allowed, rules)
         return [one for one in found if one.t_s < self.part.until_s]
 
     @cached_property
@@ -330,14 +331,16 @@ class RunEvidence:
         return {}
 
     @cached_property
-    def _allowed(self) -> NetworkConditions:
+    def allowed(self) -> NetworkConditions:
         """The conditions of the scenario's certificates."""
         allowed = allowed_conditions(self.record.scenario)
         return allowed if self.part.start_error is None else allowed._replace(start_s=0.0)
 
     @cached_property
     def _schedule(self) -> NetworkConditions:
-        return nominal_conditions(self.record.scenario)
+        scenario, is_allowed = self.record.scenario, self.part.start_error is None
+        is_allowed &= not scenario.certificate.late_periods
+        return self.allowed if is_allowed else nominal_conditions(scenario)
 
     @cached_property
     def theorem_2(self) -> Theorem2 | None:
