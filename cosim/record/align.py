@@ -15,14 +15,14 @@ If a controller dies, there is no x_c until the restarted controller has its fir
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache
-from itertools import pairwise
+from operator import itemgetter
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.loop_line import SPAN, Columns, LoopLine, lines_of
+from cosim.record.loop_line import SPAN, Columns, LoopLine
 from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
@@ -318,11 +318,10 @@ _TOGETHER = WeakKeyDictionary[RunRecord, BoundedPart]()
 """Loops that were aligned together."""
 
 
-def align_together(records: Sequence[RunRecord]) -> None:
+def align_line(line: LoopLine) -> None:
     """Align like loops at once; they are kept as long as their records."""
-    for line in lines_of(records):
-        with suppress(ValueError):  # damaged: each loop is aligned alone
-            _TOGETHER.update(dict(zip(line.records, _bounded_line(line), strict=True)))
+    with suppress(ValueError):  # damaged: each loop is aligned alone
+        _TOGETHER.update(dict(zip(line.records, _bounded_line(line), strict=True)))
 
 
 @np.errstate(all="ignore")  # a run may diverge
@@ -330,14 +329,13 @@ def _bounded_line(line: LoopLine) -> Iterator[BoundedPart]:
     """Yield the aligned part of each loop of a line."""
     scenario, loop, table = line.scenario, line.loop, SENSOR_MEASUREMENT
     columns = ("input", "t_ns", "event", "x", "x_s", "e_s_norm", "compared", "threshold")
-    rows, shifts, starts = line.columns(table, *columns), line.shifts(table), line.starts(table)
+    rows, shifts, pieces = line.columns(table, *columns), line.shifts(table), line.pieces(table)
     track, untils_ns = _line_track(line)
-    pieces = [slice(*ends) for ends in pairwise(starts.tolist())]
     x_c, received = _at(
         ModelFlow(loop.H),
         track,
         line.numbers(table, "t_ns"),
-        np.repeat(untils_ns, np.diff(starts)),
+        untils_ns[shifts // SPAN],
         pieces,
     )
     received = np.maximum(received - shifts, NO_SEQUENCE)
@@ -354,13 +352,13 @@ def _bounded_line(line: LoopLine) -> Iterator[BoundedPart]:
         yield BoundedPart(
             AlignedPart(
                 record[table],
-                AlignedRun(*(column[own] for column in aligned)),
+                AlignedRun(*map(itemgetter(own), aligned)),
                 None if steps is None else true_states(steps, t_ns),
             ),
             bounded.shared[own],
             (bounded.error_bounds[0][own], bounded.error_bounds[1][own]),
             bounded.residual[own],
-            SinceEvent(*(column[own] for column in since)),
+            SinceEvent(*map(itemgetter(own), since)),
         )
 
 
@@ -410,8 +408,9 @@ def _bounded(record: RunRecord) -> Iterator[BoundedPart]:
 
 def _bounded_part(scenario: Scenario, part: AlignedPart, found: ErrorBounds) -> BoundedPart:
     shared = shares_update(scenario, part.aligned)
-    both = tuple(np.where(shared, one, np.nan) for one in (found.identity, found.printed))
-    return BoundedPart(part, shared, both, identity_residual(scenario, part.aligned, found.missed))
+    identity, printed = (np.where(shared, one, np.nan) for one in (found.identity, found.printed))
+    residual = identity_residual(scenario, part.aligned, found.missed)
+    return BoundedPart(part, shared, (identity, printed), residual)
 
 
 def shares_update(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:

@@ -16,12 +16,12 @@ from cosim.record.run_record import RunRecord
 from noack.core.cached_method import cached_method
 from noack.protocol.machine_interface import RESTART
 from noack.protocol.record_tables import SETTINGS
+from noack.scenario.parameter_changes import settings_key
 
 SPAN = 2**56
 """More than the numbers of inputs and messages, and the times in ns, of a loop."""
 _LINE_ROWS = 2**16
 """Rows of a line's largest table: more would leave the processor's cache."""
-_DRAWN = ("name", "seeds", "plant", "initial_state", "A", "B")
 Columns = Mapping[str, NDArray[Any]]
 Numbers = NDArray[np.int64]
 
@@ -69,10 +69,9 @@ class LoopLine:
             raise ValueError(f"{table}: no run has this {name}")
         return np.asarray(values + self.shifts(table))
 
-    def split(self, table: str, values: NDArray[Any]) -> Iterator[NDArray[Any]]:
-        """Yield the part of each loop of values of all rows of a table."""
-        starts = self.starts(table).tolist()
-        return (values[begin:end] for begin, end in pairwise(starts))
+    def pieces(self, table: str) -> list[slice]:
+        """Return where the rows of each loop are in a table."""
+        return [slice(*ends) for ends in pairwise(self.starts(table).tolist())]
 
 
 def lines_of(records: Sequence[RunRecord]) -> Iterator[LoopLine]:
@@ -99,6 +98,4 @@ def _kind(record: RunRecord) -> object:
         return None
     if scenario.trigger.weight is not None or any(scenario.controller.setpoint or ()):
         return None  # a matrix product for all loops may have other last bits
-    # Loops of one entry differ in these only; the other values are the same objects.
-    parts = (*scenario, *scenario.plant)
-    return [id(value) for name, value in parts if name not in _DRAWN]
+    return settings_key(scenario)
