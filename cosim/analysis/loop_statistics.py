@@ -220,7 +220,8 @@ class _Unmatched:
         """Add the next numbers; one is received in the same part as it is sent, or later."""
         self._newest = max(self._newest, int(arrived.max(initial=-1)))
         sent = np.concatenate([self._sent, sent])
-        self._sent = sent[:0] if np.array_equal(sent, arrived) else np.setdiff1d(sent, arrived)
+        begins_alike = np.array_equal(sent[: len(arrived)], arrived)
+        self._sent = sent[len(arrived) :] if begins_alike else np.setdiff1d(sent, arrived)
         return self
 
     def count(self, *, complete: bool) -> int:
