@@ -14,7 +14,7 @@ from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
 from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run, worst_loop
-from cosim.analysis.replay.alike_replay import replay_line
+from cosim.analysis.replay.alike_replay import replay_in_turn
 from cosim.analysis.replay.run_replay import replay, stored_verdict
 from cosim.analysis.run_summary import Outcome, linearisation, summarise
 from cosim.analysis.summary_model import (
@@ -29,8 +29,6 @@ from cosim.analysis.summary_model import (
 from cosim.live.end_helpers import EndHelpers, PreparedEnding
 from cosim.live.progress import work_bar
 from cosim.output.viewer.rerun_program import is_installed, require_viewer
-from cosim.record.align import align_line
-from cosim.record.loop_line import lines_of
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
@@ -236,10 +234,7 @@ def _judged_loops(
     """Judge some loops, of which expectations may be known; ``beside`` replays the only one."""
     records = run.together(block)
     expected = known or _expectations([one.scenario for one in records])
-    replayed: dict[RunRecord, ReplayPart] = {}
-    for line in lines_of(records) if len(run.loops) > 1 else ():
-        align_line(line)
-        replayed |= replay_line(line) if run.kind == "live" else {}
+    replayed = replay_in_turn(records) if run.kind == "live" and len(run.loops) > 1 else {}
     judged, claims = [], [*map(claims_of, records)]
     for one, own in zip(claims, expected, strict=True):
         one.certificates = own.certificates

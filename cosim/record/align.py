@@ -13,16 +13,13 @@ If a controller dies, there is no x_c until the restarted controller has its fir
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from functools import lru_cache
-from operator import itemgetter
+from itertools import pairwise
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.loop_line import SPAN, Columns, LoopLine
 from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
@@ -37,7 +34,7 @@ from noack.protocol.record_tables import (
 )
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of, steady_state
 from noack.scenario.scenario import Scenario
-from noack.theory.paper import ErrorBounds, ErrorMonitor
+from noack.theory.paper import ErrorMonitor
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
@@ -100,12 +97,10 @@ def in_common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
 
 def initial_track(scenario: Scenario) -> ControllerTrack:
     """The controller's state before its first input."""
-    x_c = _first_state(scenario, loop_of(scenario))
+    loop = loop_of(scenario)
+    known = scenario.network.initial_sync == "known_state"
+    x_c = loop.x0 if known else np.zeros(loop.n)
     return ControllerTrack(np.zeros(1, np.int64), x_c[None, :], np.full(1, NO_SEQUENCE))
-
-
-def _first_state(scenario: Scenario, loop: LoopMatrices) -> Reals:
-    return loop.x0 if scenario.network.initial_sync == "known_state" else np.zeros(loop.n)
 
 
 def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> ControllerTrack:
@@ -116,10 +111,10 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     model_ns = np.concatenate([steps["model_t_ns"], deliveries["model_t_ns"]])[order]
     x_c = np.concatenate([steps["x_c"], deliveries["x_c"]])[order]
     lives = inputs[order] // GENERATION
-    track = before
-    for life in np.unique(lives):
-        which = lives == life
-        track = _continued(track, int(life), model_ns[which], x_c[which], newest[which])
+    track, begins = before, np.flatnonzero(np.diff(lives, prepend=-1)).tolist()
+    for begin, end in pairwise([*begins, len(lives)]):
+        own = slice(begin, end)
+        track = _continued(track, int(lives[begin]), model_ns[own], x_c[own], newest[own])
     return track
 
 
@@ -147,7 +142,7 @@ def _continued(
 @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
 def join(
     loop: LoopMatrices,
-    measurements: Rows | Columns,
+    measurements: Rows,
     track: ControllerTrack,
     until_ns: int,
     *,
@@ -166,28 +161,15 @@ def join(
             acknowledged event appears in the next sample.
     """
     t_ns = measurements["t_ns"]
-    flow = ModelFlow(loop.H, loop.setpoint) if flow is None else flow
-    x_c, received = _at(flow, track, t_ns, until_ns)
-    return _with_controller(loop, measurements, x_c, received, acknowledged=acknowledged)
-
-
-@np.errstate(over="ignore", invalid="ignore")
-def _with_controller(
-    loop: LoopMatrices,
-    measurements: Rows | Columns,
-    x_c: Reals,
-    received: NDArray[np.int64],
-    *,
-    acknowledged: bool,
-) -> AlignedRun:
-    """Return measurements with the controller's states, (k, n), and its newest updates, (k,)."""
     reset = (measurements["event"] != NO_SEQUENCE) & (not acknowledged)
     x_s = np.where(reset[:, None], measurements["x"], measurements["x_s"])
+    flow = ModelFlow(loop.H, loop.setpoint) if flow is None else flow
+    x_c, received = _at(flow, track, t_ns, until_ns)
     e_c = x_c - measurements["x"]
     if loop.weight is not None:
         e_c = e_c @ loop.weight.T
     return AlignedRun(
-        measurements["t_ns"],
+        t_ns,
         measurements["x"],
         x_s,
         x_c,
@@ -199,7 +181,7 @@ def _with_controller(
     )
 
 
-def _threshold(measurements: Rows | Columns) -> Reals:
+def _threshold(measurements: Rows) -> Reals:
     """Return the value of ‖e_s‖_W at which both sides of the comparison would be equal.
 
     It assumes that the left side is proportional to ‖e_s‖_W. For a trigger that compares ‖e_s‖_W
@@ -212,13 +194,8 @@ def _threshold(measurements: Rows | Columns) -> Reals:
 
 
 def _at(
-    flow: ModelFlow,
-    track: ControllerTrack,
-    t_ns: Times,
-    until_ns: int | Times,
-    pieces: Sequence[slice] = (slice(None),),
+    flow: ModelFlow, track: ControllerTrack, t_ns: Times, until_ns: int
 ) -> tuple[Reals, NDArray[np.int64]]:
-    """Return the controller's states and newest updates at some times; loops are in pieces."""
     x_c = np.full((len(t_ns), track.x_c.shape[1]), np.nan)
     received = np.full(len(t_ns), NO_SEQUENCE, dtype=np.int64)
     index = np.searchsorted(track.model_ns, t_ns, side="right") - 1
@@ -230,20 +207,20 @@ def _at(
             state = int(index[i])
             x_c[i] = flow(track.x_c[state], int(track.model_ns[state]), int(t_ns[i]))
         return x_c, received
+    propagate = flow.propagate
     if not dt_ns.any():  # mostly: the controller's model is advanced to each of these times
         x_c[known] = track.x_c[index[known]]
         return x_c, received
-    for own in pieces:
-        for step_ns in np.unique(dt_ns[own][known[own]]):
-            which = known[own] & (dt_ns[own] == step_ns)
-            x_c[own][which] = flow.propagate.rows(track.x_c[index[own][which]], int(step_ns))
+    for step_ns in np.unique(dt_ns[known]):
+        which = known & (dt_ns == step_ns)
+        x_c[which] = propagate.rows(track.x_c[index[which]], int(step_ns))
     return x_c, received
 
 
 class AlignedPart(NamedTuple):
     """Consecutive measurements, aligned."""
 
-    rows: Rows | Columns
+    rows: Rows
     """Their rows of ``sensor_measurement``, (k,)."""
     aligned: AlignedRun
     true_x: Reals | None
@@ -252,10 +229,7 @@ class AlignedPart(NamedTuple):
 
 def aligned_parts(record: RunRecord) -> Iterator[AlignedPart]:
     """Align a run part by part; a run without measurements has one empty part."""
-    if record in _TOGETHER:
-        yield _TOGETHER[record].part
-    else:
-        yield from _short_run(record) if record.is_short else _aligned(record)
+    yield from _short_run(record) if record.is_short else _aligned(record)
 
 
 @lru_cache(maxsize=1)
@@ -310,74 +284,6 @@ class BoundedPart(NamedTuple):
     """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN where it is not bounded."""
     residual: Reals
     """Residual of (I1), (k,)."""
-    since_event: "SinceEvent | None" = None
-    """None if it is not computed yet."""
-
-
-_TOGETHER = WeakKeyDictionary[RunRecord, BoundedPart]()
-"""Loops that were aligned together."""
-
-
-def align_line(line: LoopLine) -> None:
-    """Align like loops at once; they are kept as long as their records."""
-    with suppress(ValueError):  # damaged: each loop is aligned alone
-        _TOGETHER.update(dict(zip(line.records, _bounded_line(line), strict=True)))
-
-
-@np.errstate(all="ignore")  # a run may diverge
-def _bounded_line(line: LoopLine) -> Iterator[BoundedPart]:
-    """Yield the aligned part of each loop of a line."""
-    scenario, loop, table = line.scenario, line.loop, SENSOR_MEASUREMENT
-    columns = ("input", "t_ns", "event", "x", "x_s", "e_s_norm", "compared", "threshold")
-    rows, shifts, pieces = line.columns(table, *columns), line.shifts(table), line.pieces(table)
-    track, untils_ns = _line_track(line)
-    x_c, received = _at(
-        ModelFlow(loop.H),
-        track,
-        line.numbers(table, "t_ns"),
-        untils_ns[shifts // SPAN],
-        pieces,
-    )
-    received = np.maximum(received - shifts, NO_SEQUENCE)
-    acknowledged = scenario.protocol.acknowledges
-    aligned = _with_controller(loop, rows, x_c, received, acknowledged=acknowledged)
-    monitor = ErrorMonitor(loop.H, policy_of(scenario), scenario.timing.measurement_period_ns)
-    events = np.where(rows["event"] >= 0, line.numbers(table, "event"), NO_SEQUENCE)
-    missed = monitor.take(rows["t_ns"], rows["x_s"] - rows["x"], events, received + shifts)
-    bounded = _bounded_part(scenario, AlignedPart(rows, aligned, None), missed)
-    since = EventFollower(scenario, [one.loop for one in line.records]).take(rows, aligned, pieces)
-    for record, own in zip(line.records, pieces, strict=True):
-        steps = None if scenario.coverage.knows_state else record[PLANT_STEP]
-        t_ns = rows["t_ns"][own]
-        yield BoundedPart(
-            AlignedPart(
-                record[table],
-                AlignedRun(*map(itemgetter(own), aligned)),
-                None if steps is None else true_states(steps, t_ns),
-            ),
-            bounded.shared[own],
-            (bounded.error_bounds[0][own], bounded.error_bounds[1][own]),
-            bounded.residual[own],
-            SinceEvent(*map(itemgetter(own), since)),
-        )
-
-
-def _line_track(line: LoopLine) -> tuple[ControllerTrack, Times]:
-    """Return the controllers' states of a line, and the end of each loop's, (loops,)."""
-    steps, deliveries = CONTROLLER_STEP, CONTROLLER_DELIVERY
-    tables, firsts = (steps, deliveries), np.arange(len(line.records)) * SPAN
-    inputs = np.concatenate([firsts - 1, *(line.numbers(one, "input") for one in tables)])
-    model_ns = np.concatenate([firsts, *(line.numbers(one, "model_t_ns") for one in tables)])
-    newest = [firsts, line.shifts(steps), line.numbers(deliveries, "sequence") - NO_SEQUENCE]
-    states = [_first_state(line.scenario, one.loop)[None] for one in line.records]
-    x_c = np.concatenate([*states, *(line.column(one, "x_c") for one in tables)])
-    order = np.argsort(inputs, kind="stable")
-    model_ns, received = model_ns[order], np.maximum.accumulate(np.concatenate(newest)[order])
-    if ((inputs + 1) % SPAN > GENERATION).any() or (np.diff(model_ns) < 0).any():
-        raise ValueError("the numbers of inputs, or their times, are not those of a loop")
-    ends = np.arange(1, len(firsts) + 1) + sum(line.starts(one)[1:] for one in tables)
-    period_ns = line.scenario.timing.controller_period_ns
-    return ControllerTrack(model_ns, x_c[order], received + NO_SEQUENCE), model_ns[ends - 1] + period_ns
 
 
 def bounded_parts(record: RunRecord) -> Iterator[BoundedPart]:
@@ -385,10 +291,7 @@ def bounded_parts(record: RunRecord) -> Iterator[BoundedPart]:
 
     Summary and claims use those of a short run in turn.
     """
-    if record in _TOGETHER:
-        yield _TOGETHER[record]
-    else:
-        yield from _short_bounds(record) if record.is_short else _bounded(record)
+    yield from _short_bounds(record) if record.is_short else _bounded(record)
 
 
 @lru_cache(maxsize=1)
@@ -401,16 +304,13 @@ def _bounded(record: RunRecord) -> Iterator[BoundedPart]:
     period_ns = scenario.timing.measurement_period_ns
     monitor = ErrorMonitor(record.loop.H, policy_of(scenario), period_ns)
     for part in aligned_parts(record):
-        rows, e_s = part.rows, part.rows["x_s"] - part.rows["x"]
-        missed = monitor.take(rows["t_ns"], e_s, rows["event"], part.aligned.received)
-        yield _bounded_part(scenario, part, missed)
-
-
-def _bounded_part(scenario: Scenario, part: AlignedPart, found: ErrorBounds) -> BoundedPart:
-    shared = shares_update(scenario, part.aligned)
-    identity, printed = (np.where(shared, one, np.nan) for one in (found.identity, found.printed))
-    residual = identity_residual(scenario, part.aligned, found.missed)
-    return BoundedPart(part, shared, (identity, printed), residual)
+        rows, aligned = part.rows, part.aligned
+        e_s = rows["x_s"] - rows["x"]
+        found = monitor.take(rows["t_ns"], e_s, rows["event"], aligned.received)
+        shared = shares_update(scenario, aligned)
+        identity, printed = (np.where(shared, one, np.nan) for one in (found.identity, found.printed))
+        residual = identity_residual(scenario, aligned, found.missed)
+        yield BoundedPart(part, shared, (identity, printed), residual)
 
 
 def shares_update(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:
@@ -490,33 +390,27 @@ class SinceEvent(NamedTuple):
 
 
 class EventFollower:
-    """Follows the newest event of a run of a resolved scenario, or those of like ``loops``."""
+    """Follows the newest event of a run of a resolved scenario."""
 
-    def __init__(self, scenario: Scenario, loops: Sequence[LoopMatrices] = ()) -> None:
-        loops = loops or [loop_of(scenario)]
+    def __init__(self, scenario: Scenario) -> None:
+        loop = loop_of(scenario)
         self._scenario = scenario
-        self._propagate = [Propagator(one.A + one.B @ one.K) for one in loops]
-        self._x = np.full(loops[0].n, np.nan)
+        self._propagate = Propagator(loop.A + loop.B @ loop.K)
+        self._x = np.full(loop.n, np.nan)
         self._event_ns = 0
         self._event = NO_SEQUENCE
 
     @np.errstate(all="ignore")  # a run may diverge
-    def take(
-        self, rows: Rows | Columns, aligned: AlignedRun, pieces: Sequence[slice] = (slice(None),)
-    ) -> SinceEvent:
-        """Return what follows from the newest event, at the next measurements, or at all of loops."""
+    def take(self, rows: Rows, aligned: AlignedRun) -> SinceEvent:
+        """Return what follows from the newest event, at the next measurements."""
         new = np.flatnonzero(rows["event"] != NO_SEQUENCE)
         events = np.append(self._event, rows["event"][new])
         event_ns = np.append(self._event_ns, rows["t_ns"][new])
         x = np.concatenate([self._x[None], rows["x"][new]])
-        newest = np.searchsorted(new, np.arange(len(rows["event"])), "right")
-        for own in pieces[1:]:  # a loop's first event is not that of the loop before
-            newest[own][newest[own] <= np.searchsorted(new, own.start)] = 0
+        newest = np.cumsum(rows["event"] != NO_SEQUENCE)
         period_ns = self._scenario.timing.measurement_period_ns
         age_ns = rows["t_ns"] - event_ns[newest]
-        periods, predicted = age_ns // period_ns, x[newest]
-        for propagate, own in zip(self._propagate, pieces, strict=True):
-            predicted[own] = propagate.leaps(predicted[own], periods[own], period_ns)
+        predicted = self._propagate.leaps(x[newest], age_ns // period_ns, period_ns)
         age_s = np.where(events[newest] == NO_SEQUENCE, np.nan, age_ns * 1e-9)
         shared = in_common(self._scenario, aligned)
         missing = np.where(shared, events[newest] - aligned.received, UNKNOWN)

@@ -120,13 +120,13 @@ class RunEvidence:
         """Yield all measurements in order, part by part."""
         scenario = self.record.scenario
         last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
-        for part, shared, both, residual, known in bounded_parts(self.record):
+        for part, shared, both, residual in bounded_parts(self.record):
             rows, joined = part.rows, part.aligned
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
             true_x = joined.x if part.true_x is None else part.true_x
-            since = known or follower.take(rows, joined)
+            since = follower.take(rows, joined)
             yield Samples(joined, shared, both, residual, true_x, passed, since)
 
     @cached_property

@@ -1,10 +1,10 @@
-"""Replays loops of one kind in turn, whose machines are made at once.
+"""Replays loops in turn, whose machines are made at once.
 
 This finds out whether all rows and messages of a loop are equal, as they are in almost every run.
 If one of them is not, the loop is replayed alone, which finds and explains the first difference.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -22,12 +22,11 @@ from cosim.analysis.replay.machine_replay import (
 )
 from cosim.analysis.replay.run_replay import headers_of, hops
 from cosim.analysis.summary_model import ReplayPart
-from cosim.record.loop_line import LoopLine
 from cosim.record.record_source import Rows
 from cosim.record.run_record import RunRecord
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Start
-from noack.protocol.record_tables import NETEM_PACKET, direction_of
+from noack.protocol.record_tables import NETEM_PACKET, SETTINGS, direction_of
 from noack.protocol.wire_format import HEADER_ROW, MAGIC, Flow, datagram_bytes
 
 
@@ -41,12 +40,17 @@ def _require(holds: bool | np.bool_) -> None:
 
 
 @np.errstate(all="ignore")  # a diverging run overflows and is replayed all the same
-def replay_line(line: LoopLine) -> Mapping[RunRecord, ReplayPart]:
-    """Return the results of the loops that are complete, and replayed without a difference."""
-    found, scenarios = dict[RunRecord, ReplayPart](), [record.scenario for record in line.records]
+def replay_in_turn(records: Sequence[RunRecord]) -> Mapping[RunRecord, ReplayPart]:
+    """Return the results of the loops that are complete, and replayed without a difference.
+
+    The rows of the loops are in memory.
+    """
+    found: dict[RunRecord, ReplayPart] = {}
+    loops = [one for one in records if one.is_short and not any(map(one.count, SETTINGS))]
     with suppress(*DAMAGE):
-        machines = {role: machines_of(role, scenarios, Start(0)) for role in line.records[0].roles}
-        for place, record in enumerate(line.records):
+        scenarios = [one.scenario for one in loops]
+        machines = {role: machines_of(role, scenarios, Start(0)) for role in loops[0].roles}
+        for place, record in enumerate(loops):
             with suppress(_OtherError, *DAMAGE):
                 found[record] = _replayed(record, place, machines)
     return found
