@@ -207,13 +207,11 @@ def _at(
             state = int(index[i])
             x_c[i] = flow(track.x_c[state], int(track.model_ns[state]), int(t_ns[i]))
         return x_c, received
-    propagate = flow.propagate
-    if not dt_ns.any():  # mostly: the controller's model is advanced to each of these times
-        x_c[known] = track.x_c[index[known]]
-        return x_c, received
-    for step_ns in np.unique(dt_ns[known]):
-        which = known & (dt_ns == step_ns)
-        x_c[which] = propagate.rows(track.x_c[index[which]], int(step_ns))
+    x_c[known] = track.x_c[index[known]]
+    older = np.flatnonzero(known & (dt_ns != 0))  # few: mostly the model is advanced to these times
+    for step_ns in np.unique(dt_ns[older]):
+        which = older[dt_ns[older] == step_ns]
+        x_c[which] = flow.propagate.rows(x_c[which], int(step_ns))
     return x_c, received
 
 

@@ -91,7 +91,8 @@ class Samples:
     """x of the plant, (k, n), where the sensor estimates it, too; NaN where it is not recorded."""
     inter_event_s: tuple[Reals, Reals]
     """Times of the events, without the run's first, and the times since the event before."""
-    since_event: SinceEvent
+    since_event: SinceEvent | None
+    """None if no certificate has bounds from the newest event."""
 
     @cached_property
     def t_s(self) -> Reals:
@@ -119,14 +120,16 @@ class RunEvidence:
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
         scenario = self.record.scenario
-        last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
+        last_ns, follower = np.zeros(0, np.int64), None
+        if any(map(self.known_state_bounds, self.certificates)):
+            follower = EventFollower(scenario)
         for part, shared, both, residual in bounded_parts(self.record):
             rows, joined = part.rows, part.aligned
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
             true_x = joined.x if part.true_x is None else part.true_x
-            since = follower.take(rows, joined)
+            since = None if follower is None else follower.take(rows, joined)
             yield Samples(joined, shared, both, residual, true_x, passed, since)
 
     @cached_property
@@ -303,15 +306,17 @@ class RunEvidence:
             known[id(certificate)] = None if first is None else VoidFrom(first.t_s, why)
         return known[id(certificate)]
 
-    def missing_events(self, samples: Samples, bounds: KnownStateBounds) -> NDArray[np.int64]:
+    def missing_events(
+        self, samples: Samples, since: SinceEvent, bounds: KnownStateBounds
+    ) -> NDArray[np.int64]:
         """Return how many events are missing in the input since the newest event, (k,).
 
         The bounds assume that an update acts within their delay. Where the plant applied its first
         input later than that, the number is unknown until then.
         """
-        event_s = samples.t_s - samples.since_event.age_s
+        event_s = samples.t_s - since.age_s
         early = event_s + bounds.delay_s < self.started_s - 1e-9
-        return np.asarray(np.where(early, UNKNOWN, samples.since_event.missing))
+        return np.asarray(np.where(early, UNKNOWN, since.missing))
 
     def known_state_bounds(self, certificate: ScenarioCertificate) -> KnownStateBounds | None:
         """Return the bounds from the newest event of a certificate; None if it has none."""
