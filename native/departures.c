@@ -31,8 +31,7 @@ int is_first_intact(const noack_decision *decision, int copy) {
 int64_t departure_order(int64_t direction, int64_t put) { return (direction << 62) + put; }
 
 static int is_before(const noack_heap_entry *a, const noack_heap_entry *b) {
-    return a->release_ns < b->release_ns
-           || (a->release_ns == b->release_ns && a->number < b->number);
+    return a->due_ns < b->due_ns || (a->due_ns == b->due_ns && a->number < b->number);
 }
 
 void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry) {

@@ -598,13 +598,17 @@ typedef struct { /* rows of a table of the record, packed as numpy has them */
                           those of the table */
 } noack_table;
 
+typedef struct { /* of a heap, by (due_ns, number): a delayed datagram, or the next tick of a loop */
+    int64_t due_ns, number;
+    int64_t slot; /* of the datagram */
+} noack_heap_entry;
+
 typedef struct { /* the machines of one role, of all loops */
     int64_t role, loops;
     noack_plant *plants; /* (loops,) of this role; the others are NULL */
     noack_sensor *sensors;
     noack_controller *controllers;
-    int64_t *due_ns;    /* (loops,) next tick of each machine, in the run's time; INT64_MAX: none */
-    int64_t *heap;      /* (loops,) loops with a tick, by (due_ns, number); a heap */
+    noack_heap_entry *heap; /* (loops,) the next tick of each machine that has one, in the run's time */
     int64_t heap_count;
     noack_table tables[3];
     noack_note *notes;
@@ -878,10 +882,6 @@ typedef struct { /* a datagram that is stored, or about to be sent */
     uint8_t counts; /* 1: it is the first intact copy */
     uint8_t unused;
 } noack_slot;
-
-typedef struct { /* an entry of the heap of delayed datagrams */
-    int64_t release_ns, number, slot;
-} noack_heap_entry;
 
 typedef struct { /* a stored datagram that waits until the link is free; see native/waiting.c */
     int64_t key, order, row, size_bytes, after_ns, earliest_ns;

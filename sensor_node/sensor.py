@@ -18,13 +18,14 @@ are unknown, and the first known input is used.
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
-from noack.machines.loop_machines import LoopMachines, Role, alike_loops, set_machine, take_changes
+from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.record_tables import (
@@ -92,7 +93,7 @@ class Observer:
 
 
 @dataclass
-class Sensor:
+class Sensor(MachinePart):
     """The sensor of one loop.
 
     Its time is the time of the measurements: its output depends on the measured values and their
@@ -127,7 +128,6 @@ class Sensor:
     horizon_ns: int = _ANY_TIME_NS
 
     role = SENSOR
-    external = None
 
     def __post_init__(self) -> None:
         self._trigger: EventTrigger | None = None
@@ -218,10 +218,6 @@ class Sensor:
             return ()
         return self.observer.first_notice(int(rows["t_ns"][0]))
 
-    def note(self, sensor: CData, note: CData) -> Notice:
-        """Raise ValueError: the core's sensor writes no notes."""
-        raise ValueError("a sensor writes no notes")
-
     def _decide(self, sensor: CData) -> None:
         """Ask the user's trigger about a measurement."""
         trigger, n = self._trigger, sensor.machine.n
@@ -307,9 +303,7 @@ def sensors_of(
     Of the plant's data they use at most x(0). After a restart, a sensor transmits its first
     measurement.
     """
-    alike, parts = alike_loops(loops), list[Sensor]()
-    for number, (loop, first) in enumerate(zip(loops, alike, strict=True)):
-        parts.append(_part(start, loop) if number == first else _redrawn(start, parts[first], loop))
+    parts, alike = parts_of(loops, partial(_part, start), partial(_redrawn, start))
     return LoopMachines(parts, phases_ns, alike=alike)
 
 

@@ -140,7 +140,7 @@ def _served_metrics(loaded: "scenario.Scenario", where: str) -> "Iterator[run_wa
     metrics_server.require_package()
     found = run_metrics.RunMetrics(loaded)
     with metrics_server.metrics_server(where, found.collect) as at:
-        print_to_stderr(f"noack: metrics: http://{address.text_of(at)}/metrics")
+        print_to_stderr(f"noack: metrics: http://{address.address_text(at)}/metrics")
         yield found.watcher()
 
 

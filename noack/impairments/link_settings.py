@@ -11,7 +11,6 @@ from typing import Annotated, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
-from noack.core.core_library import core
 from noack.impairments.constraints import AnyConstraint, find_longest_burst, require_consistent
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
@@ -22,8 +21,6 @@ from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
 from noack.settings.section import ScenarioSection
 
-NEVER_NS: int = core.NOACK_NEVER_NS
-"""A time that never comes."""
 Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
 Constraints = Annotated[tuple[AnyConstraint, ...], Field(max_length=8)]
 

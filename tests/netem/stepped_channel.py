@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
-from netem.channel import NO_TIME_NS, Channel, Datagram
+from netem.channel import Channel, Datagram
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import core, ffi
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
@@ -26,8 +27,7 @@ class SteppedChannel:
 
     def next_deadline_ns(self) -> int | None:
         """Time of the next departure in either direction; None: nothing is in flight."""
-        due_ns = int(core.noack_channel_due_ns(self.channel.core))
-        return None if due_ns == NO_TIME_NS else due_ns
+        return None if (due_ns := self.channel.due_ns) == NEVER_NS else due_ns
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Process a datagram; return it if it is neither lost nor delayed."""

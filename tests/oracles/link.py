@@ -18,7 +18,7 @@ from noack.core.core_library import core
 from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
 from noack.impairments.disciplines.priority import Priority
 from noack.impairments.kinds.rate import Rate
-from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
+from noack.impairments.link_settings import Counters, Decisions, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
@@ -113,7 +113,7 @@ class Link:
     def change(self, settings: LinkSettings) -> None:
         """Apply other settings; see native/link_change.c."""
         self._serve(math.inf)
-        latest_ns = np.full(self._state.rows, NEVER_NS, np.int64)
+        latest_ns = np.full(self._state.rows, core.NOACK_NEVER_NS, np.int64)
         for leaving in self._in_flight:
             row = self._rows[leaving.datagram.flow]
             latest_ns[row] = max(latest_ns[row], leaving.release_ns)
@@ -162,10 +162,10 @@ class Link:
         )  # fmt: skip
         self._inputs += 1
         record = Record(NETEM_PACKET, row)
-        if decision.release_ns == NEVER_NS:
+        if decision.release_ns == core.NOACK_NEVER_NS:
             return (record,)
         leaving = self._release(message, decision.release_ns, decision.bit, copy=False)
-        if decision.copy_ns != NEVER_NS:
+        if decision.copy_ns != core.NOACK_NEVER_NS:
             leaving += self._release(message, decision.copy_ns, decision.copy_bit, copy=True)
         self._serve(now_ns)
         return (*leaving, record)

@@ -17,8 +17,9 @@ from cosim.analysis.summary_model import ReplayDifference
 from cosim.record.processes import Life, split_by_life
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
-from netem.channel import NO_TIME_NS, Channel, channel_of
+from netem.channel import Channel, channel_of
 from noack.core.cached_method import cached_method
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines
@@ -181,7 +182,7 @@ class InputReplay:
         if self.difference is not None or replay.difference == core.NOACK_EQUAL:
             return
         at, other = replay.difference_at, replay.other_ns
-        other_ns = None if other == NO_TIME_NS else other
+        other_ns = None if other == NEVER_NS else other
         table, row, rows = place_of(at)
         now_ns = int(rows["now_ns"][row])
         if replay.difference == core.NOACK_TIME_RUNS_BACKWARD:
