@@ -122,7 +122,10 @@ noack_packet_row packet_row(
 int is_first_intact(const noack_decision *decision, int copy);
 /* At equal times, datagrams leave in order of direction, then of arrival: put counts them. */
 int64_t departure_order(int64_t direction, int64_t put);
-/* The heap has room. */
+
+/* heap.c */
+
+/* There must be room. */
 void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
 /* Remove the first entry. */
 void heap_pop(noack_heap_entry *heap, int64_t *count);
