@@ -1,4 +1,4 @@
-"""The arguments and options that commands share: of scenarios, runs, costs, figures and tables."""
+"""The arguments and options that commands share, and how a shell completes them."""
 
 import os
 from collections.abc import Sequence
@@ -11,21 +11,64 @@ from typing import TYPE_CHECKING, Annotated, TypeVar, dataclass_transform
 import typer
 from typer import Argument, Option
 
-from cosim.cli import completion
 from cosim.lazy_modules import lazy_modules
 from cosim.output.figure_format import FigureFiles, FigureFormat, figure_files
-from cosim.record.run_directory import DEFAULT_RUNS, chosen_run
-from cosim.shipped_files import find_shipped
+from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE, chosen_run
+from cosim.shipped_files import find_shipped, shipped_names
 from noack.core.errors import CallerError
 
 with lazy_modules():
-    from noack.scenario import scenario_file
+    from cosim.studies.paper import results
+    from noack.scenario import runtime_parameters, scenario, scenario_file, toml_file
 
 if TYPE_CHECKING:
     from noack.core.linear_systems import Matrix
     from noack.scenario.scenario import Scenario
 
 T = TypeVar("T")
+
+
+def complete_scenarios(incomplete: str) -> list[str]:
+    """Return matching names of shipped scenarios; the shell completes file names itself."""
+    return _matching(incomplete, shipped_names("scenarios"))
+
+
+def complete_campaigns(incomplete: str) -> list[str]:
+    """Return matching names of shipped campaigns."""
+    return _matching(incomplete, shipped_names("campaigns"))
+
+
+def complete_shipped(incomplete: str) -> list[str]:
+    """Return matching names of shipped scenarios and campaigns."""
+    return complete_scenarios(incomplete) + complete_campaigns(incomplete)
+
+
+def complete_papers(incomplete: str) -> list[str]:
+    """Return matching names of published results."""
+    return _matching(incomplete, list(results.NAMES))
+
+
+def complete_runs(incomplete: str) -> list[str]:
+    """Return matching run directories below ``runs``, the newest first."""
+    found = [path.parent for path in DEFAULT_RUNS.glob(f"*/{SCENARIO_FILE}")]
+    by_name = sorted(found, key=lambda path: (path.name == LATEST, path.name), reverse=True)
+    return _matching(incomplete, [str(path) for path in by_name])
+
+
+def complete_settings(incomplete: str) -> list[str]:
+    """Return matching keys for ``--set``, each with its =."""
+    known = (*runtime_parameters.SHORT, *toml_file.keys(scenario.Scenario))
+    return _matching(incomplete, [f"{key}=" for key in known])
+
+
+def complete_runtime_parameters(incomplete: str) -> list[str]:
+    """Return matching names of the runtime parameters, short and full."""
+    short = runtime_parameters.SHORT
+    return _matching(incomplete, [*short, *short.values()])
+
+
+def _matching(incomplete: str, words: list[str]) -> list[str]:
+    return [word for word in words if word.startswith(incomplete)]
 
 
 def find_scenario(name: str) -> Path:
@@ -42,12 +85,12 @@ ScenarioArgument = Annotated[
     str,
     Argument(
         help="Scenario file (TOML), or the name of a shipped scenario.",
-        autocompletion=completion.scenarios,
+        autocompletion=complete_scenarios,
     ),
 ]
 RunArgument = Annotated[
     Path | None,
-    Argument(help="Run directory; the last run by default.", autocompletion=completion.run_directories),
+    Argument(help="Run directory; the last run by default.", autocompletion=complete_runs),
 ]
 LoopOption = Annotated[str | None, Option("--loop", metavar="NAME", help="Only the loop of this name.")]
 SetOption = Annotated[
@@ -56,7 +99,7 @@ SetOption = Annotated[
         "--set",
         metavar="KEY=VALUE",
         help="Replace a value of the scenario, e.g. trigger.beta=0.3, or for short beta=0.3.",
-        autocompletion=completion.settings,
+        autocompletion=complete_settings,
     ),
 ]
 OutOption = Annotated[Path | None, Option("--out")]

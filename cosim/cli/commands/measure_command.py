@@ -7,7 +7,6 @@ from typing import Annotated
 from typer import Argument, Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
 from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus
@@ -134,7 +133,7 @@ class WrittenOptions(opt.FigureOptions):
         form: Write the network as the trace itself, or as a fitted model.
     """
 
-    for_scenario: Annotated[str | None, Option(metavar="SCENARIO", autocompletion=completion.scenarios)] = (
+    for_scenario: Annotated[str | None, Option(metavar="SCENARIO", autocompletion=opt.complete_scenarios)] = (
         None
     )
     settings: opt.SetOption = None

@@ -8,7 +8,6 @@ import typer
 from typer import Argument, Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
 from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from cosim.output.export import FORMATS, export_run, export_scenario, export_suffix, needs_run
@@ -304,7 +303,7 @@ def collect(
 
 @cli.command(cli.RUNS, 80, takes="about a second")
 def compare(
-    directories: Annotated[list[Path], Argument(metavar="RUN...", autocompletion=completion.run_directories)],
+    directories: Annotated[list[Path], Argument(metavar="RUN...", autocompletion=opt.complete_runs)],
     *,
     out: Path = cli.DEFAULT_RUNS / "comparison.html",
     width: opt.WidthOption = None,

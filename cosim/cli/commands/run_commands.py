@@ -7,7 +7,6 @@ import typer
 from typer import Argument, Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
 from cosim.cli import options as opt
 from cosim.cli.execute_run import LiveOptions, OutputOptions, finalize_run, run_processes, warn_of_violations
 from cosim.lazy_modules import lazy_modules
@@ -199,11 +198,11 @@ def _print_run(
 def set_(
     settings: Annotated[
         list[str] | None,
-        Argument(metavar="[KEY VALUE]...", autocompletion=completion.runtime_parameters),
+        Argument(metavar="[KEY VALUE]...", autocompletion=opt.complete_runtime_parameters),
     ] = None,
     *,
     session: Annotated[str | None, opt.SESSION] = None,
-    run: Annotated[Path | None, Option(autocompletion=completion.run_directories)] = None,
+    run: Annotated[Path | None, Option(autocompletion=opt.complete_runs)] = None,
     json: opt.JsonOption = False,
 ) -> None:
     """Change a live run: losses, M, trigger, set point.

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 from typer import Argument, Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
 from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
@@ -52,7 +51,7 @@ PlantArgument = Annotated[
 
 @cli.command(cli.FILES, 20)
 def scenarios(
-    name: Annotated[str | None, Argument(autocompletion=completion.shipped)] = None,
+    name: Annotated[str | None, Argument(autocompletion=opt.complete_shipped)] = None,
     *,
     json: opt.JsonOption = False,
 ) -> None:

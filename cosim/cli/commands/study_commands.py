@@ -11,7 +11,6 @@ import typer
 from typer import Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
 from cosim.cli import options as opt
 from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
 from cosim.lazy_modules import lazy_modules
@@ -34,7 +33,7 @@ with lazy_modules():
 
 @cli.command(cli.CAMPAIGNS, 10, takes="seconds to minutes, by the number of draws")
 def campaign(
-    file: Annotated[str, typer.Argument(autocompletion=completion.campaigns)],
+    file: Annotated[str, typer.Argument(autocompletion=opt.complete_campaigns)],
     *,
     draws: Annotated[int | None, Option(min=1)] = None,
     workers: Workers = None,
@@ -76,7 +75,7 @@ def campaign(
 
 @cli.command(cli.THEORY, 30, takes="up to a minute")
 def paper(
-    name: Annotated[str | None, typer.Argument(autocompletion=completion.papers)] = None,
+    name: Annotated[str | None, typer.Argument(autocompletion=opt.complete_papers)] = None,
     *,
     list_names: Annotated[bool, Option("--list")] = False,
     draws: Annotated[int | None, Option(min=1)] = None,
