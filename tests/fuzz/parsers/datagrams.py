@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 
-from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeSender
+from cosim.measurement.probe_ends import ProbePlan, ProbeReceiver, ProbeSender
 from noack.core.errors import PeerError
 from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection, loop_number, read_header

@@ -18,7 +18,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Self
 
-from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeResult, ProbeSender
+from cosim.measurement.probe_ends import ProbePlan, ProbeReceiver, ProbeResult, ProbeSender
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NeverStartedError, PeerError, why
 from noack.core.file_access import open_growing
