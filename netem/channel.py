@@ -301,7 +301,5 @@ def encoded(message: CData) -> bytes:
     """Return the datagram of a simulated run with a ``noack_message``."""
     vector = np.array(ffi.unpack(message.vector, message.entries))
     return Encoder(RUN_ID, bytes(KEY_BYTES)).encode(
-        Message(
-            Flow(message.flow), message.sequence, message.t_ns, vector, message.loop, message.error_level
-        )
+        Message(Flow(message.flow), message.sequence, message.t_ns, vector, message.loop, message.error_level)
     )

@@ -64,7 +64,9 @@ class LinkSettings(ScenarioSection):
     @property
     def reads_errors(self) -> bool:
         """Whether such a queue chooses by the errors that updates report."""
-        return any(isinstance(one, Rate) and isinstance(one.discipline, MaximumError) for one in self.impairments)
+        return any(
+            isinstance(one, Rate) and isinstance(one.discipline, MaximumError) for one in self.impairments
+        )
 
     @property
     def longest_burst(self) -> int | None:

@@ -401,7 +401,8 @@ class NetworkSection(DirectionSection):
         for name in ("acknowledgements", "actuation"):
             direction: DirectionSection | None = getattr(self, name)
             if direction is not None and direction.link.reads_errors:
-                raise ValueError(f"{name}.impairments: only updates report the error that maximum_error needs")
+                why = "only updates report the error that maximum_error needs; take another discipline"
+                raise ValueError(f"{name}.impairments: {why}")
         return self
 
     @property
