@@ -265,9 +265,7 @@ def alone(network: Scenario) -> Scenario:
     if network.network.protocol != "none":
         raise CallerError('network: nothing is acknowledged here; set protocol = "none"')
     if network.network.link.reads_errors:
-        raise CallerError(
-            "network: maximum_error needs the updates of noack's sensors; take another discipline"
-        )
+        raise CallerError("network: maximum_error is for noack's own sensors; take another discipline")
     return network
 
 

@@ -39,7 +39,6 @@ MAGIC = b"NA"
 VERSION = 1
 MAX_DIMENSION = 64
 MAX_LOOPS = 65_535
-MAX_ERROR_LEVEL = 255
 TIMES_NS = 2**62
 """Upper limit of times: sums of two fit the record's columns."""
 _HEADER = struct.Struct("<2sBBBBHQQq")
@@ -235,10 +234,8 @@ class Encoder:
         try:
             if not 0 <= message.loop <= MAX_LOOPS:
                 raise OverflowError(f"loop {message.loop}")
-            if not 0 <= message.error_level <= MAX_ERROR_LEVEL:
-                raise OverflowError(f"error level {message.error_level}")
             own.flow, own.loop, own.t_ns = message.flow, message.loop, message.t_ns
-            own.error_level = message.error_level
+            own.error_level = message.error_level.to_bytes(1, "little")[0]
             own.sequence = _signed(message.sequence)
         except OverflowError as error:
             raise ValueError(f"a number does not fit its field: {error}") from None
