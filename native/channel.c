@@ -107,6 +107,7 @@ int64_t noack_channel_handle(
     channel->answered = 0;
     channel->reached_ns = now_ns;
     serve(link, channel->waiting, now_ns, channel->heap, &channel->heap_count);
+    link->flows[row].error_level = noack_wire_error_level(datagram->head, datagram->size_bytes);
     if (asks)
         link_repeat(link, row, datagram->size_bytes, now_ns, &channel->outcome, &decision);
     else

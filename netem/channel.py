@@ -249,7 +249,7 @@ def require_stand_alone(network: Scenario) -> Scenario:
     """Return a scenario whose network is used outside a run of noack.
 
     Raises:
-        CallerError: the network changes, has several loops, or acknowledges.
+        CallerError: the network changes, has several loops, acknowledges, or chooses by errors.
     """
     for name, given in (("changes", network.changes), ("loops", network.loops)):
         if given:
@@ -259,6 +259,8 @@ def require_stand_alone(network: Scenario) -> Scenario:
             )
     if network.network.protocol != "none":
         raise CallerError('network: nothing is acknowledged here; set protocol = "none"')
+    if network.network.link.reads_errors:
+        raise CallerError("network: maximum_error is for noack's own sensors; take another discipline")
     return network
 
 
@@ -292,5 +294,5 @@ def encoded(message: CData) -> bytes:
     """Return the datagram of a simulated run with a ``noack_message``."""
     vector = np.array(ffi.unpack(message.vector, message.entries))
     return Encoder(RUN_ID, bytes(KEY_BYTES)).encode(
-        Message(Flow(message.flow), message.sequence, message.t_ns, vector, message.loop)
+        Message(Flow(message.flow), message.sequence, message.t_ns, vector, message.loop, message.error_level)
     )

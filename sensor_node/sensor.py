@@ -112,6 +112,7 @@ class Sensor(MachinePart):
         schedule: the announced changes of its settings; None if they cannot change.
         timeout_ns: how long to wait for an acknowledgement; None: updates are not acknowledged.
         observer: estimates x from the measurements; None: they are x.
+        reports_error: whether the network chooses by the errors of updates, which then report them.
         horizon_ns: a measurement with a later time is rejected.
     """
 
@@ -125,6 +126,7 @@ class Sensor(MachinePart):
     schedule: ChangeSchedule[tuple[Vector | None, Policy]] | None = None
     timeout_ns: int | None = None
     observer: Observer | None = None
+    reports_error: bool = False
     horizon_ns: int = _ANY_TIME_NS
 
     role = SENSOR
@@ -170,7 +172,7 @@ class Sensor(MachinePart):
         memory.fill(sensor, {
             "is_user": self._trigger is not None, "acknowledged": self.timeout_ns is not None,
             "timeout_ns": self.timeout_ns or 0, "knows_state": self.x0 is not None,
-            "events": self.first_number, "wait_ns": -1,
+            "events": self.first_number, "wait_ns": -1, "reports_error": self.reports_error,
             "x_s": start, "event_x": np.zeros(n), "x": np.zeros(n), "e_s": np.zeros(n),
         })  # fmt: skip
         sensor.trigger.event_ns = -1
@@ -321,6 +323,7 @@ def _part(start: Start, resolved: Scenario) -> Sensor:
         schedule=None if acknowledges else ChangeSchedule(resolved, _prepared),
         timeout_ns=resolved.timing.acknowledgement_timeout_ns if acknowledges else None,
         observer=observer_of(resolved, restarted=start.is_restart),
+        reports_error=resolved.network.link.reads_errors,
         horizon_ns=resolved.timing.horizon_ns,
     )
 

@@ -243,6 +243,8 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
     noack_decision decision;
     client->last_ns = relay->now_ns;
     serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
+    if (!relay->devices)
+        link->flows[client->place].error_level = noack_wire_error_level(data, size_bytes);
     noack_link_decide(
         link, client->place, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,
         &decision);

@@ -12,6 +12,7 @@ from typing import Annotated, NamedTuple, Self
 from pydantic import Field, model_validator
 
 from noack.impairments.constraints import AnyConstraint, find_longest_burst, require_consistent
+from noack.impairments.disciplines.maximum_error import MaximumError
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.blackout import Blackout
@@ -56,6 +57,13 @@ class LinkSettings(ScenarioSection):
     def chooses(self) -> bool:
         """Whether the queue of a rate chooses what it sends when the link is free."""
         return any(isinstance(one, Rate) and one.scheduler for one in self.impairments)
+
+    @property
+    def reads_errors(self) -> bool:
+        """Whether such a queue chooses by the errors that updates report."""
+        return any(
+            isinstance(one, Rate) and isinstance(one.discipline, MaximumError) for one in self.impairments
+        )
 
     @property
     def longest_burst(self) -> int | None:

@@ -52,7 +52,8 @@ _DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
 _HEADER_WORDS = 3
 SEQUENCE, TIME, VECTOR = 0, 1, 2
-"""Columns of the words of a message; those of its vector have the bits of its entries."""
+"""Columns of the words of a message; those of its vector have the bits of its entries. A message that
+was sent has its error level after them."""
 _DATAGRAM_WORDS = 1 + PACKET_HEAD_BYTES // 8
 
 
@@ -72,7 +73,7 @@ class InputReplay:
         self.difference: ReplayDifference | None = None
         self._machine, self._sizes = machine, sizes
         self._is_network = isinstance(machine, Channel)
-        width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values())
+        width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values()) + 1
         self._core: CData = ffi.new(
             "noack_input_replay *",
             {
@@ -129,14 +130,15 @@ class InputReplay:
         return int(replay.next)
 
     def sent_in(self, flow: Flow) -> Numbers:
-        """Return the messages of a flow that the machine sent in the newest part, (k, 2 + n).
+        """Return the messages of a flow that the machine sent in the newest part, (k, 3 + n).
 
-        The words of a message are its sequence number, its time, and its vector's n entries.
+        The words of a message are its sequence number, its time, its vector's n entries, and its
+        error level.
         """
         sent = self._sent[: self._core.sent_count]
         mine = sent[:, 0] == flow
         words = sent if mine.all() else sent[mine]
-        return words[:, 1 : _HEADER_WORDS + self._sizes.get(flow, 0)]
+        return words[:, 1 : _HEADER_WORDS + self._sizes.get(flow, 0) + 1]
 
     def forwarded(self) -> tuple[Numbers, NDArray[np.void]]:
         """Return flows and heads of the datagrams that left the network in the newest part."""
