@@ -7,7 +7,8 @@ import pytest
 
 from noack.theory.bounds.terms import NetworkConditions
 from tests.noack.theory.certificate_kinds.comparison import KINDS, examine
-from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, constants_of, dominated_by_errors
+from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, constants_of
+from tests.noack.theory.certificate_kinds.decaying import dominated_by_errors
 
 FEW, MOST = 6, 60
 LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 25, "continuous time": 15}

@@ -30,6 +30,7 @@ from tests.noack.theory.disturbed_loops import (
     worst_shares,
 )
 from tests.oracles.lossy_loops import (
+    DRIFTING,
     RUNS,
     STEPS,
     Steps,
@@ -120,8 +121,8 @@ BROKEN: dict[str, tuple[Change, dict[str, Any]]] = {
     ),
     "no delay": (
         lambda bounds: replace(bounds, delay_s=0.0),
-        {"disturbed": False, "n": 1, "m": 1, "mansd": 0, "delay_steps": 4, "sample_steps": 1,
-         "hold_steps": 0, "step_share": 0.03},
+        {"disturbed": False, "mansd": 0, "delay_steps": 4, "sample_steps": 1, "hold_steps": 0,
+         "step_share": 0.03, "beta": 0.01, **DRIFTING},
     ),
     "no disturbance": (
         lambda bounds: replace(bounds, disturbances=0 * bounds.disturbances),
