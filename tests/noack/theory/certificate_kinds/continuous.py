@@ -21,9 +21,9 @@ from noack.theory.certificates.delivery_flow import UNDISTURBED, DeliveryFlow, R
 from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
 from noack.theory.certificates.scheduled_flow import _ScheduledFlow
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificate_kinds.decaying import bounds_of, certified_by, near_the_example, search
+from tests.noack.theory.certificate_kinds.decaying import bounds_of, certified_by, dominated_by_errors, search
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time
-from tests.oracles.lossy_loops import System, random_system
+from tests.oracles.lossy_loops import DRIFTING, System, random_system
 
 
 def only_the_start() -> AbstractContextManager[Any]:
@@ -88,13 +88,13 @@ def _bounds(system: System) -> Bounds | None:
         return None
 
 
-def _without_one_loss(system: System) -> Bounds | None:
-    return _bounds(replace(system, mansd=system.mansd - 1))
-
-
-def _broken(mistake: Callable[[], AbstractContextManager[Any]], system: System) -> Bounds | None:
+def _broken(
+    certify: Callable[[System], Bounds | None],
+    mistake: Callable[[], AbstractContextManager[Any]],
+    system: System,
+) -> Bounds | None:
     with mistake():
-        return _bounds(system)
+        return certify(system)
 
 
 def _worst(system: System, trace: ContinuousTrace) -> dict[str, float]:
@@ -113,14 +113,16 @@ def _simulate(system: System, rng: np.random.Generator) -> Observed:
     return search(system, rng, simulate_continuous_time, _worst)
 
 
-_MISMATCH = partial(_draw, mismatch=0.5, window=(1, 1), recovery=0)
-
-
 CONTINUOUS = Kind(
     "continuous time", _draw, _bounds, _simulate,
-    {"one loss less": Broken(_without_one_loss, partial(_MISMATCH, mansd=1, n=1))}
+    {
+        "one loss less": Broken(
+            lambda system: _bounds(replace(system, mansd=system.mansd - 1)),
+            partial(_draw, mansd=1, **DRIFTING),
+        )
+    }
     | {
-        name: Broken(partial(_broken, mistake), partial(near_the_example, **where))
+        name: Broken(partial(_broken, _bounds, mistake), partial(dominated_by_errors, **where))
         for name, mistake, where in (
             ("the ellipsoid holds x(0) only", only_the_start, {"far": False}),
             ("no lost updates at an event", no_lost_updates, {"far": True}),
@@ -133,13 +135,8 @@ CONTINUOUS = Kind(
 _certified = certified_by(System.certify)
 
 
-def _broken_schedule(mistake: Callable[[], AbstractContextManager[Any]], system: System) -> Bounds | None:
-    with mistake():
-        return _certified(system)
-
-
 def _sampled(rng: np.random.Generator, far: bool) -> System:
-    near = near_the_example(rng, far=far)
+    near = dominated_by_errors(rng, far=far)
     return replace(near, step_s=0.02, delay_steps=1, hold_steps=1, known_start=rng.uniform() < 0.5)
 
 
@@ -150,19 +147,18 @@ def _scheduled(rng: np.random.Generator) -> System:
     return random_system(rng, n=int(rng.integers(1, 5)))
 
 
-_LATE = {"n": 1, "m": 1, "mansd": 0, "delay_steps": 4, "hold_steps": 0, "mismatch": 0.5}
-_HELD = {"n": 1, "m": 1, "mansd": 0, "delay_steps": 0, "hold_steps": 4}
-_LONG = {"beta": 0.01, "step_share": 0.03}
+_LONG = {"mansd": 0, "beta": 0.01, "step_share": 0.03}
 
 SCHEDULED = Kind(
     "schedule", _scheduled, _certified, search,
     {
-        name: Broken(partial(_broken_schedule, mistake), draw)
+        name: Broken(partial(_broken, _certified, mistake), draw)
         for name, mistake, draw in (
             ("the ellipsoid holds x(0) only", only_the_start, partial(_sampled, far=False)),
-            ("no mismatch in the flow", no_mismatch, partial(random_system, **_LATE, **_LONG)),
+            ("no mismatch in the flow", no_mismatch,
+             partial(random_system, **_LONG, **DRIFTING, delay_steps=4, hold_steps=0)),
             ("no age of inputs in the flow", no_age_of_inputs,
-             partial(random_system, **_HELD, **_LONG)),
+             partial(random_system, **_LONG, n=1, m=1, delay_steps=0, hold_steps=4)),
         )
     },
 )  # fmt: skip

@@ -7,7 +7,6 @@ out one effect each, in loops in which it matters.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import Any
@@ -15,7 +14,6 @@ from unittest.mock import patch
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, constant_kernel
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.bounds.terms import Constants, NoCertificateError
@@ -97,22 +95,18 @@ def _grown_by_losses(rng: np.random.Generator) -> System:
     )  # fmt: skip
 
 
-def dominated_by_errors(near: Matrix, *, far: bool) -> System:
-    """An example in which errors drive x further than x(0) is away, with changed numbers."""
+def dominated_by_errors(rng: np.random.Generator | None, *, far: bool, mansd: int = 3) -> System:
+    """A loop like an example in which errors drive x further than x(0) is, or not so far."""
+    near = np.ones((4, 2)) if rng is None else rng.uniform(0.9, 1.1, (4, 2))
     K = np.array([[-6.0, -3.0]]) * near[:1]
     return System(
         A=np.array([[0.0, 1.0], [2.0, -0.5] * near[1]]), B=np.array([[0.0], [1.0]]), K=K,
         H=np.array([[0.1, 1.0], [-3.6, -3.4] * near[2]]),
         weight=np.array([[2.0, 0.4], [0.0, 0.5]]),
         x0=np.array([0.4, -0.2] if far else [0.01, 0.02]) * near[3],
-        alpha=0.3, beta=0.1, known_start=True, mansd=3, step_s=0.03, sample_steps=1,
+        alpha=0.3, beta=0.1, known_start=True, mansd=mansd, step_s=0.03, sample_steps=1,
         delay_steps=0, hold_steps=0, lag_steps=0,
     )  # fmt: skip
-
-
-def near_the_example(rng: np.random.Generator, *, far: bool, mansd: int = 3) -> System:
-    """Loops that start near 0, or whose first events come soon."""
-    return replace(dominated_by_errors(rng.uniform(0.9, 1.1, (4, 2)), far=far), mansd=mansd)
 
 
 class NoCurvature(ErrorGains):
@@ -143,7 +137,6 @@ class ConstantThreshold(ErrorGains):
 
 
 INSTANT = {"sample_steps": 1, "delay_steps": 0, "hold_steps": 0, "step_share": 0.01}
-EVENTFUL = {"mismatch": 0.5, "beta": 0.01, **INSTANT}
 _FAST = {**DRIFTING, "beta": 0.01}
 
 MUTANTS: dict[str, tuple[Callable[[System], Constants], dict[str, Any]]] = {
@@ -174,7 +167,8 @@ MUTANTS: dict[str, tuple[Callable[[System], Constants], dict[str, Any]]] = {
     ),
     "only the first moment": (
         with_gains(OnlyTheFirstMoment, PlantGains),
-        {"spread": 10.0, "n": 2, "m": 1, "mansd": 1, "alpha_share": 0.8, **EVENTFUL},
+        {"spread": 10.0, "n": 2, "m": 1, "mansd": 1, "alpha_share": 0.8, "mismatch": 0.5,
+         "beta": 0.01, **INSTANT},
     ),
     "constant threshold": (
         with_gains(ConstantThreshold, PlantGains),
@@ -275,7 +269,7 @@ DECAYING = Kind(
         ),
         "no forced response": Broken(
             certified_by(with_gains(ErrorGains, NoForcedResponse)),
-            partial(near_the_example, far=False),
+            partial(dominated_by_errors, far=False),
         ),
     },
 )  # fmt: skip
