@@ -168,7 +168,7 @@ QUANTITIES = {
 }
 
 
-def triggers(paper: Mapping[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]:
+def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]:
     """Return the settings of every policy by name; constant thresholds are a fifth of β."""
     W, delta = {"weight": weight.tolist()}, 0.2 * paper["beta"]
     square = weight.T @ weight
@@ -306,5 +306,5 @@ def network_design(options: argparse.Namespace) -> Iterator[Row]:
         about = f"{' '.join((name, *settings[:1]))}, {kind}"
         keys = {"certified": "M", "cost": "cost", "transmissions": "transmissions"}
         for key in [key for key in keys if key in found.given]:
-            before, after = (float(loop[key] or 0) for loop in (found.given, found.best))
+            before, after = (float(str(loop[key] or 0)) for loop in (found.given, found.best))
             yield Row(f"{about}: {keys[key]}", after, "", Peer("given loop", before))

@@ -49,8 +49,8 @@ typedef void stage_function(packet *packet, const noack_stage *stage, noack_stag
    depend on other stages. */
 stage_function apply_bernoulli, apply_four_state, apply_gilbert_elliott, apply_periodic,
     apply_scripted, apply_worst_case, apply_tail_drop, apply_blackout, apply_corrupt, apply_delay,
-    apply_duplicate, apply_earliest_deadline, apply_opportunities, apply_priority, apply_reorder,
-    apply_replay, apply_schedule;
+    apply_duplicate, apply_earliest_deadline, apply_maximum_error, apply_opportunities,
+    apply_priority, apply_reorder, apply_replay, apply_schedule;
 
 /* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. */
 static inline void refuse(noack_decision *decision, int64_t fate) {
@@ -122,14 +122,18 @@ noack_packet_row packet_row(
 int is_first_intact(const noack_decision *decision, int copy);
 /* At equal times, datagrams leave in order of direction, then of arrival: put counts them. */
 int64_t departure_order(int64_t direction, int64_t put);
-/* The heap has room. */
+
+/* heap.c */
+
+/* There must be room. */
 void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
 /* Remove the first entry. */
 void heap_pop(noack_heap_entry *heap, int64_t *count);
 
 /* Whether the queue of a stage chooses when its link is free (waiting.c). */
 static inline int is_scheduler(const noack_stage *stage) {
-    return stage->kind == NOACK_PRIORITY || stage->kind == NOACK_EARLIEST_DEADLINE;
+    return stage->kind == NOACK_PRIORITY || stage->kind == NOACK_EARLIEST_DEADLINE
+           || stage->kind == NOACK_MAXIMUM_ERROR;
 }
 
 /* waiting.c: the number of a packet's flow in the table of a stage. */

@@ -20,6 +20,7 @@ from cosim.output.figure_description import (
     Line,
     Panel,
     Row,
+    Steps,
     plain,
     time_axis,
 )
@@ -117,7 +118,8 @@ def _link_rows(over_time: LoopsOverTime, names: Sequence[str], in_flight: InFlig
         ("Datagrams in the network", queue, Axis(label="datagrams", ends=(0.0, None))),
         (
             "Share of the link",
-            _curves(ends_s - ends_s[0] / 2, 100 * shares, names),
+            # Steps: an interval between two without traffic is visible, too.
+            _curves(ends_s - ends_s[0] / 2, 100 * shares, names, steps="mid"),
             Axis(label="%", ends=(0.0, None)),
         ),
     )
@@ -147,11 +149,11 @@ def _rows(over_time: LoopsOverTime, *panels: tuple[str, Sequence[Item], Axis]) -
     ]  # fmt: skip
 
 
-def _curves(t_s: Reals, values: Reals, names: Sequence[str]) -> list[Item]:
+def _curves(t_s: Reals, values: Reals, names: Sequence[str], steps: Steps = "") -> list[Item]:
     """Describe a curve for each of a few loops, (L, k) over (k,), or quantiles over many."""
     if len(names) <= NAMED:
         return [
-            Line(x=t_s, y=curve, label=name, colour=colour)
+            Line(x=t_s, y=curve, label=name, colour=colour, steps=steps)
             for name, colour, curve in zip(names, palette.SERIES, values, strict=False)
         ]
     levels = quantiles(values)

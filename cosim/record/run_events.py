@@ -97,8 +97,7 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
     schedule = ChangeSchedule[None](scenario)
     for number, change in sorted(found.items(), key=lambda one: (one[1].t_ns, one[0])):
         if _add(schedule, change, change.t_ns):
-            taken = schedule.take(change.t_ns)
-            assert taken is not None
+            (taken,) = schedule.take(change.t_ns)
             made.append(RecordedChange(change, since[number], taken.scenario))
     return made
 
@@ -111,7 +110,7 @@ def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
         if change.number not in known:  # a restarted controller receives it again
             known.add(change.number)
             _add(schedule, change, since_ns)
-    while (taken := schedule.take(NEVER_NS)) is not None:
+    for taken in schedule.take(NEVER_NS):
         flow.change(taken.since_ns, loop_of(taken.scenario).setpoint)
     return flow
 

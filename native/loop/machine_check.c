@@ -249,7 +249,7 @@ const char *noack_process_check(const noack_process *process) {
     if (!is_between(NOACK_PLANT, process->role, NOACK_CONTROLLER)
         || !is_between(1, process->loops, MOST_LOOPS))
         return "a process has no role or no loops";
-    if (process->due_ns == NULL || process->heap == NULL || process->notes == NULL
+    if (process->heap == NULL || process->notes == NULL
         || !is_between(1, process->note_places, MOST_LENGTH)
         || !is_between(0, process->note_count, process->note_places)
         || (process->role == NOACK_PLANT && process->plants == NULL)

@@ -40,6 +40,8 @@ _PPB = 10**9
 SLEW_PPB = 5_000_000
 """Default of the slew rate: 0.5 % of the rate of the process's own clock."""
 NS_PER_S = 1_000_000_000
+NEVER_NS = 2**63 - 1
+"""A time that never comes."""
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 _NAMESPACE = Path("/proc/self/ns/time")
 

@@ -8,7 +8,8 @@ Layout, little endian (``docs/wire.md`` has test vectors)::
          0     2  magic, the bytes "NA"
          2     1  version: 1, or 2 of an encrypted datagram
          3     1  flow: 1 measurement, 2 update, 3 actuation, 4 acknowledgement
-         4     2  dimension n of the vector, 1 to 64; 0 of an acknowledgement
+         4     1  dimension n of the vector, 1 to 64; 0 of an acknowledgement
+         5     1  error level of an update; 0: unknown
          6     2  number of the loop, unsigned, 0 to 65,534; 0 in a run of one loop
          8     8  run id, unsigned
         16     8  sequence number, unsigned, from 0 within a flow; what is acknowledged
@@ -40,13 +41,14 @@ MAX_DIMENSION = 64
 MAX_LOOPS = 65_535
 TIMES_NS = 2**62
 """Upper limit of times: sums of two fit the record's columns."""
-_HEADER = struct.Struct("<2sBBHHQQq")
+_HEADER = struct.Struct("<2sBBBBHQQq")
 HEADER_ROW = np.dtype(
     [
         ("magic", "S2"),
         ("version", "u1"),
         ("flow", "u1"),
-        ("dimension", "<u2"),
+        ("dimension", "u1"),
+        ("error_level", "u1"),
         ("loop", "<u2"),
         ("run_id", "<u8"),
         ("sequence", "<u8"),
@@ -146,6 +148,8 @@ class Message(NamedTuple):
     vector: Vector
     loop: int = 0
     """The number of its loop, among the loops of its run."""
+    error_level: int = 0
+    """Of an update: its error as a share of its threshold, on the scale of docs/wire.md; 0: unknown."""
 
 
 class Rejection(StrEnum):
@@ -169,6 +173,7 @@ class Header(NamedTuple):
     version: int
     flow: int
     dimension: int
+    error_level: int
     loop: int
     run_id: int
     sequence: int
@@ -230,6 +235,7 @@ class Encoder:
             if not 0 <= message.loop <= MAX_LOOPS:
                 raise OverflowError(f"loop {message.loop}")
             own.flow, own.loop, own.t_ns = message.flow, message.loop, message.t_ns
+            own.error_level = message.error_level.to_bytes(1, "little")[0]
             own.sequence = _signed(message.sequence)
         except OverflowError as error:
             raise ValueError(f"a number does not fit its field: {error}") from None

@@ -136,9 +136,10 @@ class ModelSection(ScenarioSection):
             raise ValueError("parameters: only a named model has parameters")
         if self.A is None or self.B is None or self.gain is None:
             missing = [k for k in ("A", "B", "gain") if getattr(self, k) is None]
+            hint = "; noack gain FILE computes one" if missing == ["gain"] else ""
             raise ValueError(
                 f"{missing[0]}: give a model by name, or by the matrices A, B and gain, or by a "
-                f"file of them (missing: {', '.join(missing)})"
+                f"file of them (missing: {', '.join(missing)}){hint}"
             )
         n = len(self.A)
         require_shape(self.A, "A", (n, n), "the system matrix is square")
@@ -398,6 +399,11 @@ class NetworkSection(DirectionSection):
             )
         if self.actuation is not None and self.protocol == "ack":
             raise ValueError('actuation: not with protocol = "ack"')
+        for name in ("acknowledgements", "actuation"):
+            direction: DirectionSection | None = getattr(self, name)
+            if direction is not None and direction.link.reads_errors:
+                why = "only updates report the error that maximum_error needs; take another discipline"
+                raise ValueError(f"{name}.impairments: {why}")
         return self
 
     @property

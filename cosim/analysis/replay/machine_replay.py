@@ -17,7 +17,8 @@ from cosim.analysis.summary_model import ReplayDifference
 from cosim.record.processes import Life, split_by_life
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
-from netem.channel import NO_TIME_NS, Channel, channel_of
+from netem.channel import Channel, channel_of
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines
@@ -50,7 +51,8 @@ DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
 _HEADER_WORDS = 3
 SEQUENCE, TIME, VECTOR = 0, 1, 2
-"""Columns of the words of a message; those of its vector have the bits of its entries."""
+"""Columns of the words of a message; those of its vector have the bits of its entries. A message that
+was sent has its error level after them."""
 _DATAGRAM_WORDS = 1 + PACKET_HEAD_BYTES // 8
 
 
@@ -70,7 +72,7 @@ class InputReplay:
         self.difference: ReplayDifference | None = None
         self._machine, self._sizes = machine, sizes
         self._is_network = isinstance(machine, Channel)
-        width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values())
+        width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values()) + 1
         self._core: CData = ffi.new(
             "noack_input_replay *",
             {
@@ -127,14 +129,15 @@ class InputReplay:
         return int(replay.next)
 
     def sent_in(self, flow: Flow) -> Numbers:
-        """Return the messages of a flow that the machine sent in the newest part, (k, 2 + n).
+        """Return the messages of a flow that the machine sent in the newest part, (k, 3 + n).
 
-        The words of a message are its sequence number, its time, and its vector's n entries.
+        The words of a message are its sequence number, its time, its vector's n entries, and its
+        error level.
         """
         sent = self._sent[: self._core.sent_count]
         mine = sent[:, 0] == flow
         words = sent if mine.all() else sent[mine]
-        return words[:, 1 : _HEADER_WORDS + self._sizes.get(flow, 0)]
+        return words[:, 1 : _HEADER_WORDS + self._sizes.get(flow, 0) + 1]
 
     def forwarded(self) -> tuple[Numbers, NDArray[np.void]]:
         """Return flows and heads of the datagrams that left the network in the newest part."""
@@ -180,7 +183,7 @@ class InputReplay:
         if self.difference is not None or replay.difference == core.NOACK_EQUAL:
             return
         at, other = replay.difference_at, replay.other_ns
-        other_ns = None if other == NO_TIME_NS else other
+        other_ns = None if other == NEVER_NS else other
         table, row, rows = place_of(at)
         now_ns = int(rows["now_ns"][row])
         if replay.difference == core.NOACK_TIME_RUNS_BACKWARD:

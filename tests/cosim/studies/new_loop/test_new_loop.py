@@ -174,10 +174,10 @@ def test_poles_are_placed(poles: list[complex]) -> None:
     np.testing.assert_allclose(np.sort_complex(found.eigenvalues), np.sort_complex(poles), atol=1e-5)
 
 
-def test_the_double_integrators_gain_is_the_textbooks() -> None:
-    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    model = replace(noack.linearise("double_integrator"), A=A, B=B)
-    found = noack.gain(model, q=[1.0, 0.0])
+def test_the_double_integrators_gain_is_the_textbooks_and_none_is_needed_before() -> None:
+    model = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}
+    settings = {"model": model, "plant.uncertainty_B": [[0.0], [0.0]]}
+    found = noack.gain("double_integrator", q=[1.0, 0.0], settings=settings)
     np.testing.assert_allclose(found.K, [[-1.0, -np.sqrt(2.0)]], atol=1e-9)
 
 

@@ -27,6 +27,7 @@ from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
 from tests.noack.theory.certificate_kinds.shares import Case, shares_of
 from tests.oracles.lossy_loops import (
+    DRIFTING,
     EventRule,
     Flags,
     Reals,
@@ -371,7 +372,7 @@ def without(name: str) -> Callable[[Scenario, Conditions], Any]:
 INSTANT = {"delay_steps": 0, "hold_steps": 0, "known_start": True, "window": (1, 1), "recovery": 0}
 LATE = {"n": 2, "m": 1, "known_start": True, "window": (1, 1), "recovery": 0, "lag_steps": 0,
         "sample_steps": 2, "mansd": 1}  # fmt: skip
-FAR = {"n": 1, "m": 1, "mismatch": 0.5, "step_share": 0.01, "sample_steps": 1, **INSTANT}
+FAR = {**DRIFTING, "step_share": 0.01, "sample_steps": 1, **INSTANT}
 
 BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dict[str, Any]]] = {
     **{
@@ -382,8 +383,8 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
     },
     "periodic, no age of the input": (
         "periodic", without("hold_s"), {
-            **LATE, "delay_steps": 0, "hold_steps": 3, "sample_steps": 3, "mansd": 6,
-            "mismatch": 0.0, "step_share": 0.03,
+            **LATE, "delay_steps": 0, "hold_steps": 1, "mansd": 6, "mismatch": 0.0,
+            "step_share": 0.03,
         },
     ),
     "self_triggered, no late update": (
@@ -402,10 +403,10 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
     "relative, no share": ("relative", with_trigger(NoShares), {**FAR, "mansd": 0}),
     "mixed, no share": ("mixed", with_trigger(NoShares), {**FAR, "mansd": 0, "beta": 0.01}),
     "quadratic, no cross term": (
-        "quadratic", with_trigger(NoCrossTerm), {**FAR, "mansd": 0, "beta": 0.01},
+        "quadratic", with_trigger(NoCrossTerm), {**FAR, "mansd": 0, "beta": 0.001},
     ),
     "dwell, no growth before the test": (
-        "dwell", with_trigger(NoDwell), {**FAR, "mansd": 0, "beta": 0.01},
+        "dwell", with_trigger(NoDwell), {**FAR, "mansd": 0, "beta": 0.001, "step_share": 0.03},
     ),
     "send_on_area, no growth after the average": (
         "send_on_area", with_trigger(NoTimeOfTheArea), {**FAR, "mansd": 0, "beta": 0.01},
