@@ -469,7 +469,7 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
             parts.append(combined([reader.observed()]))
         for table, rows in part.items():
             reader.take(table, rows)
-    return combined([*parts, reader.end()]) if parts else reader.end()
+    return combined([*parts, reader.end()])
 
 
 _MOST_WAITING = 100_000
