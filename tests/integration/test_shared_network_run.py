@@ -21,7 +21,7 @@ def different(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
     change = "changes=[{ at_s = 1.5, set = { mansd = 2 } }]"
     settings = (*live.settings(horizon_s=3.0), "--set", change)
     with live.begun(tmp_path_factory.mktemp("different")) as start:
-        return start(*settings, command=("run", "different_loops")).finish()
+        return start(*settings, command=("run", "different_loops"), viewer=True).finish()
 
 
 def test_all_loops_reach_the_horizon_at_their_rates_and_are_replayed(
