@@ -44,7 +44,8 @@ from noack.theory.bounds.terms import Constants, NetworkConditions, Part
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 from noack.theory.certificates.loss_accumulation import LossAccumulation
 
-_SIGNALS = 6
+_SIGNALS, _BEGUN, _LATER = 7, 3, 6
+"""Number of the signals; places of π̄ and π, those of ‖p‖ with the start and without."""
 _EPSILON = float(np.finfo(float).eps)
 
 
@@ -152,7 +153,7 @@ class KnownBounds:
     """Bounds of one loop that hold, each of which may be replaced by a smaller one."""
 
     signals: Vector
-    """Of (q, b, η, π, sup‖R_E x‖, 1), or β̃ for b."""
+    """Of (q, b, η, π or the start's, sup‖R_E x‖, 1, π), or β̃ for b."""
     states: dict[str, float]
     """Of sup‖C x‖."""
     errors: dict[Output, float]
@@ -188,6 +189,7 @@ class ErrorInequalities:
             output: Coefficients(free + start[output], gain) for output, (free, gain) in plant.states.items()
         }
         self._growths = [list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every]
+        self._begin_s = math.inf if earlier_error else conditions.start_s
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
@@ -236,7 +238,7 @@ class ErrorInequalities:
         solved: Matrix,
         is_counted: NDArray[np.bool_],
     ) -> LoopConstants:
-        """Return what follows from bounds of the signals, (loops, 6)."""
+        """Return what follows from bounds of the signals, (loops, 7)."""
         states = signals.free + _applied(signals.states, solved)
         state = dict(zip(self._states, np.moveaxis(states, -1, 0), strict=True))
         held, estimation = solved[..., 0], solved[..., 2]
@@ -264,13 +266,15 @@ class ErrorInequalities:
     def _signals(
         self, method: BoundMethod, events: Counts, spacing_s: Vector, own: ErrorGrowth | None
     ) -> "_Signals":
-        """Return how all outputs depend on (q, b, η, π, sup‖R_E x‖, 1).
+        """Return how all outputs depend on (q, b, η, π̄, sup‖R_E x‖, 1, π).
 
         Every ‖e_s‖_W has grown by ``own`` from at most b at the last test; without it b is β̃. An
         event's x_s − x̂ is at most this plus η, the present x_s − x is at most this.
         """
         held, test, estimated, *_ = np.eye(_SIGNALS)
-        sensor = test if own is None else _columns(0.0, own.stretch, 0.0, *own.driven)
+        sensor = test
+        if own is not None:
+            sensor = self._split(_columns(0.0, own.stretch, 0.0, *own.driven, 0.0), own.highest)
         present = {output: self._present(output, own) for output in self._error.outputs}
         received, dropouts = present[Output.GAIN], np.full_like(events, self._conditions.dropouts)
 
@@ -288,6 +292,12 @@ class ErrorInequalities:
             errors = {output: row + gone[output] for output, row in present.items()}
             earlier = gone[Output.GAIN]
             near = received + missing(Output.GAIN, events - dropouts)
+        if own is not None:
+            sups = {output: kernels[0].sup() for output, kernels in self._plant.driven.items()}
+            errors = {output: self._split(row, sups[output]) for output, row in errors.items()}
+            received, earlier, near = (
+                self._split(row, sups[Output.GAIN]) for row in (received, earlier, near)
+            )
         whole = errors[Output.GAIN]
         lost = whole[..., 1] - near[..., 1]
         alone = self._alone(lost, spacing_s)
@@ -311,8 +321,22 @@ class ErrorInequalities:
         until_s, still = later_s + (0.0 if own is None else own.longest_s), np.zeros(())
         driven: tuple[Vector, Vector, Vector] = (still, still, still)
         if until_s > 0:
-            driven = self._plant.growths(until_s, COARSE_CELLS)[output].totals
-        return _columns(0.0, self._error.now_until(until_s)[output], 0.0, *driven)
+            growth = self._plant.growths(until_s, COARSE_CELLS)[output]
+            driven = growth.totals if own is None else growth.means(own.ages_s + later_s)
+        return _columns(0.0, self._error.now_until(until_s)[output], 0.0, *driven, 0.0)
+
+    def _split(self, row: Matrix, highest: Vector) -> Matrix:
+        """Split what the input error drives: ‖p‖ > π only before the first input.
+
+        ``highest`` bounds what a p of 1 adds in a unit of time.
+        """
+        if self._begin_s == math.inf:
+            return row
+        row = row.copy()
+        beyond = np.minimum(row[..., _BEGUN], self._begin_s * highest)
+        row[..., _LATER] += row[..., _BEGUN] - beyond
+        row[..., _BEGUN] = beyond
+        return row
 
     def _missing(self, output: Output, events: Counts, spacing_s: Vector, own: ErrorGrowth | None) -> Matrix:
         """Return the bound of the part of sup‖C e_c‖ from missing events as a row of the signals.
@@ -321,16 +345,16 @@ class ErrorInequalities:
         """
         gain = self._missing_gain(output, events, spacing_s)
         if own is None:
-            return _columns(0.0, gain, gain, 0.0, 0.0, 0.0)
+            return _columns(0.0, gain, gain, 0.0, 0.0, 0.0, 0.0)
         driven = [gain * size for size in own.driven]
         if own.longest_s > 0:
             for place, kernel in enumerate(self._plant.driven[output]):
-                followed = own.longest_s * sum_of_sups(kernel, events, spacing_s)
+                followed = own.mean_s * sum_of_sups(kernel, events, spacing_s)
                 driven[place] = np.minimum(driven[place], followed)
-        return _columns(0.0, gain, gain, *driven)
+        return _columns(0.0, gain, gain, *driven, 0.0)
 
     def _solved(self, signals: "_Signals", growing: ErrorGrowth, own: ErrorGrowth | None) -> Solution:
-        """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
+        """Return the loop gains, (loops,), and the bounds of the signals, (loops, 7)."""
         errors, beyond, held = signals.errors, self._beyond, self.age_gains
         held_input, _, estimated, *_ = np.eye(_SIGNALS)
         input_error = errors[Output.GAIN] + held_input
@@ -349,11 +373,12 @@ class ErrorInequalities:
         of_test = (through + growing.estimation * estimated, growing.fixed + free)
         if own is None:
             by_input, mismatched, forced = growing.driven
+            driven = _columns(0.0, 0.0, 0.0, by_input, mismatched, 0.0, 0.0)
             of_test = (
-                growing.stretch * of_test[0] + _columns(0.0, 0.0, 0.0, by_input, mismatched, 0.0),
+                growing.stretch * of_test[0] + self._split(driven, growing.highest),
                 growing.stretch * of_test[1] + forced,
             )
-        others = ((input_error, beyond), of_mismatch, (0.0 * input_error, 1.0))
+        others = ((input_error, beyond), of_mismatch, (0.0 * input_error, 1.0), (input_error, 0.0))
         each = (of_age, of_test, of_estimate, *others)
         rows = _rows(*(row for row, _ in each))
         right = _columns(*(right for _, right in each))
@@ -385,14 +410,14 @@ class ErrorInequalities:
         for name, (free, gain) in self._states.items():
             states[name] = min(states[name], float(free + gain * known.input_error))
         age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
-        driven = np.array([v[3], v[4], 1.0])
         tested = []
         for growth in growths:
             b = growth.fixed + sum(share * states[C] for C, share in growth.shares.items())
-            grown = growth.stretch * b + float(np.array(growth.driven) @ driven)
+            driven = self._split(_columns(0.0, growth.stretch, 0.0, *growth.driven, 0.0), growth.highest)
+            grown = float(driven @ np.array([0.0, b, *v[2:]]))
             tested.append(b if len(growths) == 1 else grown)
         beyond = max(known.input_error, self.start_error)
-        found = [age, max(tested), 0.0, beyond, states[Output.MISMATCH], 1.0]
+        found = [age, max(tested), 0.0, beyond, states[Output.MISMATCH], 1.0, known.input_error]
         known.signals = np.minimum(v, np.array(found, dtype=np.float64))
 
     @property
@@ -498,7 +523,7 @@ class ErrorInequalities:
 
 
 class _Signals(NamedTuple):
-    """The outputs of x and e_c as linear functions of (q, b, η, π, sup‖R_E x‖, 1).
+    """The outputs of x and e_c as linear functions of (q, b, η, π̄, sup‖R_E x‖, 1, π).
 
     η = sup‖x̂ − x‖_W, and b bounds ‖e_s‖_W after each test, or is β̃.
     """
@@ -507,18 +532,18 @@ class _Signals(NamedTuple):
     free: Vector
     """(…, k) the constant part of sup‖C x‖."""
     states: Matrix
-    """(…, k, 6)"""
+    """(…, k, 7)"""
     errors: Mapping[Output, Vector]
-    """(…, 6) of sup‖C e_c‖."""
+    """(…, 7) of sup‖C e_c‖."""
     sensor: Vector
-    """(…, 6) of β̃ = sup‖e_s‖_W."""
+    """(…, 7) of β̃ = sup‖e_s‖_W."""
     received: Vector
-    """(…, 6) of sup‖K e_c‖ while no event is missing."""
+    """(…, 7) of sup‖K e_c‖ while no event is missing."""
     earlier: Vector
-    """(…, 6) of the part of sup‖K e_c‖ that does not come from the present e_s."""
+    """(…, 7) of the part of sup‖K e_c‖ that does not come from the present e_s."""
 
     def through(self, gains: Mapping[str, Vector | float]) -> tuple[Vector, Vector]:
-        """Return Σ_C gain_C sup‖C x‖ by its linear, (…, 6), and its constant part, (…)."""
+        """Return Σ_C gain_C sup‖C x‖ by its linear, (…, 7), and its constant part, (…)."""
         row = _columns(*(gains.get(name, 0.0) for name in self.names))
         return np.asarray((row[..., None, :] @ self.states)[..., 0, :]), _product(row, self.free)
 

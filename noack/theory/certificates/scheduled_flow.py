@@ -36,7 +36,7 @@ def is_scheduled_flow(part: Part, conditions: NetworkConditions) -> bool:
     """Return whether the constants of a loop without inputs can be sharpened."""
     error, plant, bound, estimation = part
     is_known = plant.is_one_plant and plant.forcing is None and estimation == MEASURED
-    is_tested = bound.is_tested and not bound.also and not bound.ago_s
+    is_tested = bound.is_tested and not bound.ago_s  # of several bounds the first is used
     return (
         is_known
         and is_tested
@@ -79,6 +79,7 @@ class _ScheduledFlow:
     """The bounds of one loop, made smaller in turns; events are ``spacing_s`` apart."""
 
     def __init__(self, part: Part, conditions: NetworkConditions, spacing_s: float) -> None:
+        part = part._replace(bound=part.bound._replace(also=()))
         self._part, self._conditions, self.spacing_s = part, conditions, spacing_s
         self._step = ErrorInequalities(part, conditions, 0.0)
         self.known = self._step.known(spacing_s)
@@ -148,10 +149,11 @@ class _ScheduledFlow:
             float(error.missing(Output.WEIGHTED, lost, self.spacing_s))
             for lost in range(conditions.dropouts + 1)
         ]
-        plain, level = (1 + np.array(missing)) * known.sensor, self._part.bound.reached
+        plain, bound = (1 + np.array(missing)) * known.sensor, self._part.bound
+        level = bound.reached if bound.forced_s == np.inf else None  # a due event needs no e_s
         bend = 0.0 if level is None else bend_of_error(reach, level)
         kernel = error.kernels[Output.WEIGHTED]
         errors = errors_after_losses(reach, plain, known.sensor, level, self.spacing_s, kernel, bend)
-        _, _, _, input_error, mismatch, _ = known.signals.tolist()
+        _, _, _, input_error, mismatch, *_ = known.signals.tolist()
         entered = self._entered(conditions.delay_s, input_error, mismatch)
         return error.stretch(conditions.delay_s) * float(errors[-1]) + entered
