@@ -94,9 +94,9 @@ def _compare_vectors(table: str, rows: Rows, sent: Numbers, packets: Rows | None
     """Compare the messages that a process received; some have crossed the network."""
     words, _ = received_words(table, rows)
     _require((np.diff(sent[:, SEQUENCE]) > 0).all())
-    if not np.array_equal(words, sent[: len(words)]):
+    if not np.array_equal(words, sent[: len(words), :-1]):
         _require((np.diff(words[:, SEQUENCE]) > 0).all())
-        _require(np.array_equal(words, sent[_places(sent, words[:, SEQUENCE])]))
+        _require(np.array_equal(words, sent[_places(sent, words[:, SEQUENCE]), :-1]))
     if packets is not None:
         headers, passed = headers_of(packets["head"]), packets["release_ns"] >= 0
         passed &= (headers["magic"] == MAGIC) & (packets["flow"] == direction_of(flow))
@@ -106,13 +106,14 @@ def _compare_vectors(table: str, rows: Rows, sent: Numbers, packets: Rows | None
 def _compare_heads(packets: Rows, sent: Numbers, flow: Flow, loop: int) -> None:
     """Compare what the network recorded of the messages of a flow: first bytes, and sizes."""
     headers, expected = headers_of(packets["head"]), np.zeros(len(packets), HEADER_ROW)
-    entries = sent.shape[1] - VECTOR
+    entries = sent.shape[1] - VECTOR - 1
     if len(headers):
         words = sent[_places(sent, headers["sequence"].view(np.int64))]
         expected["magic"], expected["flow"], expected["loop"] = MAGIC, flow, loop
         expected["dimension"] = entries
         expected["version"], expected["run_id"] = headers[0]["version"], headers[0]["run_id"]
         expected["sequence"], expected["t_ns"] = words[:, SEQUENCE], words[:, TIME]
+        expected["error_level"] = words[:, -1]
     _require((packets["flow"] == direction_of(flow)).all())
     _require((packets["size_bytes"] == datagram_bytes(entries)).all())
     _require(headers.tobytes() == expected.tobytes())
