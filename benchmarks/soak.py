@@ -43,9 +43,17 @@ from rich.console import Console
 
 from benchmarks.programs import FREE_PORTS, LAUNCHER, NOACK, PLAIN_TERMINAL, PROGRESS, Processes, Sample
 from benchmarks.report import MeasurementError, say
-from cosim.output import palette
-from cosim.output.figure_description import Axis, FigureDescription, Line, Panel, Row, Spans, time_axis
-from cosim.output.figure_files import save_figure
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import (
+    Axis,
+    FigureDescription,
+    Line,
+    Panel,
+    Row,
+    Spans,
+    time_axis,
+)
+from cosim.output.figures.figure_files import save_figure
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SUMMARY_FILE
 from cosim.record.run_record import load_record

@@ -5,8 +5,6 @@
    record, numbered over both directions. */
 #include "core.h"
 
-enum { MOST_LOOPS = 65535 };
-
 const char *noack_channel_check(const noack_channel *channel) {
     if (!is_between(1, channel->loops, MOST_LOOPS) || !is_between(1, channel->directions, 2))
         return "a network has 1 to 65535 loops, and one or two directions";

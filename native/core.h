@@ -25,6 +25,8 @@
 #define LATEST_NS                                                                                  \
     (INT64_C(1) << 61) /* 73 years: packets that must pass may exceed a queue's size */
 
+enum { MOST_LOOPS = 65535 }; /* of a run: datagrams have the number of the loop in 16 bits */
+
 static inline int64_t max_of(int64_t a, int64_t b) { return a > b ? a : b; }
 static inline int64_t min_of(int64_t a, int64_t b) { return a < b ? a : b; }
 static inline int is_between(int64_t least, int64_t number, int64_t most) {

@@ -684,7 +684,7 @@ void noack_observer_correct(noack_observer *observer, int64_t n, const double *y
 typedef struct { /* noack.core.clock: simulated time since the run's epoch */
     int64_t epoch_ns; /* reading of the coordinator's monotonic clock at simulated time 0 */
     double speed;     /* simulated time per time of that clock */
-    int64_t slew_ppb; /* 0: this host has that clock; else noack.core.clock: */
+    int64_t slew_ppb; /* 0: this host has that clock; else the slew of SlewedClock: */
     int64_t since_ns, begun_ns, target_ns;
 } noack_clock;
 

@@ -32,7 +32,7 @@ with lazy_modules():
     from noack.theory.certificates import assumptions
 
 if TYPE_CHECKING:
-    from cosim.output.figure_format import FigureFiles
+    from cosim.output.figures.figure_format import FigureFiles
 
 _PER_CORE = 4
 """Maximum worker processes per core; more gain nothing, and use memory."""

@@ -12,7 +12,7 @@ import typer
 from typer import Argument, Option
 
 from cosim.lazy_modules import lazy_modules
-from cosim.output.figure_format import FigureFiles, FigureFormat, figure_files
+from cosim.output.figures.figure_format import FigureFiles, FigureFormat, figure_files
 from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE, chosen_run
 from cosim.shipped_files import find_shipped, shipped_names
 from noack.core.errors import CallerError

@@ -385,13 +385,11 @@ def run_report(run_dir: Path, loop: str | None = None, *, again: bool = False) -
             loop.
         MachineError: the report cannot be written.
     """
-    outcome, run = reopen(run_dir), load_run(run_dir)
-    if loop is not None:
-        run.number_of(loop)  # refuses an unknown name
+    summary, run = _opened(run_dir, loop)
     path = run_dir / file_of_loop(REPORT_FILE, loop)
     if path.is_file() and not again:
         return path
-    return _write_report(run, outcome.summary, run_dir, loop)
+    return _write_report(run, summary, run_dir, loop)
 
 
 def write_recording(run_dir: Path, loop: str | None = None) -> None:
@@ -403,10 +401,18 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
         MachineError: the recording cannot be written.
     """
     require_viewer()
-    outcome, run = reopen(run_dir, view=False), load_run(run_dir)
+    summary, run = _opened(run_dir, loop, view=False)
+    _write_recording(run, summary, run_dir, loop)
+
+
+def _opened(run_dir: Path, loop: str | None, *, view: bool = True) -> tuple[RunSummary, RecordedRun]:
+    """Return summary and record of an earlier run, which has this loop."""
+    summary, run = reopen(run_dir, view=view).summary, load_run(run_dir)
+    if run.names != [one.name for one in summary.loops]:
+        raise CallerError(f"{run_dir}: {SUMMARY_FILE} has other loops than {SCENARIO_FILE}; one was changed")
     if loop is not None:
         run.number_of(loop)  # refuses an unknown name
-    _write_recording(run, outcome.summary, run_dir, loop)
+    return summary, run
 
 
 def import_libraries() -> None:

@@ -3,7 +3,7 @@
 
 #include "loop.h"
 
-enum { MOST_LOOPS = 65535, MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16 };
+enum { MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16 };
 static const int64_t MOST_LENGTH = INT64_C(1) << 32;
 
 /* Times and numbers of which a few sums, with the time of a message, are in the range of int64_t.

@@ -23,7 +23,6 @@ writes datagrams, with their tags by keyed BLAKE2b; :class:`EncryptedSeal` encry
 """
 
 import hashlib
-import struct
 from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
@@ -41,7 +40,6 @@ MAX_DIMENSION = 64
 MAX_LOOPS = 65_535
 TIMES_NS = 2**62
 """Upper limit of times: sums of two fit the record's columns."""
-_HEADER = struct.Struct("<2sBBBBHQQq")
 HEADER_ROW = np.dtype(
     [
         ("magic", "S2"),
@@ -55,8 +53,8 @@ HEADER_ROW = np.dtype(
         ("t_ns", "<i8"),
     ]
 )
-"""The same as a row of an array."""
-HEADER_BYTES = _HEADER.size
+"""A header as a row of an array."""
+HEADER_BYTES = HEADER_ROW.itemsize
 MAX_DATAGRAM_BYTES = HEADER_BYTES + 8 * MAX_DIMENSION + TAG_BYTES
 
 
@@ -189,7 +187,7 @@ def read_header(datagram: bytes) -> Header | None:
     """Read the header of a datagram without verification; None if it is no datagram of noack."""
     if len(datagram) < HEADER_BYTES or datagram[:2] != MAGIC:
         return None
-    return Header(*_HEADER.unpack_from(datagram)[1:])
+    return Header(*np.frombuffer(datagram, HEADER_ROW, 1).tolist()[0][1:])
 
 
 def loop_number(datagram: bytes) -> int | None:

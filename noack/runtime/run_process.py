@@ -24,7 +24,7 @@ from typing import Protocol, TypeVar
 
 from setproctitle import setproctitle
 
-from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
+from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, ExitStatus, NoackError, NoAnswerError, PeerError, one_line
 from noack.core.process_limits import exhausted_limit, require_limits
 from noack.protocol.machine_interface import BEGINNING, RESTART, Notice, Record, Start
@@ -43,6 +43,7 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
+from noack.runtime.host_clocks.clock_offset import SlewedRunClock
 from noack.runtime.host_clocks.reference_clock import ClockRecord, ReferenceClock, reference_clock
 from noack.runtime.join_ticket import (
     DEFAULT_SESSION,

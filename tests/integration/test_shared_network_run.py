@@ -26,7 +26,7 @@ def different(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
         "--set", change, "--set", f"network.impairments={queue}",
     )  # fmt: skip
     with live.begun(tmp_path_factory.mktemp("different")) as start:
-        return start(*settings, command=("run", "different_loops")).finish()
+        return start(*settings, command=("run", "different_loops"), viewer=True).finish()
 
 
 def test_all_loops_reach_the_horizon_at_their_rates_and_are_replayed(

@@ -19,8 +19,8 @@ from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.impairments.loss_guarantee import LossAutomaton
 from noack.protocol.record_tables import Fate
 from tests.netem import any_settings
-from tests.netem.loss_language import is_allowed
 from tests.oracles.link import Datagram, Link
+from tests.oracles.loss_language import is_allowed
 from tests.oracles.receiver import longest_burst
 
 MS = 1_000_000

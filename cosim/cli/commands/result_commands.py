@@ -22,7 +22,8 @@ with lazy_modules():
     from cosim.analysis import fidelity as fidelity_analysis
     from cosim.analysis import run_summary
     from cosim.live import finalize
-    from cosim.output import figure_files, result_tables, run_figures, run_tables, run_verdict
+    from cosim.output import result_tables, run_tables, run_verdict
+    from cosim.output.figures import figure_files, run_figures
     from cosim.output.viewer import live_viewer, rerun_program
     from cosim.record import collection, run_directory, run_record
     from cosim.studies import run_archive, run_comparison

@@ -8,20 +8,12 @@ from collections.abc import Callable, Sequence
 from time import monotonic_ns
 from typing import NamedTuple
 
-from noack.core.clock import (
-    NS_PER_S,
-    SLEW_PPB,
-    ClockOffset,
-    Restart,
-    RestartCause,
-    RunClock,
-    SlewedClock,
-    clock_identity,
-)
+from noack.core.clock import NS_PER_S, RunClock, clock_identity
 from noack.core.errors import PeerError
 from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import LOST_NS, clock_table
 from noack.runtime.address import Address, address_text
+from noack.runtime.host_clocks.clock_offset import SLEW_PPB, ClockOffset, Restart, RestartCause, SlewedClock
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient
 from noack.runtime.join_ticket import Ticket
 from noack.scenario.run_sections import ClocksSection

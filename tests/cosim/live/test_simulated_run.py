@@ -102,6 +102,13 @@ def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
     link = '<a href="report-periodic.html">periodic</a>'
     assert link not in before
     assert link in page.read_text()
+    scenario = run_dir / "scenario.toml"
+    given = scenario.read_text()
+    scenario.write_text(given.replace("count = 10", "count = 9"))
+    refused = invoke("report", run_dir, "--again")
+    scenario.write_text(given)
+    assert refused.exit_code == 2
+    assert refused.stderr.endswith("summary.json has other loops than scenario.toml; one was changed\n")
 
 
 def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:

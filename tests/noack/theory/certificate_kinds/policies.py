@@ -6,7 +6,7 @@ have an event. Then random settings of each policy, and the broken copies, which
 of what a trigger does.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -18,6 +18,7 @@ from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
+from noack.theory.bounds import trigger_bounds as bounds_of_triggers
 from noack.theory.bounds.terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
@@ -301,7 +302,7 @@ class NoShares(TriggerBounds):
     @property
     def comparison(self) -> ComparisonBound | None:  # type: ignore[override]
         found = super().comparison
-        return None if found is None else found._replace(shares=())
+        return None if found is None else found._replace(shares=(), has_root=False)
 
 
 @dataclass(frozen=True)
@@ -315,7 +316,7 @@ class NoCrossTerm(TriggerBounds):
 @dataclass(frozen=True)
 class NoDwell(TriggerBounds):
     def bound(self, conditions: Conditions, level: float, reached: float | None) -> TriggerBound:
-        return super().bound(conditions, level, reached)._replace(untested_s=0.0)
+        return super().bound(conditions, level, reached)._replace(untested_s=0.0, also=())
 
 
 @dataclass(frozen=True)
@@ -325,6 +326,14 @@ class NoTimeOfTheArea(TriggerBounds):
     def bound(self, conditions: Conditions, level: float, reached: float | None) -> TriggerBound:
         found = super().bound(conditions, level, reached)
         return found._replace(ago_s=0.0, also=tuple(one._replace(ago_s=0.0) for one in found.also))
+
+
+@dataclass(frozen=True)
+class ShortChord(TriggerBounds):
+    """Takes a smaller share of x than that of the chord."""
+
+    def _slope(self, level: float) -> Mapping[str, float]:
+        return {name: slope / 4 for name, slope in super()._slope(level).items()}
 
 
 @dataclass(frozen=True)
@@ -354,6 +363,19 @@ def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], 
             return certify(resolved, conditions)
 
     return broken
+
+
+def patched(target: Any, name: str, wrong: Any) -> Callable[[Scenario, Conditions], Any]:
+    def broken(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
+        with patch.object(target, name, wrong), patch.object(scenario_certificates, "_TIMED_RATES", ()):
+            return certify(resolved, conditions)
+
+    return broken
+
+
+def youngest(bound: TriggerBound, sampling_s: float) -> Any:
+    """Ages of a mean, most of which are that of the last test."""
+    return np.append(np.full(9, 1e-9), 1.0) * (bound.ago_s + sampling_s) if bound.ago_s else None
 
 
 def without_one_loss(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
@@ -410,6 +432,13 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
     ),
     "send_on_area, no growth after the average": (
         "send_on_area", with_trigger(NoTimeOfTheArea), {**FAR, "mansd": 0, "beta": 0.01},
+    ),
+    "send_on_area, a mean over the last moment": (
+        "send_on_area", patched(bounds_of_triggers, "_mean_ages_s", youngest),
+        {**FAR, "mansd": 0, "beta": 0.01},
+    ),
+    "mixed, a chord that is too short": (
+        "mixed", with_trigger(ShortChord), {**FAR, "mansd": 0, "beta": 0.01},
     ),
     "periodic, a third of the period": (
         "periodic", with_trigger(AThirdOfTheTime), {**FAR, "mansd": 0},
