@@ -2,37 +2,31 @@
 
 Its programs are ``python -m benchmarks.ends spool SECONDS FOLDER [SCENARIO]``, which makes the
 directory of a run that ended without a recorder, and prints its path, and ``finalize RUN_DIR``,
-which finalises it, and prints the CPU time of each phase as JSON. A run is simulated; its rows are
-spooled as those of a live run are: in batches of 50 ms, with the rows of all loops in the order of
-time. The replay of a long run takes place in another process, after that has written some of the
-tables; only the replay's CPU time is a phase.
+which finalises it, and prints the CPU time of its replay, which takes place in another process. A run
+is simulated; its rows are spooled as those of a live run are: in batches of 50 ms, with the rows of
+all loops in the order of time.
 """
 
 import argparse
-import functools
-import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.programs import execute
 from benchmarks.report import Goal, MeasurementError, Peer, Row, benchmark, say
-from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.replay import run_replay
 from cosim.analysis.summary_model import ReplayPart
 from cosim.cli import find_scenario
 from cosim.live import finalize
 from cosim.live.simulated_run import simulate_run
-from cosim.output.viewer import run_recording
 from cosim.record.record_source import joined
 from cosim.record.run_directory import RECORD, write_environment
 from cosim.record.table_files import TableFile
@@ -43,18 +37,8 @@ from noack.scenario.scenario_file import load
 
 LENGTHS_S = (120.0, 600.0)
 """Both are replayed in a process of its own; a shorter run is not."""
-REPLAY = "replay"
 _BATCH_NS = 50_000_000
 _SETTINGS = ("trigger.floor=1e-3",)  # without a floor, the threshold vanishes within an hour
-_PHASES = (
-    ("spool and Parquet", finalize, "finish_record"),
-    ("recording", run_recording, "write_view"),
-    ("summary", finalize, "summarise"),
-    ("fidelity", finalize, "fidelity_for_summary"),
-    ("conditions", RunClaims, "violations"),
-    ("claims", RunClaims, "judge"),
-    ("report", finalize, "_write_report"),
-)
 
 
 def print_spooled(horizon_s: str, folder: str, path: str = "") -> None:
@@ -80,20 +64,16 @@ def print_spooled(horizon_s: str, folder: str, path: str = "") -> None:
 
 
 def print_finalized(run_dir: str) -> None:
-    """Finalise a run; print the CPU time of each phase, s."""
-    took_s: Counter[str] = Counter()
-    for phase, owner, name in _PHASES:
-        setattr(owner, name, _timed(getattr(owner, name), phase, took_s))
-    from benchmarks.ends import stored_verdict as timed_verdict  # the other process has no __main__
+    """Finalise a run; print the CPU time of its replay, s."""
+    from benchmarks.ends import timed_verdict  # the other process has no __main__
 
-    vars(finalize)[timed_verdict.__name__] = timed_verdict
-    finalize.reopen(Path(run_dir))
-    if (noted := _replay_file(Path(run_dir))).exists():
-        took_s[REPLAY] = float(noted.read_text())
-    print(json.dumps(took_s))
+    reopen = finalize.reopen  # first: a lazy module that is loaded later would replace the function
+    vars(finalize)["stored_verdict"] = timed_verdict
+    reopen(Path(run_dir))
+    print(_replay_file(Path(run_dir)).read_text())
 
 
-def stored_verdict(run_dir: Path) -> ReplayPart:
+def timed_verdict(run_dir: Path) -> ReplayPart:
     """Replay a run, and note the CPU time in s."""
     begun_s = time.process_time()
     verdict = run_replay.stored_verdict(run_dir)
@@ -105,25 +85,14 @@ def _replay_file(run_dir: Path) -> Path:
     return run_dir.with_name(f"{run_dir.name}-replay-s")
 
 
-def _timed(function: Callable[..., Any], phase: str, took_s: Counter[str]) -> Callable[..., Any]:
-    @functools.wraps(function)
-    def timed(*arguments: Any, **options: Any) -> Any:
-        begun_s = time.process_time()
-        try:
-            return function(*arguments, **options)
-        finally:
-            took_s[phase] += time.process_time() - begun_s
-
-    return timed
-
-
 class End(NamedTuple):
     """What the end of one run cost."""
 
     wall_s: float
     cpu_s: float
     peak_mib: float
-    phases_s: Mapping[str, float] = {}
+    replay_s: float
+    """CPU time of the replay."""
 
 
 def end_of(horizon_s: float, folder: Path) -> End:
@@ -148,7 +117,7 @@ def end_of(horizon_s: float, folder: Path) -> End:
         raise MeasurementError(f"the end of the run failed with {process.returncode}")
     shutil.rmtree(run_dir)
     cpu_s = usage.ru_utime + usage.ru_stime
-    return End(wall_s, cpu_s, usage.ru_maxrss / 1024, json.loads(output))
+    return End(wall_s, cpu_s, usage.ru_maxrss / 1024, float(output))
 
 
 def rows_of(ends: Mapping[float, End]) -> Iterator[Row]:
@@ -174,10 +143,7 @@ def rows_of(ends: Mapping[float, End]) -> Iterator[Row]:
         note="of the additional length, replay beside the rest",
     )
     yield speed("the same, by CPU time of all processes", long.cpu_s - short.cpu_s, Goal(">=", 200))
-    yield speed("of it, the replay", long.phases_s[REPLAY] - short.phases_s[REPLAY], Goal(">=", 2000))
-    for phase, took_s in long.phases_s.items():
-        hour_s = 3600 * (took_s - short.phases_s.get(phase, 0.0)) / length_s
-        yield Row(f"phase: {phase}, per hour of the run", hour_s, "s")
+    yield speed("of it, the replay", long.replay_s - short.replay_s, Goal(">=", 2000))
 
 
 @benchmark(
@@ -205,4 +171,7 @@ def long_run(options: argparse.Namespace) -> Iterator[Row]:
 
 if __name__ == "__main__":
     _, program, *arguments = sys.argv
-    {"spool": print_spooled, "finalize": print_finalized}[program](*arguments)
+    if program == "spool":
+        print_spooled(*arguments)
+    else:
+        print_finalized(*arguments)

@@ -4,6 +4,7 @@ import argparse
 import json
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -15,7 +16,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 import psutil
 
-from benchmarks.bare_programs import Flood, command_of
+from benchmarks.flood_sender import Flood
 from benchmarks.programs import imported_s, processes_of, udp_port
 from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from cosim.analysis.loop_statistics import lateness_us
@@ -276,8 +277,9 @@ def floods(options: argparse.Namespace) -> Iterator[Row]:
 
         def flood(processes: Processes, case: Case = case) -> Flood:
             ports = [udp_port(processes[role]) for role in case.roles]
-            command = command_of("flood", FLOOD_S, case.rate_hz, *ports)
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            program = [sys.executable, "-m", "benchmarks.flood_sender"]
+            program += map(str, (FLOOD_S, case.rate_hz, *ports))
+            done = subprocess.run(program, stdout=subprocess.PIPE, text=True, check=True)
             return Flood(**json.loads(done.stdout))
 
         settings = ["horizon_s=8", f"realtime.enabled={str(case.asked).lower()}"]

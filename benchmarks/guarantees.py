@@ -1,20 +1,17 @@
-"""What is guaranteed: losses over very many decisions, certificates beside attacks, and designs."""
+"""What is guaranteed: losses over very many decisions, and certificates beside attacks."""
 
 import argparse
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import Goal, Peer, Row, benchmark, compared, say
+from benchmarks.report import Goal, Row, benchmark, compared, say
 from cosim.analysis.adversary import Objective, Worst, conditions_of, find_worst
 from cosim.cli import find_scenario
-from cosim.shipped_files import find_shipped
-from cosim.studies.design.event_design import EventSearch, design_for_network
-from cosim.studies.design.network_search import Wish
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.linear_systems import Matrix
@@ -168,7 +165,7 @@ QUANTITIES = {
 }
 
 
-def triggers(paper: Mapping[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]:
+def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]:
     """Return the settings of every policy by name; constant thresholds are a fifth of β."""
     W, delta = {"weight": weight.tolist()}, 0.2 * paper["beta"]
     square = weight.T @ weight
@@ -263,48 +260,3 @@ def tightness(options: argparse.Namespace) -> Iterator[Row]:
         for policy, trigger in triggers(paper, np.array(loop.decaying.weight)).items():
             if policy in (options.policy or (policy,)):
                 yield from tightness_rows(loop, policy, trigger)
-
-
-_LINEAR = 'plant.system={kind="linear"}'
-
-
-class _Design(NamedTuple):
-    """A scenario with settings; with a period it is time-triggered."""
-
-    scenario: str
-    period_s: float | None = None
-    settings: tuple[str, ...] = ()
-
-
-_DESIGNS = (
-    _Design("lane_following", 0.5),
-    _Design("unstable_pendulum", 0.25),
-    _Design("double_integrator", 2.0),
-    _Design("f16_lateral", 0.2, ("mode=zoh",)),
-    _Design("cart_pole", 0.2, (_LINEAR,)),
-    _Design("lane_following"),
-    _Design("unstable_pendulum"),
-    _Design("double_integrator"),
-    _Design("f16_lateral"),
-    _Design("cart_pole", None, (_LINEAR,)),
-)
-
-
-@benchmark("network_design", "Design for a network: the largest M of the given and a designed loop")
-def network_design(options: argparse.Namespace) -> Iterator[Row]:
-    """Design each scenario's loop; with events, for the bound of ‖x‖ that it has for its own M."""
-    for name, period_s, settings in _DESIGNS:
-        given = load(find_shipped(name, "scenarios"), settings)
-        wish = Wish(period_s=period_s)
-        kind = "events" if period_s is None else f"every {period_s:g} s"
-        if period_s is None:
-            search = EventSearch(given, wish, 0)
-            bound = search.state_bound(search.given, given.network.mansd + 1)
-            wish = Wish(bounds={"state": bound})
-            kind = f"events, sup‖x‖ ≤ {bound:.4g} certified"
-        found = design_for_network(given, wish)
-        about = f"{' '.join((name, *settings[:1]))}, {kind}"
-        keys = {"certified": "M", "cost": "cost", "transmissions": "transmissions"}
-        for key in [key for key in keys if key in found.given]:
-            before, after = (float(loop[key] or 0) for loop in (found.given, found.best))
-            yield Row(f"{about}: {keys[key]}", after, "", Peer("given loop", before))

@@ -29,8 +29,8 @@ import numpy as np
 
 from benchmarks.programs import FREE_PORTS, TwoHosts, two_hosts
 from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, say
-from noack.core.clock import ClockOffset, Restart
 from noack.runtime.address import Address
+from noack.runtime.host_clocks.clock_offset import ClockOffset, Restart
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient, TimeReference, answering
 from noack.runtime.real_time_loop import realtime
 from tests.integration.conftest import starting

@@ -4,6 +4,7 @@ import argparse
 import json
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -12,9 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.bare_programs import LOOPS, PRIORITY, command_of
-from benchmarks.programs import compiled, noack
-from benchmarks.report import Figures, Goal, MeasurementError, Peer, Rounds, Row, benchmark
+from benchmarks.programs import PRIORITY, compiled, execute, noack
+from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark
 
 ROUNDS = 3
 OURS, PING = "noack", "ping and relay in C"
@@ -98,9 +98,8 @@ def latency(options: argparse.Namespace) -> Iterator[Row]:
 
 TICK_ROUNDS, ROUND_S = 9, 1
 PERIOD_US = 1000
-LOOP, KERNEL = "run_loop", "cyclictest"
+LOOP, KERNEL = "loop of a run", "cyclictest"
 _HISTOGRAM_US = 20_000
-_ASKED = {True: "real-time settings", False: "no settings"}
 
 
 def cyclictest(seconds: int = ROUND_S, priority: int = PRIORITY, core: int | None = None) -> Figures:
@@ -130,43 +129,27 @@ def cyclictest(seconds: int = ROUND_S, priority: int = PRIORITY, core: int | Non
     return {"p50": p50_us, "p99": p99_us, "max": float(thread["max"])}
 
 
-def ticks(kind: str, *, asked: bool, refused: set[str]) -> Figures:
-    """Run a loop; return the lateness of its ticks, µs. A refused SCHED_FIFO is added."""
-    numbers = (round(ROUND_S * 1e6 / PERIOD_US), 1000 * PERIOD_US, PRIORITY if asked else 0)
-    command = command_of("ticks", kind, *numbers)
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode != 0:
-        raise MeasurementError(f"the {kind} loop ended with {done.returncode}")
-    figures, granted = json.loads(done.stdout)
-    if asked and granted["sched_fifo"] != "applied":
-        refused.add(f"SCHED_FIFO {granted['sched_fifo']}")
-    found: Figures = figures
-    return found
+def wake_ups() -> Figures:
+    """Return the lateness of a round of a run's loop with real-time settings, µs."""
+    numbers = map(str, (1000 * PERIOD_US, ROUND_S, PRIORITY, 0))
+    found = json.loads(execute([sys.executable, "-m", "cosim.doctor.probe", "wake", *numbers]).stdout)
+    if (answer := found["granted"]["sched_fifo"]) != "applied":
+        raise MeasurementError(f"SCHED_FIFO {answer}")
+    p50, p99, most = (np.quantile(found["realtime"], (0.5, 0.99, 1)) / 1e3).tolist()
+    return {"p50": p50, "p99": p99, "max": most}
 
 
 @benchmark("lateness", "Lateness of a 1 kHz loop")
 def lateness(options: argparse.Namespace) -> Iterator[Row]:
-    """Run our 1 kHz loop, cyclictest and asyncio in turn.
+    """Run our 1 kHz loop, as ``noack doctor`` does, and cyclictest in turn.
 
     cyclictest (Debian: rt-tests) is the kernel's own measure: a C loop on ``clock_nanosleep`` with
     SCHED_FIFO, locked memory and no deep idle states, the settings that our processes request.
-    Without SCHED_FIFO, there is no comparison with cyclictest, and the goal is not judged.
     """
-    rounds, refused = Rounds(), set[str]()
-    loops = {(kind, asked): f"{kind}, {_ASKED[asked]}" for asked in _ASKED for kind in LOOPS}
-    sides = {KERNEL: cyclictest}
-    for (kind, asked), side in loops.items():
-        sides[side] = partial(ticks, kind, asked=asked, refused=refused)
-    rounds.in_turn(TICK_ROUNDS, sides)
-    ours = loops[LOOP, True]
-    for reason in refused:
-        rounds.add(ours, reason)
-    name, worst = f"tick lateness {{}}, {_ASKED[True]}", rounds.of(ours, "max")
-    note = f"maximum of all {len(worst)} rounds of {ROUND_S} s; the peer's is the machine's own"
-    yield rounds.row(name.format("p50"), "µs", "p50", ours, KERNEL)
-    yield rounds.row(name.format("p99"), "µs", "p99", ours, KERNEL, Goal("<=", 1.5))
-    most = Peer(KERNEL, max(rounds.of(KERNEL, "max"), default=None))
-    yield Row(name.format("max"), max(worst, default=None), "µs", most, note=note)
-    for (kind, asked), side in loops.items():
-        if kind != LOOP:
-            yield rounds.row(f"tick lateness p99, {_ASKED[asked]}", "µs", "p99", loops[LOOP, asked], side)
+    rounds = Rounds()
+    rounds.in_turn(TICK_ROUNDS, {KERNEL: cyclictest, LOOP: wake_ups})
+    row = partial(rounds.row, unit="µs", ours=LOOP, peer=KERNEL)
+    yield row("tick lateness p50", quantity="p50")
+    yield row("tick lateness p99", quantity="p99", goal=Goal("<=", 1.5))
+    note = f"median of {TICK_ROUNDS} rounds of {ROUND_S} s; the peer's is the machine's own"
+    yield row("tick lateness max", quantity="max", note=note)

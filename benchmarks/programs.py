@@ -34,6 +34,8 @@ FREE_PORTS = ("--set", "ports={}")
 """A benchmark can run at the same time as a demo, whose ports are fixed."""
 NOACK = (sys.executable, "-m", "cosim.cli")
 LAUNCHER = "launcher"
+PRIORITY = 50
+"""SCHED_FIFO priority of a run's processes, by default."""
 
 
 def provide() -> None:
@@ -163,12 +165,12 @@ class Sample(NamedTuple):
         """Sample a process."""
         with process.oneshot():
             memory, cpu = process.memory_full_info(), process.cpu_times()
-            kib = (memory.rss, getattr(memory, "pss", memory.uss), memory.uss)
-            sockets = len(process.net_connections("all"))
             return cls(
-                *(one / 1024 for one in kib),
+                memory.rss / 1024,
+                getattr(memory, "pss", memory.uss) / 1024,
+                memory.uss / 1024,
                 process.num_fds(),
-                sockets,
+                len(process.net_connections("all")),
                 process.num_threads(),
                 cpu.user + cpu.system,
             )
@@ -221,7 +223,7 @@ def processes_of(launcher: psutil.Process) -> dict[str, psutil.Process]:
 def is_of(role: str, process: psutil.Process) -> bool:
     """Whether a process has a role in a run, by its title; not if it has ended."""
     try:
-        return process.cmdline()[:1] == [f"noack {role}"]
+        return bool(process.cmdline()[:1] == [f"noack {role}"])
     except psutil.NoSuchProcess:
         return False
 

@@ -103,7 +103,7 @@ class Row:
 
     def as_json(self) -> dict[str, object]:
         """Return the row as ``--json`` writes it."""
-        row = {
+        row: dict[str, object] = {
             "name": self.name,
             "value": self.value,
             "unit": self.unit,

@@ -162,8 +162,8 @@ def _follow(
     return memory, used_s, time.monotonic() - ended_s
 
 
-def figures(load: Load, found: Measured, single_us: float) -> list[Row]:
-    """Return the figures of a run; ``single_us`` is the CPU time of a step of one loop alone."""
+def figures(load: Load, found: Measured) -> list[Row]:
+    """Return the figures of a run."""
     network, loops = found.summary["network"], found.summary["loops"]
     step_us = load.step_us(found)
     equal = [one["replay"]["bit_exact"] for one in (network, *loops)].count(True)
@@ -185,7 +185,6 @@ def figures(load: Load, found: Measured, single_us: float) -> list[Row]:
             goal=_NOTHING),
         Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US.get(load.rate_hz),
             note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in found.cpu_s.items())),
-        Row("the same", step_us, "µs", Peer("one loop alone", single_us)),
         Row("growth of memory in the second half, worst process", growth, "MiB",
             goal=Goal("<", _FLAT_MIB),
             note=", ".join(
@@ -209,11 +208,10 @@ def memory(load: Load, found: Measured) -> Iterator[Row]:
 
 def libraries_mib(count: int) -> float:
     """Return the private memory of so many Pythons at once that import the libraries."""
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    command, pipe = [sys.executable, "-c", _LIBRARIES], subprocess.PIPE
     with ExitStack() as stack:
         pythons = [
-            stack.enter_context(subprocess.Popen([sys.executable, "-c", _LIBRARIES], **pipes))
-            for _ in range(count)
+            stack.enter_context(subprocess.Popen(command, stdin=pipe, stdout=pipe)) for _ in range(count)
         ]
         for python in pythons:
             assert python.stdout is not None
@@ -234,25 +232,24 @@ def libraries_mib(count: int) -> float:
     },
 )
 def fleet(options: argparse.Namespace) -> Iterator[Row]:
-    """Measure many loops through one bottleneck, live, beside one loop at the same rate.
+    """Measure many loops through one bottleneck, live, and the memory of one loop.
 
     Each loop samples, computes and applies its input at the same rate. A step is one of the plant
     of one loop: with it come a measurement, a tick of the controller and an actuation. The CPU time
-    is that of plant, sensor, emulator and controller while the loops run. Their alternative is one
-    loop alone, and that of their memory as many Pythons that import the libraries of each process.
+    is that of plant, sensor, emulator and controller while the loops run. The memory is that of one
+    loop, beside as many Pythons that import the libraries of each process.
     """
+
+    def measured(load: Load) -> Measured:
+        say(str(load))
+        with tempfile.TemporaryDirectory(dir=options.fleet_dir) as folder:
+            return run(load, Path(folder))
+
     for loops, rate_hz in ((options.fleet_loops, 50.0), (20, 500.0)):
         load = Load(loops, rate_hz, options.fleet_s)
-        single = load._replace(loops=1, horizon_s=min(load.horizon_s, _SINGLE_S))
-        measured = []
-        for one in (single, load):
-            say(str(one))
-            with tempfile.TemporaryDirectory(dir=options.fleet_dir) as folder:
-                measured.append(run(one, Path(folder)))
-        alone, together = measured
-        yield from figures(load, together, single.step_us(alone))
-        if rate_hz != 50.0:
-            yield from memory(single, alone)
+        yield from figures(load, measured(load))
+    alone = Load(1, 500.0, min(options.fleet_s, _SINGLE_S))
+    yield from memory(alone, measured(alone))
 
 
 ROUNDS = 1

@@ -1,8 +1,8 @@
 """The simulators beside scipy's integrator, live runs and earlier versions; plants; campaigns.
 
-The exact simulators and the integrator run the paper's example in continuous time with the same
-packet fates. The event times of both are compared: figures of an integrator that does not agree
-count for nothing.
+The exact simulator and the integrator run the paper's example in continuous time with the same
+packet fates. Their event times are compared: figures of an integrator that does not agree count for
+nothing.
 """
 
 import argparse
@@ -11,22 +11,21 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import psutil
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from benchmarks.bare_programs import PRIORITY
-from benchmarks.programs import NOACK
+from benchmarks.programs import NOACK, PRIORITY
 from benchmarks.report import (
     Goal,
     MeasurementError,
     Peer,
     Row,
-    Side,
     benchmark,
     compared,
     cpu_ms,
@@ -37,7 +36,6 @@ from benchmarks.report import (
 from cosim.analysis.replay import replay
 from cosim.cli import find_scenario
 from cosim.shipped_files import find_shipped
-from cosim.simulation.continuous import continuous_loop_of, network_fates, simulate_continuous
 from cosim.simulation.exact_simulation import Population, Setting, run_batch, run_with_events, setting_of
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
@@ -61,13 +59,14 @@ from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from plant_server.plant import plants_of
 
+Method = Literal["RK45", "DOP853"]
+
 
 def integrated(
     setting: Setting,
     draw: Population,
     delivered: NDArray[np.bool_],
-    method: str,
-    rtol: float = 1e-8,
+    method: Method,
 ) -> list[float]:
     """Return event times by ``solve_ivp`` of plant and both models, from crossing to crossing."""
     A, B, x = draw.A[0], draw.B[0], draw.x0[0]
@@ -87,36 +86,18 @@ def integrated(
 
     t_s, z, found = 0.0, np.concatenate([x, x, x]), [0.0]
     while True:
-        span, atol = (t_s, setting.horizon_s), 1e-2 * rtol
-        solution = solve_ivp(flow, span, z, method=method, events=excess, rtol=rtol, atol=atol)
-        if not len(solution.t_events[0]):
+        span = t_s, setting.horizon_s
+        solution = solve_ivp(flow, span, z, method=method, events=excess, rtol=1e-8, atol=1e-10)
+        assert solution.t_events is not None
+        assert solution.y_events is not None
+        (at_s,), (states,) = solution.t_events, solution.y_events
+        if not len(at_s):
             return found
-        t_s, z = float(solution.t_events[0][0]), solution.y_events[0][0].copy()
+        t_s, z = float(at_s[0]), states[0].copy()
         z[n : 2 * n] = z[:n]
         if delivered[len(found)]:
             z[2 * n :] = z[:n]
         found.append(t_s)
-
-
-def beside_scipy(
-    name: str,
-    unit: str,
-    ours: Side,
-    peer: tuple[str, Side],
-    error_s: float,
-    agreement_s: float,
-    goal: Goal | None,
-) -> Row:
-    """Compare a simulator with the integrator, whose event times differ by at most ``error_s``."""
-    return compared(
-        name,
-        unit,
-        ours,
-        (f"solve_ivp, {peer[0]}", peer[1]),
-        goal,
-        note=f"event times differ by {error_s:.1g} s from those of {peer[0]}",
-        unjudged=None if error_s <= agreement_s else "the two do not agree",
-    )
 
 
 def apart_s(found: Vector, expected: list[float]) -> float:
@@ -128,31 +109,6 @@ def apart_s(found: Vector, expected: list[float]) -> float:
 _LOOPS, _LOOPS_HZ, _LOOPS_S = 50, 50.0, 10.0
 _REPLAYED_S = 600.0
 _SAMPLED_RUNS, _PYTHON_MACHINES_S = 20, 0.71
-
-
-def continuous_row(scenario: Scenario) -> Row:
-    """A run in continuous time; the integrator's accuracy is such that event times agree."""
-    system, fate = continuous_loop_of(scenario), network_fates(scenario)
-    fates, loop = [fate(i) for i in range(1000)], system.loop
-    draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.zeros(1, np.uint64))
-    setting, horizon_s, rtol = setting_of(scenario), scenario.horizon_s, 1e-10
-
-    def ours() -> Vector:
-        run = simulate_continuous(system, horizon_s=horizon_s, delivered=fates, known_start=False)
-        return run.event_s
-
-    def theirs() -> list[float]:
-        return integrated(setting, draw, np.array(fates), "DOP853", rtol)
-
-    return beside_scipy(
-        f"{horizon_s:g} s in continuous time",
-        "ms",
-        cpu_ms(ours),
-        (f"DOP853, rtol {rtol:g}", cpu_ms(theirs)),
-        apart_s(ours(), theirs()),
-        1e-8,
-        Goal("<=", 0.1),
-    )
 
 
 def many_loops(scenario: Scenario) -> Scenario:
@@ -184,7 +140,6 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
     work = SampledWork(in_virtual_time(lane), 0, None, None, 0.05, 10**6)
     live = Peer("the live run", 1e3 * horizon_s / lane.speed)
     earlier = Peer("the Python machines of b3991367 in virtual time", 1 / _PYTHON_MACHINES_S)
-    yield continuous_row(lane)
     machines = cpu_ms(lambda: simulate(lane))
     name = f"{horizon_s:g} s of the machines in virtual time"
     yield compared(name, "ms", machines, live, Goal("<=", 1e-3))
@@ -240,21 +195,24 @@ def batch_rows(mode: str) -> list[Row]:
     """Return the rows of a mode: the engine beside the integrator's default, and its fastest."""
     setting, population = drawn(mode)
     rows, events = run_with_events(setting, population)
-    draws = [Population(*(part[i : i + 1] for part in population)) for i in range(DRAWS)]
-    batch = Population(*(np.concatenate([part] * ENGINE[mode]) for part in population))
+    draws = [Population._make(part[i : i + 1] for part in population) for i in range(DRAWS)]
+    batch = Population._make(np.concatenate([part] * ENGINE[mode]) for part in population)
     few = range(INTEGRATED[mode])
     engine = per_cpu_s(len(batch.A), lambda: run_batch(setting, batch))
     name, found = f"lane_following, {setting.horizon_s:g} s, {mode}", list[Row]()
-    for method, goal in (("RK45", Goal(">=", 1000)), ("DOP853", None)):
+    methods: dict[Method, Goal | None] = {"RK45": Goal(">=", 1000), "DOP853": None}
+    for method, goal in methods.items():
 
-        def integrate(method: str = method) -> list[list[float]]:
+        def integrate(method: Method = method) -> list[list[float]]:
             # The last event has no fate that matters.
             fates = [np.append(events[i].delivered, False) for i in few]
             return [integrated(setting, draws[i], fates[i], method) for i in few]
 
         error_s = max(map(apart_s, (events[i].event_s for i in few), integrate()))
-        peer = f"{method}, rtol 1e-8", per_cpu_s(len(few), integrate)
-        found.append(beside_scipy(name, "runs/s", engine, peer, error_s, _AGREEMENT_S, goal))
+        peer = f"solve_ivp, {method}, rtol 1e-8", per_cpu_s(len(few), integrate)
+        note = f"event times differ by {error_s:.1g} s from those of {method}"
+        doubt = None if error_s <= _AGREEMENT_S else "the two do not agree"
+        found.append(compared(name, "runs/s", engine, peer, goal, note=note, unjudged=doubt))
     value = median(row.value for row in found if row.value is not None)
     note = f"{rows['transmissions'].mean():.0f} events a run"
     return [Row(name, value, "runs/s", goal=Goal(">=", _FASTEST[mode]), note=note), *found]
@@ -280,7 +238,7 @@ def batches(options: argparse.Namespace) -> Iterator[Row]:
         trigger = example.model_dump(mode="json", exclude_none=True)
         whole = f"{name} of {trigger['rule']['policy']}" if "rule" in trigger else name
         other = drawn("model", trigger)
-        side, peer = (per_cpu_s(DRAWS, lambda run=run: run_batch(*run)) for run in (other, paper))
+        side, peer = (per_cpu_s(DRAWS, partial(run_batch, *run)) for run in (other, paper))
         yield compared(f"model, {whole}", "runs/s", side, ("decaying", peer))
 
 
@@ -321,7 +279,7 @@ def steps_us(scenario: Scenario) -> Iterator[float]:
 def timed_steps(scenario: Scenario) -> list[tuple[float, ...]]:
     """Make steps of a scenario and of a linear plant in turn; return the µs of both."""
     sides = steps_us(scenario), steps_us(resolve(load(find_scenario(_LINEAR))))
-    found = []
+    found = list[tuple[float, ...]]()
     with realtime(True, PRIORITY):
         due_ns = time.monotonic_ns()
         for pair in zip(*sides, strict=False):

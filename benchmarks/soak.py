@@ -43,9 +43,17 @@ from rich.console import Console
 
 from benchmarks.programs import FREE_PORTS, LAUNCHER, NOACK, PLAIN_TERMINAL, PROGRESS, Processes, Sample
 from benchmarks.report import MeasurementError, say
-from cosim.output import palette
-from cosim.output.figure_description import Axis, FigureDescription, Line, Panel, Row, Spans, time_axis
-from cosim.output.figure_files import save_figure
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import (
+    Axis,
+    FigureDescription,
+    Line,
+    Panel,
+    Row,
+    Spans,
+    time_axis,
+)
+from cosim.output.figures.figure_files import save_figure
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SUMMARY_FILE
 from cosim.record.run_record import load_record
@@ -104,13 +112,13 @@ def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend
     judged = samples[(samples[:, 0] >= begin_s) & (samples[:, 0] <= length_s)]
     windows = np.minimum((judged[:, 0] - begin_s) / judged_s * WINDOWS, WINDOWS - 1).astype(int)
     medians = [_low_median(judged[windows == window]) for window in np.unique(windows)]
-    shares = (
+    at_10, at_50, at_100 = (
         float(samples[np.abs(samples[:, 0] - share * length_s).argmin(), 1]) if len(samples) else math.nan
         for share in (0.1, 0.5, 1.0)
     )
     if judged_s < LEAST_S or len(medians) < LEAST_WINDOWS:
         verdict: Word = "too short" if judged_s < LEAST_S else "unknown"
-        return Trend(*shares, math.nan, math.nan, allowed_kib, math.nan, verdict)
+        return Trend(at_10, at_50, at_100, math.nan, math.nan, allowed_kib, math.nan, verdict)
     apart = np.array([after - before for before, after in combinations(medians, 2)])
     slope = float(_low_median(apart[:, 1] / apart[:, 0]))
     rising, growth_kib = float((apart[:, 1] > 0).mean()), slope * judged_s
@@ -120,7 +128,7 @@ def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend
         and judged_s >= STEADY_FROM_S * (1 - WARM_UP_SHARE)
     )
     verdict = "grows" if growth_kib > allowed_kib else "creeps" if steady else "flat"
-    return Trend(*shares, 3600 * slope, growth_kib, allowed_kib, rising, verdict)
+    return Trend(at_10, at_50, at_100, 3600 * slope, growth_kib, allowed_kib, rising, verdict)
 
 
 def _low_median(values: Values) -> Values:
@@ -233,10 +241,9 @@ class Result:
     """Descriptions of all faults."""
 
     @property
-    def loop(self) -> Mapping[str, Any]:
+    def loop(self) -> dict[str, Any]:
         """The summary of the loop; empty without a summary."""
-        loops: Sequence[Mapping[str, Any]] = self.summary.get("loops", ())
-        return loops[0] if loops else {}
+        return dict(next(iter(self.summary.get("loops", ())), {}))
 
     def as_json(self) -> dict[str, object]:
         """Return everything, for ``--json``."""
@@ -311,7 +318,7 @@ class _Soak:
             looks = [(at_s - began_s, sample) for at_s, sample in self._looks.get(role, ())]
             looks = [look for look in looks if 0 <= look[0] <= length_s]
             if looks:
-                watched[role] = Watched(*zip(*looks, strict=True), length_s)
+                watched[role] = Watched([at_s for at_s, _ in looks], [one for _, one in looks], length_s)
                 self._faults += watched[role].faults(role)
             else:
                 self._faults.append(f"{role}: was never seen")

@@ -9,6 +9,7 @@ Losses are compared with the network's guarantee from the recorded rows.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
-from noack.machines.loop_machines import LoopMachines, Role, alike_loops, set_machine, take_changes
+from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.protocol.machine_interface import BEGINNING, FAILED, External, Notice, Start
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
 from noack.protocol.wire_format import Flow
@@ -142,7 +143,7 @@ def _cap(guarantee: LossGuarantee) -> int:
 
 
 @dataclass
-class Controller:
+class Controller(MachinePart):
     """The controller of one loop.
 
     Args:
@@ -279,10 +280,6 @@ class Controller:
             notices += self._losses.add(sequence, newest, losses, t_ns, now_ns)
         return notices
 
-    def note(self, controller: CData, note: CData) -> Notice:
-        """Raise ValueError: the core's controller writes no notes."""
-        raise ValueError("a controller writes no notes")
-
     def _call(self, controller: CData, method: Callable[[ControlLaw], Vector | None]) -> Sequence[Notice]:
         """Call the control law; after its first failure, the input is the safe input."""
         m = controller.machine.m
@@ -323,9 +320,7 @@ def controllers_of(
 
     Of the plant's data they use at most x(0).
     """
-    alike, parts = alike_loops(loops), list[Controller]()
-    for number, (loop, first) in enumerate(zip(loops, alike, strict=True)):
-        parts.append(_part(start, loop) if number == first else _redrawn(parts[first], loop))
+    parts, alike = parts_of(loops, partial(_part, start), _redrawn)
     if not start.is_restart:
         return LoopMachines(parts, phases_ns, alike=alike)
     phases = tuple(phases_ns or (0,) * len(loops))  # they determine the first ticks

@@ -17,7 +17,8 @@ local f = {
     magic = ProtoField.string("noack.magic", "Magic"),
     version = ProtoField.uint8("noack.version", "Version"),
     flow = ProtoField.uint8("noack.flow", "Flow", base.DEC, FLOWS),
-    dimension = ProtoField.uint16("noack.dimension", "Dimension"),
+    dimension = ProtoField.uint8("noack.dimension", "Dimension"),
+    error_level = ProtoField.uint8("noack.error_level", "Error level"),
     loop = ProtoField.uint16("noack.loop", "Loop"),
     run_id = ProtoField.uint64("noack.run_id", "Run id", base.HEX),
     sequence = ProtoField.uint64("noack.sequence", "Sequence number"),
@@ -61,7 +62,7 @@ function noack.dissector(tvb, pinfo, tree)
         return 0
     end
     local version, flow = tvb(2, 1):uint(), tvb(3, 1):uint()
-    local dimension = tvb(4, 2):le_uint()
+    local dimension = tvb(4, 1):uint()
     local least = flow == ACKNOWLEDGEMENT and 0 or 1
     local fits = dimension >= least and dimension <= MAX_DIMENSION
         and tvb:reported_len() == datagram_bytes(dimension)
@@ -70,7 +71,8 @@ function noack.dissector(tvb, pinfo, tree)
     root:add(f.magic, tvb(0, 2))
     local version_item = root:add(f.version, tvb(2, 1))
     local flow_item = root:add(f.flow, tvb(3, 1))
-    local dimension_item = root:add_le(f.dimension, tvb(4, 2))
+    local dimension_item = root:add(f.dimension, tvb(4, 1))
+    root:add(f.error_level, tvb(5, 1))
     root:add_le(f.loop, tvb(6, 2))
     root:add_le(f.run_id, tvb(8, 8))
     root:add_le(f.sequence, tvb(16, 8))
@@ -121,7 +123,7 @@ local function heuristic(tvb, pinfo, tree)
     local version = tvb(2, 1):uint()
     local known = (version == VERSION or version == ENCRYPTED_VERSION)
         and FLOWS[tvb(3, 1):uint()] ~= nil
-    local sized = tvb:reported_len() == datagram_bytes(tvb(4, 2):le_uint())
+    local sized = tvb:reported_len() == datagram_bytes(tvb(4, 1):uint())
     if not (known or sized) then
         return false
     end

@@ -37,7 +37,7 @@ OWN = f"{sys.platform}_{platform.machine()}".lower()
 """The platform of this machine."""
 _LIVE = ("driver/driver.c", "relay/*.c")
 """Sockets and timers of live runs: only Linux has them. Elsewhere the library is without them."""
-MACHINES = ("loop/*.c", "elementary.c", "wire.c", "clock.c")
+MACHINES = ("loop/*.c", "elementary.c", "heap.c", "wire.c", "clock.c")
 """What a node needs: the steps of every role, wire format and clock. No sockets, no allocation, no
 files; of the C library only memcpy and its like, and mathematical functions (docs/node.md)."""
 _EXAMPLES = HERE / "examples"

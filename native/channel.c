@@ -5,8 +5,6 @@
    record, numbered over both directions. */
 #include "core.h"
 
-enum { MOST_LOOPS = 65535 };
-
 const char *noack_channel_check(const noack_channel *channel) {
     if (!is_between(1, channel->loops, MOST_LOOPS) || !is_between(1, channel->directions, 2))
         return "a network has 1 to 65535 loops, and one or two directions";
@@ -30,7 +28,7 @@ void noack_channel_add_places(noack_channel *channel, int64_t from) {
 }
 
 int64_t noack_channel_due_ns(const noack_channel *channel) {
-    return channel->heap_count > 0 ? channel->heap[0].release_ns : INT64_MAX;
+    return channel->heap_count > 0 ? channel->heap[0].due_ns : INT64_MAX;
 }
 
 static int64_t leave(noack_channel *channel, const noack_delayed *leaving) {
@@ -43,11 +41,11 @@ static int64_t leave(noack_channel *channel, const noack_delayed *leaving) {
 
 /* Whether a datagram of the same direction is due and has not left. */
 static int is_behind(const noack_channel *channel, int64_t direction, int64_t release_ns) {
-    if (channel->heap_count == 0 || channel->heap[0].release_ns > release_ns)
+    if (channel->heap_count == 0 || channel->heap[0].due_ns > release_ns)
         return 0;
     for (int64_t i = 0; i < channel->heap_count; i++) {
         const noack_datagram *other = &channel->delayed[channel->heap[i].slot].datagram;
-        if (channel->heap[i].release_ns <= release_ns && other->flow / channel->loops == direction)
+        if (channel->heap[i].due_ns <= release_ns && other->flow / channel->loops == direction)
             return 1;
     }
     return 0;
@@ -107,6 +105,7 @@ int64_t noack_channel_handle(
     channel->answered = 0;
     channel->reached_ns = now_ns;
     serve(link, channel->waiting, now_ns, channel->heap, &channel->heap_count);
+    link->flows[row].error_level = noack_wire_error_level(datagram->head, datagram->size_bytes);
     if (asks)
         link_repeat(link, row, datagram->size_bytes, now_ns, &channel->outcome, &decision);
     else
@@ -126,13 +125,13 @@ int64_t noack_channel_release(noack_channel *channel, int64_t now_ns) {
     channel->leaving_count = 0;
     if (channel->release_count == channel->row_places)
         return NOACK_ROWS_FULL;
-    noack_heap_entry due = channel->heap[0];
-    noack_delayed *leaving = &channel->delayed[due.slot];
+    noack_heap_entry entry = channel->heap[0];
+    noack_delayed *leaving = &channel->delayed[entry.slot];
     heap_pop(channel->heap, &channel->heap_count);
     channel->releases[channel->release_count++] = (noack_release_row){
         .input = channel->inputs++,
         .sequence = channel->first_number + leaving->packet,
-        .t_ns = due.release_ns,
+        .t_ns = entry.due_ns,
         .now_ns = now_ns,
         .flow = leaving->datagram.flow,
         .copy = leaving->copy,
@@ -140,9 +139,9 @@ int64_t noack_channel_release(noack_channel *channel, int64_t now_ns) {
     };
     copy_datagram(&channel->leaving[channel->leaving_count++], &leaving->datagram);
     leaving->next = channel->free_place;
-    channel->free_place = due.slot;
+    channel->free_place = entry.slot;
     serve(
-        channel->links[leaving->datagram.flow / channel->loops], channel->waiting, due.release_ns,
+        channel->links[leaving->datagram.flow / channel->loops], channel->waiting, entry.due_ns,
         channel->heap, &channel->heap_count);
     return NOACK_DONE;
 }
@@ -155,6 +154,6 @@ void noack_channel_latest(noack_channel *channel, int64_t direction, int64_t *la
         const noack_datagram *one = &channel->delayed[channel->heap[i].slot].datagram;
         int64_t row = one->flow % channel->loops;
         if (one->flow / channel->loops == direction)
-            latest_ns[row] = max_of(latest_ns[row], channel->heap[i].release_ns);
+            latest_ns[row] = max_of(latest_ns[row], channel->heap[i].due_ns);
     }
 }

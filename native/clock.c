@@ -11,7 +11,7 @@ enum {
     MOST_PUT_OFF_NS = 50000000 /* if something is always near, or datagrams wait */
 };
 
-/* The offset of the coordinator's clock, as noack.core.clock.SlewedClock applies it. */
+/* The offset of the coordinator's clock, as SlewedClock (noack/runtime/host_clocks) applies it. */
 static int64_t applied_offset_ns(const noack_clock *clock, int64_t own_ns) {
     int64_t since_ns = own_ns - clock->since_ns;
     /* The product of both numbers may exceed 64 bits. */

@@ -25,6 +25,8 @@
 #define LATEST_NS                                                                                  \
     (INT64_C(1) << 61) /* 73 years: packets that must pass may exceed a queue's size */
 
+enum { MOST_LOOPS = 65535 }; /* of a run: datagrams have the number of the loop in 16 bits */
+
 static inline int64_t max_of(int64_t a, int64_t b) { return a > b ? a : b; }
 static inline int64_t min_of(int64_t a, int64_t b) { return a < b ? a : b; }
 static inline int is_between(int64_t least, int64_t number, int64_t most) {
@@ -49,8 +51,8 @@ typedef void stage_function(packet *packet, const noack_stage *stage, noack_stag
    depend on other stages. */
 stage_function apply_bernoulli, apply_four_state, apply_gilbert_elliott, apply_periodic,
     apply_scripted, apply_worst_case, apply_tail_drop, apply_blackout, apply_corrupt, apply_delay,
-    apply_duplicate, apply_earliest_deadline, apply_opportunities, apply_priority, apply_reorder,
-    apply_replay, apply_schedule;
+    apply_duplicate, apply_earliest_deadline, apply_maximum_error, apply_opportunities,
+    apply_priority, apply_reorder, apply_replay, apply_schedule;
 
 /* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. */
 static inline void refuse(noack_decision *decision, int64_t fate) {
@@ -122,14 +124,18 @@ noack_packet_row packet_row(
 int is_first_intact(const noack_decision *decision, int copy);
 /* At equal times, datagrams leave in order of direction, then of arrival: put counts them. */
 int64_t departure_order(int64_t direction, int64_t put);
-/* The heap has room. */
+
+/* heap.c */
+
+/* There must be room. */
 void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
 /* Remove the first entry. */
 void heap_pop(noack_heap_entry *heap, int64_t *count);
 
 /* Whether the queue of a stage chooses when its link is free (waiting.c). */
 static inline int is_scheduler(const noack_stage *stage) {
-    return stage->kind == NOACK_PRIORITY || stage->kind == NOACK_EARLIEST_DEADLINE;
+    return stage->kind == NOACK_PRIORITY || stage->kind == NOACK_EARLIEST_DEADLINE
+           || stage->kind == NOACK_MAXIMUM_ERROR;
 }
 
 /* waiting.c: the number of a packet's flow in the table of a stage. */

@@ -1,5 +1,5 @@
-/* What the relay and the channel of a simulation share: rows of the record, and the heap of delayed
-   datagrams. */
+/* What the relay and the channel of a simulation share: rows of the record, the order of
+ * departures. */
 #include <string.h>
 
 #include "core.h"
@@ -29,34 +29,3 @@ int is_first_intact(const noack_decision *decision, int copy) {
 }
 
 int64_t departure_order(int64_t direction, int64_t put) { return (direction << 62) + put; }
-
-static int is_before(const noack_heap_entry *a, const noack_heap_entry *b) {
-    return a->release_ns < b->release_ns
-           || (a->release_ns == b->release_ns && a->number < b->number);
-}
-
-void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry) {
-    int64_t place = (*count)++;
-    while (place > 0 && is_before(&entry, &heap[(place - 1) / 2])) {
-        heap[place] = heap[(place - 1) / 2];
-        place = (place - 1) / 2;
-    }
-    heap[place] = entry;
-}
-
-void heap_pop(noack_heap_entry *heap, int64_t *count) {
-    noack_heap_entry last = heap[--*count];
-    int64_t place = 0;
-    for (;;) {
-        int64_t below = 2 * place + 1;
-        if (below >= *count)
-            break;
-        if (below + 1 < *count && is_before(&heap[below + 1], &heap[below]))
-            below++;
-        if (!is_before(&heap[below], &last))
-            break;
-        heap[place] = heap[below];
-        place = below;
-    }
-    heap[place] = last;
-}

@@ -17,6 +17,7 @@ static stage_function *const APPLY[NOACK_STAGE_KINDS] = {
     [NOACK_DELAY] = apply_delay,
     [NOACK_DUPLICATE] = apply_duplicate,
     [NOACK_EARLIEST_DEADLINE] = apply_earliest_deadline,
+    [NOACK_MAXIMUM_ERROR] = apply_maximum_error,
     [NOACK_OPPORTUNITIES] = apply_opportunities,
     [NOACK_PRIORITY] = apply_priority,
     [NOACK_REORDER] = apply_reorder,

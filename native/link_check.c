@@ -148,6 +148,7 @@ static const char *check_stage(const noack_link *link, const noack_stage *stage)
     case NOACK_TAIL_DROP:
         return check_bottleneck(stage);
     case NOACK_EARLIEST_DEADLINE:
+    case NOACK_MAXIMUM_ERROR:
     case NOACK_PRIORITY:
         return check_scheduler(link, stage);
     case NOACK_OPPORTUNITIES:

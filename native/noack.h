@@ -66,6 +66,7 @@ enum noack_stage_kind { /* native/impairments has a file for each */
     NOACK_DELAY,
     NOACK_DUPLICATE,
     NOACK_EARLIEST_DEADLINE,
+    NOACK_MAXIMUM_ERROR,
     NOACK_OPPORTUNITIES,
     NOACK_PRIORITY,
     NOACK_REORDER,
@@ -198,6 +199,9 @@ typedef struct { /* a link's state of a flow */
     double score;               /* normal score of the link's state for the last packet */
     int64_t newest;             /* greatest number among the packets that have left intact */
     int64_t since;              /* number of the first packet under the present settings */
+    int64_t error_level;        /* of the packet that arrives; 0: unknown. The caller sets it */
+    int64_t waits, last_waiting; /* packets that wait until the link is free: how many, and the place
+                                    of the last one */
     int64_t longest_loss_burst; /* since then; counts final losses only */
 } noack_flow;
 
@@ -402,6 +406,7 @@ enum noack_question { /* what Python must do before a step goes on; the step is 
 
 typedef struct { /* a message of the loop, decoded */
     int64_t flow, loop, sequence, t_ns, entries;
+    int64_t error_level; /* of an update: docs/wire.md; 0: none */
     double vector[64];
 } noack_message;
 
@@ -516,6 +521,7 @@ typedef struct { /* sensor_node/sensor.py makes it */
     int64_t is_user;      /* 1: the user's trigger decides */
     int64_t acknowledged; /* 1: only an acknowledged update resets x_s */
     int64_t timeout_ns;   /* of an acknowledgement */
+    int64_t reports_error; /* 1: updates have an error level, by which the network chooses */
     int64_t plant_period_ns;
     noack_observer observer;
     /* state */
@@ -598,13 +604,17 @@ typedef struct { /* rows of a table of the record, packed as numpy has them */
                           those of the table */
 } noack_table;
 
+typedef struct { /* of a heap, by (due_ns, number): a delayed datagram, or the next tick of a loop */
+    int64_t due_ns, number;
+    int64_t slot; /* of the datagram */
+} noack_heap_entry;
+
 typedef struct { /* the machines of one role, of all loops */
     int64_t role, loops;
     noack_plant *plants; /* (loops,) of this role; the others are NULL */
     noack_sensor *sensors;
     noack_controller *controllers;
-    int64_t *due_ns;    /* (loops,) next tick of each machine, in the run's time; INT64_MAX: none */
-    int64_t *heap;      /* (loops,) loops with a tick, by (due_ns, number); a heap */
+    noack_heap_entry *heap; /* (loops,) the next tick of each machine that has one, in the run's time */
     int64_t heap_count;
     noack_table tables[3];
     noack_note *notes;
@@ -674,7 +684,7 @@ void noack_observer_correct(noack_observer *observer, int64_t n, const double *y
 typedef struct { /* noack.core.clock: simulated time since the run's epoch */
     int64_t epoch_ns; /* reading of the coordinator's monotonic clock at simulated time 0 */
     double speed;     /* simulated time per time of that clock */
-    int64_t slew_ppb; /* 0: this host has that clock; else noack.core.clock: */
+    int64_t slew_ppb; /* 0: this host has that clock; else the slew of SlewedClock: */
     int64_t since_ns, begun_ns, target_ns;
 } noack_clock;
 
@@ -729,6 +739,9 @@ int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, 
 /* The number in a header, not verified; -1: the datagram is too short. */
 int64_t noack_wire_loop(const uint8_t *datagram, int64_t size_bytes);
 int64_t noack_wire_flow(const uint8_t *datagram, int64_t size_bytes);
+
+/* The error level in the header of an update, not verified; 0: there is none. */
+int64_t noack_wire_error_level(const uint8_t *datagram, int64_t size_bytes);
 
 /* Examine a datagram that may be one of a loop; return a noack_examination. opened: 1 if Python has
    decrypted its vector in place. The message is complete if the datagram is accepted. */
@@ -879,13 +892,10 @@ typedef struct { /* a datagram that is stored, or about to be sent */
     uint8_t unused;
 } noack_slot;
 
-typedef struct { /* an entry of the heap of delayed datagrams */
-    int64_t release_ns, number, slot;
-} noack_heap_entry;
-
 typedef struct { /* a stored datagram that waits until the link is free; see native/waiting.c */
     int64_t key, order, row, size_bytes, after_ns, earliest_ns;
-    int64_t left, right; /* the heap: places + 1; 0: none */
+    int64_t left, right, parent; /* the heap: places + 1; 0: none */
+    int64_t before; /* the place of the one before it in its flow, if that waits */
 } noack_waiting;
 
 typedef struct {    /* a datagram that arrives or departs; a tap receives it */
@@ -1232,8 +1242,8 @@ typedef struct { /* the replay of a machine, or of the network */
     int64_t difference_at; /* at which input */
     int64_t other_ns;      /* the time before, or the deadline; INT64_MAX: there is none */
     uint8_t replayed[8192]; /* the row that the machine wrote then */
-    /* What was sent. Of a message: flow, sequence number, time and vector. Of a datagram: flow and
-       head. There is room for a message of each input, or for two datagrams. */
+    /* What was sent. Of a message: flow, sequence number, time, vector and error level. Of a datagram:
+       flow and head. There is room for a message of each input, or for two datagrams. */
     int64_t sent_width, sent_count;
     int64_t *sent; /* (count or 2 count, sent_width) */
 } noack_input_replay;

@@ -12,19 +12,22 @@
    are added to the departure.
 
    The guarantee needs none of these times, only an order: a flow's packets leave in the order of
-   their arrival. Their keys do not decrease, so they begin in this order, and none is given a
-   departure before that of an earlier one (first_release_ns, the last departure of the flow). So no
-   packet is ever stale, whatever the other stages do: the losses are those that are decided at the
-   arrivals, which noack_must_pass allows, and no packet needs to be held back for others. */
+   their arrival. A packet that arrives with a smaller key than those of its flow that wait gives it
+   to them. So the keys of what waits do not decrease along a flow: its packets begin in this order,
+   and none is given a departure before that of an earlier one (first_release_ns, the last departure
+   of the flow). So no packet is ever stale, whatever the other stages do: the losses are those that
+   are decided at the arrivals, which noack_must_pass allows, and no packet needs to be held back
+   for others. */
 #include "core.h"
 
 static int is_before(const noack_waiting *a, const noack_waiting *b) {
     return a->key < b->key || (a->key == b->key && a->order < b->order);
 }
 
-/* Merge two heaps, each given by its first place + 1; 0: an empty one. */
+/* Merge two heaps, each given by its first place + 1; 0: an empty one. The first of the result has
+   no parent. */
 static int64_t merge(noack_waiting *waiting, int64_t a, int64_t b) {
-    int64_t root = 0, *end = &root;
+    int64_t root = 0, *end = &root, parent = 0;
     while (a != 0 && b != 0) {
         if (is_before(&waiting[b - 1], &waiting[a - 1])) {
             int64_t other = a;
@@ -33,12 +36,27 @@ static int64_t merge(noack_waiting *waiting, int64_t a, int64_t b) {
         }
         noack_waiting *first = &waiting[a - 1];
         *end = a;
+        first->parent = parent;
+        parent = a;
         a = first->right;
         first->right = first->left;
         end = &first->left;
     }
     *end = a != 0 ? a : b;
+    if (*end != 0)
+        waiting[*end - 1].parent = parent;
     return root;
+}
+
+/* Give what waits at a place a smaller key. */
+static void advance(noack_queue *queue, noack_waiting *waiting, int64_t place, int64_t key) {
+    noack_waiting *one = &waiting[place];
+    one->key = key;
+    if (one->parent == 0)
+        return;
+    noack_waiting *parent = &waiting[one->parent - 1];
+    *(parent->left == place + 1 ? &parent->left : &parent->right) = 0;
+    queue->waiting = merge(waiting, queue->waiting, place + 1);
 }
 
 int64_t flow_number(const packet *packet, const noack_stage *stage) {
@@ -76,16 +94,25 @@ void wait_for_link(
     noack_link *link, int64_t row, noack_waiting *waiting, int64_t place, int64_t order,
     const noack_decision *decision) {
     noack_queue *queue = &link->queues[link->scheduler];
+    noack_flow *flow = &link->flows[row];
+    int64_t earlier = flow->last_waiting, key = decision->key;
     waiting[place] = (noack_waiting){
-        .key = decision->key,
+        .key = key,
         .order = order,
         .row = row,
         .size_bytes = decision->size_bytes,
         .after_ns = decision->after_ns,
         .earliest_ns = decision->release_ns,
+        .before = earlier,
     };
     queue->waiting = merge(waiting, queue->waiting, place + 1);
     queue->waits++;
+    for (int64_t left = flow->waits; left > 0 && waiting[earlier].key > key; left--) {
+        advance(queue, waiting, earlier, key);
+        earlier = waiting[earlier].before;
+    }
+    flow->last_waiting = place;
+    flow->waits++;
 }
 
 void serve(
@@ -101,6 +128,7 @@ void serve(
         noack_flow *flow = &link->flows[next->row];
         queue->waiting = merge(waiting, next->left, next->right);
         queue->waits--;
+        flow->waits--;
         int64_t end_ns = noack_queue_serve(link, link->scheduler, next->size_bytes);
         int64_t leaves_ns = max_of(end_ns + next->after_ns, next->earliest_ns);
         flow->first_release_ns = max_of(flow->first_release_ns, leaves_ns);

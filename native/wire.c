@@ -11,6 +11,7 @@ enum {
     ENCRYPTED_VERSION = 2,
     FLOW = 3,
     DIMENSION = 4,
+    ERROR_LEVEL = 5,
     LOOP = 6,
     RUN = 8,
     SEQUENCE = 16,
@@ -108,12 +109,13 @@ void noack_wire_tag(
 }
 
 void wire_header(const noack_wire *wire, const noack_message *message, uint8_t *datagram) {
-    uint16_t entries = (uint16_t)message->entries, loop = (uint16_t)message->loop;
+    uint16_t loop = (uint16_t)message->loop;
     datagram[0] = 'N';
     datagram[1] = 'A';
     datagram[2] = wire->encrypted ? ENCRYPTED_VERSION : VERSION;
     datagram[FLOW] = (uint8_t)message->flow;
-    memcpy(datagram + DIMENSION, &entries, sizeof entries);
+    datagram[DIMENSION] = (uint8_t)message->entries;
+    datagram[ERROR_LEVEL] = (uint8_t)message->error_level;
     memcpy(datagram + LOOP, &loop, sizeof loop);
     memcpy(datagram + RUN, &wire->run_id, 8);
     memcpy(datagram + SEQUENCE, &message->sequence, 8);
@@ -137,6 +139,13 @@ int64_t noack_wire_flow(const uint8_t *datagram, int64_t size_bytes) {
     return size_bytes < NOACK_HEADER_BYTES ? -1 : datagram[FLOW];
 }
 
+int64_t noack_wire_error_level(const uint8_t *datagram, int64_t size_bytes) {
+    if (noack_wire_flow(datagram, size_bytes) != NOACK_UPDATE || datagram[0] != 'N'
+        || datagram[1] != 'A' || (datagram[2] != VERSION && datagram[2] != ENCRYPTED_VERSION))
+        return 0;
+    return datagram[ERROR_LEVEL];
+}
+
 /* The tests that need no key: they reject most invalid input and name common mistakes. */
 static int64_t examine_header(
     const noack_wire *wire, const noack_reception *reception, int64_t loop, const uint8_t *datagram,
@@ -146,7 +155,7 @@ static int64_t examine_header(
     int version = wire->encrypted ? ENCRYPTED_VERSION : VERSION;
     if (datagram[0] != 'N' || datagram[1] != 'A' || datagram[2] != version)
         return NOACK_BAD_VERSION;
-    int64_t entries = datagram[DIMENSION] | datagram[DIMENSION + 1] << 8;
+    int64_t entries = datagram[DIMENSION];
     if (entries != reception->entries || entries > NOACK_MAX_ENTRIES
         || size_bytes != VECTOR + 8 * entries + NOACK_TAG_BYTES)
         return NOACK_BAD_LENGTH;
@@ -193,6 +202,7 @@ int64_t noack_wire_examine(
     message->flow = reception->flow;
     message->loop = loop;
     message->entries = reception->entries;
+    message->error_level = datagram[ERROR_LEVEL];
     memcpy(&message->sequence, datagram + SEQUENCE, 8);
     memcpy(&message->t_ns, datagram + TIME, 8);
     memcpy(message->vector, datagram + VECTOR, 8 * (size_t)message->entries);

@@ -40,9 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with join_run("netem", given) as run:
                 run_network(run)
             return ExitStatus.OK
-        from netem.stand_alone import alone  # a run's emulator starts without it
+        from netem.stand_alone import run_stand_alone  # a run's emulator starts without it
 
-        return alone(given)
+        return run_stand_alone(given)
     except NoackError as error:
         return failed(str(error), error.exit_status, who="noack netem", as_json=as_json)
 

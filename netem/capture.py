@@ -34,7 +34,7 @@ from netem.relay_links import EVENT, Bytes, Events, LinkSpec
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError, why
 from noack.core.file_access import open_growing
-from noack.runtime.address import text_of
+from noack.runtime.address import address_text
 
 _SNAP_BYTES = 262_144
 """Larger than any datagram: payloads are captured completely."""
@@ -180,7 +180,7 @@ class CaptureWriter:
         """Why the capture ended early, in one line; None if it did not."""
         self._section = PcapngSection(
             [
-                (f"{spec.name} {side}", text_of(address))
+                (f"{spec.name} {side}", address_text(address))
                 for spec in specs
                 for side, address in (("client", spec.listen), ("server", spec.to))
             ]

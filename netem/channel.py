@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.link_state import LinkState
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
-from noack.impairments.link_settings import NEVER_NS, LinkSettings
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
@@ -28,15 +29,13 @@ Rows = NDArray[np.void]
 Network = Callable[[bytes, int], int | None]
 """Maps an update's datagram and the current time, ns, to its delay, ns, or to None for a loss."""
 
-_PACKET_ROW = np.dtype(
+PACKET_ROW = np.dtype(
     [
         *((name, "<i8") for name in dtype_of("noack_packet_row").names[:-1]),  # type: ignore[index]
         ("head", f"V{PACKET_HEAD_BYTES}"),
     ]
 )
 _RELEASE_ROW = dtype_of("noack_release_row")
-NO_TIME_NS = 2**63 - 1
-"""Stands for a time that never comes, in the core."""
 RUN_ID = 0
 """Run number in the datagrams of every simulated run: a record depends on the scenario alone.
 
@@ -97,7 +96,7 @@ class Channel:
         self.core: CData = ffi.new("noack_channel *", {
             "loops": loops, "directions": len(links), "links": [link.core for link in links],
             "is_scripted": network is not None, "first_number": first_number,
-            "inputs": first_number, "reached_ns": -1, "change_ns": NO_TIME_NS, "free_place": -1,
+            "inputs": first_number, "reached_ns": -1, "change_ns": NEVER_NS, "free_place": -1,
             "row_places": _ROWS,
         })  # fmt: skip
         """The channel, as the core's functions take it; valid as long as this object lives."""
@@ -144,7 +143,7 @@ class Channel:
 
     @property
     def due_ns(self) -> int:
-        """When the next packet leaves; :data:`NO_TIME_NS`: there is none."""
+        """When the next packet leaves; :data:`NEVER_NS`: there is none."""
         return int(core.noack_channel_due_ns(self.core))
 
     def release(self, now_ns: int) -> list[Leaving]:
@@ -163,7 +162,7 @@ class Channel:
     def take_rows(self) -> list[tuple[str, Rows]]:
         """Return all rows since the last call, in batches of a table in their order."""
         channel, taken = self.core, self._taken
-        packets = self._packets[: channel.packet_count].view(_PACKET_ROW).copy()
+        packets = self._packets[: channel.packet_count].view(PACKET_ROW).copy()
         releases = self._releases[: channel.release_count].copy()
         channel.packet_count = channel.release_count = 0
         self._taken = []
@@ -181,7 +180,7 @@ class Channel:
             NETEM_SETTING, change, self.core.inputs, now_ns, self.core.reached_ns
         )
         self.core.inputs += 1
-        self._set_change_time()
+        self.core.change_ns = self._schedule.next_ns
         return outputs
 
     def _change(self) -> None:
@@ -190,17 +189,13 @@ class Channel:
         first, channel = self.links[0], self.core
         for settings in due_settings(self._schedule, first.settings, channel.change_ns):
             self.change(settings)
-        self._set_change_time()
+        self.core.change_ns = self._schedule.next_ns
 
     def change(self, settings: LinkSettings) -> None:
         """Apply other settings to the first direction; see native/link_change.c."""
-        latest_ns = np.full(self.links[0].rows, NEVER_NS, np.int64)
+        latest_ns = np.full(self.links[0].rows, core.NOACK_NEVER_NS, np.int64)
         core.noack_channel_latest(self.core, 0, pointer_to(latest_ns, "int64_t *"))
         self.links[0].change(settings, latest_ns)
-
-    def _set_change_time(self) -> None:
-        next_ns = None if self._schedule is None else self._schedule.next_ns
-        self.core.change_ns = NO_TIME_NS if next_ns is None else next_ns
 
     def decide(self, data: bytes) -> None:
         """Let the user's network decide for the datagram that the core asked about."""
@@ -250,11 +245,11 @@ def channel_of(
     return Channel(links, loops=loops, first_number=start.first_number, schedule=schedule, network=network)
 
 
-def alone(network: Scenario) -> Scenario:
+def require_stand_alone(network: Scenario) -> Scenario:
     """Return a scenario whose network is used outside a run of noack.
 
     Raises:
-        CallerError: the network changes, has several loops, or acknowledges.
+        CallerError: the network changes, has several loops, acknowledges, or chooses by errors.
     """
     for name, given in (("changes", network.changes), ("loops", network.loops)):
         if given:
@@ -264,6 +259,8 @@ def alone(network: Scenario) -> Scenario:
             )
     if network.network.protocol != "none":
         raise CallerError('network: nothing is acknowledged here; set protocol = "none"')
+    if network.network.link.reads_errors:
+        raise CallerError("network: maximum_error is for noack's own sensors; take another discipline")
     return network
 
 
@@ -284,7 +281,7 @@ def due_settings(
     schedule: ChangeSchedule[LinkSettings], present: LinkSettings, now_ns: int
 ) -> Iterator[LinkSettings]:
     """Yield the settings that replace the present ones before a datagram that arrives now."""
-    while (change := schedule.take(now_ns)) is not None:
+    for change in schedule.take(now_ns):
         assert change.prepared is not None
         first = present.first_delivered  # a restarted emulator has its own value
         settings = change.prepared.model_copy(update={"first_delivered": first})
@@ -297,5 +294,5 @@ def encoded(message: CData) -> bytes:
     """Return the datagram of a simulated run with a ``noack_message``."""
     vector = np.array(ffi.unpack(message.vector, message.entries))
     return Encoder(RUN_ID, bytes(KEY_BYTES)).encode(
-        Message(Flow(message.flow), message.sequence, message.t_ns, vector, message.loop)
+        Message(Flow(message.flow), message.sequence, message.t_ns, vector, message.loop, message.error_level)
     )

@@ -18,15 +18,14 @@ from netem.relay_links import (
     LinkSpec,
     OpenLink,
     has_data,
-    packed_name,
+    report_line,
     return_path,
-    say,
     stamp_arrivals,
 )
 from netem.relay_memory import RelayDirection, RelayMemory, name_array
 from netem.shell.devices import DeviceLink
 from noack.core.core_library import core
-from noack.runtime.address import text_of
+from noack.runtime.address import address_text, packed_name
 from noack.runtime.udp_sockets import drops_of
 
 KERNEL = "lost_in_kernel"
@@ -70,14 +69,14 @@ class LinkWarnings:
         """Set the total number of ICMP port-unreachable messages from the server's host."""
         if answers:
             self._report(
-                f"nothing listens on {text_of(self._spec.to)} (ICMP port unreachable); "
+                f"nothing listens on {address_text(self._spec.to)} (ICMP port unreachable); "
                 "what is sent there is lost"
             )
 
     def _report(self, reason: str) -> None:
         if reason not in self._reported:
             self._reported.add(reason)
-            say(f"link {self._spec.name}: {reason}")
+            report_line(f"link {self._spec.name}: {reason}")
 
 
 class UnintendedLosses:
@@ -109,7 +108,7 @@ class UnintendedLosses:
             if datagrams > self._reported[cause]:
                 self._reported[cause] = datagrams
                 text = _CAUSES.get(cause, f"could not be sent ({cause})")
-                say(f"{self._where}: {datagrams} datagrams {text}, against the guarantee")
+                report_line(f"{self._where}: {datagrams} datagrams {text}, against the guarantee")
 
     def _set(self, cause: str, datagrams: int) -> None:
         if datagrams > 0:

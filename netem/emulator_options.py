@@ -27,14 +27,13 @@ from netem.tc_words import (
     require_no_dashes,
     settings_of,
     tc_command,
-    text_of,
+    words_of,
 )
 from noack.core.errors import CallerError, shortened
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import expected_loss, read_files, with_kept_loss
 from noack.impairments.words import OWN_TIME_S
-from noack.runtime.address import parse_address, parse_destination
-from noack.runtime.address import text_of as address_text
+from noack.runtime.address import address_text, parse_address, parse_destination
 from noack.runtime.command_line import Parser
 from noack.runtime.run_process import add_options
 
@@ -333,7 +332,7 @@ def explain(specs: Sequence[LinkSpec], written: Sequence[LinkSpec], *, as_json: 
 def _document(settings: LinkSettings) -> dict[str, object]:
     prediction, tc = expected_loss(settings), tc_command(settings)
     return {
-        "words": text_of(settings),
+        "words": words_of(settings),
         "settings": settings.model_dump(mode="json", exclude_none=True),
         "meaning": [one.meaning() for one in settings.impairments]
         + [f"{words}: {meaning}" for words, meaning in settings_meaning(settings)],

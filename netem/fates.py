@@ -35,7 +35,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from netem.relay_links import DIRECTIONS, EVENT, Bytes, Direction, LinkSpec, say
+from netem.relay_links import DIRECTIONS, EVENT, Bytes, Direction, LinkSpec, report_line
 from noack.core.core_library import Rows, dtype_of
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_growing, open_regular
@@ -238,7 +238,7 @@ class FateRecorder:
             self._report(f"cannot be written ({_reason(error)})")
 
     def _report(self, what: str) -> None:
-        say(f"fate trace {self._path}: {what}; it cannot be replayed; the relay continues")
+        report_line(f"fate trace {self._path}: {what}; it cannot be replayed; the relay continues")
 
 
 def _reason(error: OSError | ValueError) -> str:

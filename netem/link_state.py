@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from noack.core.core_library import Array, CData, core, dtype_of, ffi, pointer_to
 from noack.core.random_streams import stream_key
 from noack.impairments.feature import Stage, StageTables
-from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
+from noack.impairments.link_settings import Counters, Decisions, LinkSettings
 from noack.impairments.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
 from noack.impairments.loss_prediction import with_kept_loss
 
@@ -194,7 +194,7 @@ class LinkState:
             **tables_of,
             "decisions_begin": self._decisions_begin,
             "memory": np.zeros((rows, len(named)), dtype_of("noack_stage_memory")),
-            "recent_ns": np.full((rows, link.recent_width), NEVER_NS, np.int64),
+            "recent_ns": np.full((rows, link.recent_width), core.NOACK_NEVER_NS, np.int64),
             "losses": np.zeros((rows, link.loss_width), np.int64),
             "queues": np.zeros(len(named), dtype_of("noack_queue")),
             "departures_ns": np.zeros(places, np.int64),
@@ -213,7 +213,8 @@ class LinkState:
         """Double the number of flows that have room."""
         for name in ("flows", "memory", "recent_ns", "losses"):
             old = self._memory[name]
-            self._memory[name] = np.concatenate((old, np.zeros_like(old)))
+            empty = core.NOACK_NEVER_NS if name == "recent_ns" else 0
+            self._memory[name] = np.concatenate((old, np.full_like(old, empty)))
         self.flows = self._memory["flows"].view(self.flows.dtype)
         self.core.rows = len(self.flows)
         self._point(self.core)

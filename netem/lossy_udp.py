@@ -20,12 +20,12 @@ from netem.control.emulator_statistics import (
     statistics,
 )
 from netem.relay import Relay
-from netem.relay_links import DIRECTIONS, Address, Direction, LinkSpec
+from netem.relay_links import DIRECTIONS, Direction, LinkSpec
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, why
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import read_files
-from noack.runtime.address import parse_address, parse_destination, text_of
+from noack.runtime.address import Address, address_text, parse_address, parse_destination
 
 
 class LossyUdp:
@@ -138,7 +138,7 @@ class LossyUdp:
 
     def __str__(self) -> str:
         """Where the link leads, its settings, and what was lost."""
-        lines = [f"{self._spec.name} to {text_of(self._spec.to)}, seed {self.seed}"]
+        lines = [f"{self._spec.name} to {address_text(self._spec.to)}, seed {self.seed}"]
         for direction, counts in (("forward", self.forward), ("reverse", self.reverse)):
             lost = counts["received"] - counts["fates"].get("delivered", 0)
             lost -= counts["fates"].get("forced", 0)
@@ -183,7 +183,7 @@ def _text(address: str | Sequence[str | int], what: str) -> str:
         return address
     match address:
         case [str(host), int(port), *_]:
-            return text_of((host, port))
+            return address_text((host, port))
     raise CallerError(f"{what}: {address!r}; give host and port, or 'host:port'")
 
 

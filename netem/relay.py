@@ -10,7 +10,6 @@ import numpy as np
 from netem.client_table import ClientTable, LinkWarnings, UnintendedLosses
 from netem.relay_links import (
     DIRECTIONS,
-    Address,
     Direction,
     DirectionReport,
     FlowReport,
@@ -27,7 +26,7 @@ from netem.shell.devices import DeviceLink
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.address import packed_name
+from noack.runtime.address import Address, packed_name
 
 _PERIOD_NS = 40_000_000
 _RARE_PERIOD_NS = 250_000_000
@@ -115,7 +114,7 @@ class Relay:
         while not stop():
             housekeeping()
             now_ns = self._now_ns()
-            self._keep_house(now_ns)
+            self._do_housekeeping(now_ns)
             self._relay_until(now_ns + _PERIOD_NS)
         self._end()
 
@@ -197,7 +196,7 @@ class Relay:
             for tap in self._taps:
                 tap.take(events, data)
 
-    def _keep_house(self, now_ns: int) -> None:
+    def _do_housekeeping(self, now_ns: int) -> None:
         """Remove idle clients, open return paths again, check for losses."""
         self._memory.core.no_memory = 0  # check again
         self._clients.query_some_drops()

@@ -23,14 +23,12 @@ from numpy.typing import NDArray
 from noack.core.core_library import core, dtype_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import Counters, Decisions, LinkSettings
-from noack.runtime.address import SocketName as SocketName
-from noack.runtime.address import packed_name as packed_name
-from noack.runtime.address import text_of
+from noack.runtime.address import Address, SocketName, address_text
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.udp_sockets import drops_of, enlarge_buffer
+from noack.runtime.udp_sockets import bind_to, drops_of, enlarge_buffer
 
 
-def say(line: str) -> None:
+def report_line(line: str) -> None:
     """Write a line; if standard error is closed, the emulator continues."""
     print_to_stderr(f"noack netem: {line}")
 
@@ -42,9 +40,6 @@ EVENT = dtype_of("noack_event")
 """One event, with the fields of ``noack_event`` in native/noack.h; the payload is ``data[offset :
 offset + size_bytes]``."""
 
-
-Address = tuple[str, int]
-"""Numeric host (IPv4 or IPv6) and port."""
 
 Direction = Literal["forward", "reverse"]
 DIRECTIONS: tuple[Direction, Direction] = ("forward", "reverse")
@@ -220,19 +215,8 @@ def listen(spec: LinkSpec, name: SocketName) -> Endpoint:
         CallerError: the address cannot be bound.
     """
     endpoint = _udp_socket(name)
-    try:
-        endpoint.bind(name)
-    except OSError as error:
-        endpoint.close()
-        reason = {
-            errno.EADDRINUSE: "is already taken by another program",
-            errno.EACCES: "needs privileges that this user does not have",
-            errno.EADDRNOTAVAIL: "is no address of this machine",
-        }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
-        raise CallerError(
-            f"link {spec.name}: UDP port {text_of(spec.listen)} {reason}; "
-            "listen on another, or on port 0 for any"
-        ) from None
+    what = f"link {spec.name}: UDP port {address_text(spec.listen)}"
+    bind_to(endpoint, name, what, "listen on another, or on port 0 for any")
     _prepare(endpoint)
     return endpoint
 
@@ -418,7 +402,7 @@ class OpenLink:
 
     def client_text(self, name: bytes) -> str:
         """Return a client's packed address as text."""
-        return text_of(unpacked_address(name))
+        return address_text(unpacked_address(name))
 
     @property
     def discarded(self) -> int:
@@ -449,7 +433,7 @@ def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:
             server = socket_name(spec.to, f"link {spec.name}: to")
             if spec.to[1] == 0:
                 raise CallerError(
-                    f"link {spec.name}: to {text_of(spec.to)}: nobody can be at port 0; give the server's"
+                    f"link {spec.name}: to {address_text(spec.to)}: port 0 is no destination; give its port"
                 )
             endpoint = undo.enter_context(listen(spec, own_name))
             path = None if spec.return_path else undo.enter_context(one_way_path(server))
@@ -476,7 +460,7 @@ def _refuse_loops(links: Sequence[OpenLink]) -> None:
             if following_link is link:
                 over = f" over {', '.join(passed[1:])}" if len(passed) > 1 else ""
                 raise CallerError(
-                    f"link {link.spec.name}: {text_of(link.spec.to)} leads back to itself{over}"
+                    f"link {link.spec.name}: {address_text(link.spec.to)} leads back to itself{over}"
                 )
             if following_link.spec.name in passed:
                 break

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from netem.link_state import Integers, LinkState
 from netem.relay_links import EVENT, Bytes
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, Rows, core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
 CLIENT, SOCKET, SLOT = map(dtype_of, ("noack_client", "noack_socket", "noack_slot"))
 ENTRY = dtype_of("noack_heap_entry")
-PACKET_ROW, RELEASE_ROW = dtype_of("noack_packet_row"), dtype_of("noack_release_row")
 _CLIENTS, _SLOTS, _ROWS = 64, 256, 16
 _EVENTS = 8192
 _DATA_BYTES = 16 * 1024 * 1024
@@ -43,12 +43,12 @@ class RelayMemory:
         self.directions: CData = ffi.new("noack_direction[]", 2 * links)
         self.events: Rows = np.zeros(_EVENTS if taps else 0, EVENT)
         self.data: Bytes = np.zeros(_DATA_BYTES if taps == 2 else 0, np.uint8)
-        self.packets: Rows = np.zeros(row_count, PACKET_ROW)
-        self.releases: Rows = np.zeros(row_count, RELEASE_ROW)
+        self.packets: Rows = np.zeros(row_count, dtype_of("noack_packet_row"))
+        self.releases: Rows = np.zeros(row_count, dtype_of("noack_release_row"))
         self._scratch = zeros_in_lines(core.noack_relay_scratch_bytes(), np.dtype(np.uint8))
         self.core: CData = ffi.new("noack_relay *", {
             "links": links, "epoll": self._epoll.fileno(), "only_socket": -1,
-            "clock": {"speed": 1.0}, "change_ns": 2**63 - 1, "segment": segment,
+            "clock": {"speed": 1.0}, "change_ns": NEVER_NS, "segment": segment,
             "segment_below": 2**16, "taps": taps, "records": row_count > 0,
             "directions": self.directions,
             "event_count": len(self.events), "data_bytes": len(self.data),
@@ -136,7 +136,7 @@ class RelayMemory:
 
     def latest_ns(self, direction: int, rows: int) -> Integers:
         """Return the last departure time (rows,) of each flow's packets in flight; −1: none."""
-        latest = np.full(rows, -1, np.int64)
+        latest = np.full(rows, core.NOACK_NEVER_NS, np.int64)
         core.noack_relay_latest(self.core, direction, pointer_to(latest, "int64_t *"))
         return latest
 

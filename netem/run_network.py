@@ -9,14 +9,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from netem.channel import Datagram, at_start, due_settings, link_name
+from netem.channel import PACKET_ROW, Datagram, at_start, due_settings, link_name
 from netem.relay_links import let_wait, stamp_arrivals
-from netem.relay_memory import PACKET_ROW, RelayDirection, RelayMemory, name_array
+from netem.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.clock import RunClock
 from noack.core.core_library import Rows, core
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Notice, Record, Start
-from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING
 from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.real_time_loop import RecordSink, RowSink
@@ -26,11 +26,8 @@ from noack.scenario.scenario import Scenario
 
 _ROWS = 256
 """Rows of each table of the record that it keeps: as many as telemetry has in a batch."""
-_WORDS = (PACKET_ROW.names or ())[:-1]
-_PACKET_ROW = np.dtype([*((name, "<i8") for name in _WORDS), ("head", f"V{PACKET_HEAD_BYTES}")])
 _AT_ONCE_NS = -(2**63)
 """Do what is due, and do not wait."""
-_NEVER_NS = 2**63 - 1
 
 
 class RunNetwork:
@@ -119,13 +116,13 @@ class RunNetwork:
 
     def next_deadline_ns(self) -> int | None:
         """Time of the next departure; None: nothing is in flight."""
-        return self._relay.heap[0].release_ns if self._relay.heap_length else None
+        return self._relay.heap[0].due_ns if self._relay.heap_length else None
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Accept a change; see :meth:`netem.channel.Channel.announce`."""
         outputs = self._schedule.announce(NETEM_SETTING, change, self._relay.inputs, now_ns, self._reached_ns)
         self._relay.inputs += 1
-        self._set_change_time()
+        self._relay.change_ns = self._schedule.next_ns
         return outputs
 
     def drive(self, until_ns: int, sink: RowSink) -> None:
@@ -180,22 +177,18 @@ class RunNetwork:
         if reason == core.NOACK_CHANGE_DUE:
             for settings in due_settings(self._schedule, one.settings, relay.now_ns):
                 one.change(settings, self._memory.latest_ns(0, one.rows))
-            self._set_change_time()
+            self._relay.change_ns = self._schedule.next_ns
         elif reason == core.NOACK_STORE_FULL:
             self._memory.add_room()
         elif reason == core.NOACK_HOUSEKEEPING:
             relay.no_memory = 0  # check again
         return reason
 
-    def _set_change_time(self) -> None:
-        next_ns = self._schedule.next_ns
-        self._relay.change_ns = _NEVER_NS if next_ns is None else next_ns
-
     def _pass_rows(self, sink: RowSink) -> None:
         packets, releases = self._memory.take_rows()
         if len(packets):
             self._reached_ns = int(packets["now_ns"][-1])
-            sink.extend_table(NETEM_PACKET, packets.view(_PACKET_ROW))
+            sink.extend_table(NETEM_PACKET, packets.view(PACKET_ROW))
         if len(releases):
             sink.extend_table(NETEM_RELEASE, releases)
 

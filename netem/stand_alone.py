@@ -1,6 +1,6 @@
 """A stand-alone emulator: runs a relay, with what watches, changes and records it; prints totals.
 
-:func:`alone` reads the command line, :func:`relay` relays until Ctrl-C, :func:`attached` adds live
+:func:`run_stand_alone` reads the command line, :func:`relay` relays until Ctrl-C, :func:`attached` adds live
 control, statistics lines, metrics and the live screen.
 """
 
@@ -30,12 +30,12 @@ from netem.control.statistics_view import Screen, picture_of
 from netem.emulator_options import command_line_parser, explain, parsed, specs_of
 from netem.fates import FateRecorder, read_fates
 from netem.relay import Relay
-from netem.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, raise_file_limit, say
+from netem.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, raise_file_limit, report_line
 from netem.shell.devices import DeviceLink
 from noack.core.errors import CallerError, ExitStatus, NoackError, why
 from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.address import text_of
+from noack.runtime.address import address_text
 from noack.runtime.command_line import LogFormat, Signals, failed, log_event, log_format
 from noack.runtime.connections.metrics_server import OPTION, metrics_server, require_package
 from noack.runtime.real_time_loop import realtime
@@ -88,7 +88,7 @@ def add_recording_options(parser: argparse.ArgumentParser, *, shell: bool = Fals
     _add_watching_options(parser)
 
 
-def alone(arguments: Sequence[str]) -> ExitStatus:
+def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
     """Run a stand-alone emulator until Ctrl-C, or explain its settings; print the totals.
 
     Returns:
@@ -163,7 +163,7 @@ def relay(
             has_ended = stack.enter_context(running)
         for setting, answer in stack.enter_context(realtime(options.realtime, _FIFO_PRIORITY)).items():
             if answer.startswith("refused"):
-                say(f"{setting} {answer}")
+                report_line(f"{setting} {answer}")
         takes_output = options.view or (options.stats is not None and options.stats_file is None)
         if program is None:
             is_free = options.capture != "-" and not takes_output
@@ -224,9 +224,9 @@ def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
     finally:
         writer.close()
         if writer.error is not None:
-            say(writer.error)
+            report_line(writer.error)
         elif writer.missing_events:
-            say(f"the capture lacks {writer.missing_events} events")
+            report_line(f"the capture lacks {writer.missing_events} events")
 
 
 def _report_ready(opened: Relay, *, print_it: bool, as_json: bool) -> None:
@@ -234,14 +234,15 @@ def _report_ready(opened: Relay, *, print_it: bool, as_json: bool) -> None:
 
     ``print_it``: also print a line on standard output that other programs can wait for.
     """
-    listen = {name: text_of(address) for name, address in opened.addresses().items()}
+    listen = {name: address_text(address) for name, address in opened.addresses().items()}
     for spec in opened.specs:
         name = f" ({spec.name})" if len(opened.specs) > 1 else ""
-        say(f"{listen[spec.name]} → {text_of(spec.to)}{name}, Ctrl-C ends")
+        report_line(f"{listen[spec.name]} → {address_text(spec.to)}{name}, Ctrl-C ends")
     line = f"ready: listening on {', '.join(listen.values())}"
     if as_json:
         links = [
-            {"name": spec.name, "listen": listen[spec.name], "to": text_of(spec.to)} for spec in opened.specs
+            {"name": spec.name, "listen": listen[spec.name], "to": address_text(spec.to)}
+            for spec in opened.specs
         ]
         line = json.dumps({"ready": links})
     if print_it and sys.stdout is not None:
@@ -343,7 +344,7 @@ def _metrics(commands: CommandQueue, where: str) -> Iterator[None]:
     from netem.control.emulator_metrics import EmulatorMetrics  # an optional package
 
     with metrics_server(where, EmulatorMetrics(commands).collect) as address:
-        say(f"metrics: http://{text_of(address)}/metrics")
+        report_line(f"metrics: http://{address_text(address)}/metrics")
         yield
 
 
@@ -364,7 +365,7 @@ def _statistics_lines(commands: CommandQueue, period_s: float, path: Path | None
             file.flush()
         except OSError as error:
             name = "standard output" if path is None else path
-            say(f"statistics cannot be written to {name} ({error.strerror}); the relay continues")
+            report_line(f"statistics cannot be written to {name} ({error.strerror}); the relay continues")
             # Also, closing the file writes the buffer once more; this must not fail.
             nothing = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nothing, file.fileno())

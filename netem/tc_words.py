@@ -133,7 +133,7 @@ def settings_of(words: str | Sequence[str]) -> LinkSettings:
     return settings
 
 
-def text_of(settings: LinkSettings) -> str:
+def words_of(settings: LinkSettings) -> str:
     """Return words that :func:`parse` reads back to the same settings."""
     words = [impairment.text() for impairment in settings.impairments]
     words += guarantee_words(settings)

@@ -26,12 +26,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.clock import NS_PER_S
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import Place, SignalSource
-from noack.machines.loop_machines import NEVER_NS, LoopMachines, Role, alike_loops, set_machine
+from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedError
 from noack.protocol.machine_interface import BEGINNING, FAILED, External, Notice, Start
@@ -149,7 +149,7 @@ def watchdog_notice(watchdog: Watchdog, note: CData) -> Notice:
 
 
 @dataclass
-class Plant:
+class Plant(MachinePart):
     """The plant of one loop.
 
     Args:
@@ -182,8 +182,6 @@ class Plant:
     section: PlantSection | None = None
 
     role = PLANT
-    schedule = None
-    counts_every_message = False
 
     @property
     def shape(self) -> RecordShape:
@@ -279,11 +277,7 @@ class Plant:
         x[:], z[:] = self.system.x, self.system.z
         return ()
 
-    def inspect(self, rows: NDArray[np.void]) -> Sequence[Notice]:
-        """Received actuations need no line in the log."""
-        return ()
-
-    def note(self, plant: CData, note: CData) -> Notice:
+    def note(self, note: CData) -> Notice:
         """Return the line about actuations that are missing, or arrive again."""
         return watchdog_notice(self.watchdog, note)
 
@@ -309,9 +303,7 @@ def plants_of(
 
     A plant cannot be restarted during the run: ``start`` has no effect.
     """
-    alike, parts = alike_loops(loops), list[Plant]()
-    for number, (loop, first) in enumerate(zip(loops, alike, strict=True)):
-        parts.append(_part(loop) if number == first else _redrawn(parts[first], loop))
+    parts, alike = parts_of(loops, _part, _redrawn)
     return LoopMachines(parts, phases_ns, alike=alike)
 
 

@@ -18,13 +18,14 @@ are unknown, and the first known input is used.
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
-from noack.machines.loop_machines import LoopMachines, Role, alike_loops, set_machine, take_changes
+from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.record_tables import (
@@ -92,7 +93,7 @@ class Observer:
 
 
 @dataclass
-class Sensor:
+class Sensor(MachinePart):
     """The sensor of one loop.
 
     Its time is the time of the measurements: its output depends on the measured values and their
@@ -111,6 +112,7 @@ class Sensor:
         schedule: the announced changes of its settings; None if they cannot change.
         timeout_ns: how long to wait for an acknowledgement; None: updates are not acknowledged.
         observer: estimates x from the measurements; None: they are x.
+        reports_error: whether the network chooses by the errors of updates, which then report them.
         horizon_ns: a measurement with a later time is rejected.
     """
 
@@ -124,10 +126,10 @@ class Sensor:
     schedule: ChangeSchedule[tuple[Vector | None, Policy]] | None = None
     timeout_ns: int | None = None
     observer: Observer | None = None
+    reports_error: bool = False
     horizon_ns: int = _ANY_TIME_NS
 
     role = SENSOR
-    external = None
 
     def __post_init__(self) -> None:
         self._trigger: EventTrigger | None = None
@@ -170,7 +172,7 @@ class Sensor:
         memory.fill(sensor, {
             "is_user": self._trigger is not None, "acknowledged": self.timeout_ns is not None,
             "timeout_ns": self.timeout_ns or 0, "knows_state": self.x0 is not None,
-            "events": self.first_number, "wait_ns": -1,
+            "events": self.first_number, "wait_ns": -1, "reports_error": self.reports_error,
             "x_s": start, "event_x": np.zeros(n), "x": np.zeros(n), "e_s": np.zeros(n),
         })  # fmt: skip
         sensor.trigger.event_ns = -1
@@ -217,10 +219,6 @@ class Sensor:
         if self.observer is None:
             return ()
         return self.observer.first_notice(int(rows["t_ns"][0]))
-
-    def note(self, sensor: CData, note: CData) -> Notice:
-        """Raise ValueError: the core's sensor writes no notes."""
-        raise ValueError("a sensor writes no notes")
 
     def _decide(self, sensor: CData) -> None:
         """Ask the user's trigger about a measurement."""
@@ -307,9 +305,7 @@ def sensors_of(
     Of the plant's data they use at most x(0). After a restart, a sensor transmits its first
     measurement.
     """
-    alike, parts = alike_loops(loops), list[Sensor]()
-    for number, (loop, first) in enumerate(zip(loops, alike, strict=True)):
-        parts.append(_part(start, loop) if number == first else _redrawn(start, parts[first], loop))
+    parts, alike = parts_of(loops, partial(_part, start), partial(_redrawn, start))
     return LoopMachines(parts, phases_ns, alike=alike)
 
 
@@ -327,6 +323,7 @@ def _part(start: Start, resolved: Scenario) -> Sensor:
         schedule=None if acknowledges else ChangeSchedule(resolved, _prepared),
         timeout_ns=resolved.timing.acknowledgement_timeout_ns if acknowledges else None,
         observer=observer_of(resolved, restarted=start.is_restart),
+        reports_error=resolved.network.link.reads_errors,
         horizon_ns=resolved.timing.horizon_ns,
     )
 

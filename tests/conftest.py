@@ -13,6 +13,7 @@ from typing import Any
 
 # Before numpy is imported: threads slow small matrices down.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
+os.environ["MPLBACKEND"] = "Agg"  # no window, also where there is a display
 
 import pytest
 from hypothesis import HealthCheck, settings

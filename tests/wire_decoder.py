@@ -56,7 +56,9 @@ class Decoder:
         if found != core.NOACK_ACCEPTED:
             return None
         vector = np.array(ffi.unpack(message.vector, message.entries), np.float64)
-        return wire_format.Message(self._flow, message.sequence, message.t_ns, vector, self._loop)
+        return wire_format.Message(
+            self._flow, message.sequence, message.t_ns, vector, self._loop, message.error_level
+        )
 
     def _examine(self, datagram: bytes, from_peer: bool, *, opened: bool) -> int:
         return int(

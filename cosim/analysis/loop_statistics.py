@@ -34,12 +34,11 @@ from cosim.record.align import (
     SizeStatistics,
     bounded_parts,
     expected_rms,
-    identity_residual,
-    in_common,
+    shares_update,
 )
 from cosim.record.run_events import NEVER_NS, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.core.linear_systems import Matrix, all_entries, row_norms
+from noack.core.linear_systems import Matrix, row_norms
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -139,7 +138,8 @@ VIOLATION = "violation"
 def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
     """Return the number of lost updates by cause, without causes of no losses."""
     fates = outcomes.fate
-    causes = {one.name.lower(): int((fates == one).sum()) for one in Fate if not one.effective}
+    counts = Counter(fates.tolist())
+    causes = {one.name.lower(): counts[one] for one in Fate if not one.effective}
     causes["delivered_out_of_order"] = int((effective(fates) & outcomes.lost).sum())
     return {cause: n for cause, n in causes.items() if n}
 
@@ -220,7 +220,8 @@ class _Unmatched:
         """Add the next numbers; one is received in the same part as it is sent, or later."""
         self._newest = max(self._newest, int(arrived.max(initial=-1)))
         sent = np.concatenate([self._sent, sent])
-        self._sent = sent[:0] if np.array_equal(sent, arrived) else np.setdiff1d(sent, arrived)
+        begins_alike = np.array_equal(sent[: len(arrived)], arrived)
+        self._sent = sent[len(arrived) :] if begins_alike else np.setdiff1d(sent, arrived)
         return self
 
     def count(self, *, complete: bool) -> int:
@@ -340,11 +341,12 @@ class SampleFactsReader:
         self._fresh_ns: int | None = None
         self._newest, self._last_ns = -1, 0
 
-    def take(self, joined: AlignedRun) -> None:
-        """Add the next measurements."""
+    def take(self, joined: AlignedRun, common: NDArray[np.bool_] | None = None) -> None:
+        """Add the next measurements; it may be known where sensor and controller share an update."""
         if not len(joined.t_ns):
             return
-        found, common, t_s = self._found, shares_update(self._scenario, joined), joined.t_ns * 1e-9
+        common = shares_update(self._scenario, joined) if common is None else common
+        found, t_s = self._found, joined.t_ns * 1e-9
         started = np.logical_or.accumulate(common) | found.any_in_common
         gaps = np.flatnonzero(started & ~common)
         gap_s = float(t_s[gaps[0]]) if found.gap_s is None and len(gaps) else found.gap_s
@@ -366,12 +368,6 @@ class SampleFactsReader:
         since_ns = self._last_ns - self._fresh_ns
         longest_ns = max(self._found.longest_update_ns, since_ns)
         return self._found._replace(longest_update_ns=longest_ns)
-
-
-def shares_update(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
-    """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
-    finite = np.isfinite(joined.e_c_norm) & all_entries(np.isfinite(joined.x_s))
-    return np.asarray(finite & in_common(scenario, joined))
 
 
 class Signals(TypedDict):
@@ -402,10 +398,10 @@ class SignalStatistics:
         self._scale, self._read = 0.0, 0
         self._half = record.count(SENSOR_MEASUREMENT) // 2
         facts = SampleFactsReader(record.scenario)
-        for part, bounds in bounded_parts(record):
+        for bounded in bounded_parts(record):
+            part, left = bounded.part, bounded.residual
             self._add(part)
-            facts.take(part.aligned)
-            left = identity_residual(record.scenario, part.aligned, bounds.missed)
+            facts.take(part.aligned, bounded.shared)
             self._residual = _larger(self._residual, left[~np.isnan(left)])
             self._estimation_error(part)
             self._read += len(part.rows)

@@ -15,9 +15,14 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import duration
 from noack.impairments.constraints import join_guarantee
-from noack.impairments.guarantee_inclusion import Pattern, find_pattern_beyond
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, outcome_letters
+from noack.impairments.loss_guarantee import (
+    LongestBurst,
+    LossGuarantee,
+    Pattern,
+    find_pattern_beyond,
+    outcome_letters,
+)
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.scenario import Scenario

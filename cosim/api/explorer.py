@@ -14,7 +14,7 @@ from noack.core.number_format import as_text
 with lazy_modules():
     from cosim.interactive import draft as drafts
     from cosim.interactive import exploration_figure as explored
-    from cosim.output import figure_drawing
+    from cosim.output.figures import figure_drawing
 
 if TYPE_CHECKING:
     from ipywidgets import Widget

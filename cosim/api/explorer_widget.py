@@ -20,8 +20,8 @@ from cosim.interactive.exploration_figure import (
     DraftResults,
     exploration_figure,
 )
-from cosim.output.figure_drawing import draw
-from cosim.output.figure_layout import settings
+from cosim.output.figures.figure_drawing import draw
+from cosim.output.figures.figure_layout import settings
 from noack.core.errors import NoackError
 from noack.core.number_format import as_html
 

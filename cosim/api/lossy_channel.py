@@ -17,7 +17,7 @@ from gymnasium.spaces.utils import flatdim
 
 from cosim.api.scenarios import Source, load
 from cosim.shipped_files import find_shipped
-from netem.channel import Channel, Leaving, alone, link_name
+from netem.channel import Channel, Leaving, link_name, require_stand_alone
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -108,7 +108,7 @@ class LossyChannel(
             self, network=network, step_s=step_s, first_action=first_action, seed=seed
         )
         super().__init__(env)
-        scenario = alone(_loaded(network))
+        scenario = require_stand_alone(_loaded(network))
         self._network, self._step_ns = scenario.network, _step_ns(env, step_s)
         if seed is not None and (not isinstance(seed, int) or seed < 0):
             raise CallerError(f"LossyChannel: seed = {seed!r}: must be a whole number, 0 or more")

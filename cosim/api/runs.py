@@ -27,15 +27,8 @@ with lazy_modules():
     from cosim.live import launcher, simulated_run
     from cosim.live import progress as progress_display
     from cosim.output import export as exports
-    from cosim.output import (
-        figure_drawing,
-        figure_files,
-        figure_format,
-        network_figures,
-        result_tables,
-        run_figures,
-        run_tables,
-    )
+    from cosim.output import result_tables, run_tables
+    from cosim.output.figures import figure_drawing, figure_files, figure_format, network_figures, run_figures
     from cosim.record import data_frames, run_record, table_files
     from cosim.studies import run_archive, run_comparison
 
@@ -45,7 +38,7 @@ if TYPE_CHECKING:
 
     from cosim.analysis.replay import Replay
     from cosim.analysis.summary_model import Claim, RunSummary
-    from cosim.output.figure_description import FigureDescription
+    from cosim.output.figures.figure_description import FigureDescription
 
 Folder = str | PathLike[str]
 

@@ -35,7 +35,8 @@ from noack.traces.trace_formats import find_trace
 with lazy_modules():
     from cosim.live import progress as progress_display
     from cosim.measurement import measurement_outputs
-    from cosim.output import certificate_report, figure_drawing, result_tables
+    from cosim.output import certificate_report, result_tables
+    from cosim.output.figures import figure_drawing
     from cosim.studies.campaign import (
         campaign_figures,
         campaign_file,

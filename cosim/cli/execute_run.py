@@ -13,6 +13,7 @@ import typer
 from typer import Option
 
 from cosim.cli import command as cli
+from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, PeerError
 from noack.runtime.command_line import LogFormat, log_format, print_to_stderr
@@ -31,14 +32,14 @@ with lazy_modules():
     from noack.theory.certificates import assumptions
 
 if TYPE_CHECKING:
-    from cosim.output.figure_format import FigureFiles
+    from cosim.output.figures.figure_format import FigureFiles
 
 _PER_CORE = 4
 """Maximum worker processes per core; more gain nothing, and use memory."""
 Workers = Annotated[int | None, Option(help="Worker processes; one per core by default.", min=1)]
 
 
-@cli.option_group
+@opt.option_group
 class OutputOptions:
     """What a command prints and writes at the end of a run.
 
@@ -47,8 +48,8 @@ class OutputOptions:
     """
 
     report: bool = True
-    verbose: cli.VerboseOption = False
-    json: cli.JsonOption = False
+    verbose: opt.VerboseOption = False
+    json: opt.JsonOption = False
 
 
 def _log_format(context: typer.Context, wanted: LogFormat) -> LogFormat:
@@ -59,7 +60,7 @@ def _log_format(context: typer.Context, wanted: LogFormat) -> LogFormat:
     return wanted
 
 
-@cli.option_group
+@opt.option_group
 class LiveOptions(OutputOptions):
     """How a live run is made.
 
@@ -71,7 +72,7 @@ class LiveOptions(OutputOptions):
         log_format: Format of standard error: text, or JSON Lines for log collectors.
     """
 
-    runs: cli.RunsOption = cli.DEFAULT_RUNS
+    runs: opt.RunsOption = cli.DEFAULT_RUNS
     live: Annotated[bool, Option("--live")] = False
     metrics: Annotated[str | None, Option(metavar="[HOST]:PORT")] = None
     log_format: Annotated[LogFormat, Option(callback=_log_format, is_eager=True)] = LogFormat.TEXT
@@ -140,7 +141,7 @@ def _served_metrics(loaded: "scenario.Scenario", where: str) -> "Iterator[run_wa
     metrics_server.require_package()
     found = run_metrics.RunMetrics(loaded)
     with metrics_server.metrics_server(where, found.collect) as at:
-        print_to_stderr(f"noack: metrics: http://{address.text_of(at)}/metrics")
+        print_to_stderr(f"noack: metrics: http://{address.address_text(at)}/metrics")
         yield found.watcher()
 
 

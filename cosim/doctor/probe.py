@@ -65,7 +65,7 @@ class _Ticks:
     def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
         self.late_ns += (rows["now_ns"] - rows["t_ns"]).tolist()
 
-    def tend(self, now_ns: int, sink: RecordSink) -> None:
+    def do_housekeeping(self, now_ns: int, sink: RecordSink) -> None:
         pass
 
     def append(self, record: Record) -> None:

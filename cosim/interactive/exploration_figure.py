@@ -12,7 +12,7 @@ import numpy as np
 from cosim.interactive.draft import Draft
 from cosim.interactive.exploration import Ensemble, Exploration, explore_ensemble, run_of, why_not_exact
 from cosim.interactive.scenario_guarantee import Guarantee, Margin, certify, margin_of, warning
-from cosim.output.figure_description import (
+from cosim.output.figures.figure_description import (
     DASHED,
     DOTTED,
     Axis,
@@ -24,7 +24,7 @@ from cosim.output.figure_description import (
     Row,
     time_axis,
 )
-from cosim.output.palette import CERTIFIED, CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD
+from cosim.output.figures.palette import CERTIFIED, CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.scenario.scenario import Scenario

@@ -29,7 +29,7 @@ from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.settings_panel import TextPanel, controls_part, form_part, value_text
 from cosim.lab.sources import LiveSource, RecordedSource, report_address
 from cosim.lab.stage import Stage, figure_part
-from cosim.output.figure_format import FigureFormat, figure_width_in
+from cosim.output.figures.figure_format import FigureFormat, figure_width_in
 from cosim.output.page_kit import TERMS
 from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, VerdictLine
 from noack.core.errors import NoackError
@@ -459,7 +459,7 @@ def csv_of(run: Exploration) -> bytes:
 def figure_file(shown: Shown, kind: FigureFormat) -> bytes:
     """Return the figure as a file's content; called in the worker process."""
     from cosim.interactive.exploration_figure import exploration_figure  # the worker alone
-    from cosim.output.figure_files import file_content  # needs matplotlib
+    from cosim.output.figures.figure_files import file_content  # needs matplotlib
 
     return file_content(exploration_figure(shown), kind, figure_width_in(kind, None))
 

@@ -175,9 +175,8 @@ def _new_pool() -> ProcessPoolExecutor:
 
 
 def _prepare() -> None:
-    """Yield to others, and load what is needed, so that the first answer is quick."""
+    """Yield to others. To find this function the worker has loaded what the first answer needs."""
     os.nice(_NICE)
-    from cosim.interactive import exploration, scenario_guarantee  # noqa: F401
 
 
 _QUIET_S = 0.15

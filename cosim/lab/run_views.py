@@ -29,7 +29,7 @@ from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 with lazy_modules():  # the worker alone needs them
     from cosim.api import runs
     from cosim.live import finalize
-    from cosim.output import run_figures
+    from cosim.output.figures import run_figures
 
 _READ = (SENSOR_MEASUREMENT, CONTROLLER_STEP, CONTROLLER_DELIVERY, CONTROLLER_SETTING, PLANT_STEP)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from nicegui import Client
 
-from cosim.output.figure_description import (
+from cosim.output.figures.figure_description import (
     Band,
     FigureDescription,
     Line,

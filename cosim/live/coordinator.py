@@ -33,7 +33,7 @@ from noack.runtime.control_messages import (
 )
 from noack.runtime.control_plane import ControlPlane, header_of, next_payload
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHED_AWAY_S, Event, LifeCycle, Side, State
+from noack.runtime.life_cycle import HORIZON, LAUNCHED_LOST_S, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.scenario.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
@@ -235,7 +235,7 @@ class Coordinator:
 
     def _away_s(self, member: _Member) -> float:
         """For how long an unreachable process may still come back, in seconds."""
-        most_s = LAUNCHED_AWAY_S if member.role in self._launched else AWAY_S
+        most_s = LAUNCHED_LOST_S if member.role in self._launched else LOST_AFTER_S
         return most_s - member.age_s()
 
     def _clear_barrier(self) -> None:

@@ -41,7 +41,7 @@ from noack.core.process_limits import cores as usable_cores
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
-from noack.runtime.address import text_of
+from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, stop_reason
 from noack.runtime.control_plane import run_name
 from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, published
@@ -114,7 +114,7 @@ def launch(
         if listening is not None and opened is not None:
             ticket = ticket.model_copy(update={"host": listening.address[0]})
             remote = RemoteStart(away, opened.invitation.model_dump_json())
-            watcher.listening(text_of(opened.address), listening)
+            watcher.listening(address_text(opened.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
         run = _Run(ticket, run_dir, coordinator, children, watcher, opened and opened.notices)

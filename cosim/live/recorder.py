@@ -40,7 +40,7 @@ from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane, header_of
-from noack.runtime.life_cycle import LAUNCHED_AWAY_S, LAUNCHER_GONE
+from noack.runtime.life_cycle import LAUNCHED_LOST_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess, join_run
 from noack.runtime.spool import NOTICES
 from noack.runtime.telemetry import first_row
@@ -108,7 +108,7 @@ class ProcessTokens:
         if self._plane.coordinator_gone():
             self._connected_s = now_s
             return False
-        away_s = 0.0 if stopping else LAUNCHED_AWAY_S
+        away_s = 0.0 if stopping else LAUNCHED_LOST_S
         discovered = self._restarted and now_s - self._began_s > _DISCOVERY_S
 
         def is_done(known: Mapping[str, float]) -> bool:

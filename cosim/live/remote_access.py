@@ -27,7 +27,7 @@ from cosim.live.child_processes import Host, load_hosts
 from cosim.live.coordinator import AdmissionPass, Coordinator
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.topology import LOOP_ROLES
-from noack.runtime.address import Address, family_of, parse_address, text_of
+from noack.runtime.address import Address, address_text, family_of, parse_address
 from noack.runtime.connections.coordinator_link import InvitationProof, Protection, forwarding, tls_context
 from noack.runtime.control_plane import RUNS, run_name, socket_path
 from noack.runtime.host_clocks.time_exchange import TimeReference, answering
@@ -116,7 +116,7 @@ def _listen(address: Address) -> socket.socket:
     except (OSError, PeerError) as error:
         endpoint.close()
         reason = why(error) if isinstance(error, OSError) else error
-        raise CallerError(f"cannot listen on {text_of(address)}: {reason}") from None
+        raise CallerError(f"cannot listen on {address_text(address)}: {reason}") from None
     return endpoint
 
 

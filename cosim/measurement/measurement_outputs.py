@@ -17,8 +17,8 @@ from cosim.live.progress import error_console
 from cosim.measurement.chain_fits import ChainFit
 from cosim.measurement.loss_bursts import LEVEL, Estimate, histogram, most_losses
 from cosim.measurement.network_measurement import CertificateTime, Measurement
-from cosim.output import palette
-from cosim.output.figure_description import (
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import (
     Axis,
     Bars,
     FigureDescription,
@@ -31,7 +31,7 @@ from cosim.output.figure_description import (
     one_panel,
     time_axis,
 )
-from cosim.output.figure_format import FigureFiles
+from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from noack.core.errors import CallerError, printable
 from noack.core.file_access import require_suffix, write_whole
@@ -365,7 +365,7 @@ def write_page(
         CallerError: the name does not end in .html.
         MachineError: the page cannot be written.
     """
-    from cosim.output.figure_files import save_figures  # they import matplotlib
+    from cosim.output.figures.figure_files import save_figures  # they import matplotlib
     from cosim.output.page_kit import templates
 
     require_suffix(path, "--out", ".html")

@@ -27,10 +27,11 @@ from cosim.record.run_record import RunRecord, load_record
 from netem.fates import opened_fates
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
+from noack.core.core_library import core
 from noack.core.errors import CallerError, one_line, why
 from noack.core.file_access import open_regular
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
-from noack.impairments.link_settings import NEVER_NS, LinkSettings
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, Fate
 from noack.settings.user_files import NamedFile
 from noack.traces.capture_packets import is_capture
@@ -262,7 +263,7 @@ def read_opportunities(path: Path, period_ns: int) -> PacketTrace:
     received_ns = np.full(probes, LOST_NS)
     for k, at_ns in enumerate(sent_ns.tolist()):
         release_ns = link.decide(0, _PROBE_BYTES, at_ns).release_ns
-        if release_ns != NEVER_NS:
+        if release_ns != core.NOACK_NEVER_NS:
             received_ns[k] = release_ns
     rate_bps = len(times_ms) * OPPORTUNITY_BYTES * 8 * NS_PER_S / read.length_ns
     gaps_ms = np.diff(times_ms, prepend=0)

@@ -1,5 +1,5 @@
 """Output for people: figures, tables, pages, the terminal, the viewer, and exports.
 
-A figure is described once (``figure_description``) and drawn by one renderer per medium. Tables are
+A figure is described once and drawn by one renderer per medium (``figures``). Tables are
 rows of text (``result_tables``, ``run_tables``). ``page_kit`` has the templates of all pages.
 """

@@ -172,8 +172,8 @@ def _print_notes(console: Console, found: Certificates) -> None:
         )
     if any(one.other for one in certificates):
         console.print(
-            "[dim]Two bounds hold at all times. The table has the one that tends to the smaller "
-            "value; both are in the words below.[/]"
+            "[dim]More than one bound holds at all times. The table has the one that tends to the "
+            "smallest value; all are in the words below.[/]"
         )
     for under, certificate in found:
         if certificate.void:

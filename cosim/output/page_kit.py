@@ -12,8 +12,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from cosim.analysis.fidelity import is_against
-from cosim.output.figure_description import FigureDescription
-from cosim.output.figure_files import inline
+from cosim.output.figures.figure_description import FigureDescription
+from cosim.output.figures.figure_files import inline
 from cosim.output.run_tables import interval_text
 from noack.core.number_format import number, percent
 

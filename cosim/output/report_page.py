@@ -15,10 +15,10 @@ import numpy as np
 
 from cosim.analysis.network_summary import worst_loop
 from cosim.analysis.summary_model import LoopSummary, RunSummary
-from cosim.output.figure_description import FigureDescription
-from cosim.output.network_figures import network_figures
+from cosim.output.figures.figure_description import FigureDescription
+from cosim.output.figures.network_figures import network_figures
+from cosim.output.figures.run_figures import envelopes, run_figures
 from cosim.output.page_kit import TERMS, templates, value_text, words
-from cosim.output.run_figures import envelopes, run_figures
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,

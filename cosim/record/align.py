@@ -14,6 +14,7 @@ If a controller dies, there is no x_c until the restarted controller has its fir
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +34,7 @@ from noack.protocol.record_tables import (
 )
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of, steady_state
 from noack.scenario.scenario import Scenario
-from noack.theory.paper import ErrorBounds, ErrorMonitor
+from noack.theory.paper import ErrorMonitor
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
@@ -110,10 +111,10 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     model_ns = np.concatenate([steps["model_t_ns"], deliveries["model_t_ns"]])[order]
     x_c = np.concatenate([steps["x_c"], deliveries["x_c"]])[order]
     lives = inputs[order] // GENERATION
-    track = before
-    for life in np.unique(lives):
-        which = lives == life
-        track = _continued(track, int(life), model_ns[which], x_c[which], newest[which])
+    track, begins = before, np.flatnonzero(np.diff(lives, prepend=-1)).tolist()
+    for begin, end in pairwise([*begins, len(lives)]):
+        own = slice(begin, end)
+        track = _continued(track, int(lives[begin]), model_ns[own], x_c[own], newest[own])
     return track
 
 
@@ -206,13 +207,11 @@ def _at(
             state = int(index[i])
             x_c[i] = flow(track.x_c[state], int(track.model_ns[state]), int(t_ns[i]))
         return x_c, received
-    propagate = flow.propagate
-    if not dt_ns.any():  # mostly: the controller's model is advanced to each of these times
-        x_c[known] = track.x_c[index[known]]
-        return x_c, received
-    for step_ns in np.unique(dt_ns[known]):
-        which = known & (dt_ns == step_ns)
-        x_c[which] = propagate.rows(track.x_c[index[which]], int(step_ns))
+    x_c[known] = track.x_c[index[known]]
+    older = np.flatnonzero(known & (dt_ns != 0))  # few: mostly the model is advanced to these times
+    for step_ns in np.unique(dt_ns[older]):
+        which = older[dt_ns[older] == step_ns]
+        x_c[which] = flow.propagate.rows(x_c[which], int(step_ns))
     return x_c, received
 
 
@@ -273,8 +272,20 @@ def align_tables(record: RunRecord) -> AlignedRun:
     return parts[0] if len(parts) == 1 else AlignedRun(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def bounded_parts(record: RunRecord) -> Iterator[tuple[AlignedPart, ErrorBounds]]:
-    """Yield the aligned parts with bounds of the controller's error, and (I1)'s right-hand side.
+class BoundedPart(NamedTuple):
+    """An aligned part with bounds of the controller's error; k measurements."""
+
+    part: AlignedPart
+    shared: NDArray[np.bool_]
+    """(k,) where sensor and controller share an update, and ‖e_c‖ is finite: it is bounded there."""
+    error_bounds: tuple[Reals, Reals]
+    """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN where it is not bounded."""
+    residual: Reals
+    """Residual of (I1), (k,)."""
+
+
+def bounded_parts(record: RunRecord) -> Iterator[BoundedPart]:
+    """Yield the aligned parts with bounds of the controller's error, and (I1)'s residual.
 
     Summary and claims use those of a short run in turn.
     """
@@ -282,17 +293,28 @@ def bounded_parts(record: RunRecord) -> Iterator[tuple[AlignedPart, ErrorBounds]
 
 
 @lru_cache(maxsize=1)
-def _short_bounds(record: RunRecord) -> Sequence[tuple[AlignedPart, ErrorBounds]]:
+def _short_bounds(record: RunRecord) -> Sequence[BoundedPart]:
     return tuple(_bounded(record))
 
 
-def _bounded(record: RunRecord) -> Iterator[tuple[AlignedPart, ErrorBounds]]:
+def _bounded(record: RunRecord) -> Iterator[BoundedPart]:
     scenario = record.scenario
     period_ns = scenario.timing.measurement_period_ns
     monitor = ErrorMonitor(record.loop.H, policy_of(scenario), period_ns)
     for part in aligned_parts(record):
-        rows, e_s = part.rows, part.rows["x_s"] - part.rows["x"]
-        yield part, monitor.take(rows["t_ns"], e_s, rows["event"], part.aligned.received)
+        rows, aligned = part.rows, part.aligned
+        e_s = rows["x_s"] - rows["x"]
+        found = monitor.take(rows["t_ns"], e_s, rows["event"], aligned.received)
+        shared = shares_update(scenario, aligned)
+        identity, printed = (np.where(shared, one, np.nan) for one in (found.identity, found.printed))
+        residual = identity_residual(scenario, aligned, found.missed)
+        yield BoundedPart(part, shared, (identity, printed), residual)
+
+
+def shares_update(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:
+    """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
+    finite = np.isfinite(aligned.e_c_norm) & all_entries(np.isfinite(aligned.x_s))
+    return np.asarray(finite & in_common(scenario, aligned))
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -383,7 +405,7 @@ class EventFollower:
         events = np.append(self._event, rows["event"][new])
         event_ns = np.append(self._event_ns, rows["t_ns"][new])
         x = np.concatenate([self._x[None], rows["x"][new]])
-        newest = np.searchsorted(new, np.arange(len(rows)), "right")
+        newest = np.cumsum(rows["event"] != NO_SEQUENCE)
         period_ns = self._scenario.timing.measurement_period_ns
         age_ns = rows["t_ns"] - event_ns[newest]
         predicted = self._propagate.leaps(x[newest], age_ns // period_ns, period_ns)

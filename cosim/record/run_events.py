@@ -91,12 +91,13 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
             found.setdefault(change.number, change)
             since.setdefault(change.number, {}).setdefault(OWNER[table], since_ns)
     made: list[RecordedChange] = []
+    if not found:
+        return made
     scenario = record.scenario
     schedule = ChangeSchedule[None](scenario)
     for number, change in sorted(found.items(), key=lambda one: (one[1].t_ns, one[0])):
         if _add(schedule, change, change.t_ns):
-            taken = schedule.take(change.t_ns)
-            assert taken is not None
+            (taken,) = schedule.take(change.t_ns)
             made.append(RecordedChange(change, since[number], taken.scenario))
     return made
 
@@ -109,7 +110,7 @@ def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
         if change.number not in known:  # a restarted controller receives it again
             known.add(change.number)
             _add(schedule, change, since_ns)
-    while (taken := schedule.take(NEVER_NS)) is not None:
+    for taken in schedule.take(NEVER_NS):
         flow.change(taken.since_ns, loop_of(taken.scenario).setpoint)
     return flow
 
@@ -217,9 +218,10 @@ def _outcomes(
     which = (rows["bit"] >= 0).astype(np.int64)
     numbers = 2 * rows["sequence"] + which
     effectively = effective(rows["fate"])
-    stale = np.isin(numbers, forwarded[was_stale])
+    stale = np.isin(numbers, forwarded[was_stale]) if was_stale.any() else np.zeros(len(numbers), np.bool_)
     due_ns = np.maximum(np.where(which == 1, rows["copy_ns"], rows["release_ns"]), rows["now_ns"])
-    in_flight = effectively & (due_ns > rows["now_ns"]) & ~np.isin(numbers, forwarded)
+    in_flight = effectively & (due_ns > rows["now_ns"])
+    in_flight[in_flight] = ~np.isin(numbers[in_flight], forwarded)
     fate, lost = rows["fate"].astype(np.int8), ~effectively | stale
     return PacketOutcome(sequence, event_ns, rows["now_ns"].copy(), fate, lost, in_flight, due_ns)
 
@@ -233,8 +235,8 @@ def updates_in(packets: Rows, flow: Flow = Flow.UPDATE) -> tuple[Rows, NDArray[n
         Their rows of ``netem_packet``, sequence numbers and event times.
     """
     headers = np.ascontiguousarray(packets["head"]).view(HEADER_ROW)
-    mine = (headers["magic"] == MAGIC) & np.isin(headers["version"], VERSIONS)
-    mine &= (headers["flow"] == flow) & (headers["t_ns"] >= 0)
+    mine = np.logical_or.reduce([headers["version"] == version for version in VERSIONS])
+    mine &= (headers["magic"] == MAGIC) & (headers["flow"] == flow) & (headers["t_ns"] >= 0)
     mine &= headers["sequence"] < 2**63  # others do not fit the record's columns
     return (
         packets.compress(mine),

@@ -105,9 +105,8 @@ class StoredTables(RecordSource):
             found: dict[int, list[Rows]] = {
                 number: [] for number, own in zip(loops, types, strict=True) if own == dtype
             }
-            own = self._files[table].batches(with_columns(self.types[table], (LOOP,)), within)
-            for numbers, rows in zip(own, self._files[table].batches(dtype, within), strict=True):
-                for number, part in parts_by_loop(rows, numbers[LOOP]):
+            for numbers, rows in self._files[table].batches_by_loop(dtype, within):
+                for number, part in parts_by_loop(rows, numbers):
                     if number in found:
                         found[number].append(part)
             for number, parts in found.items():
@@ -199,7 +198,18 @@ class TableFile:
         """Yield the rows of each group, or of some, as rows of a type that has fewer columns."""
         with self._open() as file:
             for group in range(len(self.groups)) if groups is None else groups:
-                yield self._rows(file, group, self._dtype if dtype is None else dtype)
+                table = self._read(file, group, dtype or self._dtype)
+                yield self._rows(table, dtype or self._dtype)
+
+    def batches_by_loop(
+        self, dtype: RowType, groups: Iterable[int]
+    ) -> Iterator[tuple[NDArray[np.uint16], Rows]]:
+        """Yield the number of the loop of each row, and the rows, of some groups."""
+        kind = self._dtype[LOOP]
+        with self._open() as file:
+            for group in groups:
+                table = self._read(file, group, dtype, LOOP)
+                yield _values(self._path, LOOP, table[LOOP], kind), self._rows(table, dtype)
 
     def whole(self) -> pa.Table:
         """Return the table, loop after loop, with all columns of the file."""
@@ -232,16 +242,19 @@ class TableFile:
             _require_columns(self._path, file.schema_arrow, self._dtype)
             yield file
 
-    def _rows(self, file: pq.ParquetFile, group: int, dtype: RowType) -> Rows:
+    def _read(self, file: pq.ParquetFile, group: int, dtype: RowType, *more: str) -> pa.Table:
         names = [column for column, _ in _columns(dtype)]
         # One thread, whose memory is used again.
-        table = file.read_row_group(group, columns=names, use_threads=False).combine_chunks()
+        table = file.read_row_group(group, columns=[*more, *names], use_threads=False).combine_chunks()
         table.validate(full=True)
-        rows, columns, copies = np.empty(len(table), dtype), iter(names), []
+        return table
+
+    def _rows(self, table: pa.Table, dtype: RowType) -> Rows:
+        rows, columns, copies = np.empty(len(table), dtype), _columns(dtype), []
         for name in dtype.names or ():
             field = dtype[name]
             for entry in rows[name].T if field.shape else [rows[name]]:
-                column = next(columns)
+                column, _ = next(columns)
                 copies.append((entry, _values(self._path, column, table[column], field.base)))
         for first in range(0, len(rows), _ROWS_IN_CACHE):
             for entry, values in copies:

@@ -13,9 +13,9 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
-from netem.channel import NO_TIME_NS, UPDATE_LINK, Channel, Leaving, alone
+from netem.channel import UPDATE_LINK, Channel, Leaving, require_stand_alone
 from netem.link_state import LinkState
-from noack.core.clock import NS_PER_S
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.record_tables import NETEM_PACKET, Fate
 from noack.scenario.scenario import Scenario
@@ -79,7 +79,7 @@ def run(scenario: Scenario, endpoints: Sequence[str], options: FederateOptions) 
     """
     if not endpoints or len({*endpoints}) < len(endpoints):
         raise CallerError("--endpoint: give one or more endpoints, each once")
-    settings = alone(scenario).network.link
+    settings = require_stand_alone(scenario).network.link
     link = LinkState(settings, scenario.seeds.loss, UPDATE_LINK, rows=len(endpoints))
     channel = Channel([link], loops=len(endpoints))
     with _joined(options) as (helics, federate):
@@ -151,7 +151,7 @@ class _Network:
         helics, end_s = self._helics, self._helics.HELICS_TIME_MAXTIME
         while True:
             due_ns = self._channel.due_ns
-            wanted_s = end_s if due_ns == NO_TIME_NS else due_ns / NS_PER_S
+            wanted_s = end_s if due_ns == NEVER_NS else due_ns / NS_PER_S
             granted_s = helics.helicsFederateRequestTime(self._federate, wanted_s)
             if granted_s >= end_s:
                 return

@@ -15,8 +15,9 @@ from controller_node.controller import controllers_of
 from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, joined, packed
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi
-from noack.machines.loop_machines import NEVER_NS, LoopMachines, row_types
+from noack.machines.loop_machines import LoopMachines, row_types
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, OWNER
 from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER

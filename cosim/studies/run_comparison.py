@@ -10,8 +10,8 @@ import numpy as np
 
 from cosim.analysis.summary_model import FidelityPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
-from cosim.output import palette
-from cosim.output.figure_description import (
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import (
     TIME,
     Axis,
     Dash,
@@ -120,7 +120,7 @@ class RunComparison:
 
     def plot(self) -> "Figure":
         """Draw states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions of all runs overlaid."""
-        from cosim.output.figure_drawing import draw  # it imports matplotlib
+        from cosim.output.figures.figure_drawing import draw  # it imports matplotlib
 
         return draw(overlay_figure(self.runs))
 
@@ -135,7 +135,7 @@ class RunComparison:
             CallerError: the name has another ending, or there is no such width.
             MachineError: the file cannot be written.
         """
-        from cosim.output.figure_files import FIGURE_SUFFIXES, save_figure  # they import matplotlib
+        from cosim.output.figures.figure_files import FIGURE_SUFFIXES, save_figure  # they import matplotlib
         from cosim.output.page_kit import templates
 
         if path.suffix in FIGURE_SUFFIXES:

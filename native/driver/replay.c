@@ -48,7 +48,7 @@ const char *noack_replay_check(const noack_input_replay *replay) {
         return "a replay has no machine";
     if (!is_between(0, replay->next, replay->count))
         return "a replay has more inputs than it has";
-    if (is_network ? replay->sent_width != SENT_DATAGRAM : replay->sent_width < SENT_HEADER)
+    if (is_network ? replay->sent_width != SENT_DATAGRAM : replay->sent_width <= SENT_HEADER)
         return "there is no room for what is sent";
     const char *wrong = NULL;
     int64_t rows = 0;
@@ -196,13 +196,14 @@ static int64_t replay_machine(
     if (question != NOACK_DONE)
         return question;
     compare(replay, table, recorded, output->table, 8 * output->words, output->row);
-    if (!output->sends || message->entries > replay->sent_width - SENT_HEADER)
+    if (!output->sends || message->entries >= replay->sent_width - SENT_HEADER)
         return NOACK_DONE;
     int64_t *sent = replay->sent + replay->sent_count++ * replay->sent_width;
     sent[0] = message->flow;
     sent[1] = message->sequence;
     sent[2] = message->t_ns;
     memcpy(sent + SENT_HEADER, message->vector, (size_t)message->entries * sizeof *message->vector);
+    sent[SENT_HEADER + message->entries] = message->error_level;
     return NOACK_DONE;
 }
 

@@ -7,7 +7,7 @@
    the record shows is written, unless the network has flipped a bit of it. */
 #include "../core.h"
 
-enum { MOST_LOOPS = 65535, MOST_PLACES = 1 << 24, MOST_OUTPUTS = 2 };
+enum { MOST_PLACES = 1 << 24, MOST_OUTPUTS = 2 };
 
 /* No datagram is rejected for its source, and none of it is read at a socket. */
 enum { FROM_PEER = 1, OPENED = 0 };

@@ -4,7 +4,6 @@
    0; the last bits of a loop do not depend on the size chosen. */
 #include "exact.h"
 
-static const int64_t NEVER_NS = INT64_C(1) << 62; /* longer times never end */
 enum { MOST_FATES = 1 << 30, CACHE_LINE = 8 /* doubles */ };
 
 #if defined(__x86_64__)

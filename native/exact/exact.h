@@ -16,7 +16,8 @@ enum {
     MOST_STEPS = 1000000 /* of a search */
 };
 
-#define NONE (-1.0) /* results of searches, instead of a time */
+#define NEVER_NS (INT64_C(1) << 62) /* longer times never end */
+#define NONE (-1.0)                 /* results of searches, instead of a time */
 #define UNRESOLVED (-2.0)
 
 typedef struct {           /* a rule between two events; times in seconds since the run's start */

@@ -6,7 +6,6 @@
 
 static const double GRID_SLACK = 1e-9; /* rounding of an event's time on the grid, of a period */
 static const double NS = 1e-9, PER_S = 1e9;
-static const int64_t NEVER_NS = INT64_C(1) << 62;
 
 static int64_t whole(double number) { /* defined for all numbers */
     return number >= 9e18 ? INT64_MAX / 2 : number > -9e18 ? (int64_t)number : -INT64_MAX / 2;

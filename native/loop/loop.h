@@ -43,7 +43,7 @@ static inline void begin_message(
     output->message.flow = flow;
     output->message.sequence = sequence;
     output->message.t_ns = t_ns;
-    output->message.entries = 0;
+    output->message.entries = output->message.error_level = 0;
 }
 
 static inline void append(noack_output *output, int64_t count, const double *values) {

@@ -3,7 +3,7 @@
 
 #include "loop.h"
 
-enum { MOST_LOOPS = 65535, MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16 };
+enum { MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16 };
 static const int64_t MOST_LENGTH = INT64_C(1) << 32;
 
 /* Times and numbers of which a few sums, with the time of a message, are in the range of int64_t.
@@ -249,7 +249,7 @@ const char *noack_process_check(const noack_process *process) {
     if (!is_between(NOACK_PLANT, process->role, NOACK_CONTROLLER)
         || !is_between(1, process->loops, MOST_LOOPS))
         return "a process has no role or no loops";
-    if (process->due_ns == NULL || process->heap == NULL || process->notes == NULL
+    if (process->heap == NULL || process->notes == NULL
         || !is_between(1, process->note_places, MOST_LENGTH)
         || !is_between(0, process->note_count, process->note_places)
         || (process->role == NOACK_PLANT && process->plants == NULL)

@@ -14,51 +14,23 @@ noack_machine *noack_process_machine(const noack_process *process, int64_t loop)
     return &process->controllers[loop].machine;
 }
 
-static int64_t due_ns(const noack_process *process, int64_t loop) {
+static void push_tick(noack_process *process, int64_t loop) {
     const noack_machine *machine = noack_process_machine(process, loop);
     int64_t t_ns = tick_ns(machine);
-    return t_ns == NO_TICK ? NO_TICK : t_ns + machine->phase_ns;
-}
-
-static int comes_first(const noack_process *process, int64_t one, int64_t other) {
-    const int64_t *due = process->due_ns;
-    return due[one] < due[other] || (due[one] == due[other] && one < other);
-}
-
-/* Lower the entry at a place of the heap until none below comes before it. */
-static void lower(noack_process *process, int64_t place) {
-    int64_t *heap = process->heap, count = process->heap_count;
-    for (int64_t below; (below = 2 * place + 1) < count; place = below) {
-        below += below + 1 < count && comes_first(process, heap[below + 1], heap[below]);
-        if (!comes_first(process, heap[below], heap[place]))
-            return;
-        int64_t loop = heap[place];
-        heap[place] = heap[below];
-        heap[below] = loop;
-    }
+    if (t_ns != NO_TICK)
+        heap_push(
+            process->heap, &process->heap_count,
+            (noack_heap_entry){t_ns + machine->phase_ns, loop, 0});
 }
 
 void noack_process_begin(noack_process *process) {
     process->heap_count = 0;
-    for (int64_t loop = 0; loop < process->loops; loop++) {
-        process->due_ns[loop] = due_ns(process, loop);
-        if (process->due_ns[loop] != NO_TICK)
-            process->heap[process->heap_count++] = loop;
-    }
-    for (int64_t place = process->heap_count / 2; place-- > 0;)
-        lower(process, place);
+    for (int64_t loop = 0; loop < process->loops; loop++)
+        push_tick(process, loop);
 }
 
 int64_t noack_process_due_ns(const noack_process *process) {
-    return process->heap_count == 0 ? NO_TICK : process->due_ns[process->heap[0]];
-}
-
-/* Set the next tick of the machine that has just done the first one of the heap. */
-static void next_tick(noack_process *process, int64_t loop) {
-    process->due_ns[loop] = due_ns(process, loop);
-    if (process->due_ns[loop] == NO_TICK)
-        process->heap[0] = process->heap[--process->heap_count];
-    lower(process, 0);
+    return process->heap_count == 0 ? NO_TICK : process->heap[0].due_ns;
 }
 
 static int is_full(const noack_process *process, int64_t table) {
@@ -134,10 +106,12 @@ int64_t noack_process_handle(noack_process *process, const noack_message *messag
 int64_t noack_process_tick(noack_process *process, int64_t now_ns) {
     if (is_full(process, NOACK_TICKS))
         return NOACK_ROWS_FULL;
-    int64_t loop = process->heap[0];
+    int64_t loop = process->heap[0].number;
     now_ns -= noack_process_machine(process, loop)->phase_ns;
     int64_t question = do_tick(process, loop, now_ns);
-    if (question == NOACK_DONE)
-        next_tick(process, loop);
+    if (question == NOACK_DONE) {
+        heap_pop(process->heap, &process->heap_count);
+        push_tick(process, loop);
+    }
     return conclude(process, loop, question);
 }

@@ -11,6 +11,8 @@
    x_s <- e^(H(t - t_k)) x(t_k), which equals the controller's model then. After a transmission the
    sensor waits for the acknowledgement until a timeout; then the current measurement is sent if the
    rule still requires it. An acknowledgement restarts the trigger's condition. */
+#include <math.h>
+
 #include "loop.h"
 
 /* The scratch of the trigger; before it are x_s and x - x_r. */
@@ -50,6 +52,18 @@ static void start(noack_sensor *sensor, int64_t t_ns, const double *x) {
             &sensor->rule, &sensor->trigger, n, t_ns, sensor->event_x, rule_scratch(sensor));
 }
 
+/* An error, as a share of its threshold, on the scale of docs/wire.md: 1 to 255, of which 128 is 1,
+   and 16 more are twice as much; 0: it is not a number. */
+static int64_t level_of(double share) {
+    int exponent;
+    if (isnan(share))
+        return 0;
+    if (share >= 256.0)
+        return 255;
+    double fraction = frexp(fmax(share, 1.0 / 256.0), &exponent); /* 1/2 <= fraction < 1 */
+    return max_of(96 + 16 * exponent + (int64_t)(32.0 * fraction), 1);
+}
+
 /* Write the row of a measurement; at an event send the update before it. */
 static void answer(
     noack_sensor *sensor, const noack_message *message, const double *x_s, const double sides[2],
@@ -69,6 +83,11 @@ static void answer(
     if (event) {
         begin_message(output, NOACK_UPDATE, sensor->events++, message->t_ns);
         append(output, n, sensor->x);
+        if (sensor->reports_error) {
+            int compares = sensor->is_user || sensor->rule.up_rows > 0;
+            double share = compares ? sides[0] / sides[1] : error;
+            output->message.error_level = sensor->first ? 255 : level_of(share);
+        }
     }
 }
 

@@ -106,7 +106,7 @@ static void line_up(noack_relay *relay) {
 /* Queue the datagrams that are due for sending; return CARRY_ON, or which buffer is full. */
 static int64_t release_due(noack_relay *relay, int64_t until_ns) {
     relay_scratch *own = scratch_of(relay);
-    while (relay->heap_length > 0 && relay->heap[0].release_ns <= until_ns) {
+    while (relay->heap_length > 0 && relay->heap[0].due_ns <= until_ns) {
         noack_heap_entry entry = relay->heap[0];
         const noack_slot *slot = &relay->slots[entry.slot];
         if (own->leaving_count == LEAVING)
@@ -114,18 +114,18 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
         if (!has_room(relay, slot->size_bytes))
             return NOACK_EVENTS_FULL;
         heap_pop(relay->heap, &relay->heap_length);
-        relay->now_ns = max_of(relay->now_ns, entry.release_ns);
+        relay->now_ns = max_of(relay->now_ns, entry.due_ns);
         relay->clients[slot->client].in_flight--;
         departure *leaving = &own->leaving[own->leaving_count];
         *leaving = (departure){
             .datagram = *slot,
-            .release_ns = entry.release_ns,
+            .release_ns = entry.due_ns,
             .slot = (int32_t)entry.slot,
             .delayed = 1,
         };
         line_up(relay);
         serve(
-            relay->directions[slot->direction].link, relay->waiting, entry.release_ns, relay->heap,
+            relay->directions[slot->direction].link, relay->waiting, entry.due_ns, relay->heap,
             &relay->heap_length);
         if (relay->records)
             record_release(relay, leaving, until_ns);
@@ -243,6 +243,8 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
     noack_decision decision;
     client->last_ns = relay->now_ns;
     serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
+    if (!relay->devices)
+        link->flows[client->place].error_level = noack_wire_error_level(data, size_bytes);
     noack_link_decide(
         link, client->place, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,
         &decision);
@@ -302,7 +304,7 @@ static int64_t decide_batch(noack_relay *relay) {
 static int64_t departs_in_ns(const noack_relay *relay) {
     if (relay->heap_length == 0)
         return INT64_MAX;
-    return noack_clock_wait_ns(&relay->clock, relay->heap[0].release_ns - relay->read_ns);
+    return noack_clock_wait_ns(&relay->clock, relay->heap[0].due_ns - relay->read_ns);
 }
 
 /* Until when to wait for datagrams; INT64_MIN: the time for housekeeping has come. */

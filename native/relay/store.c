@@ -72,7 +72,7 @@ void noack_relay_latest(noack_relay *relay, int64_t direction, int64_t *latest_n
         const noack_slot *slot = &relay->slots[relay->heap[i].slot];
         if (slot->direction == direction) {
             int64_t place = relay->clients[slot->client].place;
-            latest_ns[place] = max_of(latest_ns[place], relay->heap[i].release_ns);
+            latest_ns[place] = max_of(latest_ns[place], relay->heap[i].due_ns);
         }
     }
 }

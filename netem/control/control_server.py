@@ -21,7 +21,7 @@ from zenoh.handlers import RingChannel
 
 from netem.control.emulator_statistics import CommandQueue, Statistics, StatisticsThread
 from netem.relay_links import DIRECTIONS, Direction
-from netem.tc_words import settings_of, text_of
+from netem.tc_words import settings_of, words_of
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import with_kept_loss
@@ -238,7 +238,7 @@ class ControlServer:
 
 
 def _settings(settings: LinkSettings) -> object:
-    return {"words": text_of(settings), "settings": settings.model_dump(mode="json")}
+    return {"words": words_of(settings), "settings": settings.model_dump(mode="json")}
 
 
 def _require_read(settings: LinkSettings) -> None:

@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 
 from netem.relay import Relay
 from netem.relay_links import DIRECTIONS, Direction, DirectionReport, LinkReport, coarse, quantile_ns
-from netem.tc_words import text_of
+from netem.tc_words import words_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
 from noack.impairments.link_settings import Counters, LinkSettings
 from noack.impairments.loss_prediction import expected_loss
 from noack.protocol.record_tables import Fate
-from noack.runtime.address import text_of as address_text
+from noack.runtime.address import address_text
 
 T = TypeVar("T")
 
@@ -48,7 +48,7 @@ class AppliedSettings:
     @cached_property
     def words(self) -> str:
         """The settings in the words of ``tc netem``."""
-        return text_of(self.settings)
+        return words_of(self.settings)
 
     @cached_property
     def predicted_loss(self) -> float | None:

@@ -22,10 +22,11 @@ from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address
 from pathlib import Path
 from typing import NoReturn
 
-from netem.relay_links import Address, LinkSpec, SocketName
+from netem.relay_links import LinkSpec
 from netem.shell import process
 from noack.core.errors import CallerError
 from noack.core.process_limits import python_command
+from noack.runtime.address import Address, SocketName
 
 MTU_BYTES = 1500
 _RANGE = IPv4Network("198.18.0.0/16")

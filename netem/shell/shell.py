@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from netem.emulator_options import parsed, shell_parser, shell_spec
-from netem.relay_links import say
+from netem.relay_links import report_line
 from netem.shell import process
 from netem.shell.devices import DeviceLink, open_devices
 from netem.stand_alone import add_recording_options, check_options, relay, report_totals
@@ -90,7 +90,7 @@ class _Program:
             main = _start(self._command, addresses)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         ends = f"inside {spec.listen[0]}, outside {' and '.join(addresses.values())}"
-        say(f"{ends}; the emulator is process {os.getpid()}")
+        report_line(f"{ends}; the emulator is process {os.getpid()}")
         try:
             yield lambda: main.poll() is not None
         finally:

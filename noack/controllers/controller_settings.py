@@ -33,7 +33,6 @@ class ControlLaw(Protocol):
         Raises:
             ControlFailedError: the law cannot continue; it must not be used again.
         """
-        ...
 
     def input(self, t_s: float, x_c: Vector, setpoint: tuple[Vector, Vector] | None) -> Vector:
         """Return u, shape (m,).
@@ -46,7 +45,6 @@ class ControlLaw(Protocol):
         Raises:
             ControlFailedError: the law cannot continue; it must not be used again.
         """
-        ...
 
 
 class ControllerSettings(ScenarioSection):

@@ -101,6 +101,12 @@ class Feature(ScenarioSection):
         return self.tc_missing
 
 
+def numbers_text(numbers: Sequence[object]) -> str:
+    """Return the first numbers of flows in words."""
+    more = ",..." if len(numbers) > _MOST_SHOWN else ""
+    return f"{','.join(map(str, numbers[:_MOST_SHOWN]))}{more}"
+
+
 class QueueDiscipline(Feature):
     """Base class of queue disciplines of ``rate``; their words follow those of ``rate``."""
 
@@ -128,11 +134,6 @@ class Scheduler(QueueDiscipline):
 
         It is negative if that must arrive before; infinite if it always, or never, goes first.
         """
-
-    def shown(self, numbers: Sequence[str]) -> str:
-        """Return the numbers of the flows in words."""
-        more = ",..." if len(numbers) > _MOST_SHOWN else ""
-        return f"{','.join(numbers[:_MOST_SHOWN])}{more}"
 
     def number(self, flow: int) -> int:
         """Return the number of a flow; flows count from 0."""

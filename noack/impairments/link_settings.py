@@ -11,8 +11,8 @@ from typing import Annotated, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
-from noack.core.core_library import core
 from noack.impairments.constraints import AnyConstraint, find_longest_burst, require_consistent
+from noack.impairments.disciplines.maximum_error import MaximumError
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.blackout import Blackout
@@ -22,8 +22,6 @@ from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
 from noack.settings.section import ScenarioSection
 
-NEVER_NS: int = core.NOACK_NEVER_NS
-"""A time that never comes."""
 Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
 Constraints = Annotated[tuple[AnyConstraint, ...], Field(max_length=8)]
 
@@ -59,6 +57,13 @@ class LinkSettings(ScenarioSection):
     def chooses(self) -> bool:
         """Whether the queue of a rate chooses what it sends when the link is free."""
         return any(isinstance(one, Rate) and one.scheduler for one in self.impairments)
+
+    @property
+    def reads_errors(self) -> bool:
+        """Whether such a queue chooses by the errors that updates report."""
+        return any(
+            isinstance(one, Rate) and isinstance(one.discipline, MaximumError) for one in self.impairments
+        )
 
     @property
     def longest_burst(self) -> int | None:

@@ -49,9 +49,9 @@ from noack.impairments.markov_chain import (
     NotPredictableError,
     Pattern,
     constrained_rate,
-    list_moves,
     moves_by_outcome,
     pattern_rate,
+    reachable_moves,
     stochastic,
 )
 from noack.impairments.words import brief_percent
@@ -264,7 +264,7 @@ class LossProcess:
             NotPredictableError: there are too many states.
         """
         n, most = len(self.start), _MOST_SQUARED // len(self.start)
-        after_delivery = list_moves(guarantee, most).after_delivery
+        after_delivery = reachable_moves(guarantee, most).after_delivery
         losing, delivering = moves_by_outcome(self.moves, self.lost, guarantee)
         count = len(after_delivery) * n
         # The last state is that before the first packet.
@@ -291,7 +291,7 @@ class LossProcess:
             NotPredictableError: there are too many states or packets.
         """
         n = len(self.start)
-        after_loss, after_delivery = list_moves(guarantee, _MOST_STEPS // n)
+        after_loss, after_delivery = reachable_moves(guarantee, _MOST_STEPS // n)
         allowed = after_loss >= 0
         lost, passed = self.moves * self.lost, self.moves * (1 - self.lost)
         at = np.zeros((len(after_loss), n))

@@ -9,14 +9,13 @@ the impairments after their step.
 
 import math
 from collections.abc import Iterable
-from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.core_library import core
-from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
+from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee, Moves, list_moves
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array  # slow to import
@@ -113,34 +112,18 @@ def stochastic(matrix: Array) -> Array:
     return rows
 
 
-class Moves(NamedTuple):
-    """The a states of a guarantee; state 0 is that before the first packet."""
-
-    after_loss: NDArray[np.int64]  # (a,) −1: a loss is not allowed
-    after_delivery: NDArray[np.int64]  # (a,)
-
-
-@lru_cache(maxsize=4)
-def list_moves(guarantee: LossGuarantee, most: int) -> Moves:
-    """Return all states of a guarantee.
+def reachable_moves(guarantee: LossGuarantee, most: int) -> Moves:
+    """Return the moves between all states of a guarantee.
 
     Raises:
         NotPredictableError: there are more than ``most``.
     """
-    automaton = LossAutomaton(guarantee)
-    known, lost, delivered = 1, list[int](), list[int]()
-    while len(lost) < known:
-        states = np.arange(len(lost), known)
-        after_loss, after_delivery = automaton.after_loss(states), automaton.after_delivery(states)
-        lost += after_loss.tolist()
-        delivered += after_delivery.tolist()
-        known = max(known, 1 + int(after_loss.max()), 1 + int(after_delivery.max()))
-        if known > most:
-            raise NotPredictableError(
-                f"impairments and guarantee together have more than {MOST_JOINT_STATES} states, "
-                "too many to compute with"
-            )
-    return Moves(np.array(lost), np.array(delivered))
+    if (moves := list_moves(guarantee, most)) is None:
+        raise NotPredictableError(
+            f"impairments and guarantee together have more than {MOST_JOINT_STATES} states, "
+            "too many to compute with"
+        )
+    return moves
 
 
 def pattern_rate(lost: NDArray[np.bool_], guarantee: LossGuarantee) -> float:
@@ -182,7 +165,7 @@ def moves_by_outcome(
     """
     from scipy import sparse  # slow to import
 
-    after_loss, after_delivery = list_moves(guarantee, MOST_JOINT_STATES // len(moves))
+    after_loss, after_delivery = reachable_moves(guarantee, MOST_JOINT_STATES // len(moves))
     count = len(after_loss)
     allowed = after_loss >= 0
 

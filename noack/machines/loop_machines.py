@@ -10,14 +10,16 @@ The loops may have vectors of different sizes. The rows of a table then have roo
 what a loop's own row lacks is missing in them (:func:`row_layout`).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, lru_cache
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import External, Notice, Record
@@ -31,7 +33,6 @@ NewRows = Callable[[int, "np.dtype[np.void]"], Rows]
 """Returns memory for a number of rows of a type."""
 _ROWS, _ROWS_OF_A_LOOP, _MOST_ROWS = 1024, 256, 16_384
 _NOTES = 256
-NEVER_NS = 2**63 - 1
 
 
 class Role(NamedTuple):
@@ -52,59 +53,66 @@ class Role(NamedTuple):
         return int(getattr(core, f"NOACK_{self.name.upper()}"))
 
 
-class MachinePart(Protocol):
+class MachinePart(ABC):
     """The description of one loop's machine, and what only Python can do for it."""
 
     role: Role
-
-    @property
-    def schedule(self) -> ChangeSchedule[object] | None:
-        """The announced changes of its settings; None if they cannot change."""
-        ...
+    schedule: ChangeSchedule[object] | None = None
+    """The announced changes of its settings; None if they cannot change."""
 
     @property
     def counts_every_message(self) -> bool:
         """Whether :meth:`inspect` needs all rows, not only those of messages after losses."""
-        ...
+        return False
 
     @property
+    @abstractmethod
     def shape(self) -> RecordShape:
         """The sizes of the rows that it writes."""
-        ...
-
-    def fill(self, structure: CData, memory: CoreMemory) -> None:
-        """Fill the core's structure, at the start of the machine's work."""
-        ...
-
-    def redraw(self, structure: CData, memory: CoreMemory) -> None:
-        """Set what the draws determine, in a copy of a structure that an alike part has filled."""
-        ...
-
-    def answer(self, question: int, structure: CData) -> Sequence[Notice]:
-        """Do what a step needs before it goes on; return lines for the log."""
-        ...
 
     @property
     def external(self) -> External | None:
         """What another program has of it."""
-        ...
+        return None
 
-    def inspect(self, rows: NDArray[np.void]) -> Sequence[Notice]:
+    @abstractmethod
+    def fill(self, structure: CData, memory: CoreMemory) -> None:
+        """Fill the core's structure, at the start of the machine's work."""
+
+    @abstractmethod
+    def redraw(self, structure: CData, memory: CoreMemory) -> None:
+        """Set what the draws determine, in a copy of a structure that an alike part has filled."""
+
+    @abstractmethod
+    def answer(self, question: int, structure: CData) -> Sequence[Notice]:
+        """Do what a step needs before it goes on; return lines for the log."""
+
+    def inspect(self, rows: Rows) -> Sequence[Notice]:
         """Return lines for the log about new rows of received messages."""
-        ...
+        return ()
 
-    def note(self, structure: CData, note: CData) -> Notice:
+    def note(self, note: CData) -> Notice:
         """Return the line for the log that a step has asked for by a ``noack_note``."""
-        ...
+        raise ValueError(f"a {self.role.name} writes no notes")
 
 
 Prepared = TypeVar("Prepared")
+Part = TypeVar("Part", bound=MachinePart)
 
 
-def alike_loops(loops: Sequence[Scenario]) -> list[int]:
-    """Return for each loop the number of the first one from which it differs in draws only."""
+def parts_of(
+    loops: Sequence[Scenario], part: Callable[[Scenario], Part], redrawn: Callable[[Part, Scenario], Part]
+) -> tuple[list[Part], list[int]]:
+    """Return each loop's part, and the first loop from which it differs in draws only.
+
+    ``part`` makes the part of such a first loop; ``redrawn`` changes it for the others.
+    """
     firsts: dict[tuple[int, ...], int] = {}
-    return [firsts.setdefault(settings_key(loop), number) for number, loop in enumerate(loops)]
+    alike = [firsts.setdefault(settings_key(loop), number) for number, loop in enumerate(loops)]
+    parts: list[Part] = []
+    for number, (loop, first) in enumerate(zip(loops, alike, strict=True)):
+        parts.append(part(loop) if number == first else redrawn(parts[first], loop))
+    return parts, alike
 
 
 def set_machine(
@@ -135,18 +143,10 @@ def take_changes(
     schedule: ChangeSchedule[Prepared] | None, machine: CData
 ) -> Sequence[AppliedParameters[Prepared]]:
     """Return the changes that are due at the time at which a step asked, in order."""
-    found: list[AppliedParameters[Prepared]] = []
-    while schedule is not None and (due := schedule.take(machine.change_ns)) is not None:
-        found.append(due)
-    machine.change_ns = next_change_ns(schedule)
-    return found
-
-
-def next_change_ns(schedule: ChangeSchedule[object] | None) -> int:
-    """Return the time of the next change."""
-    if schedule is None or schedule.next_ns is None:
-        return NEVER_NS
-    return schedule.next_ns
+    assert schedule is not None
+    due = schedule.take(machine.change_ns)
+    machine.change_ns = schedule.next_ns
+    return due
 
 
 class LoopMachines:
@@ -197,8 +197,7 @@ class LoopMachines:
         process.role, process.loops = self.role.number, count
         machines = keep(ffi.new(f"{self.role.structure}[]", count))
         setattr(process, f"{self.role.name}s", machines)
-        process.due_ns = keep(ffi.new("int64_t[]", count))
-        process.heap = keep(ffi.new("int64_t[]", count))
+        process.heap = keep(ffi.new("noack_heap_entry[]", count))
         self.machines: CData = machines
         """(loops,) The structures of the machines."""
         copies: dict[int, list[int]] = {}
@@ -296,8 +295,7 @@ class LoopMachines:
                     self._inspect(found)
         for note in self._notes[: self.core.note_count]:
             loop = int(note["loop"])
-            notice = self.parts[loop].note(self.machines[loop], note)
-            self._keep_notices(loop, (notice,))
+            self._keep_notices(loop, (self.parts[loop].note(note),))
         self.core.note_count = 0
         return taken
 
@@ -327,7 +325,7 @@ class LoopMachines:
                 table, own[loop], machine.inputs, now_ns - self.phases_ns[loop], machine.reached_ns
             )
             machine.inputs += 1
-            machine.change_ns = next_change_ns(schedule)
+            machine.change_ns = schedule.next_ns
             outputs += [_with_loop(loop, output) for output in announced]
             self._note_counting(loop)
         return outputs

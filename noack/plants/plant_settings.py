@@ -50,12 +50,10 @@ class PlantSystem(Protocol):
     @property
     def x(self) -> Vector:
         """The state of the loop: the deviation from the operating point, shape (n,)."""
-        ...
 
     @property
     def z(self) -> Vector:
         """The system's own state, shape (N,); empty if x is the whole state."""
-        ...
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
         """Advance from ``t_ns`` by ``dt_ns`` under the constant input ``u``.
@@ -68,7 +66,6 @@ class PlantSystem(Protocol):
         Raises:
             SystemFailedError: the system cannot continue; do not advance it again.
         """
-        ...
 
 
 class PlantStart(NamedTuple):

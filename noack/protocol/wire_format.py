@@ -8,7 +8,8 @@ Layout, little endian (``docs/wire.md`` has test vectors)::
          0     2  magic, the bytes "NA"
          2     1  version: 1, or 2 of an encrypted datagram
          3     1  flow: 1 measurement, 2 update, 3 actuation, 4 acknowledgement
-         4     2  dimension n of the vector, 1 to 64; 0 of an acknowledgement
+         4     1  dimension n of the vector, 1 to 64; 0 of an acknowledgement
+         5     1  error level of an update; 0: unknown
          6     2  number of the loop, unsigned, 0 to 65,534; 0 in a run of one loop
          8     8  run id, unsigned
         16     8  sequence number, unsigned, from 0 within a flow; what is acknowledged
@@ -22,7 +23,6 @@ writes datagrams, with their tags by keyed BLAKE2b; :class:`EncryptedSeal` encry
 """
 
 import hashlib
-import struct
 from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
@@ -40,21 +40,21 @@ MAX_DIMENSION = 64
 MAX_LOOPS = 65_535
 TIMES_NS = 2**62
 """Upper limit of times: sums of two fit the record's columns."""
-_HEADER = struct.Struct("<2sBBHHQQq")
 HEADER_ROW = np.dtype(
     [
         ("magic", "S2"),
         ("version", "u1"),
         ("flow", "u1"),
-        ("dimension", "<u2"),
+        ("dimension", "u1"),
+        ("error_level", "u1"),
         ("loop", "<u2"),
         ("run_id", "<u8"),
         ("sequence", "<u8"),
         ("t_ns", "<i8"),
     ]
 )
-"""The same as a row of an array."""
-HEADER_BYTES = _HEADER.size
+"""A header as a row of an array."""
+HEADER_BYTES = HEADER_ROW.itemsize
 MAX_DATAGRAM_BYTES = HEADER_BYTES + 8 * MAX_DIMENSION + TAG_BYTES
 
 
@@ -146,6 +146,8 @@ class Message(NamedTuple):
     vector: Vector
     loop: int = 0
     """The number of its loop, among the loops of its run."""
+    error_level: int = 0
+    """Of an update: its error as a share of its threshold, on the scale of docs/wire.md; 0: unknown."""
 
 
 class Rejection(StrEnum):
@@ -169,6 +171,7 @@ class Header(NamedTuple):
     version: int
     flow: int
     dimension: int
+    error_level: int
     loop: int
     run_id: int
     sequence: int
@@ -184,7 +187,7 @@ def read_header(datagram: bytes) -> Header | None:
     """Read the header of a datagram without verification; None if it is no datagram of noack."""
     if len(datagram) < HEADER_BYTES or datagram[:2] != MAGIC:
         return None
-    return Header(*_HEADER.unpack_from(datagram)[1:])
+    return Header(*np.frombuffer(datagram, HEADER_ROW, 1).tolist()[0][1:])
 
 
 def loop_number(datagram: bytes) -> int | None:
@@ -230,6 +233,7 @@ class Encoder:
             if not 0 <= message.loop <= MAX_LOOPS:
                 raise OverflowError(f"loop {message.loop}")
             own.flow, own.loop, own.t_ns = message.flow, message.loop, message.t_ns
+            own.error_level = message.error_level.to_bytes(1, "little")[0]
             own.sequence = _signed(message.sequence)
         except OverflowError as error:
             raise ValueError(f"a number does not fit its field: {error}") from None

@@ -50,7 +50,7 @@ def parse_destination(text: str, what: str, like: Address | None = None) -> Addr
     return address
 
 
-def text_of(address: Address) -> str:
+def address_text(address: Address) -> str:
     """``host:port``, with an IPv6 address in brackets."""
     host, port = address[:2]
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

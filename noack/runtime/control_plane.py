@@ -23,7 +23,7 @@ from zenoh.handlers import FifoChannel, Handler, RingChannel
 from noack.core.errors import CallerError, NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
 from noack.protocol.topology import COORDINATOR
-from noack.runtime.address import text_of
+from noack.runtime.address import address_text
 from noack.runtime.control_messages import ChangeAnnouncement, message_json, parse_message
 from noack.runtime.join_ticket import RemoteAccess, Ticket
 from noack.runtime.private_folder import open_private
@@ -68,7 +68,7 @@ def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Sess
 
     own = remote.coordinator, remote.certificate, remote.private_key
     destination = Destination(remote.host, remote.port, *own, key.hex())
-    address = text_of((remote.host, remote.port))
+    address = address_text((remote.host, remote.port))
     with ExitStack() as stack:
         try:
             path = stack.enter_context(coordinator_link(destination))

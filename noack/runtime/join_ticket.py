@@ -23,7 +23,7 @@ from noack.core.errors import CallerError, PeerError, why
 from noack.core.file_access import new_file, open_regular, read_regular
 from noack.impairments.loss_prediction import found_probabilities, remember
 from noack.protocol.wire_format import KEY_BYTES
-from noack.runtime.address import LOOPBACK, Address, family_of, text_of
+from noack.runtime.address import LOOPBACK, Address, address_text, family_of
 from noack.runtime.control_messages import NumericHost, SocketAddress
 from noack.runtime.private_folder import live_lock_files, lock_file, require_name
 from noack.scenario.scenario import Scenario
@@ -220,5 +220,5 @@ def own_host(other: Address) -> str:
         try:
             probe.connect(other)  # sends nothing
         except OSError as error:
-            raise PeerError(f"cannot reach {text_of(other)}: {why(error)}") from None
+            raise PeerError(f"cannot reach {address_text(other)}: {why(error)}") from None
         return str(probe.getsockname()[0])

@@ -12,9 +12,9 @@ from noack.core.errors import CallerError, PeerError
 
 HORIZON = "horizon"  # reason of a process that has reached the end of the run
 LAUNCHER_GONE = "the launcher ended early"  # reason of a process whose launcher has ended before it
-AWAY_S = 8.0
-"""Four leases of a connection: one that a busy machine broke comes back by then."""
-LAUNCHED_AWAY_S = 30.0
+LOST_AFTER_S = 8.0
+"""A process is lost after four leases: a connection that a busy machine broke is back by then."""
+LAUNCHED_LOST_S = 30.0
 """The same for a process that the launcher started: its exit is seen at once, so there is time."""
 
 

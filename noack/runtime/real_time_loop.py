@@ -59,7 +59,6 @@ class RowSink(Protocol):
 
     def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
         """Add rows of a table."""
-        ...
 
 
 class RecordSink(RowSink, Protocol):
@@ -67,15 +66,12 @@ class RecordSink(RowSink, Protocol):
 
     def append(self, record: Record) -> None:
         """Add a row."""
-        ...
 
     def notice(self, notice: Notice) -> None:
         """Add a line for the log."""
-        ...
 
     def flush(self) -> None:
         """Publish the collected rows; called every 50 ms."""
-        ...
 
 
 class Driver(Protocol):
@@ -83,23 +79,19 @@ class Driver(Protocol):
 
     def set_clock(self, clock: RunClock) -> None:
         """Read the time as this clock does; called at the start and every 50 ms."""
-        ...
 
     def drive(self, until_ns: int, sink: RecordSink) -> None:
         """Work until about simulated time ``until_ns``; pass on the rows of the record."""
-        ...
 
     def next_deadline_ns(self) -> int | None:
         """When the next work is due; None if there is none."""
-        ...
 
 
 class Channel(Protocol):
     """The sockets of a process."""
 
-    def tend(self, now_ns: int, sink: RecordSink) -> None:
+    def do_housekeeping(self, now_ns: int, sink: RecordSink) -> None:
         """Do its own housekeeping, every 50 ms."""
-        ...
 
 
 def run_loop(
@@ -112,12 +104,12 @@ def run_loop(
     stop: Callable[[], bool],
     turns_after_end: int = 0,
     all_done: Callable[[bool], bool] = lambda done: done,
-    news: Callable[[int], Sequence[Record | Notice]] = lambda now_ns: (),
+    external_inputs: Callable[[int], Sequence[Record | Notice]] = lambda now_ns: (),
 ) -> int:
     """Drive until simulated time ``end_ns`` (None: no end), or until ``stop()``.
 
-    Every 50 ms of wall time ``stop`` is asked. Before the first step and every 50 ms, ``news``
-    passes input from outside the sockets to the machines and returns the outputs.
+    Every 50 ms of wall time ``stop`` is asked. Before the first step and every 50 ms,
+    ``external_inputs`` passes what does not come by sockets to the machines, and returns the outputs.
 
     The computer may not have run for a while before the end. So the loop goes on for up to a second
     while a deadline is missed, and for up to two seconds until ``all_done`` is true: it is told
@@ -131,15 +123,15 @@ def run_loop(
     period_ns = int(_HOUSEKEEPING_S * NS_PER_S * clock.speed)
     turns = turns_done = 0
     driver.set_clock(clock)
-    _pass_on(news(clock.now_ns()), telemetry)
-    channel.tend(clock.now_ns(), telemetry)  # datagrams may have arrived before
+    _pass_on(external_inputs(clock.now_ns()), telemetry)
+    channel.do_housekeeping(clock.now_ns(), telemetry)  # datagrams may have arrived before
     while True:
         began_s, began_cpu_s = time.monotonic(), time.thread_time()
         driver.drive(clock.now_ns() + period_ns, telemetry)
         cpu_s = time.thread_time() - began_cpu_s
         is_overloaded = cpu_s > _OVERLOAD_SHARE * (time.monotonic() - began_s)
-        channel.tend(clock.now_ns(), telemetry)
-        _pass_on(news(clock.now_ns()), telemetry)
+        channel.do_housekeeping(clock.now_ns(), telemetry)
+        _pass_on(external_inputs(clock.now_ns()), telemetry)
         driver.set_clock(clock)
         telemetry.flush()
         if is_overloaded:
@@ -255,16 +247,12 @@ def lock_memory() -> None:
     Raises:
         OSError: it is not permitted.
     """
-    if sys.platform != "linux":
-        raise OSError(0, "not available on this system")
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
+    _call_system("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
+    madvise = ctypes.CDLL(None).madvise
     for mapping in _mappings():
         if mapping.bytes <= _LARGE_BYTES:
             # Fails for special mappings, and before Linux 5.14: then each page is locked at its use
-            libc.madvise(ctypes.c_void_p(mapping.first), ctypes.c_size_t(mapping.bytes), mapping.advice)
+            madvise(ctypes.c_void_p(mapping.first), ctypes.c_size_t(mapping.bytes), mapping.advice)
 
 
 class _Mapping(NamedTuple):

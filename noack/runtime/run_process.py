@@ -24,14 +24,14 @@ from typing import Protocol, TypeVar
 
 from setproctitle import setproctitle
 
-from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
+from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, ExitStatus, NoackError, NoAnswerError, PeerError, one_line
 from noack.core.process_limits import exhausted_limit, require_limits
 from noack.protocol.machine_interface import BEGINNING, RESTART, Notice, Record, Start
 from noack.protocol.record_tables import OWNER, clock_table
 from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER, WITH_DEADLINES
 from noack.protocol.wire_format import Wire
-from noack.runtime.address import Address, text_of
+from noack.runtime.address import Address, address_text
 from noack.runtime.command_line import TICKET_ON_STDIN, Parser, Signals, failed, print_to_stderr
 from noack.runtime.control_messages import (
     Admission,
@@ -43,6 +43,7 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
+from noack.runtime.host_clocks.clock_offset import SlewedRunClock
 from noack.runtime.host_clocks.reference_clock import ClockRecord, ReferenceClock, reference_clock
 from noack.runtime.join_ticket import (
     DEFAULT_SESSION,
@@ -52,7 +53,7 @@ from noack.runtime.join_ticket import (
     loads,
     read_invitation,
 )
-from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
+from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, Driver, realtime, run_loop
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer
@@ -85,7 +86,6 @@ class Reconfigurable(Protocol):
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Process the announcement of a change."""
-        ...
 
 
 class RunProcess:
@@ -282,7 +282,7 @@ class RunProcess:
             stop=lambda: self.stopping,
             turns_after_end=_GRACE_TURNS,
             all_done=self._all_done,
-            news=lambda now_ns: self._news(machine, now_ns, next(limits)),
+            external_inputs=lambda now_ns: self._take_inputs(machine, now_ns, next(limits)),
         )
         reached_ns = self.clock.now_ns() - late_ns
         if late_ns and not self.stopping:
@@ -332,20 +332,20 @@ class RunProcess:
         # A running loop does not need the control plane. A launched process has its lifeline: on
         # a busy machine the coordinator may only seem to be gone.
         waiting = self.life.state in (State.REQUESTED, State.AT_BARRIER)
-        if waiting and self.plane.coordinator_gone(for_s=AWAY_S):
+        if waiting and self.plane.coordinator_gone(for_s=LOST_AFTER_S):
             return "lost the connection to the run's coordinator"
         return None
 
-    def _news(self, machine: Reconfigurable, now_ns: int, at_most: int | None) -> Sequence[Record | Notice]:
+    def _take_inputs(self, machine: Reconfigurable, now_ns: int, most: int | None) -> list[Record | Notice]:
         """Pass announced changes on, and compare the clocks; return the outputs."""
         outputs: list[Record | Notice] = []
-        for announced in self.updates.take(at_most) if self.role in CHANGEABLE else ():
+        for announced in self.updates.take(most) if self.role in CHANGEABLE else ():
             try:
                 outputs += machine.announce(announced.change, now_ns)
             except CallerError as error:  # not from the coordinator, which checks changes
                 print_to_stderr(f"noack {self.role}: ignored: {error}")
         if self._clock_record is not None:
-            outputs += self._clock_record.news(now_ns)
+            outputs += self._clock_record.compare(now_ns)
         return outputs
 
     def _hand_over(self, telemetry: TelemetryBuffer) -> None:
@@ -479,7 +479,7 @@ def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> Ticke
             raise PeerError("no invitation")
     ticket = read_invitation(invitation, runs)
     assert ticket.remote is not None  # else it is no invitation
-    where = text_of((ticket.remote.host, ticket.remote.port))
+    where = address_text((ticket.remote.host, ticket.remote.port))
     print(f"noack {role}: joining run of {ticket.scenario.name!r} at {where}", file=sys.stderr)
     return ticket
 

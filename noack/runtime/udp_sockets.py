@@ -21,7 +21,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.machine_interface import Notice
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES
-from noack.runtime.address import LOOPBACK, Address, SocketName, family_of, text_of
+from noack.runtime.address import LOOPBACK, Address, SocketName, address_text, family_of
 from noack.runtime.real_time_loop import RecordSink
 
 _UNKNOWN_BYTES = 128 * 1024
@@ -54,21 +54,27 @@ def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
 
     Raise CallerError, which names the setting ``key``, if the port is taken or not permitted.
     """
-    endpoint = socket.socket(family_of((host, port)), socket.SOCK_DGRAM)
+    address = host, port
+    endpoint = socket.socket(family_of(address), socket.SOCK_DGRAM)
+    what, remedy = f"UDP port {address_text(address)}", f"set {key} to another port, or to 0 for any"
+    bind_to(endpoint, address, what, remedy)
+    endpoint.setblocking(False)
+    enlarge_buffer(endpoint)
+    return endpoint
+
+
+def bind_to(endpoint: socket.socket, name: SocketName, what: str, remedy: str) -> None:
+    """Bind a socket; if that fails, close it and raise CallerError."""
     try:
-        endpoint.bind((host, port))
+        endpoint.bind(name)
     except OSError as error:
         endpoint.close()
         reason = {
             errno.EADDRINUSE: "is already taken by another program",
             errno.EACCES: "needs privileges that this user does not have",
+            errno.EADDRNOTAVAIL: "is no address of this machine",
         }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
-        raise CallerError(
-            f"UDP port {text_of((host, port))} {reason}; set {key} to another port, or to 0 for any"
-        ) from None
-    endpoint.setblocking(False)
-    enlarge_buffer(endpoint)
-    return endpoint
+        raise CallerError(f"{what} {reason}; {remedy}") from None
 
 
 def drops_of(endpoint: socket.socket) -> int | None:
@@ -138,7 +144,7 @@ class CountingSocket(ABC):
     def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
         """Process a datagram that Python has received; it is cut at :attr:`most_bytes`."""
 
-    def tend(self, now_ns: int, sink: RecordSink) -> None:
+    def do_housekeeping(self, now_ns: int, sink: RecordSink) -> None:
         """Begin the next interval of housekeeping; read the datagrams of other sources."""
         line = self._flood.next_interval(self._shed())
         if line is not None:
@@ -183,8 +189,8 @@ class CountingSocket(ABC):
         """
         drops = [drops_of(one) for one in self.peer_sockets]
         return {
-            "local": text_of(self._unexpected[0].getsockname()),
-            "destination": text_of(self._destination),
+            "local": address_text(self._unexpected[0].getsockname()),
+            "destination": address_text(self._destination),
             "received_from": self._sources.report(),
             "kernel_drops": None if None in drops else sum(n for n in drops if n is not None),
         }
@@ -339,7 +345,7 @@ class SourceCount:
         self._fold()
         self._forget(_REPORTED_SOURCES)
         named = [*self._peers.items(), *self._others.most_common()]
-        found = {text_of(source): n for source, n in named if n}
+        found = {address_text(source): n for source, n in named if n}
         return found | ({"others": self._more} if self._more else {})
 
     def _fold(self) -> None:

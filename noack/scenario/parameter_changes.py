@@ -9,11 +9,11 @@ notice.
 
 import json
 from bisect import bisect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
 from typing import Generic, NamedTuple, TypeVar
 
-from noack.core.clock import NS_PER_S
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import CHANGE_BYTES
@@ -149,9 +149,6 @@ class ChangeSchedule(Generic[Prepared]):
         self._results: dict[tuple[tuple[int, int], ...], tuple[Scenario, Prepared | None, ReadTable]] = {}
         self._all = [AppliedParameters[Prepared](-(2**63), -1, {}, scenario, None)]
         self._taken = 1
-        self.next_ns: int | None = None
-        """Time at which the next scenario that is not yet applied takes effect; None if there is
-        none."""
 
     def of_alike(self, scenario: Scenario) -> "ChangeSchedule[Prepared]":
         """Return a schedule for a loop that differs in its draws only.
@@ -173,7 +170,6 @@ class ChangeSchedule(Generic[Prepared]):
         """
         since_ns = max(change.t_ns, reached_ns + 1)
         self._all = self._with(change, since_ns)
-        self._update_next()
         return announcement_outputs(table, change, number, now_ns, since_ns)
 
     def check(self, change: ParameterChange, reached_ns: int) -> None:
@@ -200,14 +196,16 @@ class ChangeSchedule(Generic[Prepared]):
             every[place] = every[place]._replace(scenario=scenario, prepared=prepared)
         return every
 
-    def take(self, t_ns: int) -> AppliedParameters[Prepared] | None:
-        """Return the next scenario that is due at a time and not yet applied, or None."""
-        if self.next_ns is None or self.next_ns > t_ns:
-            return None
-        found = self._all[self._taken]
-        self._taken += 1
-        self._update_next()
-        return found
+    @property
+    def next_ns(self) -> int:
+        """Time at which the next scenario that is not yet applied takes effect."""
+        return self._all[self._taken].since_ns if self._taken < len(self._all) else NEVER_NS
+
+    def take(self, t_ns: int) -> Sequence[AppliedParameters[Prepared]]:
+        """Return the scenarios that are due at a time and not yet applied, in their order."""
+        due = [one for one in self._all[self._taken :] if one.since_ns <= t_ns]
+        self._taken += len(due)
+        return due
 
     @property
     def has_changes(self) -> bool:
@@ -229,7 +227,3 @@ class ChangeSchedule(Generic[Prepared]):
             ended = place + 1 < len(self._all) and self._all[place + 1].since_ns <= first_ns
             if one.since_ns <= last_ns and not ended:
                 yield one.scenario
-
-    def _update_next(self) -> None:
-        waiting = self._all[self._taken :]
-        self.next_ns = waiting[0].since_ns if waiting else None

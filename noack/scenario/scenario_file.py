@@ -208,13 +208,19 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
 
 
 def _apply(content: Table, override: str) -> str:
+    key, value = setting_of(override)
+    name = full_key(key)
+    put(content, name, value, f"--set {override}")
+    return name
+
+
+def setting_of(override: str, example: str = "trigger.beta=0.3") -> tuple[str, object]:
+    """Return key and value of ``--set KEY=VALUE``; raise CallerError if it is written otherwise."""
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
         shown = shortened(printable(override))
-        raise CallerError(f"--set {shown}: write it as key=value, e.g. trigger.beta=0.3")
-    name = full_key(key.strip())
-    put(content, name, value_of(text, f"--set {key}"), f"--set {override}")
-    return name
+        raise CallerError(f"--set {shown}: write it as key=value, e.g. {example}")
+    return key.strip(), value_of(text, f"--set {key}")
 
 
 def value_of(text: str, source: str) -> object:

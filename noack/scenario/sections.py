@@ -399,6 +399,11 @@ class NetworkSection(DirectionSection):
             )
         if self.actuation is not None and self.protocol == "ack":
             raise ValueError('actuation: not with protocol = "ack"')
+        for name in ("acknowledgements", "actuation"):
+            direction: DirectionSection | None = getattr(self, name)
+            if direction is not None and direction.link.reads_errors:
+                why = "only updates report the error that maximum_error needs; take another discipline"
+                raise ValueError(f"{name}.impairments: {why}")
         return self
 
     @property

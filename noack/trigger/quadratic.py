@@ -4,6 +4,7 @@
 period by construction. A heartbeat transmits after a number of periods without an event.
 """
 
+import math
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -12,7 +13,7 @@ from pydantic import Field
 from noack.core.clock import NS_PER_S
 from noack.settings.section import NonNegative, Rows, require_shape
 from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
-from noack.trigger.trigger_rule import NEVER_NS, TriggerRule, quadratic_form
+from noack.trigger.trigger_rule import TriggerRule, quadratic_form
 
 
 class QuadraticSettings(WeightedSettings):
@@ -41,7 +42,7 @@ class QuadraticSettings(WeightedSettings):
             floor=float(np.sqrt(self.epsilon)),
             grid_ns=period_ns,
             weight=self.weight_matrix,
-            longest_ns=self.heartbeat * period_ns if self.heartbeat else NEVER_NS,
+            longest_ns=self.heartbeat * period_ns if self.heartbeat else math.inf,
         )
 
     @property

@@ -25,8 +25,6 @@ from noack.core.core_library import CData, CoreMemory
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 
-NEVER_NS = math.inf
-
 
 class QuadraticForm(NamedTuple):
     """The quadratic form ‖P z‖² − ‖N z‖² of z = (x, e_s)."""
@@ -74,7 +72,7 @@ class TriggerRule(NamedTuple):
     """Whether ∫‖P z‖dτ since the last event is compared; then N is empty, and there is no η."""
     idle_ns: float = -math.inf
     """The comparison does not count before this time after an event."""
-    longest_ns: float = NEVER_NS
+    longest_ns: float = math.inf
     """The next event is due this time after an event; with a forecast, at the latest."""
     shortest_ns: float = 0.0
     """With a forecast: the next event is not due before this time after an event."""
@@ -86,7 +84,7 @@ class TriggerRule(NamedTuple):
     @property
     def is_decaying(self) -> bool:
         """Whether it is the paper's: it compares ‖W e_s‖ with max(c e^{−ρt}, f), and no more."""
-        return self.level > 0 and self.idle_ns == -math.inf and self.longest_ns == NEVER_NS
+        return self.level > 0 and self.idle_ns == -math.inf and self.longest_ns == math.inf
 
     @property
     def initial_dynamic_variable(self) -> float:
@@ -184,15 +182,12 @@ class EventTrigger(Protocol):
 
     def start(self, t_ns: int, x: Vector) -> None:
         """Begin, or begin again after an event."""
-        ...
 
     def restart(self, t_ns: int, x: Vector) -> None:
         """Begin after a past event that, as is known only now, has reset the model."""
-        ...
 
     def test(self, t_ns: int, x: Vector, e_s: Vector) -> "TriggerDecision":
         """Decide whether a measurement is an event."""
-        ...
 
 
 class TriggerDecision(NamedTuple):
@@ -204,7 +199,7 @@ class TriggerDecision(NamedTuple):
     """The sides of the comparison; an event if ``left`` exceeds ``right``, or if one is due."""
 
 
-_NEVER_NS = 2**60
+_LATEST_NS = 2**60
 """The core's longest time; no run is as long."""
 
 
@@ -257,4 +252,4 @@ def rule_rows(rule: TriggerRule) -> int:
 
 def _whole_ns(t_ns: float) -> int:
     """Return the first whole number from ``t_ns`` on: times of measurements are whole."""
-    return math.ceil(min(max(t_ns, -_NEVER_NS), _NEVER_NS))
+    return math.ceil(min(max(t_ns, -_LATEST_NS), _LATEST_NS))

@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 import noack
 from cosim.doctor.machine_measures import _runtime_folder
-from cosim.measurement.live.live_measurement import ProbeRows
+from cosim.measurement.live_measurement import ProbeRows
 from cosim.output.viewer.recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
 from netem.capture import CaptureWriter

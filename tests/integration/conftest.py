@@ -20,6 +20,8 @@ EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
 """Without a report; tests that need one add ``--report``."""
 PATIENCE_S = 300.0
+WITHOUT_VIEWER = {"PYTHONPATH": str(Path(__file__).with_name("without_viewer"))}
+"""Of commands whose recording is not looked at."""
 
 
 def noack_command(*arguments: str, impatient: bool = False) -> list[str]:
@@ -41,10 +43,12 @@ def starting() -> Iterator[Start]:
         before: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
         impatient: bool = False,
+        viewer: bool = False,
         cwd: Path | None = None,
     ) -> subprocess.Popen[str]:
         command = noack_command(*map(str, arguments), impatient=impatient)
         own = {} if runtime is None else {"XDG_RUNTIME_DIR": str(runtime)}
+        own |= {} if viewer else WITHOUT_VIEWER
         started.append(subprocess.Popen(
             [*before, *command], text=True, cwd=cwd, env=os.environ | own | (environment or {}),
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -155,9 +159,10 @@ def private_files(folder: Path) -> list[Path]:
     return [path for path in (folder / f"noack-{os.getuid()}").rglob("*") if path.is_file()]
 
 
-def run_scenario(runs: Path, *arguments: str) -> Finished:
+def run_scenario(runs: Path, *arguments: str, viewer: bool = False) -> Finished:
     done = subprocess.run(
         noack_command("run", "lane_following", "--json", "--runs", str(runs), *BARE, *arguments),
+        env=os.environ | ({} if viewer else WITHOUT_VIEWER),
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,

@@ -8,7 +8,7 @@ from noack.runtime import life_cycle
 
 def main() -> None:
     """Run a command; the processes that it forks have the same time-outs."""
-    life_cycle.AWAY_S, life_cycle.LAUNCHED_AWAY_S = 4.0, 8.0
+    life_cycle.LOST_AFTER_S, life_cycle.LAUNCHED_LOST_S = 4.0, 8.0
     from cosim.cli import main as noack  # it copies the time-outs
     from cosim.live import launcher  # the same
 

@@ -84,7 +84,7 @@ def test_a_process_that_is_not_ready_in_time_is_named(start: Start) -> None:
 HORIZON_S = 8.0
 SHORT = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=HORIZON_S)]
 F_SETPIPE_SZ = 1031
-AS_A_TERMINAL = os.environ | {"FORCE_COLOR": "1", "TERM": "dumb"}
+AS_A_TERMINAL = os.environ | live.WITHOUT_VIEWER | {"FORCE_COLOR": "1", "TERM": "dumb"}
 """A terminal that cannot redraw a line: progress is printed line by line, also to a pipe."""
 
 
@@ -249,7 +249,8 @@ def disturbed_run(folder: Path) -> Disturbed:
     with pytest.MonkeyPatch.context() as environment, live.begun(folder) as start:
         for name in [name for name in os.environ if "DISPLAY" in name]:
             environment.delenv(name)  # the viewer opens in a browser
-        running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=DISTURBED_S), "--live")
+        values = live.settings(speed=4.0, horizon_s=DISTURBED_S)
+        running = start(*live.AT_RATE, *values, "--live", viewer=True)
         running.wait_recording()
         viewers = viewers_of(running)
         (group,) = {os.getpgid(viewer.pid) for viewer in viewers}

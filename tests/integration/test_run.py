@@ -55,7 +55,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """A run on a machine that did not stall: a process that ends misses what others send later."""
     for _ in range(10):
         runs = tmp_path_factory.mktemp("runs")
-        found = run_scenario(runs, *settings(speed=5.0, horizon_s=20.0), "--report")
+        found = run_scenario(runs, *settings(speed=5.0, horizon_s=20.0), "--report", viewer=True)
         if (
             found.status
             or max(late["max"] for late in found.summary["loops"][0]["lateness_us"].values()) < 1e5

@@ -8,6 +8,7 @@ import pytest
 
 from cosim.analysis.replay import replay
 from cosim.record.run_record import load_run
+from noack.protocol.wire_format import read_header
 from tests.integration import conftest as live
 
 DIFFERENT = ("lane", "pendulum-1", "pendulum-2", "mass")
@@ -17,11 +18,15 @@ STEPS = {"lane": 1501, "pendulum-1": 301, "pendulum-2": 301, "mass": 1501}
 
 @pytest.fixture(scope="module")
 def different(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
-    """With the live recording, and a change of settings on the way."""
+    """With the live recording, a change of settings on the way, and a queue that chooses by errors."""
     change = "changes=[{ at_s = 1.5, set = { mansd = 2 } }]"
-    settings = (*live.settings(horizon_s=3.0), "--set", change)
+    queue = '[{kind="rate", rate_bps=300_000, discipline={kind="maximum_error"}}]'
+    settings = (
+        *live.settings(horizon_s=3.0, network__encrypted=True),
+        "--set", change, "--set", f"network.impairments={queue}",
+    )  # fmt: skip
     with live.begun(tmp_path_factory.mktemp("different")) as start:
-        return start(*settings, command=("run", "different_loops")).finish()
+        return start(*settings, command=("run", "different_loops"), viewer=True).finish()
 
 
 def test_all_loops_reach_the_horizon_at_their_rates_and_are_replayed(
@@ -36,4 +41,6 @@ def test_all_loops_reach_the_horizon_at_their_rates_and_are_replayed(
         steps = record["plant_step"]
         assert (len(steps), steps["x"].shape[1]) == (STEPS[name], SIZES[name])
         assert len(record["sensor_setting"]) == 1
+        headers = [read_header(head.tobytes()) for head in record["netem_packet"]["head"]]
+        assert all(one is not None and one.version == 2 and one.error_level > 0 for one in headers)
     assert all(loop["exit"]["status"] == 0 for loop in different.summary["loops"])

@@ -14,7 +14,7 @@ from noack.core.errors import CallerError
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from tests.cosim.simulation.batch.exact import random_population, random_setting
-from tests.trigger_rules import TABLES, random_rule
+from tests.example_rules import TABLES, random_rule
 
 LANES = ("following", "acknowledged", "actuation_loss", "crosswind")
 """Of the scenarios of the lane, those with machines of their own."""

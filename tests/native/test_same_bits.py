@@ -1,4 +1,4 @@
-"""The core computes the same bits whichever compiler has built it, with any optimisation."""
+"""The same bits: whichever compiler has built the core, and on whichever processor libraries run."""
 
 import os
 import subprocess
@@ -15,6 +15,7 @@ from tests.native import sanitized_core
 
 ROOT = sanitized_core.ROOT
 MODULE = "tests.native.digests"
+LINEAR = ("lane_following ", "f16_lateral ", "unstable_pendulum ")
 
 
 def run(command: Sequence[str | Path], **environment: str) -> list[str]:
@@ -31,6 +32,25 @@ def own_digests() -> list[str]:
     digests = run([sys.executable, "-m", MODULE])
     assert len(digests) > 300
     return digests
+
+
+@pytest.mark.parametrize(
+    "processor",
+    [
+        {"OPENBLAS_CORETYPE": "Prescott"},
+        {
+            "NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F",
+            "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4",
+        },
+    ],
+    ids=["BLAS", "numpy and C"],
+)
+def test_on_processors_of_which_the_libraries_compute_differently(processor: dict[str, str]) -> None:
+    """The settings have an effect on x86-64 only. Others' matrices and users' classes come from scipy."""
+    own = [line for line in own_digests() if line.startswith(LINEAR)]
+    other = run([sys.executable, "-m", MODULE], **processor)
+    assert len(own) > 50
+    assert [line for line in other if line.startswith(LINEAR)] == own
 
 
 def test_with_sanitizers_and_little_optimisation() -> None:

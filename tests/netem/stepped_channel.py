@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
-from netem.channel import NO_TIME_NS, Channel, Datagram
+from netem.channel import Channel, Datagram
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import core, ffi
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
@@ -11,6 +12,16 @@ from tests.oracles.link import flipped
 
 _UNKNOWN_NS = 2**62
 """An arrival at the socket that is later than its handling is unknown."""
+
+
+def send(channel: Channel, flow: int, number: int, size_bytes: int, now_ns: int, error_level: int) -> None:
+    """Let a channel take a packet as :meth:`Channel.send` does, with a header if it is long enough."""
+    head = b"NA\x01\x02\x09" + bytes([error_level])
+    datagram = ffi.new("noack_datagram *", {
+        "flow": flow, "size_bytes": size_bytes, "arrival_ns": now_ns, "bit": -1, "head": head,
+        "message": {"sequence": number},
+    })  # fmt: skip
+    channel._left(lambda: int(core.noack_channel_handle(channel.core, datagram, now_ns)))
 
 
 class SteppedChannel:
@@ -26,8 +37,7 @@ class SteppedChannel:
 
     def next_deadline_ns(self) -> int | None:
         """Time of the next departure in either direction; None: nothing is in flight."""
-        due_ns = int(core.noack_channel_due_ns(self.channel.core))
-        return None if due_ns == NO_TIME_NS else due_ns
+        return None if (due_ns := self.channel.due_ns) == NEVER_NS else due_ns
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Process a datagram; return it if it is neither lost nor delayed."""

@@ -15,7 +15,7 @@ from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import address_of, core, ffi
 from noack.impairments.kinds.opportunities import Opportunities
-from noack.impairments.link_settings import NEVER_NS, LinkSettings
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import NETEM_PACKET, Fate, tables
 from noack.scenario.resolution import resolve
@@ -167,7 +167,7 @@ def test_a_refused_change_leaves_a_link_as_it_was(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(link_state, "_require", refuse)
     with pytest.raises(ValueError, match="refused"):
-        link.change(LinkSettings(), np.full(1, NEVER_NS))
+        link.change(LinkSettings(), np.full(1, core.NOACK_NEVER_NS))
     assert (link._memory["memory"].ctypes.data, address_of(link._stages)) == begin
     assert link.decide(0, 72, 0).release_ns == MS
 

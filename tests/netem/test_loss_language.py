@@ -13,7 +13,7 @@ from netem.tc_words import settings_of
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.protocol.record_tables import Fate
-from tests.netem.loss_language import allowed_rows
+from tests.oracles.loss_language import allowed_rows
 
 LENGTH = 12
 """More than the longest window, and than a burst with the deliveries that must follow it."""

@@ -15,12 +15,12 @@ from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
 from noack.impairments.constraints import join_guarantee
-from noack.impairments.link_settings import NEVER_NS, LinkSettings, RecordedDecision
+from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.impairments.loss_guarantee import LossAutomaton
 from noack.protocol.record_tables import Fate
 from tests.netem import any_settings
-from tests.netem.loss_language import is_allowed
 from tests.oracles.link import Datagram, Link
+from tests.oracles.loss_language import is_allowed
 from tests.oracles.receiver import longest_burst
 
 MS = 1_000_000
@@ -287,7 +287,7 @@ NEVER = "–"
 
 
 def ns(text: str) -> int:
-    return NEVER_NS if text == NEVER else int(text) * 1_000_000
+    return core.NOACK_NEVER_NS if text == NEVER else int(text) * 1_000_000
 
 
 @pytest.mark.parametrize(("words", "column"), [("mansd 1", 3), ("mansd 1 first", 5)])
@@ -299,7 +299,7 @@ def test_the_link_decides_the_example_as_documented(words: str, column: int) -> 
     decisions = []
     for k, comes, wish, *_ in rows:
         fate = Fate.DROPPED if k in ("3", "4") else Fate.DELIVERED  # as the text states
-        delay_ns = NEVER_NS if wish == NEVER else ns(wish) - ns(comes)
+        delay_ns = core.NOACK_NEVER_NS if wish == NEVER else ns(wish) - ns(comes)
         decisions.append(RecordedDecision(fate, delay_ns, -1, -1, -1))
     link = Link(settings_of(words), 0, "test", decisions=[decisions])
     for row in rows:

@@ -16,9 +16,10 @@ from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, link_na
 from netem.link_state import LinkState
 from noack.core.core_library import core
 from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
+from noack.impairments.disciplines.maximum_error import MaximumError
 from noack.impairments.disciplines.priority import Priority
 from noack.impairments.kinds.rate import Rate
-from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
+from noack.impairments.link_settings import Counters, Decisions, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
@@ -40,7 +41,8 @@ class _InFlight(NamedTuple):
 
 
 class _Waiting(NamedTuple):
-    """A datagram that waits until the link is free; the smallest leaves first."""
+    """A datagram that waits until the link is free; of the flow with the smallest key, the oldest one
+    leaves first."""
 
     key: int
     number: int
@@ -113,7 +115,7 @@ class Link:
     def change(self, settings: LinkSettings) -> None:
         """Apply other settings; see native/link_change.c."""
         self._serve(math.inf)
-        latest_ns = np.full(self._state.rows, NEVER_NS, np.int64)
+        latest_ns = np.full(self._state.rows, core.NOACK_NEVER_NS, np.int64)
         for leaving in self._in_flight:
             row = self._rows[leaving.datagram.flow]
             latest_ns[row] = max(latest_ns[row], leaving.release_ns)
@@ -162,10 +164,10 @@ class Link:
         )  # fmt: skip
         self._inputs += 1
         record = Record(NETEM_PACKET, row)
-        if decision.release_ns == NEVER_NS:
+        if decision.release_ns == core.NOACK_NEVER_NS:
             return (record,)
         leaving = self._release(message, decision.release_ns, decision.bit, copy=False)
-        if decision.copy_ns != NEVER_NS:
+        if decision.copy_ns != core.NOACK_NEVER_NS:
             leaving += self._release(message, decision.copy_ns, decision.copy_bit, copy=True)
         self._serve(now_ns)
         return (*leaving, record)
@@ -206,6 +208,8 @@ class Link:
             key = rate.discipline.numbers[min(row, len(rate.discipline.numbers) - 1)]
             if isinstance(rate.discipline, EarliestDeadline):
                 key += entry_ns
+            if isinstance(rate.discipline, MaximumError) and _is_update(message.data):
+                key -= message.data[5]
             self._waiting.append(_Waiting(key, leaving.number, entry_ns, decision.after_ns, leaving))
             self._queue.waits = len(self._waiting)
             return ()
@@ -220,7 +224,7 @@ class Link:
     def _serve(self, until_ns: float) -> None:
         """Begin to send what can begin until then: of what waits, the smallest."""
         while self._waiting and (int(self._free) <= until_ns or len(self._waiting) == self.in_flight):
-            first = min(self._waiting)
+            first = min(self._waiting, key=lambda one: (self._flow_key(one), one.number))
             self._waiting.remove(first)
             rate = _scheduler(self._state.settings)
             assert rate is not None
@@ -237,6 +241,11 @@ class Link:
             self.flow(flow).first_release_ns = leaves_ns
             heapq.heappush(self._in_flight, first.leaving._replace(release_ns=leaves_ns))
 
+    def _flow_key(self, one: _Waiting) -> int:
+        """The smallest key of what waits of the same flow."""
+        flow = one.leaving.datagram.flow
+        return min(other.key for other in self._waiting if other.leaving.datagram.flow == flow)
+
     @property
     def _queue(self) -> Any:
         """The state of the queue that chooses, a ``noack_queue``."""
@@ -252,8 +261,12 @@ class Link:
 def _scheduler(settings: LinkSettings) -> Any:
     """The rate that chooses what it sends; None: there is none."""
     rates = [one for one in settings.impairments if isinstance(one, Rate)]
-    chosen = [one for one in rates if isinstance(one.discipline, Priority | EarliestDeadline)]
+    chosen = [one for one in rates if isinstance(one.discipline, Priority | EarliestDeadline | MaximumError)]
     return chosen[0] if chosen else None
+
+
+def _is_update(data: bytes) -> bool:
+    return len(data) >= 32 and data[:2] == b"NA" and data[2] in (1, 2) and data[3] == 2
 
 
 def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> Link:

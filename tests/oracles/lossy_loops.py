@@ -340,6 +340,10 @@ def systems(**fixed: Any) -> st.SearchStrategy[System]:
     return seeds.map(lambda seed: random_system(np.random.default_rng(seed), **fixed))
 
 
+DRIFTING = {"n": 1, "m": 1, "alpha_share": 0.2, "drifts": 1.5}
+"""One state that decays more slowly than its model, so e_s grows in one direction: near many bounds."""
+
+
 def random_system(rng: np.random.Generator, **fixed: Any) -> System:
     """A loop of any kind; ``fixed`` replaces some of the drawn values."""
 
@@ -358,9 +362,10 @@ def random_system(rng: np.random.Generator, **fixed: Any) -> System:
     weighted = choose("weighted", (False, True))
     weight = rng.uniform(-1, 1, (n, n)) + 1.5 * np.eye(n) if weighted else np.eye(n)
     speed = float(np.abs(np.linalg.eigvals(H)).max())
+    A, B = H - B_model @ K + mismatch * change_A, B_model + mismatch * change_B
     return System(
-        A=H - B_model @ K + mismatch * change_A,
-        B=B_model + mismatch * change_B,
+        A=-fixed["drifts"] * alpha * np.eye(n) - B @ K if "drifts" in fixed else A,
+        B=B,
         K=K,
         H=H,
         weight=weight,

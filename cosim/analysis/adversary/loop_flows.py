@@ -134,35 +134,25 @@ class PatternFlow(Protocol):
     @property
     def objective(self) -> Objective:
         """What is maximised."""
-        ...
 
     @property
     def horizon_s(self) -> float:
         """End of the runs."""
-        ...
 
     def start(self) -> Segments:
         """Return the start of all runs: after the first packet, or with x(0) known."""
-        ...
 
-    def __call__(self, t_s: Vector, z: Matrix, known: float = -np.inf) -> Segments:
-        """Follow N runs from times (N,), just after events, to their next events.
-
-        Results below ``known`` may be inaccurate.
-        """
-        ...
+    def __call__(self, t_s: Vector, z: Matrix) -> Segments:
+        """Follow N runs from times (N,), just after events, to their next events."""
 
     def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
         """Return the states just after events at times (N,); ``delivered`` updates arrive."""
-        ...
 
     def promise(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
         """Return how large the objective may become within a window, (N,), on any scale."""
-        ...
 
     def features(self, t_s: Vector, z: Matrix) -> Matrix:
         """Return numbers of size 1 that are nearly equal for runs that nearly coincide, (N, k)."""
-        ...
 
 
 _MEASURES = {
@@ -240,7 +230,7 @@ class SegmentFlow:
         scaled = z / self.measure.level(t_s)[:, None]
         return np.asarray(np.einsum("ai,ij,aj->a", scaled, self._gramians[window_s], scaled))
 
-    def __call__(self, t_s: Vector, z: Matrix, known: float = -math.inf) -> Segments:
+    def __call__(self, t_s: Vector, z: Matrix) -> Segments:
         """As :meth:`PatternFlow.__call__`, with z = (x, e_s, e_c), (N, 3n).
 
         Raises:
@@ -359,7 +349,7 @@ class SampledFlow:
         self.loop.update(runs, delivered)
         return _packed(runs)
 
-    def __call__(self, t_s: Vector, z: Matrix, known: float = -np.inf) -> Segments:
+    def __call__(self, t_s: Vector, z: Matrix) -> Segments:
         """As :meth:`PatternFlow.__call__`."""
         runs = self._runs(t_s, z)
         self.loop.follow(runs, self._scales, np.full(len(t_s), self.loop.last))

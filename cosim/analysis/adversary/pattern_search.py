@@ -132,7 +132,7 @@ class PatternSearch:
             TooManyEventsError: two events at the same time.
         """
         objective = self.flow.objective
-        segments = self.flow(nodes.t_s, nodes.z, self.value)
+        segments = self.flow(nodes.t_s, nodes.z)
         value = objective.joined(nodes.value, segments.value)
         # A sum is compared only when the run is complete.
         candidates = np.where(segments.is_event & objective.additive, -np.inf, value)

@@ -313,8 +313,12 @@ class RunClaims:
     @property
     def allowed(self) -> NetworkConditions | None:
         """The conditions of the scenario's certificates; None if it can have none."""
-        scenario = self.record.scenario
-        return allowed_conditions(scenario) if scenario.coverage.can_be_certified else None
+        scenario, first = self.record.scenario, self.parts[0]
+        if not scenario.coverage.can_be_certified:
+            return None
+        if isinstance(first, ClaimEvaluation) and first.record is self._judged:
+            return first.allowed
+        return allowed_conditions(scenario)
 
     @property
     def certified_for(self) -> NetworkConditions | None:

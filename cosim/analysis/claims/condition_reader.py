@@ -234,9 +234,10 @@ class Inputs:
 
     def _first_with_state(self, ticks: Times) -> Times:
         """The first tick with a state, of the same generation of the controller."""
-        of, which = np.unique(ticks // GENERATION, return_inverse=True)
-        first = [self._first_state.get(number, NEVER) for number in of.tolist()]
-        return np.array(first, dtype=np.int64)[which]
+        found, of = np.full(len(ticks), NEVER), ticks // GENERATION
+        for number, first in self._first_state.items():
+            found[of == number] = first
+        return found
 
     def _model_ns(self, newest: Times) -> Times:
         """Return the model time of each actuation; 0 if the actuation is not recorded."""
@@ -468,7 +469,7 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
             parts.append(combined([reader.observed()]))
         for table, rows in part.items():
             reader.take(table, rows)
-    return combined([*parts, reader.end()])
+    return combined([*parts, reader.end()]) if parts else reader.end()
 
 
 _MOST_WAITING = 100_000

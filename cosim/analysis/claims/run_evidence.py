@@ -28,16 +28,8 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
-from cosim.analysis.loop_statistics import SampleFacts, SampleFactsReader, shares_update, signal_statistics
-from cosim.record.align import (
-    UNKNOWN,
-    AlignedRun,
-    EventFollower,
-    SinceEvent,
-    aligned_parts,
-    bounded_parts,
-    identity_residual,
-)
+from cosim.analysis.loop_statistics import SampleFacts, SampleFactsReader, signal_statistics
+from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Matrix, Propagator, all_entries, row_norms, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
@@ -99,7 +91,8 @@ class Samples:
     """x of the plant, (k, n), where the sensor estimates it, too; NaN where it is not recorded."""
     inter_event_s: tuple[Reals, Reals]
     """Times of the events, without the run's first, and the times since the event before."""
-    since_event: SinceEvent
+    since_event: SinceEvent | None
+    """None if no certificate has bounds from the newest event."""
 
     @cached_property
     def t_s(self) -> Reals:
@@ -127,18 +120,17 @@ class RunEvidence:
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
         scenario = self.record.scenario
-        last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
-        for part, bounds in bounded_parts(self.record):
+        last_ns, follower = np.zeros(0, np.int64), None
+        if any(map(self.known_state_bounds, self.certificates)):
+            follower = EventFollower(scenario)
+        for part, shared, both, residual in bounded_parts(self.record):
             rows, joined = part.rows, part.aligned
-            common = shares_update(scenario, joined)
-            both = (np.where(common, one, np.nan) for one in (bounds.identity, bounds.printed))
-            residual = identity_residual(scenario, joined, bounds.missed)
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
             true_x = joined.x if part.true_x is None else part.true_x
-            since = follower.take(rows, joined)
-            yield Samples(joined, common, tuple(both), residual, true_x, passed, since)
+            since = None if follower is None else follower.take(rows, joined)
+            yield Samples(joined, shared, both, residual, true_x, passed, since)
 
     @cached_property
     def lost_in_rounding(self) -> VoidFrom | None:
@@ -187,10 +179,11 @@ class RunEvidence:
         generator is sent the certificates of each, and returns those of the latest time. A
         certificate holds for every run that meets its conditions, whenever they were chosen.
         """
-        whole, allowed, until_s = self.part.whole or self.record, self._allowed, self.part.until_s
+        whole, until_s = self.part.whole or self.record, self.part.until_s
         # Rows that are missing may be later.
         if not all(map(whole.is_complete, LOOP_ROLES)) or not any(map(_exists, self._scheduled)):
             return None
+        allowed = self.allowed
         times_s = [t_s for t_s in self.observed.later_times(allowed) if t_s < until_s]
         widest = self.observed.widened(allowed, until_s)
         if not times_s or widest == allowed:
@@ -268,9 +261,9 @@ class RunEvidence:
         """The assumptions that the run violated, the guarantee included, each at the first time."""
         scenario = self.record.scenario
         rules = {*guarantee_causes(scenario)}
-        found = self.observed.violations(self._allowed, {*causes_of(scenario)} - rules)
+        found = self.observed.violations(self.allowed, {*causes_of(scenario)} - rules)
         # An update that a newer one replaced within the certified delay is not lost.
-        found += self.observed.violations(self.certified_for or self._allowed, rules)
+        found += self.observed.violations(self.certified_for or self.allowed, rules)
         return [one for one in found if one.t_s < self.part.until_s]
 
     @cached_property
@@ -313,15 +306,17 @@ class RunEvidence:
             known[id(certificate)] = None if first is None else VoidFrom(first.t_s, why)
         return known[id(certificate)]
 
-    def missing_events(self, samples: Samples, bounds: KnownStateBounds) -> NDArray[np.int64]:
+    def missing_events(
+        self, samples: Samples, since: SinceEvent, bounds: KnownStateBounds
+    ) -> NDArray[np.int64]:
         """Return how many events are missing in the input since the newest event, (k,).
 
         The bounds assume that an update acts within their delay. Where the plant applied its first
         input later than that, the number is unknown until then.
         """
-        event_s = samples.t_s - samples.since_event.age_s
+        event_s = samples.t_s - since.age_s
         early = event_s + bounds.delay_s < self.started_s - 1e-9
-        return np.asarray(np.where(early, UNKNOWN, samples.since_event.missing))
+        return np.asarray(np.where(early, UNKNOWN, since.missing))
 
     def known_state_bounds(self, certificate: ScenarioCertificate) -> KnownStateBounds | None:
         """Return the bounds from the newest event of a certificate; None if it has none."""
@@ -341,14 +336,16 @@ class RunEvidence:
         return {}
 
     @cached_property
-    def _allowed(self) -> NetworkConditions:
+    def allowed(self) -> NetworkConditions:
         """The conditions of the scenario's certificates."""
         allowed = allowed_conditions(self.record.scenario)
         return allowed if self.part.start_error is None else allowed._replace(start_s=0.0)
 
     @cached_property
     def _schedule(self) -> NetworkConditions:
-        return nominal_conditions(self.record.scenario)
+        scenario, is_allowed = self.record.scenario, self.part.start_error is None
+        is_allowed &= not scenario.certificate.late_periods
+        return self.allowed if is_allowed else nominal_conditions(scenario)
 
     @cached_property
     def theorem_2(self) -> Theorem2 | None:

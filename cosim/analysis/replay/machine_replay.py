@@ -17,8 +17,8 @@ from cosim.analysis.summary_model import ReplayDifference
 from cosim.record.processes import Life, split_by_life
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
-from netem.channel import NO_TIME_NS, Channel, channel_of
-from noack.core.cached_method import cached_method
+from netem.channel import Channel, channel_of
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines
@@ -47,11 +47,12 @@ _ROLES = {"plant": 0, "sensor": 1, "controller": 2, "netem": 3}
 _TIMERS = (PLANT_STEP, CONTROLLER_STEP, NETEM_RELEASE)
 _ANSWERS = {PLANT_STEP: "x", CONTROLLER_STEP: "u"}
 """The column with the answer of a plant or controller outside of noack."""
-_DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
+DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
 _HEADER_WORDS = 3
 SEQUENCE, TIME, VECTOR = 0, 1, 2
-"""Columns of the words of a message; those of its vector have the bits of its entries."""
+"""Columns of the words of a message; those of its vector have the bits of its entries. A message that
+was sent has its error level after them."""
 _DATAGRAM_WORDS = 1 + PACKET_HEAD_BYTES // 8
 
 
@@ -71,7 +72,7 @@ class InputReplay:
         self.difference: ReplayDifference | None = None
         self._machine, self._sizes = machine, sizes
         self._is_network = isinstance(machine, Channel)
-        width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values())
+        width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values()) + 1
         self._core: CData = ffi.new(
             "noack_input_replay *",
             {
@@ -118,7 +119,7 @@ class InputReplay:
                 else:
                     self._recall(place_of)
                     self._machine.answer(reason)
-        except _DAMAGE as error:
+        except DAMAGE as error:
             self._explain(place_of)
             self._note(place_of, replay.next, f"the machine cannot take this input: {error}")
         self._explain(place_of)
@@ -128,14 +129,15 @@ class InputReplay:
         return int(replay.next)
 
     def sent_in(self, flow: Flow) -> Numbers:
-        """Return the messages of a flow that the machine sent in the newest part, (k, 2 + n).
+        """Return the messages of a flow that the machine sent in the newest part, (k, 3 + n).
 
-        The words of a message are its sequence number, its time, and its vector's n entries.
+        The words of a message are its sequence number, its time, its vector's n entries, and its
+        error level.
         """
         sent = self._sent[: self._core.sent_count]
         mine = sent[:, 0] == flow
         words = sent if mine.all() else sent[mine]
-        return words[:, 1 : _HEADER_WORDS + self._sizes.get(flow, 0)]
+        return words[:, 1 : _HEADER_WORDS + self._sizes.get(flow, 0) + 1]
 
     def forwarded(self) -> tuple[Numbers, NDArray[np.void]]:
         """Return flows and heads of the datagrams that left the network in the newest part."""
@@ -181,7 +183,7 @@ class InputReplay:
         if self.difference is not None or replay.difference == core.NOACK_EQUAL:
             return
         at, other = replay.difference_at, replay.other_ns
-        other_ns = None if other == NO_TIME_NS else other
+        other_ns = None if other == NEVER_NS else other
         table, row, rows = place_of(at)
         now_ns = int(rows["now_ns"][row])
         if replay.difference == core.NOACK_TIME_RUNS_BACKWARD:
@@ -303,27 +305,9 @@ _MACHINES: Mapping[str, Callable[..., LoopMachines]] = {
 }
 
 
-class SharedMachines:
-    """The first machines of several loops without changes of settings, which are made at once.
-
-    Args:
-        records: the records of the loops, each in memory as a whole.
-    """
-
-    def __init__(self, records: Sequence[RunRecord]) -> None:
-        self._loops = [
-            record for record in records if record.is_short and not any(record.count(one) for one in SETTINGS)
-        ]
-
-    def place(self, record: RunRecord) -> int | None:
-        """Return the place of a loop among the machines; None if they do not have it."""
-        numbers = [one.number for one in self._loops]
-        return numbers.index(record.number) if record.number in numbers else None
-
-    @cached_method
-    def of(self, role: str) -> LoopMachines:
-        """Return the machines of a role."""
-        return _MACHINES[role]([one.scenario for one in self._loops], start=Start(0))
+def machines_of(role: str, scenarios: Sequence[Scenario], start: Start) -> LoopMachines:
+    """Return new machines of a role for some loops."""
+    return _MACHINES[role](scenarios, start=start)
 
 
 class MachineReplay:
@@ -332,10 +316,10 @@ class MachineReplay:
     Each machine gets its recorded inputs, up to the first gap, and its rows are compared.
     """
 
-    def __init__(self, role: str, record: RunRecord, shared: SharedMachines) -> None:
+    def __init__(self, role: str, record: RunRecord) -> None:
         self._tables = record.owned_by(role)
         self._begun = record.begun_lives(role)
-        self._lives = [_LifeReplay(role, record, life, shared) for life in record.row_counts(role)]
+        self._lives = [_LifeReplay(role, record, life) for life in record.row_counts(role)]
         self.newest: list[InputReplay] = []
         """The replays of the newest part; they have what was sent."""
 
@@ -361,8 +345,8 @@ class MachineReplay:
 class _LifeReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, record: RunRecord, life: Life, shared: SharedMachines) -> None:
-        self._role, self._record, self._life, self._shared = role, record, life, shared
+    def __init__(self, role: str, record: RunRecord, life: Life) -> None:
+        self._role, self._record, self._life = role, record, life
         self._run: InputReplay | None = None
         self._count = sum(life.rows.values())
         report = life.report
@@ -392,14 +376,11 @@ class _LifeReplay:
     def _begin(self, owned: Slice) -> InputReplay:
         """Return the replay of a new machine."""
         role, scenario, generation = self._role, self._record.scenario, self._life.generation
-        start, sizes = _start(generation, owned), _sizes(role, scenario)
+        start, sizes = _start(generation, owned), sent_sizes(role, scenario)
         if role == "netem":
             channel = channel_of(scenario, start, loops=len(loops_of(scenario)))
             return InputReplay(role, channel, sizes)
-        place = None if generation else self._shared.place(self._record)
-        if place is not None:
-            return InputReplay(role, self._shared.of(role), sizes, place)
-        return InputReplay(role, _MACHINES[role]((scenario,), start=start), sizes)
+        return InputReplay(role, machines_of(role, (scenario,), start), sizes)
 
     def result(self) -> ProcessReplay:
         generation = self._life.generation
@@ -453,7 +434,7 @@ class _LifeReplay:
         )
 
 
-def _sizes(role: str, scenario: Scenario) -> Mapping[Flow, int]:
+def sent_sizes(role: str, scenario: Scenario) -> Mapping[Flow, int]:
     """Return the entries of the vectors that a machine sends, by flow."""
     if role == "netem":
         return {}

@@ -17,7 +17,6 @@ from cosim.analysis.replay.machine_replay import (
     VECTOR,
     MachineReplay,
     Numbers,
-    SharedMachines,
     received_words,
 )
 from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, Replay, difference, first_entry
@@ -55,7 +54,7 @@ class MessageComparison:
         network = record.scenario.network.flows
         self._hops = [
             _Hop(leg, table, machines[ENDS[flow].sender], flow, record.number, network)
-            for leg, table, flow in _hops(network)
+            for leg, table, flow in hops(network)
         ]
 
     def take(self, part: Slice) -> None:
@@ -79,7 +78,7 @@ class MessageComparison:
         return (*found, *_compare_changes(self._record))
 
 
-def _hops(network: Sequence[Flow]) -> Iterator[tuple[str, str, Flow]]:
+def hops(network: Sequence[Flow]) -> Iterator[tuple[str, str, Flow]]:
     """Yield the name of each hop, the receiver's table, and the flow."""
     for flow, table in _RECEIVED.items():
         sender, receiver = ENDS[flow]
@@ -150,8 +149,8 @@ class _Hop:
         self._direction = direction_of(flow)
         self._selects = table == NETEM_PACKET and len(network) > 1
         self._was_forwarded = table != NETEM_PACKET and flow in network
-        self._sent: Numbers = np.zeros((0, VECTOR), np.int64)
-        """Messages that may still be received, in order of their numbers, (k, 2 + n)."""
+        self._sent: Numbers = np.zeros((0, VECTOR + 1), np.int64)
+        """Messages that may still be received, in order of their numbers, (k, 3 + n)."""
         self._survivors: set[int] = set()
         self._waiting: Rows | None = None
         self._newest = -1
@@ -236,13 +235,13 @@ class _Hop:
         newest = np.maximum.accumulate(np.append(self._newest, numbers))
         self._newest = int(newest[-1])
         last = int(np.searchsorted(self._sent[:, SEQUENCE], self._newest, "right"))
-        in_turn = self._sent[max(last - len(words), 0) : last]
+        in_turn = self._sent[max(last - len(words), 0) : last, :-1]
         if (np.diff(newest) > 0).all() and np.array_equal(words, in_turn):  # nothing was lost
             self._compared += len(words)
             return
         places, known = self._places(numbers)
         self._compared += int(known.sum())
-        is_newer, sent = numbers > newest[:-1], self._sent[places] if known.any() else words
+        is_newer, sent = numbers > newest[:-1], self._sent[places, :-1] if known.any() else words
         if known.all() and is_newer.all() and (words == sent).all():
             return
         for row in np.flatnonzero(~(known & is_newer & (words == sent).all(axis=1))).tolist():
@@ -270,14 +269,14 @@ class _Hop:
         self._newest = int(max(self._newest, sequences.max(initial=-1)))
         places, known = self._places(sequences)
         self._compared += int(known.sum())
-        entries = self._sent.shape[1] - VECTOR
+        entries = self._sent.shape[1] - VECTOR - 1
         expected, sent = np.zeros(len(headers), HEADER_ROW), self._sent[places[known]]
         if known.any():
             own = expected[known]
             own["magic"], own["flow"] = MAGIC, self._flow
             own["dimension"], own["loop"] = entries, self._loop
             own["version"], own["run_id"] = (0, 0) if self._run is None else self._run.tolist()
-            own["sequence"], own["t_ns"] = sent[:, SEQUENCE], sent[:, TIME]
+            own["sequence"], own["t_ns"], own["error_level"] = sent[:, SEQUENCE], sent[:, TIME], sent[:, -1]
             expected[known] = own
         size_bytes = datagram_bytes(entries)
         differs = first_bytes(headers) != first_bytes(expected)
@@ -326,17 +325,14 @@ class _Hop:
 Result = TypeVar("Result", ProcessReplay, MessagesReplay)
 
 
-def replay(record: RunRecord, shared: SharedMachines | None = None) -> Replay:
+def replay(record: RunRecord) -> Replay:
     """Replay a run and compare it with its record; a process is replayed up to its first gap.
-
-    ``shared`` has the machines of several loops, if they are replayed in turn.
 
     In a run of several loops, the network is replayed once, for all of them: ``record`` is that of
     the network, or that of a loop, whose network is not replayed. The record is read part by part,
     so that memory does not grow with the length of the run.
     """
-    shared = shared or SharedMachines(())
-    machines = {role: MachineReplay(role, record, shared) for role in record.roles}
+    machines = {role: MachineReplay(role, record) for role in record.roles}
     messages = MessageComparison(record, machines) if "sensor" in machines else None
     with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
         for part in record.slices():

@@ -8,6 +8,7 @@ from typing import Annotated
 from typer import Option
 
 from cosim.cli import command as cli
+from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus
 
@@ -20,11 +21,11 @@ with lazy_modules():
 
 @cli.command(cli.FILES, 10, takes="some 10 s", on_linux=True)
 def doctor(
-    given: cli.ExampleOptions,
+    given: opt.ExampleOptions,
     *,
     seconds: Annotated[float, Option(min=0.1, max=3600)] = 2.0,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    json: cli.JsonOption = False,
+    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    json: opt.JsonOption = False,
 ) -> int:
     """Check this machine: real-time settings, timers, ports, disk.
 
@@ -59,12 +60,12 @@ def doctor(
 
 @cli.command(cli.RUNS, 5, on_linux=True)
 def lab(
-    given: cli.ExampleOptions,
+    given: opt.ExampleOptions,
     *,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    runs: opt.RunsOption = cli.DEFAULT_RUNS,
     port: Annotated[int, Option(min=0, max=65535)] = 0,
     browser: bool = True,
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Open a page in the browser: drag settings, watch the loop, run it live.
 
@@ -84,11 +85,8 @@ def lab(
             "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the repository"
         )
     edited = draft.open_draft(given.scenario)
-    for setting in given.settings or ():
-        key, equals, text = setting.partition("=")
-        if not equals:
-            raise CallerError(f"--set {setting}: write it as key=value, e.g. trigger.beta=0.3")
-        edited = edited.with_value(key.strip(), scenario_file.value_of(text, f"--set {key}"))
+    for key, value in map(scenario_file.setting_of, given.settings or ()):
+        edited = edited.with_value(key, value)
     _ = edited.scenario  # report mistakes here
     query = edited.query() if given.settings else ""
     options = lab_server.LabOptions(given.scenario, query, Path.cwd(), runs, port, browser)

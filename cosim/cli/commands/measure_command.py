@@ -7,13 +7,19 @@ from typing import Annotated
 from typer import Argument, Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
+from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus
 
 with lazy_modules():
-    from cosim.measurement import loss_bursts, measurement_outputs, network_measurement, trace_sources
-    from cosim.measurement.live import live_measurement, probe_ends
+    from cosim.measurement import (
+        live_measurement,
+        loss_bursts,
+        measurement_outputs,
+        network_measurement,
+        probe_ends,
+        trace_sources,
+    )
     from noack.core import core_library
     from noack.traces import trace_formats
 
@@ -32,7 +38,7 @@ class ClockRelation(StrEnum):
     DIFFERENT = "different"
 
 
-@cli.option_group
+@opt.option_group
 class ProbeOptions:
     """A probe, and who sends or receives it.
 
@@ -68,7 +74,7 @@ class ProbeOptions:
         )
 
 
-@cli.option_group
+@opt.option_group
 class FileOptions:
     """How files are read.
 
@@ -89,7 +95,7 @@ class FileOptions:
         return trace_sources.SourceOptions(differ, self.flow, self.sequence_at, period_ns)
 
 
-@cli.option_group
+@opt.option_group
 class LossOptions:
     """What counts as lost, and what is computed.
 
@@ -116,8 +122,8 @@ class LossOptions:
         return network_measurement.MeasurementOptions(deadline_s, shares, windows, outage_s)
 
 
-@cli.option_group
-class WrittenOptions(cli.FigureOptions):
+@opt.option_group
+class WrittenOptions(opt.FigureOptions):
     """What is compared and written.
 
     Options:
@@ -127,11 +133,11 @@ class WrittenOptions(cli.FigureOptions):
         form: Write the network as the trace itself, or as a fitted model.
     """
 
-    for_scenario: Annotated[str | None, Option(metavar="SCENARIO", autocompletion=completion.scenarios)] = (
+    for_scenario: Annotated[str | None, Option(metavar="SCENARIO", autocompletion=opt.complete_scenarios)] = (
         None
     )
-    settings: cli.SetOption = None
-    out: cli.OutOption = None
+    settings: opt.SetOption = None
+    out: opt.OutOption = None
     write: Path | None = None
     form: Annotated[NetworkForm, Option("--as")] = NetworkForm.TRACE
 
@@ -139,7 +145,7 @@ class WrittenOptions(cli.FigureOptions):
         """Return what is written; raise CallerError if an option is wrong."""
         if self.settings and self.for_scenario is None:
             raise CallerError("--set: replaces a value of the scenario of --for-scenario; give one")
-        scenario = self.for_scenario and cli.load_scenario(self.for_scenario, self.settings)
+        scenario = self.for_scenario and opt.load_scenario(self.for_scenario, self.settings)
         if self.form is NetworkForm.MODEL and self.write is None:
             raise CallerError("--as model: is the form of --write; give its FILE.toml")
         return measurement_outputs.OutputRequest(
@@ -155,7 +161,7 @@ def measure(
     files: FileOptions,
     losses: LossOptions,
     written: WrittenOptions,
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> int:
     """Measure a network: losses, bursts, M, delays, outages, and models that fit.
 

@@ -11,6 +11,7 @@ import typer
 from typer import Option
 
 from cosim.cli import command as cli
+from cosim.cli import options as opt
 from cosim.cli.execute_run import LiveOptions, run_processes
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError
@@ -21,7 +22,7 @@ with lazy_modules():
     from netem import __main__ as emulator
     from noack.protocol import topology
 
-SessionOption = Annotated[str, cli.SESSION]
+SessionOption = Annotated[str, opt.SESSION]
 
 
 class Invited(StrEnum):
@@ -37,7 +38,7 @@ class Invited(StrEnum):
 @cli.command(cli.PROCESSES, 10, on_linux=True)
 def record(
     context: typer.Context,
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
     session: SessionOption = "default",
     listen: Annotated[str | None, Option(metavar="ADDRESS[:PORT]")] = None,
@@ -76,7 +77,7 @@ def record(
     )
 
 
-@cli.option_group
+@opt.option_group
 class JoinOptions:
     """How a process joins the open run.
 
@@ -86,8 +87,8 @@ class JoinOptions:
 
     session: SessionOption = "default"
     invitation: Annotated[Path | None, Option("--invitation", metavar="FILE")] = None
-    runs: cli.RunsOption = cli.DEFAULT_RUNS
-    json: cli.JsonOption = False
+    runs: opt.RunsOption = cli.DEFAULT_RUNS
+    json: opt.JsonOption = False
 
 
 def _join(role: str, place: int, module: str, about: str) -> None:
@@ -132,13 +133,13 @@ def netem(context: typer.Context) -> int:
 
 @cli.command(cli.PROCESSES, 60)
 def helics(
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
     endpoint: Annotated[list[str], Option("--endpoint", metavar="NAME")],
     broker: Annotated[str, Option(metavar="ADDRESS")] = "",
     core: Annotated[str, Option(metavar="TYPE")] = "zmq",
     name: Annotated[str, Option(metavar="NAME")] = "noack",
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Join a federation of HELICS as its network, with the network of a scenario.
 

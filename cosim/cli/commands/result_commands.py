@@ -8,7 +8,7 @@ import typer
 from typer import Argument, Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
+from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from cosim.output.export import FORMATS, export_run, export_scenario, export_suffix, needs_run
 from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
@@ -22,7 +22,8 @@ with lazy_modules():
     from cosim.analysis import fidelity as fidelity_analysis
     from cosim.analysis import run_summary
     from cosim.live import finalize
-    from cosim.output import figure_files, result_tables, run_figures, run_tables, run_verdict
+    from cosim.output import result_tables, run_tables, run_verdict
+    from cosim.output.figures import figure_files, run_figures
     from cosim.output.viewer import live_viewer, rerun_program
     from cosim.record import collection, run_directory, run_record
     from cosim.studies import run_archive, run_comparison
@@ -30,11 +31,11 @@ with lazy_modules():
 
 @cli.command(cli.RUNS, 50)
 def summary(
-    run: cli.LoopOptions,
+    run: opt.LoopOptions,
     *,
-    verbose: cli.VerboseOption = False,
-    tables: cli.TablesOption = None,
-    json: cli.JsonOption = False,
+    verbose: opt.VerboseOption = False,
+    tables: opt.TablesOption = None,
+    json: opt.JsonOption = False,
 ) -> None:
     """Show a run's summary; finalise an interrupted run first.
 
@@ -53,12 +54,12 @@ def summary(
 
 @cli.command(cli.RUNS, 40)
 def view(
-    recording: cli.RunArgument = None,
+    recording: opt.RunArgument = None,
     *,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    loop: cli.LoopOption = None,
+    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    loop: opt.LoopOption = None,
     web: Annotated[bool, Option("--web")] = False,
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> int:
     """Show a run in the rerun viewer.
 
@@ -88,11 +89,11 @@ def view(
 
 @cli.command(cli.RUNS, 90, takes="some seconds where it is not there yet")
 def report(
-    run: cli.LoopOptions,
+    run: opt.LoopOptions,
     *,
     again: Annotated[bool, Option("--again")] = False,
-    figures: cli.FigureOptions,
-    json: cli.JsonOption = False,
+    figures: opt.FigureOptions,
+    json: opt.JsonOption = False,
 ) -> None:
     """Print the path of a run's report (one HTML page with all figures); write it if missing.
 
@@ -115,7 +116,7 @@ def report(
 
 
 @cli.command(cli.RUNS, 70, takes="about a second")
-def replay(run: cli.LoopOptions, *, json: cli.JsonOption = False) -> int:
+def replay(run: opt.LoopOptions, *, json: opt.JsonOption = False) -> int:
     """Replay a run's recorded inputs; compare the outputs bit for bit.
 
     Examples:
@@ -133,11 +134,11 @@ def replay(run: cli.LoopOptions, *, json: cli.JsonOption = False) -> int:
 
 @cli.command(cli.RUNS, 60, takes="about a second")
 def fidelity(
-    run: cli.LoopOptions,
+    run: opt.LoopOptions,
     *,
-    out: cli.OutOption = None,
-    width: cli.WidthOption = None,
-    json: cli.JsonOption = False,
+    out: opt.OutOption = None,
+    width: opt.WidthOption = None,
+    json: opt.JsonOption = False,
 ) -> int:
     """Compare a run with the ideal loop in continuous time, effect by effect.
 
@@ -165,7 +166,7 @@ def _known_format(name: str) -> str:
 
 @cli.command(cli.RUNS, 96)
 def export(
-    run: cli.LoopOptions,
+    run: opt.LoopOptions,
     *,
     file_format: Annotated[
         str,
@@ -176,10 +177,10 @@ def export(
             autocompletion=lambda: [*FORMATS],
         ),
     ],
-    out: cli.OutOption = None,
-    settings: cli.SetOption = None,
+    out: opt.OutOption = None,
+    settings: opt.SetOption = None,
     certificates: bool = True,
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Export a run for other programs: its tables, its summary and its certificates.
 
@@ -208,13 +209,13 @@ def export(
         if run.loop or not certificates:
             option = "--loop" if run.loop else "--no-certificates"
             raise CallerError(f"{option}: not with {file_format}, which is made of a scenario")
-        scenario = cli.load_scenario(_scenario_name(run), settings)
+        scenario = opt.load_scenario(_scenario_name(run), settings)
         path = out or Path(f"{scenario.name}{export_suffix(file_format)}")
         written = export_scenario(scenario, path, file_format)
     cli.print_lines(json, {"files": [str(path) for path in written]}, *written)
 
 
-def _scenario_name(run: cli.LoopOptions) -> str:
+def _scenario_name(run: opt.LoopOptions) -> str:
     """Return the file of a run's scenario, or the scenario that is given instead of a run."""
     given = run.run_dir
     if given is not None and not (given / SCENARIO_FILE).is_file():
@@ -223,7 +224,7 @@ def _scenario_name(run: cli.LoopOptions) -> str:
 
 
 @cli.command(cli.RUNS, 92, takes="about a second")
-def archive(run: cli.RunOptions, *, out: cli.OutOption = None, json: cli.JsonOption = False) -> None:
+def archive(run: opt.RunOptions, *, out: opt.OutOption = None, json: opt.JsonOption = False) -> None:
     """Archive a run: one file with everything that its repetition needs.
 
     `noack reproduce` repeats it.
@@ -249,7 +250,7 @@ def reproduce(
     run_code: Annotated[bool, Option("--run-code")] = False,
     long: Annotated[bool, Option("--long")] = False,
     into: Path | None = None,
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> int:
     """Repeat an archived run: simulate it again, or replay its record, bit for bit.
 
@@ -277,7 +278,7 @@ def collect(
     run_dir: Annotated[Path, Argument()],
     sources: Annotated[list[str], Argument()],
     *,
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Add what processes on other hosts kept of a run, and finalise it again.
 
@@ -303,11 +304,11 @@ def collect(
 
 @cli.command(cli.RUNS, 80, takes="about a second")
 def compare(
-    directories: Annotated[list[Path], Argument(metavar="RUN...", autocompletion=completion.run_directories)],
+    directories: Annotated[list[Path], Argument(metavar="RUN...", autocompletion=opt.complete_runs)],
     *,
     out: Path = cli.DEFAULT_RUNS / "comparison.html",
-    width: cli.WidthOption = None,
-    json: cli.JsonOption = False,
+    width: opt.WidthOption = None,
+    json: opt.JsonOption = False,
 ) -> None:
     """Compare runs: key numbers, settings that differ, curves overlaid.
 

@@ -7,7 +7,7 @@ import typer
 from typer import Argument, Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
+from cosim.cli import options as opt
 from cosim.cli.execute_run import LiveOptions, OutputOptions, finalize_run, run_processes, warn_of_violations
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError
@@ -31,7 +31,7 @@ _EVENTS_SHOWN = 40
 @cli.command(cli.RUNS, 20, takes="as long as the scenario's horizon, and a few seconds", on_linux=True)
 def run(
     context: typer.Context,
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
     hosts: Annotated[Path | None, Option(metavar="FILE")] = None,
     options: LiveOptions,
@@ -56,7 +56,7 @@ def demo(
     context: typer.Context,
     *,
     zoh: Annotated[bool, Option("--zoh")] = False,
-    settings: cli.SetOption = None,
+    settings: opt.SetOption = None,
     options: LiveOptions,
 ) -> int:
     """Run the paper's lane-following example live.
@@ -70,13 +70,13 @@ def demo(
         noack demo --set speed=4 --set horizon_s=8   takes 2 s of wall time
     """
     wanted = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
-    return run_processes(cli.load_scenario("lane_following", wanted), options, server=context.obj)
+    return run_processes(opt.load_scenario("lane_following", wanted), options, server=context.obj)
 
 
 @cli.command(cli.RUNS, 22, takes="as long as the scenario's horizon, and a few seconds", on_linux=True)
 def bridge(
     context: typer.Context,
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
     router: Annotated[str, Option(metavar="ENDPOINT")] = "tcp/127.0.0.1:7447",
     listen: Annotated[bool, Option("--listen")] = False,
@@ -101,10 +101,10 @@ def bridge(
 
 @cli.command(cli.RUNS, 30, takes="about a second; the report, some more")
 def simulate(
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
-    trigger: cli.TriggerOption = cli.TriggerMode.SAMPLED,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    trigger: opt.TriggerOption = opt.TriggerMode.SAMPLED,
+    runs: opt.RunsOption = cli.DEFAULT_RUNS,
     options: OutputOptions,
 ) -> int:
     """Run a scenario in virtual time: no sockets, no deadlines missed.
@@ -119,7 +119,7 @@ def simulate(
     loaded = given.load()
     link_load.require_capacity(loaded)
     warn_of_violations(loaded)
-    if trigger is cli.TriggerMode.CONTINUOUS:
+    if trigger is opt.TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=options.json)
     with progress.simulation_bar(progress.error_console(), loaded.horizon_s) as bar:
         ending = simulated_run.simulate_run(loaded, runs, bar)
@@ -198,12 +198,12 @@ def _print_run(
 def set_(
     settings: Annotated[
         list[str] | None,
-        Argument(metavar="[KEY VALUE]...", autocompletion=completion.runtime_parameters),
+        Argument(metavar="[KEY VALUE]...", autocompletion=opt.complete_runtime_parameters),
     ] = None,
     *,
-    session: Annotated[str | None, cli.SESSION] = None,
-    run: Annotated[Path | None, Option(autocompletion=completion.run_directories)] = None,
-    json: cli.JsonOption = False,
+    session: Annotated[str | None, opt.SESSION] = None,
+    run: Annotated[Path | None, Option(autocompletion=opt.complete_runs)] = None,
+    json: opt.JsonOption = False,
 ) -> None:
     """Change a live run: losses, M, trigger, set point.
 

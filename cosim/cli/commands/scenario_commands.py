@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 from typer import Argument, Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
+from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.clock import NS_PER_S
@@ -51,9 +51,9 @@ PlantArgument = Annotated[
 
 @cli.command(cli.FILES, 20)
 def scenarios(
-    name: Annotated[str | None, Argument(autocompletion=completion.shipped)] = None,
+    name: Annotated[str | None, Argument(autocompletion=opt.complete_shipped)] = None,
     *,
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """List the shipped scenarios and campaigns, or print one of them.
 
@@ -102,7 +102,7 @@ def _print_shipped(console: "Console", some: Sequence[ShippedFile]) -> None:
 
 
 @cli.command(cli.FILES, 30)
-def check(given: cli.ScenarioOptions, *, json: cli.JsonOption = False) -> None:
+def check(given: opt.ScenarioOptions, *, json: opt.JsonOption = False) -> None:
     """Check a scenario and print it with all defaults and random draws filled in.
 
     The output is a scenario file. Comments at its end say which of the paper's assumptions hold.
@@ -215,7 +215,7 @@ def schema(
     *,
     netem: Annotated[bool, Option("--netem")] = False,
     campaign: Annotated[bool, Option("--campaign")] = False,
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Print the JSON Schema of scenario files, for editors.
 
@@ -239,13 +239,13 @@ def schema(
 @cli.command(cli.FILES, 12, takes="about a second")
 def linearise(
     plant: PlantArgument,
-    settings: cli.SetOption = None,
+    settings: opt.SetOption = None,
     *,
     at: str | None = None,
     held: Annotated[str | None, Option("--input")] = None,
     within: float = 0.1,
-    out: cli.OutOption = None,
-    json: cli.JsonOption = False,
+    out: opt.OutOption = None,
+    json: opt.JsonOption = False,
 ) -> None:
     """Print the linear model of a plant, its error, its eigenvalues and its controllable part.
 
@@ -276,13 +276,13 @@ def linearise(
 @cli.command(cli.FILES, 14, takes="about a second")
 def gain(
     plant: PlantArgument,
-    settings: cli.SetOption = None,
+    settings: opt.SetOption = None,
     *,
     q: Annotated[str | None, Option("--q")] = None,
     r: Annotated[str | None, Option("--r")] = None,
     poles: str | None = None,
-    out: cli.OutOption = None,
-    json: cli.JsonOption = False,
+    out: opt.OutOption = None,
+    json: opt.JsonOption = False,
 ) -> None:
     """Compute the gain K of u = K x: a linear-quadratic regulator, or given closed-loop poles.
 
@@ -311,11 +311,11 @@ def gain(
 @cli.command(cli.FILES, 16, takes="some 10 s")
 def new(
     file: Annotated[Path, Argument(metavar="FILE.toml", help="The scenario file to write.")],
-    settings: cli.SetOption = None,
+    settings: opt.SetOption = None,
     *,
     plant: Annotated[str, Option("--plant", metavar="PLANT")],
     x0: Annotated[str | None, Option("--x0")] = None,
-    json: cli.JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Write a complete scenario for a plant, with comments, and settings that are certified.
 
@@ -353,13 +353,7 @@ def new(
 
 def _settings(given: Sequence[str] | None) -> "Table":
     """Return the values of --set by their keys."""
-    found: Table = {}
-    for one in given or ():
-        key, equals, text = one.partition("=")
-        if not equals:
-            raise CallerError(f"--set {one}: write it as key=value, e.g. plant.system.cart_kg=1.0")
-        found[key.strip()] = scenario_file.value_of(text, f"--set {key}")
-    return found
+    return dict(scenario_file.setting_of(one, "plant.system.cart_kg=1.0") for one in given or ())
 
 
 def _numbers(option: str, text: str | None, kind: Callable[[str], Number] = float) -> list[Number] | None:

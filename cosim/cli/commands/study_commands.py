@@ -11,7 +11,7 @@ import typer
 from typer import Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
+from cosim.cli import options as opt
 from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
 from cosim.lazy_modules import lazy_modules
 from cosim.shipped_files import find_shipped
@@ -21,7 +21,7 @@ from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
     from cosim.live import progress
-    from cosim.output import figure_format, result_tables
+    from cosim.output import result_tables
     from cosim.studies.campaign import campaign_file, campaign_grid, campaign_report
     from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result
     from cosim.studies.design import design_page, design_search, design_space, event_design, network_search
@@ -33,15 +33,15 @@ with lazy_modules():
 
 @cli.command(cli.CAMPAIGNS, 10, takes="seconds to minutes, by the number of draws")
 def campaign(
-    file: Annotated[str, typer.Argument(autocompletion=completion.campaigns)],
+    file: Annotated[str, typer.Argument(autocompletion=opt.complete_campaigns)],
     *,
     draws: Annotated[int | None, Option(min=1)] = None,
     workers: Workers = None,
     scheduler: Annotated[str | None, Option(metavar="tcp://HOST:PORT")] = None,
-    out: cli.OutOption = None,
-    figures: cli.FigureOptions,
-    tables: cli.TablesOption = None,
-    json: cli.JsonOption = False,
+    out: opt.OutOption = None,
+    figures: opt.FigureOptions,
+    tables: opt.TablesOption = None,
+    json: opt.JsonOption = False,
 ) -> int:
     """Run a scenario over a grid of settings, with many random draws at each point.
 
@@ -75,13 +75,13 @@ def campaign(
 
 @cli.command(cli.THEORY, 30, takes="up to a minute")
 def paper(
-    name: Annotated[str | None, typer.Argument(autocompletion=completion.papers)] = None,
+    name: Annotated[str | None, typer.Argument(autocompletion=opt.complete_papers)] = None,
     *,
     list_names: Annotated[bool, Option("--list")] = False,
     draws: Annotated[int | None, Option(min=1)] = None,
-    out: cli.OutOption = None,
-    tables: cli.TablesOption = None,
-    json: cli.JsonOption = False,
+    out: opt.OutOption = None,
+    tables: opt.TablesOption = None,
+    json: opt.JsonOption = False,
 ) -> int:
     """Reproduce the paper's Section V, or another published result: published against computed.
 
@@ -136,7 +136,7 @@ def paper(
     return ExitStatus.OK
 
 
-@cli.option_group
+@opt.option_group
 class LimitOptions:
     """What a design must meet.
 
@@ -194,7 +194,7 @@ class DesignAim(StrEnum):
     TRANSMISSIONS = "transmissions"
 
 
-@cli.option_group
+@opt.option_group
 class NetworkOptions:
     """What a design for a network must meet.
 
@@ -249,55 +249,65 @@ class NetworkOptions:
         )
 
 
-@cli.option_group
-class GainOptions:
-    """The gain of a design.
+@opt.option_group
+class GainOptions(opt.CostOptions):
+    """The gain of a design, and the costs of its regulator.
 
     Options:
         gain: Gain K: `given` in the scenario, or `lqr` of the nominal model.
-        Q: LQR state cost: rows, or a diagonal, e.g. '[1, 1]'.
-        R: LQR input cost: rows, or a diagonal.
     """
 
     gain: str = "given"
-    Q: Annotated[str | None, Option("--Q")] = None
-    R: Annotated[str | None, Option("--R")] = None
 
     def regulator(
         self, given: "scenario.Scenario"
     ) -> "tuple[linear_systems.Matrix, linear_systems.Matrix] | None":
-        """Return the LQR costs Q (n, n) and R (m, m); None for the scenario's gain.
-
-        Raise CallerError if one is wrong.
-        """
+        """Return the LQR costs, None for the scenario's gain; raise CallerError if one is wrong."""
         if self.gain not in ("given", "lqr"):
             raise CallerError(f'--gain: given or lqr, not "{self.gain}"')
         if self.gain == "lqr":
-            return self.costs(given)
+            return self.matrices(given)
         if self.Q or self.R:
             raise CallerError("--Q, --R: are for --gain lqr only")
         return None
 
-    def costs(self, given: "scenario.Scenario") -> "tuple[linear_systems.Matrix, linear_systems.Matrix]":
-        """Return Q (n, n) and R (m, m); raise CallerError if one is wrong."""
-        n, m = given.model.dimensions
-        return cli.weight_matrix("--Q", self.Q, n), cli.weight_matrix("--R", self.R, m)
+
+@opt.option_group
+class DesignFiles:
+    """The files of a design.
+
+    Options:
+        out: Write the chosen scenario to this file (TOML).
+        page: File of the page (HTML); runs/design/NAME.html by default.
+    """
+
+    out: opt.OutOption = None
+    page: Path | None = None
+
+    def page_of(self, name: str) -> Path:
+        """Return the file of the page; raise CallerError if there is no folder for the scenario."""
+        if self.out is not None and not self.out.parent.is_dir():
+            raise CallerError(f"--out {self.out}: there is no folder {self.out.parent}")
+        return self.page or cli.DEFAULT_RUNS / "design" / f"{name}.html"
+
+    def write(self, scenario_toml: str) -> list[Path]:
+        """Write the chosen scenario, if it is wanted; return the written files."""
+        return [] if self.out is None else [write_whole(self.out, scenario_toml)]
 
 
 @cli.command(cli.CAMPAIGNS, 20, takes="up to a minute")
 def design(
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
     network: NetworkOptions,
     wanted: LimitOptions,
     weights: str = "identity,chosen",
     feedback: GainOptions,
     draws: Annotated[int, Option(min=20)] = 2000,
-    seed: cli.SeedOption = 0,
-    out: cli.OutOption = None,
-    page: Path | None = None,
-    figures: cli.FigureOptions,
-    json: cli.JsonOption = False,
+    seed: opt.SeedOption = 0,
+    files: DesignFiles,
+    figures: opt.FigureOptions,
+    json: opt.JsonOption = False,
 ) -> int:
     """Choose a trigger that transmits least, or a gain that tolerates the most losses.
 
@@ -311,8 +321,6 @@ def design(
     Options:
         weights: Norms to try: `identity`, `given` in the scenario, `chosen` by noack.
         draws: Draws that choose the trigger; the same number of new draws confirm it.
-        out: Write the chosen scenario to this file (TOML).
-        page: File of the page (HTML); runs/design/NAME.html by default.
 
     Examples:
         noack design lane_following --settling 14   the fewest transmissions
@@ -323,73 +331,46 @@ def design(
         noack design lane_periodic --for transmissions --cost 1   the longest period
     """
     figure_files, loaded = figures.files, given.load()
-    if out is not None and not out.parent.is_dir():
-        raise CallerError(f"--out {out}: there is no folder {out.parent}")
     if network.aim is not DesignAim.SETTLING:
         if wanted.settling is not None or feedback.gain != "given":
             raise CallerError(f"--settling, --gain: are not for --for {network.aim.value}")
-        return _design_for_network(
-            loaded,
-            network.wish(feedback.costs(loaded), wanted.bounds()),
-            seed,
-            out,
-            page,
-            figure_files,
-            json,
-        )
-    return _design_for_settling(loaded, wanted, weights, feedback, draws, seed, out, page, figure_files, json)
-
-
-def _design_for_settling(
-    loaded: "scenario.Scenario",
-    wanted: LimitOptions,
-    weights: str,
-    feedback: GainOptions,
-    draws: int,
-    seed: int,
-    out: Path | None,
-    page: Path | None,
-    figure_files: "figure_format.FigureFiles | None",
-    json: bool,
-) -> int:
-    loaded.decaying  # noqa: B018 - raises for another policy
-    limits = wanted.limits()
-    norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
-    with progress.work_bar("choosing norms") as bar:
-        families = design_space.families_of(loaded, norms, feedback.regulator(loaded), bar)
-    with progress.work_bar("trying candidates") as bar:
-        found = design_search.design(families, limits, draws=draws, seed=seed, progress=bar)
-    path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}.html"
-    written = design_page.write_page(found, path, figure_files)
-    if out is not None and found.feasible:
-        written.append(write_whole(out, scenario_file.dumps(found.scenario)))
+        page = files.page_of(f"{loaded.name}-network")
+        wish = network.wish(feedback.matrices(loaded), wanted.bounds())
+        with progress.work_bar("trying gains") as bar:
+            outcome = event_design.design_for_network(loaded, wish, seed, bar)
+        written = design_page.write_outcome(outcome, page, figure_files)
+        written += files.write(outcome.written()) if outcome.is_certified else []
+        cli.show_with_files(json, outcome.to_json(), written, design_page.print_design, outcome)
+        return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
+    page = files.page_of(loaded.name)
+    found = _trigger_of(loaded, wanted.limits(), weights, feedback, draws, seed)
+    written = design_page.write_page(found, page, figure_files)
+    written += files.write(scenario_file.dumps(found.scenario)) if found.feasible else []
     cli.show_with_files(json, found.document(), written, design_page.print_found, found)
     if not found.confirmed:
         print_to_stderr(f"noack: {found.verdict()}")
     return ExitStatus.OK if found.confirmed else ExitStatus.FAILED
 
 
-def _design_for_network(
+def _trigger_of(
     loaded: "scenario.Scenario",
-    wish: "network_search.Wish",
+    limits: "design_search.DesignLimits",
+    weights: str,
+    feedback: GainOptions,
+    draws: int,
     seed: int,
-    out: Path | None,
-    page: Path | None,
-    figure_files: "figure_format.FigureFiles | None",
-    json: bool,
-) -> int:
-    with progress.work_bar("trying gains") as bar:
-        found = event_design.design_for_network(loaded, wish, seed, bar)
-    path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}-network.html"
-    written = design_page.write_outcome(found, path, figure_files)
-    if out is not None and found.is_certified:
-        written.append(write_whole(out, found.written()))
-    cli.show_with_files(json, found.to_json(), written, design_page.print_design, found)
-    return ExitStatus.OK if found.is_certified else ExitStatus.FAILED
+) -> "design_search.DesignResult":
+    """Choose the trigger with the fewest transmissions that meets the limits."""
+    loaded.decaying  # noqa: B018 - raises for another policy
+    norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
+    with progress.work_bar("choosing norms") as bar:
+        families = design_space.families_of(loaded, norms, feedback.regulator(loaded), bar)
+    with progress.work_bar("trying candidates") as bar:
+        return design_search.design(families, limits, draws=draws, seed=seed, progress=bar)
 
 
-@cli.option_group
-class StudyOptions(cli.ScenarioOptions):
+@opt.option_group
+class StudyOptions(opt.ScenarioOptions):
     """What a study runs.
 
     Options:
@@ -416,17 +397,14 @@ class StudyOptions(cli.ScenarioOptions):
     policy: Annotated[list[str] | None, Option("--policy", metavar="NAME=TRIGGER")] = None
     disturbance: float | None = None
     draws: Annotated[int | None, Option(min=1, max=10_000)] = None
-    seed: cli.SeedOption = 0
+    seed: opt.SeedOption = 0
 
     def plan(self) -> "capacity_plan.CapacityPlan":
         """Return what is run; raise CallerError if an option is wrong."""
         depth = self._depth()
-        path = cli.find_scenario(self.scenario)
-        settings: dict[str, Any] = {}
-        for text in self.settings or ():
-            key, _, value = text.partition("=")
-            settings[key.strip()] = scenario_file.value_of(value, f"--set {key}")
+        path = opt.find_scenario(self.scenario)
         given = scenario_file.load(path, self.settings or ())
+        settings: dict[str, Any] = dict(map(scenario_file.setting_of, self.settings or ()))
         if self.rate_bps is not None:
             given = capacity_plan.with_rate(given, self.rate_bps)
             settings["network.impairments"] = [
@@ -449,7 +427,11 @@ class StudyOptions(cli.ScenarioOptions):
             carried = capacity_plan.periodic_loops(given, kinds)
             counts = capacity_plan.default_counts(carried, least, depth)
         else:
-            counts = capacity_plan.require_counts(_counts(self.loops), least)
+            try:
+                given_counts = [int(count) for count in self.loops.split(",")]
+            except ValueError:
+                raise CallerError(f"--loops {self.loops}: write it as N,N,..., e.g. 5,10,20") from None
+            counts = capacity_plan.require_counts(given_counts, least)
         return capacity_plan.CapacityPlan(
             scenario=given,
             kinds=kinds,
@@ -496,9 +478,9 @@ def capacity(
     *,
     confirm: Annotated[str | None, Option("--confirm", metavar="POLICY=N,...")] = None,
     workers: Workers = None,
-    out: cli.OutOption = None,
-    figures: cli.FigureOptions,
-    json: cli.JsonOption = False,
+    out: opt.OutOption = None,
+    figures: opt.FigureOptions,
+    json: opt.JsonOption = False,
 ) -> int:
     """How many loops a link carries, until guarantee, deadline or cost is exceeded.
 
@@ -563,10 +545,3 @@ def _announce(
         + ("" if longer == plan else f"; --thorough: {capacity_result.time_text(longer_s)}")
     )
     return estimated_s
-
-
-def _counts(text: str) -> list[int]:
-    try:
-        return [int(count) for count in text.split(",")]
-    except ValueError:
-        raise CallerError(f"--loops {text}: write it as N,N,..., e.g. 5,10,20") from None

@@ -7,6 +7,7 @@ import typer
 from typer import Option
 
 from cosim.cli import command as cli
+from cosim.cli import options as opt
 from cosim.cli.execute_run import LiveOptions, run_processes
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus
@@ -24,13 +25,13 @@ with lazy_modules():
 
 @cli.command(cli.THEORY, 10, takes="about two seconds; half a minute where events are due after many tests")
 def certify(
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
     weight: str = "given",
     late: Annotated[int | None, Option(min=0, max=1000)] = None,
-    tables: cli.TablesOption = None,
-    out: cli.OutOption = None,
-    json: cli.JsonOption = False,
+    tables: opt.TablesOption = None,
+    out: opt.OutOption = None,
+    json: opt.JsonOption = False,
 ) -> int:
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
 
@@ -73,7 +74,7 @@ def certify(
 @cli.command(cli.THEORY, 30, takes="some seconds")
 def margin(
     context: typer.Context,
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
     most: Annotated[int, Option(min=1, max=1000)] = 16,
     accuracy: float = 2e-4,
@@ -81,9 +82,9 @@ def margin(
     guarantee: Annotated[list[str] | None, Option("--guarantee", metavar="WORDS")] = None,
     effort: float = 1.0,
     play: Annotated[bool, Option("--play")] = False,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    tables: cli.TablesOption = None,
-    json: cli.JsonOption = False,
+    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    tables: opt.TablesOption = None,
+    json: opt.JsonOption = False,
 ) -> int:
     """Find the largest M for which a loop is stable under every loss pattern.
 
@@ -131,11 +132,11 @@ def margin(
 
 @cli.command(cli.THEORY, 35, takes="a second")
 def cost(
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
-    weights: cli.CostOptions,
-    tables: cli.TablesOption = None,
-    json: cli.JsonOption = False,
+    weights: opt.CostOptions,
+    tables: opt.TablesOption = None,
+    json: opt.JsonOption = False,
 ) -> int:
     """Compute the mean cost, and the rms of all states, under a scenario's random losses.
 
@@ -169,14 +170,14 @@ class AdversaryAim(StrEnum):
 
 @cli.command(cli.THEORY, 20, takes="some 20 s")
 def adversary(
-    given: cli.ScenarioOptions,
+    given: opt.ScenarioOptions,
     *,
     objective: AdversaryAim = AdversaryAim.ALL,
     horizon: float | None = None,
     nodes: Annotated[int, Option(min=0)] = 500_000,
     beam: Annotated[int, Option(min=0)] = 512,
-    trigger: cli.TriggerOption = cli.TriggerMode.SAMPLED,
-    json: cli.JsonOption = False,
+    trigger: opt.TriggerOption = opt.TriggerMode.SAMPLED,
+    json: opt.JsonOption = False,
 ) -> int:
     """Search for the worst losses that the network may cause; compare them with the bounds.
 
@@ -198,7 +199,7 @@ def adversary(
         noack adversary lane_following --trigger continuous   the paper's loop, in exact time
     """
     resolved = resolution.resolve(given.load(*([] if horizon is None else [f"horizon_s={horizon}"])))
-    continuous = trigger is cli.TriggerMode.CONTINUOUS
+    continuous = trigger is opt.TriggerMode.CONTINUOUS
     conditions = adversary_search.conditions_of(resolved, continuous=continuous)
     certificate = scenario_certificates.certify(resolved, conditions)
     kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from controller_node.controller import controllers_of
 from cosim.record.run_directory import SCENARIO_FILE
-from netem.channel import UPDATE_LINK, Channel, alone
+from netem.channel import UPDATE_LINK, Channel, require_stand_alone
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import LIBRARY, SCRATCH_MATRICES, SOURCES, CData, core, ffi
@@ -111,7 +111,7 @@ def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
         path /= scenario.name
     if not (name := path.name.removesuffix(SUFFIX)):
         raise CallerError(f"{path}: must be the name of a file, such as loop{SUFFIX}")
-    alone(scenario)
+    require_stand_alone(scenario)
     kind = scenario.controller.kind
     if scenario.network.flows != (Flow.UPDATE,):
         raise CallerError(

@@ -35,8 +35,8 @@ from uuid import UUID
 import rerun as rr
 import rerun.blueprint as rrb
 
-from cosim.output import palette
-from cosim.output.palette import (
+from cosim.output.figures import palette
+from cosim.output.figures.palette import (
     CERTIFIED,
     CONTROLLER,
     IDENTITY,
@@ -48,7 +48,7 @@ from cosim.output.palette import (
     THRESHOLD,
     Colour,
 )
-from cosim.output.palette import FORCED as FORCED_COLOUR
+from cosim.output.figures.palette import FORCED as FORCED_COLOUR
 from cosim.output.viewer.network_diagram import DIAGRAM, NetworkDiagram
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Picture, Shape, label, lines, panel
 

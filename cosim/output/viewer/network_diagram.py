@@ -14,7 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from cosim.output.palette import CONTROLLER, FORCED, LOST, NETWORK, PLANT, SENSOR
+from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, NETWORK, PLANT, SENSOR
 from cosim.output.viewer.pictures.picture import STILL, Columns, Shape, label, lines, style, upright
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import Fate, effective

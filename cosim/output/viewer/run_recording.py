@@ -44,7 +44,7 @@ from cosim.analysis.network_summary import (
 )
 from cosim.analysis.summary_model import RunSummary
 from cosim.analysis.value_reduction import Reals, is_long
-from cosim.output.palette import CONTROLLER, LOST, NETWORK, SERIES
+from cosim.output.figures.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.network_diagram import NetworkDiagram

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.output.figure_description import (
+from cosim.output.figures.figure_description import (
     DASHES,
     MARKERS,
     Axis,
@@ -25,7 +25,7 @@ from cosim.output.figure_description import (
     plain,
     series_colour,
 )
-from cosim.output.palette import Colour
+from cosim.output.figures.palette import Colour
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
 from cosim.studies.campaign.chunk_store import Store

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.output.figure_files import save_figures
-from cosim.output.figure_format import FigureFiles
+from cosim.output.figures.figure_files import save_figures
+from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.studies.campaign.campaign_figures import figures

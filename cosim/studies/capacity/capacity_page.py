@@ -10,10 +10,10 @@ import numpy as np
 from pydantic_core import to_json
 from rich.console import Console
 
-from cosim.output import palette
-from cosim.output.figure_description import FigureDescription, Item, Marks, Rule, series_colour
-from cosim.output.figure_files import save_figure
-from cosim.output.figure_format import SCREEN_IN, FigureFiles, FigureFormat
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import FigureDescription, Item, Marks, Rule, series_colour
+from cosim.output.figures.figure_files import save_figure
+from cosim.output.figures.figure_format import SCREEN_IN, FigureFiles, FigureFormat
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.studies.campaign.campaign_figures import curve_figure

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from cosim.output import palette
-from cosim.output.figure_description import (
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import (
     MARKERS,
     Axis,
     FigureDescription,
@@ -25,8 +25,8 @@ from cosim.output.figure_description import (
     plain,
     series_colour,
 )
-from cosim.output.figure_files import save_figures
-from cosim.output.figure_format import FigureFiles
+from cosim.output.figures.figure_files import save_figures
+from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.studies.design.design_search import WORDS, DesignResult, certified

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.output.figure_description import Axis, FigureDescription, Line, Panel
-from cosim.output.palette import LOST, NETWORK
+from cosim.output.figures.figure_description import Axis, FigureDescription, Line, Panel
+from cosim.output.figures.palette import LOST, NETWORK
 from cosim.simulation.exact_simulation import Population, run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.design_page import DesignOutcome, figure_of, gain_text

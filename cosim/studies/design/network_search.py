@@ -19,8 +19,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cosim.analysis.margin_search import stability_document
-from cosim.output import palette
-from cosim.output.figure_description import Axis, FigureDescription, Item, Line, Marks, Panel, Rule
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import Axis, FigureDescription, Item, Line, Marks, Panel, Rule
 from cosim.studies.design.design_page import DesignOutcome, figure_of, gain_text
 from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from cosim.output.figure_description import FigureDescription
-from cosim.output.figure_files import save_figure
-from cosim.output.run_figures import Trajectory, Transmissions, states_figure
+from cosim.output.figures.figure_description import FigureDescription
+from cosim.output.figures.figure_files import save_figure
+from cosim.output.figures.run_figures import Trajectory, Transmissions, states_figure
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import timeless
 from cosim.studies.campaign.campaign_figures import figures

@@ -6,7 +6,7 @@ from pydantic import Field, FiniteFloat
 
 from noack.core.clock import NS_PER_S
 from noack.impairments.clauses import Clause, Part
-from noack.impairments.feature import MOST_FLOWS, Scheduler
+from noack.impairments.feature import MOST_FLOWS, Scheduler, numbers_text
 from noack.impairments.words import OWN_TIME_S, list_of, time_text
 
 
@@ -39,5 +39,5 @@ class EarliestDeadline(Scheduler):
         return self.number(flow) - self.number(other)
 
     def meaning(self) -> str:
-        times = self.shown([time_text(deadline_s) for deadline_s in self.deadlines_s])
+        times = numbers_text([time_text(deadline_s) for deadline_s in self.deadlines_s])
         return f"more are dropped; it sends first what has the earliest deadline, {times} by flow"

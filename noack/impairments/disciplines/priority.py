@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from noack.impairments.clauses import Clause, Part
-from noack.impairments.feature import MOST_FLOWS, Scheduler
+from noack.impairments.feature import MOST_FLOWS, Scheduler, numbers_text
 from noack.impairments.words import COUNT, list_of
 
 
@@ -40,5 +40,5 @@ class Priority(Scheduler):
         return math.copysign(math.inf, below) if below else 0.0
 
     def meaning(self) -> str:
-        levels = self.shown([str(level) for level in self.levels])
+        levels = numbers_text(self.levels)
         return f"more are dropped; the flow with the smallest number goes first, {levels} by flow"

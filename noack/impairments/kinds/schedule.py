@@ -9,11 +9,10 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.impairments.clauses import Clause, Part
-from noack.impairments.feature import MOST_FLOWS, Impairment, Stage, StageTables, add_numbers
+from noack.impairments.feature import MOST_FLOWS, Impairment, Stage, StageTables, add_numbers, numbers_text
 from noack.impairments.words import COUNT, OWN_TIME_S, list_of, time_text
 
 _EXAMPLE = "schedule 1,2,1,3 slot 5ms"
-_MOST_SHOWN = 12
 
 
 class Schedule(Impairment):
@@ -86,10 +85,9 @@ class Schedule(Impairment):
         return True, False  # a flow's packets leave in the order of arrival
 
     def meaning(self) -> str:
-        more = ",..." if len(self.order) > _MOST_SHOWN else ""
         return (
             f"delivers one packet at the begin of each slot of {time_text(self.slot_s)}, of the "
-            f"flows {','.join(map(str, self.order[:_MOST_SHOWN]))}{more} in turn; of each flow "
+            f"flows {numbers_text(self.order)} in turn; of each flow "
             f"{self.queue} may wait, more are dropped, and all of a flow without a slot"
         )
 

@@ -31,7 +31,7 @@ Begin = Callable[[socket.socket, bytes, str], Coroutine[Any, Any, None]]
 class FirstBytes:
     """What a connection must send before it is served."""
 
-    judge: Callable[[bytes, Any], bool | None]
+    accept: Callable[[bytes, Any], bool | None]
     """Given the bytes and the other end's address: whether it is served; None: more are needed."""
     most: int
     """More bytes are not read, and not waited for."""
@@ -200,7 +200,7 @@ class _Gate:
             self._end(waiting)
             return True
         waiting.data += data
-        served = first.judge(waiting.data, waiting.source)
+        served = first.accept(waiting.data, waiting.source)
         if served is None and len(waiting.data) < first.most:
             return False
         if served:

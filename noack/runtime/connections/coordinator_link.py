@@ -171,7 +171,7 @@ def forwarding(
     if protection is not None:
         proof, own = protection.proof, listening.getsockname()
         first = FirstBytes(
-            judge=lambda data, other: proof.check(data, other, own),
+            accept=lambda data, other: proof.check(data, other, own),
             most=PROOF_BYTES,
             within_s=_PROOF_S,
             refused=Answer.REFUSED.value,

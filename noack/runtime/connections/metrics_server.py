@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from noack.core.errors import CallerError, MachineError, why
-from noack.runtime.address import Address, family_of, parse_address, text_of
+from noack.runtime.address import Address, address_text, family_of, parse_address
 from noack.runtime.connections.connection_gate import FirstBytes, TaskLimit, accepting
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def _listening(address: Address) -> Iterator[socket.socket]:
         except (OSError, OverflowError) as error:
             reason = why(error) if isinstance(error, OSError) else str(error)
             kind = MachineError if isinstance(error, PermissionError) else CallerError
-            raise kind(f"{OPTION} {text_of(address)}: {reason}") from None
+            raise kind(f"{OPTION} {address_text(address)}: {reason}") from None
         yield listening
 
 

@@ -8,20 +8,12 @@ from collections.abc import Callable, Sequence
 from time import monotonic_ns
 from typing import NamedTuple
 
-from noack.core.clock import (
-    NS_PER_S,
-    SLEW_PPB,
-    ClockOffset,
-    Restart,
-    RestartCause,
-    RunClock,
-    SlewedClock,
-    clock_identity,
-)
+from noack.core.clock import NS_PER_S, RunClock, clock_identity
 from noack.core.errors import PeerError
 from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import LOST_NS, clock_table
-from noack.runtime.address import Address, text_of
+from noack.runtime.address import Address, address_text
+from noack.runtime.host_clocks.clock_offset import SLEW_PPB, ClockOffset, Restart, RestartCause, SlewedClock
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient
 from noack.runtime.join_ticket import Ticket
 from noack.scenario.run_sections import ClocksSection
@@ -79,7 +71,7 @@ class ReferenceClock:
         clocks: HostClocks | None = None,
     ) -> None:
         self._clocks = HostClocks() if clocks is None else clocks
-        self._where = text_of(reference)
+        self._where = address_text(reference)
         self._largest_ns = round(settings.largest_error_us * _NS_PER_US)
         self._offset = ClockOffset(round(settings.relative_rate_ppm * _PPB_PER_PPM))
         self._client = TimeClient(reference, key, self._offset, clocks=self._clocks)
@@ -223,7 +215,7 @@ class ClockRecord:
         self._lost: str | None = None
         self._largest_ns = 0
 
-    def news(self, now_ns: int) -> Sequence[Record | Notice]:
+    def compare(self, now_ns: int) -> Sequence[Record | Notice]:
         """Compare the clocks; return the row, and a notice if the bound was lost or found again."""
         report = self._direct() if self._reference is None else self._reference.poll()
         outputs: list[Record | Notice] = []

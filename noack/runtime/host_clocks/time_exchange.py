@@ -45,10 +45,10 @@ from contextlib import contextmanager, suppress
 from enum import IntEnum
 from typing import NamedTuple
 
-from noack.core.clock import ClockOffset, Exchange, Restart
 from noack.core.errors import CallerError, why
 from noack.protocol.wire_format import TAG_BYTES, TIMES_NS, Rejection, Tagger
-from noack.runtime.address import Address, family_of, text_of
+from noack.runtime.address import Address, address_text, family_of
+from noack.runtime.host_clocks.clock_offset import ClockOffset, Exchange, Restart
 
 MAGIC = b"NC"
 VERSION = 1
@@ -258,7 +258,7 @@ def _open_socket(address: Address, use: Callable[[socket.socket, Address], None]
         use(endpoint, address)
     except OSError as error:
         endpoint.close()
-        raise CallerError(f"cannot {what} {text_of(address)}: {why(error)}") from None
+        raise CallerError(f"cannot {what} {address_text(address)}: {why(error)}") from None
     return endpoint
 
 

@@ -103,11 +103,15 @@ class TriggerBound(NamedTuple):
     """share_C by the name of C in :attr:`PlantGains.outputs`."""
     untested_s: float = 0.0
     """After an event the trigger is not tested for this time: e_s grows from 0 for up to h more."""
+    is_one_growth: bool = False
+    """Whether the growth without a test is bounded as after one, for the longest time of both."""
     is_tested: bool = True
     """Whether there is a test at all; without one, only the time since the event bounds e_s."""
     ago_s: float = 0.0
     """The bound is that of ‖e_s‖_W at some time up to this long before the test. An event comes no
     earlier than this after the last one, unless ‖e_s‖_W has exceeded ``reached``."""
+    is_mean: bool = False
+    """Whether it also bounds the mean of ‖e_s‖_W over that time, or that since the event."""
     apart_s: float = 0.0
     """Events are at least this far apart, whatever happens to e_s."""
     due_s: float = math.inf

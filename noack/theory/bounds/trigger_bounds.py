@@ -41,6 +41,8 @@ class ComparisonBound(NamedTuple):
     least: float
     """An event needs ‖W e_s‖ > ``least`` · f, unless it is due by its time; 0 if nothing is known.
     """
+    has_root: bool = False
+    """Whether ‖W e_s‖ ≤ (size² f² + ‖S₀ x‖²)^½ + Σ ‖S_i x‖, S₀ the first share, holds, too."""
 
 
 def comparison_bound(rule: TriggerRule, weight: Matrix) -> ComparisonBound | None:
@@ -66,12 +68,12 @@ def comparison_bound(rule: TriggerRule, weight: Matrix) -> ComparisonBound | Non
         return _of_mixed_form(rule.form, weight)
     P, N = up[:, n:], down[:, :n]
     if np.array_equal(P, weight):
-        return ComparisonBound(1.0, (N,) if N.any() else (), 1.0)
+        return ComparisonBound(1.0, (N,) if N.any() else (), 1.0, bool(N.any()))
     if not _is_definite(P.T @ P, 1.0):
         return None
     size = float(np.linalg.norm(weight @ np.linalg.pinv(P), 2)) * _ROUNDING
     least = 1 / (float(np.linalg.norm(P @ np.linalg.inv(weight), 2)) * _ROUNDING)
-    return ComparisonBound(size, (size * N,) if N.any() else (), least)
+    return ComparisonBound(size, (size * N,) if N.any() else (), least, bool(N.any()))
 
 
 def _of_mixed_form(form: QuadraticForm, weight: Matrix) -> ComparisonBound | None:
@@ -88,7 +90,7 @@ def _of_mixed_form(form: QuadraticForm, weight: Matrix) -> ComparisonBound | Non
     F = np.linalg.cholesky(Q[n:, n:]).T
     size = float(np.linalg.norm(weight @ np.linalg.inv(F), 2)) * _ROUNDING
     shares = (size * C, _ROUNDING * weight @ J)
-    return ComparisonBound(size, tuple(S for S in shares if S.any()), 0.0)
+    return ComparisonBound(size, tuple(S for S in shares if S.any()), 0.0, bool(C.any()))
 
 
 def _is_definite(Q: Matrix, size: float) -> bool:
@@ -118,6 +120,8 @@ class TriggerBounds:
     weight: Matrix
     fastest_per_s: float
     """Rate of the model's fastest mode."""
+    largest: float = math.inf
+    """A bound of the ‖W x‖ that the rule compares, if one is known."""
 
     @cached_property
     def comparison(self) -> ComparisonBound | None:
@@ -205,9 +209,13 @@ class TriggerBounds:
         if self.comparison is not None:
             if reached is not None:
                 reached = reached * self.comparison.least / self.comparison.size or None
-            shares = dict.fromkeys(self.outputs, 1.0)
+            shares = {**dict.fromkeys(self.outputs, 1.0), **self._slope(level)}
+            # Of the trapezoids of tests that may be missing, the oldest may count most.
+            is_mean = self.area > 0 and h_s == conditions.spacing_s
             for ago_s, beta, least in self._levels(conditions, level, reached):
-                bounds.append(TriggerBound(beta, least, shares, untested_s, ago_s=ago_s))
+                bound = TriggerBound(beta, least, shares, untested_s, ago_s=ago_s, is_mean=is_mean)
+                # What enters is followed if there is one growth; two growths are smaller.
+                bounds += [bound._replace(is_one_growth=True), bound] if untested_s else [bound]
         if math.isfinite(due_s):
             bounds.append(TriggerBound(0.0, None, {}, due_s - h_s, is_tested=False))
         if not bounds:
@@ -267,6 +275,19 @@ class TriggerBounds:
             bounds.append(f"the next event at the latest {longest_s:g} s after the last one")
         return "; ".join(bounds)
 
+    @property
+    def has_chord(self) -> bool:
+        """Whether a known bound of x makes that of e_s smaller."""
+        return self.comparison is not None and self.comparison.has_root and self.is_constant
+
+    def _slope(self, level: float) -> Mapping[str, float]:
+        """Return a smaller factor of the first share: (f² + s²)^½ is below its chord over [0, S]."""
+        if not self.has_chord or math.isinf(self.largest):
+            return {}
+        name, S = next(iter(self.outputs.items()))
+        most = self.largest * float(spectral_norm(S @ np.linalg.inv(self.weight))) * _ROUNDING
+        return {name: (math.hypot(level, most) - level) / most * _ROUNDING}
+
     def _levels(
         self, conditions: NetworkConditions, level: float, reached: float | None
     ) -> list[tuple[float, float, float | None]]:
@@ -317,10 +338,16 @@ class ErrorGrowth:
 
     Then ‖e_s‖_W ≤ ``fixed`` + ``estimation`` η + Σ_C ``shares``_C sup‖C x‖ =: b. Until the next
     test, sup‖e_s‖_W ≤ ``stretch`` b + ``driven`` · (sup‖p‖, sup‖R_E x‖, 1).
+
+    ``ages_s``: b bounds the mean of ‖e_s‖_W over the times so long ago; by default ``longest_s``.
     """
 
-    def __init__(self, plant: PlantGains, longest_s: float, after: TriggerBound) -> None:
+    def __init__(
+        self, plant: PlantGains, longest_s: float, after: TriggerBound, ages_s: Vector | None = None
+    ) -> None:
         outputs = plant.outputs
+        self.ages_s = np.array([longest_s]) if ages_s is None else ages_s
+        self.mean_s, self.highest = float(self.ages_s.mean()), np.zeros(())
         self.longest_s, self.stretch = longest_s, plant.error.stretch(longest_s)
         self.fixed, self.shares = after.beta, after.shares
         # The trigger tests x_s − x̂, and may compare it with x̂.
@@ -331,17 +358,32 @@ class ErrorGrowth:
         still = np.zeros(())
         self.driven: tuple[Vector, Vector, Vector] = (still, still, still)
         if longest_s > 0:
-            self.driven = plant.growth(longest_s, COARSE_CELLS).totals
+            growth = plant.growth(longest_s, COARSE_CELLS)
+            self.driven, self.highest = growth.means(self.ages_s), growth.input_error.sup_on_grid()
 
 
 def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[ErrorGrowth]:
-    """Return the growth from the bound after a test, and from 0 after an event."""
+    """Return how e_s grows after a test, and from 0 after an event, or one growth for both."""
+    tested_s, untested_s = sampling_s + bound.ago_s, sampling_s + bound.untested_s
+    if bound.is_one_growth:
+        return [ErrorGrowth(plant, max(tested_s, untested_s), bound)]
     growths = []
     if bound.is_tested:
-        growths.append(ErrorGrowth(plant, sampling_s + bound.ago_s, bound))
+        growths.append(ErrorGrowth(plant, tested_s, bound, _mean_ages_s(bound, sampling_s)))
     if bound.untested_s > 0 or not bound.is_tested:
-        growths.append(ErrorGrowth(plant, sampling_s + bound.untested_s, TriggerBound(0.0, None)))
+        growths.append(ErrorGrowth(plant, untested_s, TriggerBound(0.0, None)))
     return growths
+
+
+def _mean_ages_s(bound: TriggerBound, sampling_s: float) -> Vector | None:
+    """Return the ages of the e_s of which the bound is that of a mean, at most, if it is one."""
+    if not (bound.is_mean and bound.ago_s):
+        return None
+    if sampling_s == 0:
+        return bound.ago_s * np.arange(1, COARSE_CELLS + 1) / COARSE_CELLS
+    # The trapezoid of the two tests i and i + 1 before the last one.
+    tests = np.arange(1, round(bound.ago_s / sampling_s) + 1)
+    return sampling_s * np.concatenate([tests, tests + 1])
 
 
 def first_passage_s(

@@ -25,10 +25,12 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part, TriggerBound
 from noack.theory.bounds.trigger_bounds import TriggerBounds
-from noack.theory.certificates.solution import Problem, Search
+from noack.theory.certificates.solution import Problem, Search, sharpened
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
+_CHORDS = 2
+"""So often the chord of a threshold is shortened by the bound of x that it has given."""
 Added = tuple[Constants, Constants | None]
 """Constants whose bounds are added."""
 _RATES = (0.05, 0.2, 0.4, 0.7)
@@ -82,17 +84,35 @@ class DisturbedCertificate:
                 return [two]
             except NotDecayingError:
                 pass
+        found = yield from self._of_other_thresholds(conditions, decays=decays, longest=longest)
+        for _ in range(_CHORDS if longest and self.trigger.has_chord else 0):
+            sizes = [
+                sum(one.state_weighted + one.estimation_error for one in pair if one is not None)
+                for pair in found
+            ]
+            known = replace(self, trigger=replace(self.trigger, largest=min(sizes)))
+            found = yield from known._of_other_thresholds(conditions, decays=decays, longest=longest)
+        return found
+
+    def _of_other_thresholds(
+        self, conditions: NetworkConditions, *, decays: bool, longest: bool
+    ) -> Search[list[Added]]:
+        """Search for the constants of a threshold that does not decay, or more slowly than the loop.
+
+        Raises: as :meth:`constants`.
+        """
         level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
         bound = self.trigger.bound(conditions, level, floor or None)
-        part = self._together._replace(bound=bound)
-        (constants,) = yield Problem((part,), conditions, self.start_error, structured, longest)
+        part, structured = self._together._replace(bound=bound), self.start_error == 0.0
+        problem = Problem((part,), conditions, self.start_error, structured, longest)
+        constants = yield from sharpened(problem)
         # The mean of an integral bounds e_s over a time that suits only one of several parts.
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
         divided: list[Added] = []
         if decays and is_divided and longest:
             apart_s = constants.inter_event_s or 0.0
             divided = yield from self._of_constant_threshold(conditions, apart_s)
-        return divided or [(constants, None)]
+        return [*divided, (constants, None)]
 
     def with_plants(self, first: Constants, rest: Constants | None) -> Sequence[tuple[PlantGains, Constants]]:
         """Return constants of :meth:`constants` with the plants of their parts."""

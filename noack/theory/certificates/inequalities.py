@@ -30,14 +30,12 @@ misses g by r, adding w max r/(w − F w) is enough.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
 from noack.theory.bounds.terms import Constants, NetworkConditions, Part
@@ -46,7 +44,7 @@ from noack.theory.certificates.loss_accumulation import LossAccumulation
 
 _SIGNALS = 6
 _HELD, _INPUT, _ONE = (np.eye(_SIGNALS)[place] for place in (0, 3, 5))
-_MOST_STAGES = 16
+MOST_STAGES = 16
 """With more missing events π is used for all of them."""
 _EPSILON = float(np.finfo(float).eps)
 
@@ -150,29 +148,6 @@ class LoopConstants(NamedTuple):
         return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **own)
 
 
-@dataclass
-class KnownBounds:
-    """Bounds of one loop that hold, each of which may be replaced by a smaller one."""
-
-    signals: Vector
-    """Of (q, b, η, π, sup‖R_E x‖, 1), or β̃ for b."""
-    states: dict[str, float]
-    """Of sup‖C x‖."""
-    errors: dict[Output, float]
-    """Of sup‖C e_c‖."""
-    sensor: float = math.inf
-    """Of β̃ = sup‖e_s‖_W."""
-    earlier: float = math.inf
-    """Of the part of ‖u − Kx‖ that does not come from the present e_s."""
-    received: float = math.inf
-    """Of ‖u − Kx‖ while no event is missing."""
-
-    @property
-    def input_error(self) -> float:
-        """π."""
-        return self.errors[Output.GAIN] + float(self.signals[0])
-
-
 class ErrorInequalities:
     """The inequalities of one part, and their solution for assumed spacings of events.
 
@@ -191,6 +166,7 @@ class ErrorInequalities:
             output: Coefficients(free + start[output], gain) for output, (free, gain) in plant.states.items()
         }
         self._growths = [list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every]
+        self._begin_s = math.inf if earlier_error else conditions.start_s
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
@@ -215,13 +191,7 @@ class ErrorInequalities:
         if conditions.delay_s > 0:  # without a spacing, any number of updates may be in flight
             events[is_spaced] += np.ceil(conditions.delay_s / spacing_s[is_spaced]).astype(np.int64)
         is_counted = is_spaced | (conditions.delay_s == 0)
-        solved: list[tuple[_Signals, Vector, Matrix]] = []
-        for growths in self._growths:  # all bounds of e_s hold; of each, one growth applies
-            own = growths[0] if len(growths) == 1 and self._error.decays else None
-            signals = self._signals(method, events, spacing_s, own)
-            each = [self._solved(signals, growth, own) for growth in growths]
-            gain = np.max([one.loop_gain for one in each], axis=0)
-            solved.append((signals, gain, np.max([one.bound for one in each], axis=0)))
+        solved = self._solutions(method, events, spacing_s)
         smallest = np.min([bound for _, _, bound in solved], axis=0)
         gain = np.where(is_counted, np.min([gain for _, gain, _ in solved], axis=0), np.inf)
         found = []
@@ -230,6 +200,19 @@ class ErrorInequalities:
             found.append(self._found(signals, events, gain, bound, is_counted))
         exists = np.any([one.exists for one in found], axis=0)
         return LoopConstants(*map(np.fmin.reduce, zip(*found, strict=True)))._replace(exists=exists)
+
+    def _solutions(
+        self, method: BoundMethod, events: Counts, spacing_s: Vector
+    ) -> "list[tuple[_Signals, Vector, Matrix]]":
+        """Return the signals, the loop gains and the bounds of all signals for each bound of e_s."""
+        solved = []
+        for growths in self._growths:  # all bounds of e_s hold; of each, one growth applies
+            own = growths[0] if len(growths) == 1 and self._error.decays else None
+            signals = self._signals(method, events, spacing_s, own)
+            each = [self._solved(signals, growth, own) for growth in growths]
+            gain = np.max([one.loop_gain for one in each], axis=0)
+            solved.append((signals, gain, np.max([one.bound for one in each], axis=0)))
+        return solved
 
     def _found(
         self,
@@ -270,8 +253,6 @@ class ErrorInequalities:
         events: Counts,
         spacing_s: Vector,
         own: ErrorGrowth | None,
-        *,
-        staged: bool = True,
     ) -> "_Signals":
         """Return how all outputs depend on (q, b, η, π, sup‖R_E x‖, 1).
 
@@ -279,23 +260,29 @@ class ErrorInequalities:
         event's x_s − x̂ is at most this plus η, the present x_s − x is at most this.
         """
         held, test, estimated, *_ = np.eye(_SIGNALS)
-        sensor = test if own is None else _columns(0.0, own.stretch, 0.0, *own.driven)
-        present = {output: self._present(output, own) for output in self._error.outputs}
-        received, dropouts = present[Output.GAIN], np.full_like(events, self._conditions.dropouts)
-        drifts = method is BoundMethod.DRIFTING
-        if drifts:  # d ago, e_c consisted of e_s and of the errors of events that are lost.
-            delay_s = self._conditions.delay_s
-            present = {output: self._present(output, own, delay_s) for output in present}
-        counted = dropouts if drifts else events
-        stages = self._stages(present[Output.GAIN], counted, spacing_s, own) if staged else None
-        gone = {output: self._missing(output, counted, spacing_s, own, stages) for output in present}
-        errors = {output: row + gone[output] for output, row in present.items()}
+        sensor = test
+        if own is not None:
+            sensor = self._begun(_columns(0.0, own.stretch, 0.0, *own.driven), own.highest)
+        counted, flying = events, events - self._conditions.dropouts
+        now = present = {output: self._present(output, own) for output in self._error.outputs}
+        if drifts := method is BoundMethod.DRIFTING:
+            # d ago, e_c consisted of e_s and of the errors of events that are lost.
+            counted, flying = events - flying, 0 * events
+            present = {output: self._present(output, own, self._conditions.delay_s) for output in now}
+
+        def with_missing(
+            output: Output, present: Matrix, count: Counts, stages: _Stages | None = None
+        ) -> Matrix:
+            return self._with_missing(output, present, count, spacing_s, own, stages)
+
+        stages = self._stages(present[Output.GAIN], counted, spacing_s, own)
+        errors = {output: with_missing(output, row, counted, stages) for output, row in present.items()}
         whole = errors[Output.GAIN]
-        earlier, near = (whole, present[Output.GAIN]) if drifts else (gone[Output.GAIN], received)
+        earlier = whole if drifts else with_missing(Output.GAIN, 0 * _ONE, counted, stages)
+        received = with_missing(Output.GAIN, now[Output.GAIN], 0 * events)
+        near = with_missing(Output.GAIN, present[Output.GAIN], flying)
         lost = self._missing_gain(Output.GAIN, counted, spacing_s)
-        if not drifts:
-            near = near + self._missing(Output.GAIN, events - dropouts, spacing_s, own)
-            lost = lost - self._missing_gain(Output.GAIN, events - dropouts, spacing_s)
+        lost = lost - self._missing_gain(Output.GAIN, flying, spacing_s)
         alone = self._alone(lost, spacing_s)
         states = []
         for name, (_, gain) in self._states.items():
@@ -317,34 +304,43 @@ class ErrorInequalities:
         until_s, still = later_s + (0.0 if own is None else own.longest_s), np.zeros(())
         driven: tuple[Vector, Vector, Vector] = (still, still, still)
         if until_s > 0:
-            driven = self._plant.growths(until_s, COARSE_CELLS)[output].totals
+            growth = self._plant.growths(until_s, COARSE_CELLS)[output]
+            driven = growth.totals if own is None else growth.means(own.ages_s + later_s)
         return _columns(0.0, self._error.now_until(until_s)[output], 0.0, *driven)
 
-    def _missing(
+    def _with_missing(
         self,
         output: Output,
+        present: Matrix,
         events: Counts,
         spacing_s: Vector,
         own: ErrorGrowth | None,
         stages: "_Stages | None" = None,
     ) -> Matrix:
-        """Return the bound of the part of sup‖C e_c‖ from missing events as a row of the signals.
+        """Return the bound of sup‖C e_c‖ as a row of the signals, given that of e_s, ``present``.
 
         The part of e_s that has grown since the last test is followed from where it entered.
         """
         gain = self._missing_gain(output, events, spacing_s)
-        if own is None:
-            return _columns(0.0, gain, gain, 0.0, 0.0, 0.0)
-        driven = [gain * size for size in own.driven]
-        if own.longest_s > 0:
+        driven: list[Vector | float] = [0.0] * 3 if own is None else [gain * size for size in own.driven]
+        if own is not None and own.longest_s > 0:
             for place, kernel in enumerate(self._plant.driven[output]):
-                followed = own.longest_s * sum_of_sups(kernel, events, spacing_s)
+                followed = own.mean_s * sum_of_sups(kernel, events, spacing_s)
                 driven[place] = np.minimum(driven[place], followed)
-        row = _columns(0.0, gain, gain, *driven)
-        if stages is not None:
-            row[..., 3] = 0.0
-            row = row + stages.entered(*self._entered(output, len(stages.inputs), spacing_s, own), events)
+        highest = self._plant.driven[output][0].sup() if self._error.decays else 0.0
+        row = self._begun(present + _columns(0.0, gain, gain, *driven), highest)
+        if stages is not None and own is not None:
+            row[..., 3] = present[..., 3]
+            row += stages.entered(*self._entered(output, len(stages.inputs), spacing_s, own), events)
         return row
+
+    def _begun(self, row: Matrix, highest: Vector | float) -> Matrix:
+        """Add what enters before the first input, where ‖p‖ is not bounded by π.
+
+        ``highest`` bounds what a p of 1 adds in a unit of time.
+        """
+        begun = np.fmin(row[..., 3], self._begin_s * highest)
+        return np.asarray(row + (self._beyond * begun)[..., None] * _ONE)
 
     def _entered(
         self, output: Output, count: int, spacing_s: Vector, own: ErrorGrowth
@@ -358,7 +354,7 @@ class ErrorInequalities:
         ages_s = spacing_s[:, None] * np.arange(count)
         sups = np.broadcast_to(self._plant.driven[output][0].sups(ages_s), ages_s.shape).T
         gains = self._error.kernels[output].sups(ages_s).T
-        return np.minimum(gains * own.driven[0], own.longest_s * sups), sups
+        return np.minimum(gains * own.driven[0], own.mean_s * sups), sups
 
     def _stages(
         self, present: Matrix, events: Counts, spacing_s: Vector, own: ErrorGrowth | None
@@ -370,20 +366,19 @@ class ErrorInequalities:
         from missing events.
         """
         count, delay_s = int(events.max(initial=0)), self._conditions.delay_s
-        if own is None or own.longest_s == 0 or not 0 < count <= _MOST_STAGES or not spacing_s.all():
+        if own is None or own.longest_s == 0 or not 0 < count <= MOST_STAGES or not spacing_s.all():
             return None
         sizes, sups = self._entered(Output.GAIN, count, spacing_s, own)
         shape = len(spacing_s), _SIGNALS
         late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own.longest_s)
-        still, highest = np.zeros(shape), float(np.max(self._plant.driven[Output.GAIN][0].sup()))
+        highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
         stages = _Stages(np.zeros((0, *shape)), late_s)
-        beyond = np.broadcast_to(self._beyond, spacing_s.shape)[:, None] * _ONE
         for number in range(count):
             counts = np.full_like(events, number)
-            row = present + _HELD + beyond + self._missing(Output.GAIN, counts, spacing_s, own)
+            row = _HELD + self._with_missing(Output.GAIN, present, counts, spacing_s, own)
             late = np.minimum(present[..., 3], highest * (delay_s - number * spacing_s).clip(min=0.0))
             row[..., 3] = late
-            row = row + (stages.entered(sizes, sups, counts) if number else still)
+            row = row + stages.entered(sizes, sups, counts)
             left = 1 - (present[..., 3] - late)[..., None]
             row = np.where(left > 0, row / np.where(left > 0, left, 1.0), _INPUT)
             stages = stages._replace(inputs=np.concatenate([stages.inputs, row[None]]))
@@ -408,57 +403,13 @@ class ErrorInequalities:
         through, free = signals.through(growing.shares)
         of_test = (through + growing.estimation * estimated, growing.fixed + free)
         if own is None:
-            by_input, mismatched, forced = growing.driven
-            of_test = (
-                growing.stretch * of_test[0] + _columns(0.0, 0.0, 0.0, by_input, mismatched, 0.0),
-                growing.stretch * of_test[1] + forced,
-            )
-        others = ((input_error, beyond), of_mismatch, (0.0 * input_error, 1.0))
+            driven = self._begun(_columns(0.0, 0.0, 0.0, *growing.driven), growing.highest)
+            of_test = growing.stretch * of_test[0] + driven, growing.stretch * of_test[1]
+        others = ((input_error, 0.0), of_mismatch, (0.0 * input_error, 1.0))
         each = (of_age, of_test, of_estimate, *others)
         rows = _rows(*(row for row, _ in each))
         right = _columns(*(right for _, right in each))
         return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
-
-    def known(self, spacing_s: float) -> KnownBounds:
-        """Return the bounds of one loop with one bound of e_s; infinite without a certificate."""
-        (growths,) = self._growths
-        own = growths[0] if len(growths) == 1 else None
-        solved = [
-            np.max([self._solved(signals, one, own).bound[0] for one in growths], axis=0)
-            for signals in self._each_method(spacing_s)
-        ]
-        states, errors = (
-            dict.fromkeys(self._states, math.inf),
-            dict.fromkeys(self._error.outputs, math.inf),
-        )
-        return KnownBounds(np.min(solved, axis=0), states, errors)
-
-    def insert(self, known: KnownBounds, spacing_s: float) -> None:
-        """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
-        (growths,), v, states, errors = self._growths, known.signals, known.states, known.errors
-        for method in self._each_method(spacing_s):
-            for output, row in method.errors.items():
-                errors[output] = min(errors[output], float(row[0] @ v))
-            known.sensor = min(known.sensor, float(method.sensor @ v))
-            known.received = min(known.received, float(method.received @ v + v[0]))
-        known.earlier = min(known.earlier, float(method.earlier[0] @ v + v[0]))
-        for name, (free, gain) in self._states.items():
-            states[name] = min(states[name], float(free + gain * known.input_error))
-        age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
-        driven = np.array([v[3], v[4], 1.0])
-        tested = []
-        for growth in growths:
-            b = growth.fixed + sum(share * states[C] for C, share in growth.shares.items())
-            grown = growth.stretch * b + float(np.array(growth.driven) @ driven)
-            tested.append(b if len(growths) == 1 else grown)
-        beyond = max(known.input_error, self.start_error)
-        found = [age, max(tested), 0.0, beyond, states[Output.MISMATCH], 1.0]
-        known.signals = np.minimum(v, np.array(found, dtype=np.float64))
-
-    @property
-    def start_error(self) -> float:
-        """sup‖u − Kx‖ of one loop before the first input."""
-        return float(self._beyond)
 
     @property
     def age_gains(self) -> Mapping[Output, float]:
@@ -469,32 +420,6 @@ class ErrorInequalities:
             Output.GAIN_CURVATURE: hold_s**2 / 2,
             Output.WEIGHTED: self._remainder,
         }
-
-    def next_event_s(self, known: KnownBounds) -> float:
-        """Return the time between two events that follows from bounds; 0 if there is none."""
-        if all(bound.reached is None for bound in self._bound.every):
-            return 0.0
-        still, never = np.zeros(1), np.zeros(1, dtype=bool)
-        events = np.zeros(1, dtype=np.int64)
-        mismatch, earlier = known.signals[4:5], still + known.earlier
-        before, after = (still,) * 6, (still,) * 3
-        constants = LoopConstants(events, *before, mismatch, *after, earlier, ~never)
-        return float(self.inter_event_s(constants, never, ~never)[0])
-
-    @cached_method
-    def _each_method(self, spacing_s: float) -> "list[_Signals]":
-        """Return the signals by each method, the one by missing events last."""
-        conditions, events = self._conditions, np.full(1, self._conditions.dropouts)
-        if conditions.delay_s > 0:
-            events = events + math.ceil(conditions.delay_s / spacing_s)
-        growths = self._growths[0]
-        own = growths[0] if len(growths) == 1 else None
-        spacing = np.array([spacing_s])
-        return [
-            self._signals(method, events, spacing, own, staged=staged)
-            for method in self.methods
-            for staged in (False, True)
-        ]
 
     def _missing_gain(self, output: Output, events: Counts, spacing_s: Vector) -> Vector:
         if self._error.decays or math.isinf(self._bound.due_s):

@@ -7,6 +7,11 @@ changes: e_c begins with what has entered within d, at most ``late``, and q driv
 (BU, −BU). Both are bounded by the certificate's constants; what they change is added to every
 bound. Each bound that becomes smaller is inserted into all others.
 
+The inequalities have one bound of e_s in each row, so that they stay linear. Inserted bounds need not:
+for each error and output the smallest of all bounds of e_s counts, and where e_s may have grown in
+two ways, from a test or from an event, the larger one of them. What entered before the i-th missing
+event is bounded by π_i, the bound of ‖p‖ while at most i events are missing.
+
 **The next event.** After an event e_s begins at 0. If updates act at once and no input is held, it
 is C_r z(t_k) after r, C_r = (0, I) e^{Fr} − e^{(H+αI)r} (0, I), as long as no update is received.
 At the event z(t_k) is (ξ, 0), or up to it ‖e_c‖_W ≤ D', since one event less is missing than may
@@ -15,16 +20,18 @@ time.
 """
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from noack.core.linear_systems import Vector, spectral_abscissa
+from noack.core.cached_method import cached_method
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.bounds.contraction import spectral_norm
-from noack.theory.bounds.gains import Output
+from noack.theory.bounds.gains import Output, PlantGains
 from noack.theory.bounds.terms import MEASURED, Constants, NetworkConditions, Part
-from noack.theory.bounds.trigger_bounds import COARSE_CELLS
+from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth
 from noack.theory.certificates.delivery_flow import (
     ROUNDING,
     Disturbed,
@@ -34,7 +41,7 @@ from noack.theory.certificates.delivery_flow import (
     error_after,
     errors_after_losses,
 )
-from noack.theory.certificates.inequalities import ErrorInequalities
+from noack.theory.certificates.inequalities import MOST_STAGES, BoundMethod, ErrorInequalities, LoopConstants
 from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
 
 _ROUNDS, _SETTLED = 20, 0.99
@@ -47,10 +54,9 @@ def is_scheduled_flow(part: Part, conditions: NetworkConditions) -> bool:
     """Return whether the constants of a loop without inputs can be sharpened."""
     error, plant, bound, estimation = part
     is_known = plant.is_one_plant and plant.forcing is None and estimation == MEASURED
-    is_tested = bound.is_tested and not bound.also and not bound.ago_s
     return (
         is_known
-        and is_tested
+        and bound.is_tested
         and plant.alpha_per_s == error.alpha_per_s
         and spectral_abscissa(error.scaled_H) < 0
     )
@@ -93,7 +99,7 @@ class _ScheduledFlow:
 
     def __init__(self, part: Part, conditions: NetworkConditions, spacing_s: float) -> None:
         self._part, self._conditions, self.spacing_s = part, conditions, spacing_s
-        self._step = ErrorInequalities(part, conditions, 0.0)
+        self._step = _Inserted(part, conditions, 0.0)
         self.known = self._step.known(spacing_s)
         self._late_s = max(conditions.delay_s, conditions.start_s)
         self._errors: Vector | None = None
@@ -164,8 +170,10 @@ class _ScheduledFlow:
             float(error.missing(Output.WEIGHTED, lost, self.spacing_s))
             for lost in range(conditions.dropouts + 1)
         ]
-        plain, level = (1 + np.array(missing)) * known.sensor, self._part.bound.reached
+        plain, bound = (1 + np.array(missing)) * known.sensor, self._part.bound
         errors = plain if self._errors is None else np.minimum(plain, self._errors)
+        is_level = bound.forced_s == math.inf and not bound.ago_s  # otherwise an event needs no e_s
+        level = bound.reached if is_level else None
         bend = 0.0 if level is None else bend_of_error(reach, level)
         if level is not None and reach.by.is_none:
             at_event = max(float(errors_at_events(errors)[-1]), _LEAST_SHARE * reach.limit)
@@ -176,7 +184,7 @@ class _ScheduledFlow:
         errors = errors_after_losses(reach, errors, known.sensor, level, self.spacing_s, kernel, bend)
         self._errors = errors
         _, _, _, input_error, mismatch, _ = known.signals.tolist()
-        entered = self._entered(conditions.delay_s, input_error, mismatch)
+        entered = self._entered(conditions.delay_s, max(input_error, self._step.start_error), mismatch)
         return error.stretch(conditions.delay_s) * float(errors[-1]) + entered
 
 
@@ -210,3 +218,208 @@ def _next_event_s(at_events: Reach, level: float, known_s: float, bend: float) -
         slope = (later - size) / step_s
         found_s, size = found_s + step_s, later
     return found_s
+
+
+class _ErrorsByNumber:
+    """The gains of the errors of one loop, of events ``spacing_s`` apart, of which ``count`` are missing.
+
+    The present e_s is followed for ``later_s``, as if nothing reset it. ``growths``: how e_s may grow
+    under each bound of it. Axes are named o, output; g, growth; m, newer missing events; i, older ones.
+    """
+
+    def __init__(
+        self,
+        plant: PlantGains,
+        growths: Sequence[Sequence[ErrorGrowth]],
+        delay_s: float,
+        begin_s: float,
+        spacing_s: float,
+        count: int,
+        later_s: float,
+    ) -> None:
+        error, each = plant.error, [growth for row in growths for growth in row]
+        self.count = count
+        self._ends = np.cumsum([0, *map(len, growths)])
+        self._is_staged = 0 < count <= MOST_STAGES
+        numbers = np.arange(count + 1, dtype=np.float64)
+        ages_s = spacing_s * numbers[:-1]
+        self._gains = np.array([error.kernels[C].sups(ages_s) for C in error.outputs])
+        """(o, m)"""
+        kernels = [plant.driven[C] for C in error.outputs]
+        by_input, mismatched = (np.array([pair[k].sups(ages_s) for pair in kernels]) for k in (0, 1))
+        grown = np.array([growth.driven[:2] for growth in each])
+        means_s, longest_s = np.array([(growth.mean_s, growth.longest_s) for growth in each]).T
+        self._entered, self._mismatched = (
+            np.minimum(self._gains[:, None] * grown[:, k, None], means_s[:, None] * sups[:, None])
+            for k, sups in enumerate((by_input, mismatched))
+        )
+        """(o, g, m): of what enters before a missing event."""
+        in_flight_s = np.maximum(delay_s - spacing_s * numbers, 0.0)
+        late_s = np.minimum(in_flight_s[:-1], longest_s[:, None])
+        late = late_s[:, None] * by_input[:, None, :, None]
+        self._late = np.minimum(self._entered[..., None], late if self._is_staged else np.inf)
+        """(o, g, m, i): the part that may have entered while an update was in flight."""
+        now, highest = [error.now_until(later_s + g.longest_s) for g in each], [k.sup() for k, _ in kernels]
+        self._now = np.array([[gains[C] for gains in now] for C in error.outputs])
+        """(o, g)"""
+        driven = np.zeros((len(kernels), len(each), 2))
+        for place, growth in enumerate(each):
+            if (until_s := later_s + growth.longest_s) > 0:
+                followed = plant.growths(until_s, COARSE_CELLS)
+                means = [followed[C].means(growth.ages_s + later_s)[:2] for C in error.outputs]
+                driven[:, place] = means
+        self._now_entered, self._now_mismatched = driven[..., 0], driven[..., 1]
+        late = np.array(highest)[:, None, None] * in_flight_s
+        self._now_late = np.minimum(self._now_entered[..., None], late if self._is_staged else np.inf)
+        """(o, g, j)"""
+        self._begun = np.fmin(
+            begin_s * np.array(highest)[:, None],
+            np.cumsum([self._now_entered.max(axis=1), *self._entered.max(axis=1).T], axis=0).T,
+        )
+        """(o, j): of what enters before the first input, beyond the bounds of later times."""
+
+    def bound(
+        self, b: Vector, inputs: Vector, input_error: float, mismatch: float, start_error: float
+    ) -> tuple[Matrix, Matrix]:
+        """Bound sup‖C e_c‖ while at most 0, 1, … events are missing, and its part from these, (o, j).
+
+        Given are bounds of ‖e_s‖_W after a test for each growth, of π_i, π and sup‖R_E x‖.
+        """
+        stages = inputs if self._is_staged else np.array([input_error])
+        i = stages[: max(len(stages) - 1, 1)]
+        errors = self._gains[:, None] * b[:, None] + self._mismatched * mismatch
+        errors = errors[..., None] + (self._entered[..., None] - self._late) * i + self._late * input_error
+        errors = self._best(errors)
+        now = self._now * b + self._now_mismatched * mismatch
+        now = now[..., None] + (self._now_entered[..., None] - self._now_late) * stages
+        present = self._best(now + self._now_late * input_error)
+        count, last = errors.shape[1], errors.shape[2] - 1
+        older = np.arange(count)
+        missing = [
+            errors[:, older[:number], np.minimum(number - 1 - older[:number], last)].sum(axis=1)
+            for number in range(count + 1)
+        ]
+        alone = np.array(missing).T + self._begun * max(start_error - float(stages[0]), 0.0)
+        whole = np.broadcast_to(present, alone.shape) + alone
+        return np.maximum.accumulate(whole, axis=1), np.maximum.accumulate(alone, axis=1)
+
+    def _best(self, values: Matrix) -> Matrix:
+        """Return the smallest over all bounds of e_s of the largest over its growths, (o, …)."""
+        rows = [values[:, a:b].max(axis=1) for a, b in zip(self._ends, self._ends[1:], strict=False)]
+        return np.asarray(np.min(rows, axis=0))
+
+
+@dataclass
+class _KnownBounds:
+    """Bounds of one loop that hold, each of which may be replaced by a smaller one."""
+
+    signals: Vector
+    """Of (q, b, η, π, sup‖R_E x‖, 1), or β̃ for b."""
+    states: dict[str, float]
+    """Of sup‖C x‖."""
+    errors: dict[Output, float]
+    """Of sup‖C e_c‖."""
+    sensor: float = math.inf
+    """Of β̃ = sup‖e_s‖_W."""
+    earlier: float = math.inf
+    """Of the part of ‖u − Kx‖ that does not come from the present e_s."""
+    received: float = math.inf
+    """Of ‖u − Kx‖ while no event is missing."""
+    inputs: dict[BoundMethod, Vector] = field(default_factory=dict)
+    """Of ‖p‖ while at most 0, 1, … events are missing."""
+
+    @property
+    def input_error(self) -> float:
+        """π."""
+        return self.errors[Output.GAIN] + float(self.signals[0])
+
+
+class _Inserted(ErrorInequalities):
+    """The inequalities of one loop without disturbances, into which bounds are inserted."""
+
+    def known(self, spacing_s: float) -> _KnownBounds:
+        """Return the bounds of one loop; infinite without a certificate."""
+        spacing, events = np.array([spacing_s]), np.array([self._missing_events(spacing_s)])
+        solved = [
+            bound[0] for method in self.methods for _, _, bound in self._solutions(method, events, spacing)
+        ]
+        infinite = dict.fromkeys(self._states, math.inf), dict.fromkeys(self._error.outputs, math.inf)
+        return _KnownBounds(np.min(solved, axis=0), *infinite)
+
+    def insert(self, known: _KnownBounds, spacing_s: float) -> None:
+        """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
+        v, states, errors = known.signals, known.states, known.errors
+        (held, input_error, mismatch), place = (
+            v[[0, 3, 4]].tolist(),
+            [*self._error.outputs].index(Output.GAIN),
+        )
+        for name, (free, gain) in self._states.items():
+            states[name] = min(states[name], float(free + gain * input_error))
+        growths = [growth for row in self._growths for growth in row]
+        b = np.array([g.fixed + sum(share * states[C] for C, share in g.shares.items()) for g in growths])
+        for method, by_number in self._by_number(spacing_s).items():
+            inputs, before = np.full(by_number.count + 1, input_error), np.inf
+            if len(known.inputs.get(method, ())) == len(inputs):
+                inputs = np.minimum(inputs, known.inputs[method])
+            while (inputs < _NEARLY * before).any():
+                whole, missing = by_number.bound(b, inputs, input_error, mismatch, self.start_error)
+                inputs, before = np.minimum(inputs, whole[place] + held), inputs
+            known.inputs[method] = inputs
+            for output, size in zip(self._error.outputs, whole[:, -1].tolist(), strict=True):
+                errors[output] = min(errors[output], size)
+            if method is BoundMethod.MISSING:
+                known.earlier = min(known.earlier, float(missing[place, -1]) + held)
+                known.received = min(known.received, float(whole[place, 0]) + held)
+        rows = iter(b.tolist())
+        sizes = [max(self._grown(one, next(rows), *v[3:5]) for one in row) for row in self._growths]
+        known.sensor = min(known.sensor, *sizes)
+        age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
+        found_v = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
+        known.signals = np.minimum(v, np.array(found_v, dtype=np.float64))
+
+    def _grown(self, growth: ErrorGrowth, b: float, input_error: float, mismatch: float) -> float:
+        """Return how large e_s may become under one bound."""
+        by_input, mismatched, _ = growth.driven
+        begun = np.fmin(by_input, self._begin_s * growth.highest) * max(self.start_error - input_error, 0.0)
+        return float(growth.stretch * b + by_input * input_error + mismatched * mismatch + begun)
+
+    @cached_method
+    def _by_number(self, spacing_s: float) -> Mapping[BoundMethod, _ErrorsByNumber]:
+        conditions = self._conditions
+        numbers = {
+            BoundMethod.DRIFTING: (conditions.dropouts, conditions.delay_s),
+            BoundMethod.MISSING: (self._missing_events(spacing_s), 0.0),
+        }
+        return {
+            method: _ErrorsByNumber(
+                self._plant,
+                self._growths,
+                conditions.delay_s,
+                self._begin_s,
+                spacing_s,
+                *numbers[method],
+            )
+            for method in self.methods
+        }
+
+    def _missing_events(self, spacing_s: float) -> int:
+        """Return how many events may be missing: lost, or in flight."""
+        conditions = self._conditions
+        flying = math.ceil(conditions.delay_s / spacing_s) if conditions.delay_s > 0 else 0
+        return conditions.dropouts + flying
+
+    @property
+    def start_error(self) -> float:
+        """sup‖u − Kx‖ of one loop before the first input."""
+        return float(self._beyond)
+
+    def next_event_s(self, known: _KnownBounds) -> float:
+        """Return the time between two events that follows from bounds; 0 if there is none."""
+        if all(bound.reached is None for bound in self._bound.every):
+            return 0.0
+        still, never = np.zeros(1), np.zeros(1, dtype=bool)
+        events = np.zeros(1, dtype=np.int64)
+        mismatch, earlier = known.signals[4:5], still + known.earlier
+        before, after = (still,) * 6, (still,) * 3
+        constants = LoopConstants(events, *before, mismatch, *after, earlier, ~never)
+        return float(self.inter_event_s(constants, never, ~never)[0])

@@ -15,7 +15,7 @@ certificates are sufficient only (docs/theory.md, "The margin of a time-triggere
    (``joint_spectral_radius.py``). A cycle of the graph bounds it from below, and is a pattern that
    destabilises the loop if its radius is above 1 (``switched_system.py``). From above it is bounded
    by polytopes that the maps take into each other (``invariant_polytopes.py``), by quadratic norms
-   (``quadratic_norms.py``), and by products of many maps (``branch_and_bound.py``).
+   (``quadratic_norms.py``), and by products of many maps.
 
 A heuristic in floating point searches for the polytopes, norms and cycles. ``exact_matrices.py``
 then verifies what they prove, with all rounding errors included. If the lower bound is below 1 and

@@ -9,6 +9,7 @@ pattern of losses, and of such times, is a path. The edges, with the loop's maps
 (:mod:`noack.theory.margins.switched_system`).
 """
 
+import math
 import time
 from functools import cache
 from typing import NamedTuple
@@ -24,7 +25,6 @@ from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import ACCURACY, MOST_VERTICES, joint_spectral_radius
 from noack.theory.margins.switched_system import Edge
 from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
-from noack.trigger.trigger_rule import NEVER_NS
 
 MOST_EDGES = 5000
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
@@ -321,7 +321,7 @@ def intervals_ns(resolved: Scenario) -> tuple[int, int]:
         CallerError: there is no longest time.
     """
     rule, step_ns = rule_of(resolved), resolved.timing.measurement_period_ns
-    if rule.longest_ns == NEVER_NS:
+    if rule.longest_ns == math.inf:
         raise CallerError(
             f'trigger.policy = "{resolved.trigger.policy}": this needs a longest time '
             "between two events, as periodic and deadline have; use e.g. "

@@ -8,7 +8,7 @@ c log γ + Σ tr P_v − Σ log det F is made small by Newton's method, for larg
 The bound is computed from the norms with all rounding, so it does not depend on the search. It may
 stay above the joint spectral radius. Then there are more norms if the nodes also remember the last
 edges (:func:`remembering`), or products of several steps are shorter than γ^duration
-(:mod:`noack.theory.margins.branch_and_bound`).
+(:func:`~noack.theory.margins.joint_spectral_radius.bound_by_products`).
 """
 
 import math

@@ -7,7 +7,7 @@ import pytest
 
 import noack
 from cosim.analysis.margin_search import find_longest_period, find_margin, undecided_text
-from cosim.cli.command import load_scenario
+from cosim.cli.options import load_scenario
 from noack.core.linear_systems import discretise
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import tomli_w
 
-from cosim.cli import command as cli
+from cosim.cli import options
 from cosim.live import finalize
 from cosim.record.run_directory import SUMMARY_FILE
 from tests.command_line import invoke
@@ -48,7 +48,7 @@ def test_ctrl_c_during_any_command_gives_one_line(line: str, monkeypatch: pytest
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "load_scenario", interrupted)
+    monkeypatch.setattr(options, "load_scenario", interrupted)
     done = invoke(*line.split())
     assert (done.exit_code, done.stdout, done.stderr) == (130, "", INTERRUPTED)
     done = invoke(*line.split(), "--json")

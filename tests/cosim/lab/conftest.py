@@ -8,13 +8,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
 import pytest
 
 from tests.integration import conftest as live
-from tools.screenshot_recording import Browser
+from tools.screenshot_recording import EMULATED_CARD, Browser
 
 SLIDERS = "document.querySelectorAll('.lab-slider').length"
 _TWO_FRAMES = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
@@ -180,16 +181,29 @@ def address(folder: Path) -> Iterator[str]:
         yield server.address
 
 
-@pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+@contextmanager
+def started(profile: Path, *card: str) -> Iterator[Browser]:
     found = shutil.which("chromium") or shutil.which("google-chrome")
     if found is None or sys.platform != "linux" or not hasattr(os, "fork"):
         pytest.skip("no chromium here")
-    started = Browser(found, str(tmp_path_factory.mktemp("browser")))
+    browser = Browser(found, str(profile), card)
     try:
-        yield started
+        yield browser
     finally:
-        started.close()
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with started(tmp_path_factory.mktemp("browser")) as browser:
+        yield browser
+
+
+@pytest.fixture
+def with_card(tmp_path: Path) -> Iterator[Browser]:
+    """A browser with an emulated graphics card, which draws at a high cost, for rerun's viewer."""
+    with started(tmp_path, *EMULATED_CARD) as browser:
+        yield browser
 
 
 @pytest.fixture

@@ -237,8 +237,8 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
     page.wait(f"[...document.querySelectorAll('.q-select')].some(e => e.innerText.includes({run.name!r}))")
 
 
-def test_a_click_reaches_the_run_while_the_viewer_draws(browser: Browser, address: str) -> None:
-    page = Page(browser, address.partition("?")[0] + "?scenario=lane_following&horizon_s=600")
+def test_a_click_reaches_the_run_while_the_viewer_draws(with_card: Browser, address: str) -> None:
+    page = Page(with_card, address.partition("?")[0] + "?scenario=lane_following&horizon_s=600")
     page.click("live", "button")
     page.press_button("run live")
     page.wait(f"{TEXT}.includes('of 600 s')")
@@ -249,7 +249,7 @@ def test_a_click_reaches_the_run_while_the_viewer_draws(browser: Browser, addres
     page.press_button("kill controller")
     page.wait(f"{log}.includes('controller died: killed by SIGKILL')")
     # The viewer has a process of its own, whose drawing does not keep the page from its clicks.
-    targets = browser.call("Target.getTargets")["targetInfos"]
+    targets = with_card.call("Target.getTargets")["targetInfos"]
     assert any(one["url"].startswith(viewer) for one in targets if one["type"] == "iframe")
     page.press_button("stop")
     page.wait(f"{TEXT}.includes('stopped after ')")

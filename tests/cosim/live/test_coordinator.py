@@ -123,7 +123,7 @@ def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
         "cannot join: the sensor before it may still come back; try again in 8 s"
     )
     token(plane, barrier, None)
-    monkeypatch.setattr(coordinator, "AWAY_S", -1.0)
+    monkeypatch.setattr(coordinator, "LOST_AFTER_S", -1.0)
     barrier.poll()
     assert barrier.failures() == {}
     lose(plane, barrier)

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.measurement.live.live_measurement import ProbeSocket, host_number
-from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeResult, ProbeSender
+from cosim.measurement.live_measurement import ProbeSocket, host_number
+from cosim.measurement.probe_ends import ProbePlan, ProbeReceiver, ProbeResult, ProbeSender
 from noack.core.clock import NS_PER_S
 from noack.protocol.probe_format import PROBE_BYTES, ProbeDatagram, ProbeKind, encode_probe
 

@@ -14,8 +14,8 @@ from matplotlib.legend import Legend
 
 import noack
 from cosim.analysis.value_reduction import QuantileSketch
-from cosim.output import palette
-from cosim.output.figure_description import (
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import (
     Axis,
     FigureDescription,
     Line,
@@ -25,12 +25,12 @@ from cosim.output.figure_description import (
     plain,
     time_axis,
 )
-from cosim.output.figure_drawing import draw
-from cosim.output.figure_files import inline, save_figure, save_figures
-from cosim.output.figure_format import figure_files
-from cosim.output.run_figures import Trajectory, Transmissions, run_figures, states_figure
+from cosim.output.figures.figure_drawing import draw
+from cosim.output.figures.figure_files import inline, save_figure, save_figures
+from cosim.output.figures.figure_format import figure_files
+from cosim.output.figures.run_figures import Trajectory, Transmissions, run_figures, states_figure
+from cosim.output.figures.timing_figures import later_than
 from cosim.output.run_tables import key_numbers
-from cosim.output.timing_figures import later_than
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError

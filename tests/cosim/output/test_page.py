@@ -12,11 +12,11 @@ import pytest
 from cosim.analysis.replay.replay_result import difference
 from cosim.analysis.summary_model import RunSummary
 from cosim.live import finalize as concluding
-from cosim.output import figure_files, report_page
-from cosim.output.figure_description import Axis, Line, Panel, one_panel
-from cosim.output.figure_files import inline
+from cosim.output import report_page
+from cosim.output.figures.figure_description import Axis, Line, Panel, one_panel
+from cosim.output.figures.figure_files import inline
+from cosim.output.figures.run_figures import run_figures
 from cosim.output.report_page import Report, page, write_report
-from cosim.output.run_figures import run_figures
 from cosim.record.run_directory import REPORT_FILE, RunEnding
 from cosim.record.run_record import RunRecord
 from noack.core.errors import ExitStatus
@@ -204,7 +204,7 @@ def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> Non
     figure = one_panel("a", Panel(items=[line], x=Axis(), y=Axis()), 1.0)
     figure = figure.captioned("", 'named "so"')
     assert not Page(inline(figure)).attributes("img")
-    monkeypatch.setattr(figure_files, "_HEAVY_CHARACTERS", 10)
+    monkeypatch.setattr("cosim.output.figures.figure_files._HEAVY_CHARACTERS", 10)
     (image,) = Page(inline(figure)).attributes("img")
     assert image["alt"] == 'named "so"'
     assert (image["src"] or "").startswith("data:image/png;base64,")

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from cosim.record import align
 from cosim.record.align import Reals, bounded_parts
 from cosim.record.run_record import Rows, RunRecord
 
@@ -37,7 +36,4 @@ def flipped(record: RunRecord, table: str, row: int, column: str, bit: int) -> R
 
 def identity_residual(record: RunRecord) -> Reals:
     """The residual of (I1) at each measurement of a run, (k,)."""
-    parts = bounded_parts(record)
-    return np.concatenate(
-        [align.identity_residual(record.scenario, one.aligned, own.missed) for one, own in parts]
-    )
+    return np.concatenate([one.residual for one in bounded_parts(record)])

@@ -9,8 +9,8 @@ from cosim.analysis.replay import replay
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, Fate
-from noack.protocol.wire_format import datagram_bytes
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, SENSOR_MEASUREMENT, Fate
+from noack.protocol.wire_format import HEADER_ROW, datagram_bytes
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed
@@ -118,3 +118,34 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     assert found == replay(other, SharedMachines([*shared.loops[:2], other]))
     assert found.first_difference is not None
     assert found.first_difference.column == "head"
+
+
+def test_updates_report_their_errors_to_a_queue_that_chooses_by_them(crowded: Content) -> None:
+    """Level 128 + 16 k + j stands for shares of the threshold from 2^k (1 + j/16) to the next one."""
+    triggers: Content = {
+        "decaying": {"beta": 0.01, "alpha_per_s": 0.2, "floor": 0.01},
+        "periodic": {"period_s": 0.03},
+        "relative": {"sigma": 0.02},
+        "send_on_area": {"delta_s": 0.002},
+    }
+    loops = [{"name": name, "trigger": {"policy": name, **keys}} for name, keys in triggers.items()]
+    plain = run(crowded, *loops)
+    crowded["network"]["impairments"][0]["discipline"] = {"kind": "maximum_error"}
+    shared = run(crowded, *loops)
+    assert replay(shared.network).bit_exact
+    seen: set[int] = set()
+    for before, record in zip(plain.loops, shared.loops, strict=True):
+        assert not np.ascontiguousarray(before[NETEM_PACKET]["head"]).view(HEADER_ROW)["error_level"].any()
+        assert replay(record).bit_exact
+        events = record[SENSOR_MEASUREMENT][record[SENSOR_MEASUREMENT]["event"] >= 0]
+        levels = np.ascontiguousarray(record[NETEM_PACKET]["head"]).view(HEADER_ROW)["error_level"]
+        assert levels[0] == 255  # the controller knows nothing yet
+        sides = zip(events["e_s_norm"], events["compared"], events["threshold"], strict=True)
+        for level, (error, left, right) in list(zip(levels.tolist(), sides, strict=True))[1:]:
+            share = left / right if right else error  # a periodic trigger has no threshold
+            least, following = (2.0 ** (k // 16 - 8) * (1 + k % 16 / 16) for k in (level, level + 1))
+            assert level == 1 or least <= share
+            assert level == 255 or share < following
+            seen.add(level)
+    assert min(seen) < 120
+    assert max(seen) > 136

@@ -28,7 +28,7 @@ from tests.wire_decoder import Decoder
 SCENARIOS = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
 RANDOM = 96
 """Random scenarios: 8 of each trigger policy."""
-LONGEST_S = 4.0
+LONGEST_S = 2.0
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)

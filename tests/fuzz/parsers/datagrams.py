@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 
-from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeSender
+from cosim.measurement.probe_ends import ProbePlan, ProbeReceiver, ProbeSender
 from noack.core.errors import PeerError
 from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection, loop_number, read_header
@@ -65,17 +65,18 @@ def _sound(choices: Choices, encoder: Encoder, flow: Flow, dimension: int) -> by
     sequence, t_ns = choices.integer() % 2**64, choices.integer()
     t_ns = (t_ns + 2**63) % 2**64 - 2**63
     vector = np.array([choices.real() for _ in range(dimension)])
-    return encoder.encode(Message(flow, sequence, t_ns, vector))
+    return encoder.encode(Message(flow, sequence, t_ns, vector, error_level=choices.one([0, 128])))
 
 
 def _odd(choices: Choices, dimension: int) -> bytes:
     """Return a datagram with the correct key but any header or any content length."""
     magic, version = choices.one([b"NA", b"NB", b"\0\0"]), choices.one([1, 0, 2, 255])
-    flow, n = choices.one([1, 2, 3, 4, 0, 5, 255]), choices.one([dimension, 0, 1, 64, 65, 65_535])
+    flow, n = choices.one([1, 2, 3, 4, 0, 5, 255]), choices.one([dimension, 0, 1, 64, 65, 255])
     loop, run = choices.one([0, 1, 65_535]), choices.one([RUN, RUN ^ 1, 0])
+    level = choices.one([0, 1, 255])
     sequence, t_ns = choices.integer() % 2**64, choices.integer() % 2**63
     numbers = choices.one([dimension, n % 65, 0])
-    content = struct.pack("<2sBBHHQQq", magic, version, flow, n, loop, run, sequence, t_ns)
+    content = struct.pack("<2sBBBBHQQq", magic, version, flow, n, level, loop, run, sequence, t_ns)
     content += struct.pack(f"<{numbers}d", *(choices.real() for _ in range(numbers)))
     content += choices.take(choices.one([0, 0, 1, 8]))
     return content + _tag(content)
@@ -102,7 +103,7 @@ def _is_sound(datagram: bytes, flow: Flow, dimension: int, newest: int) -> bool:
     """Whether a datagram must be accepted according to ``docs/wire.md``."""
     if len(datagram) != 48 + 8 * dimension or _tag(datagram[:-16]) != datagram[-16:]:
         return False
-    magic, version, kind, n, loop, run, sequence, t_ns = struct.unpack_from("<2sBBHHQQq", datagram)
+    magic, version, kind, n, _, loop, run, sequence, t_ns = struct.unpack_from("<2sBBBBHQQq", datagram)
     vector = struct.unpack_from(f"<{dimension}d", datagram, 32)
     return (
         (magic, version, kind, n, loop, run) == (b"NA", 1, flow.value, dimension, 0, RUN)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from netem.link_state import LinkState
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
-from noack.impairments.link_settings import NEVER_NS, LinkSettings, RecordedDecision
+from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from tests.fuzz.edits import Choices
 from tests.fuzz.harness import Harness
 from tests.netem.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
@@ -46,7 +46,7 @@ def link_numbers_input(data: bytes) -> None:
             if link.rows != before.rows:
                 return
             link.flows = before.flows
-            latest_ns = np.full(link.rows, NEVER_NS, np.int64)
+            latest_ns = np.full(link.rows, core.NOACK_NEVER_NS, np.int64)
             core.noack_link_change(before, link, pointer_to(latest_ns, "int64_t *"))
             kept |= {"flows": owner["flows"]}
         if link.rows:
@@ -61,7 +61,7 @@ def _decide(link: Any, choices: Choices) -> None:
         row, size = choices.below(256) % link.rows, choices.integer() % (LARGEST_BYTES + 1)
         core.noack_link_decide(link, row, size, now_ns, decision)
         assert core.NOACK_DELIVERED <= decision.fate <= core.NOACK_BLACKED_OUT
-        if decision.release_ns != NEVER_NS and choices.flag():
+        if decision.release_ns != core.NOACK_NEVER_NS and choices.flag():
             delayed = decision.release_ns > now_ns
             core.noack_link_leave(link, row, decision.packet, size, delayed, decision.bit < 0)
         step_ns = choices.integer() if choices.below(8) == 1 else choices.below(1 << 16) << 10
@@ -143,7 +143,7 @@ def _allocate(link: Any, tables: dict[str, Words]) -> dict[str, Any]:
     kept |= {
         "flows": np.zeros(rows, dtype_of("noack_flow")),
         "memory": np.zeros(rows * stages, dtype_of("noack_stage_memory")),
-        "recent_ns": np.full(rows * max(link.recent_width, 0), NEVER_NS, np.int64),
+        "recent_ns": np.full(rows * max(link.recent_width, 0), core.NOACK_NEVER_NS, np.int64),
         "losses": np.zeros(rows * max(link.loss_width, 0), np.int64),
         "queues": np.zeros(stages, dtype_of("noack_queue")),
         "departures_ns": np.zeros(max(link.departure_places, 0), np.int64),

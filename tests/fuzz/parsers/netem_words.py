@@ -12,7 +12,7 @@ import tomli_w
 from netem.control.control_server import ControlServer, SettingsChange
 from netem.relay_links import DIRECTIONS
 from netem.tc_words import EXAMPLES as ANY_WORD
-from netem.tc_words import json_schema, load_links, parse, settings_of, tc_command, text_of
+from netem.tc_words import json_schema, load_links, parse, settings_of, tc_command, words_of
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import SHAPES
 from noack.impairments.link_settings import LinkSettings
@@ -76,12 +76,12 @@ def words_input(data: bytes) -> None:
 
 def _check(words: str | list[str]) -> None:
     parsed = parse(words)
-    text = text_of(parsed.settings)
+    text = words_of(parsed.settings)
     try:
         assert parse(text).settings == parsed.settings, text
     except CallerError as error:
         raise AssertionError(f"written settings cannot be read: {error}") from error
-    assert text_of(parse(text).settings) == text
+    assert words_of(parse(text).settings) == text
     tc_command(parsed.settings)
     for impairment in parsed.settings.impairments:
         impairment.meaning()
@@ -138,7 +138,7 @@ def links_input(data: bytes) -> None:
             for settings in (spec.forward, spec.reverse):
                 assert LinkSettings.model_validate_json(settings.model_dump_json()) == settings
                 if words_can_say(settings):
-                    assert settings_of(text_of(settings)) == settings
+                    assert settings_of(words_of(settings)) == settings
 
 
 _CONTROL_SCHEMA = vocabulary(SettingsChange.model_json_schema())

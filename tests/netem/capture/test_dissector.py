@@ -73,7 +73,7 @@ def shown(fields: Fields, name: str) -> str:
 @pytest.mark.parametrize("encrypted", [False, True])
 def test_every_field_is_shown(tshark: Tshark, tmp_path: Path, encrypted: bool) -> None:
     messages = [
-        Message(Flow.UPDATE, 2**64 - 1, -1, np.array([-0.0, 5e-324, -1.5e308])),
+        Message(Flow.UPDATE, 2**64 - 1, -1, np.array([-0.0, 5e-324, -1.5e308]), error_level=255),
         Message(Flow.ACTUATION, 0, -(2**63), np.array([1.0])),
         Message(Flow.MEASUREMENT, 1, 2**63 - 1, np.full(64, 0.1), 2**16 - 1),
         Message(Flow.ACKNOWLEDGEMENT, 17, 1_234_000_000, np.zeros(0)),
@@ -86,6 +86,7 @@ def test_every_field_is_shown(tshark: Tshark, tmp_path: Path, encrypted: bool) -
         assert shown(fields, "version") == ("2" if encrypted else "1")
         assert shown(fields, "flow") == str(int(message.flow))
         assert shown(fields, "dimension") == str(len(message.vector))
+        assert shown(fields, "error_level") == str(message.error_level)
         assert shown(fields, "loop") == str(message.loop)
         assert shown(fields, "run_id") == f"0x{RUN:016x}"
         assert shown(fields, "sequence") == str(message.sequence)

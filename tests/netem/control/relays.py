@@ -19,19 +19,12 @@ from numpy.typing import NDArray
 from netem import relay_links
 from netem.control.emulator_statistics import CommandQueue
 from netem.relay import Relay
-from netem.relay_links import (
-    DIRECTIONS,
-    Address,
-    Direction,
-    DirectionReport,
-    FlowReport,
-    LinkReport,
-    LinkSpec,
-)
+from netem.relay_links import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport, LinkSpec
 from netem.stand_alone import _add_watching_options, check_watching_options
 from netem.tc_words import settings_of
 from noack.core.core_library import core
 from noack.impairments.link_settings import Counters, LinkSettings
+from noack.runtime.address import Address
 
 SETTINGS = settings_of("loss 10% delay 10ms mansd 2")
 HERE: Address = ("127.0.0.1", 5000)

@@ -22,7 +22,7 @@ from netem.control.emulator_statistics import CommandQueue, statistics
 from netem.stand_alone import attached
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, PeerError
-from noack.runtime.address import text_of
+from noack.runtime.address import address_text
 from noack.runtime.connections import metrics_server as servers
 from tests.netem.control.relays import FakeRelay, options, press_q, read_until, terminal
 from tests.noack.runtime.test_log_and_metrics import read, slow_reader
@@ -76,7 +76,7 @@ def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(
     threads = threading.active_count()
     monkeypatch.setattr(servers, "_REQUEST_S", 3600.0)
     asked: list[tuple[str, int]] = []
-    monkeypatch.setattr(stand_alone, "text_of", lambda at: asked.append(at) or text_of(at))
+    monkeypatch.setattr(stand_alone, "address_text", lambda at: asked.append(at) or address_text(at))
     with (
         ExitStack() as stack,
         attached(relay, options("--metrics", ":0")) as side,

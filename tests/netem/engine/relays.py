@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.relay import Relay
-from netem.relay_links import Address, LinkReport, LinkSpec, Tap
+from netem.relay_links import LinkReport, LinkSpec, Tap
 from noack.impairments.link_settings import LinkSettings
+from noack.runtime.address import Address
 from noack.runtime.udp_sockets import enlarge_buffer
 
 PATIENCE_S = 60

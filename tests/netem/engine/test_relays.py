@@ -17,7 +17,7 @@ from netem.relay_links import DirectionReport
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.runtime import udp_sockets
-from noack.runtime.address import text_of
+from noack.runtime.address import address_text
 from tests.netem.engine.relays import (
     HOSTS,
     KeepAll,
@@ -63,7 +63,8 @@ def test_both_directions_work_over_both_versions_of_ip(here: int, there: int) ->
             assert all(drain(client) == [] for client in clients)
             report = one.report()
         assert (report.clients, report.clients_ever) == (2, 2)
-        assert {flow.client for flow in report.forward.flows} == {text_of(name_of(one)) for one in clients}
+        addresses = {address_text(name_of(one)) for one in clients}
+        assert {flow.client for flow in report.forward.flows} == addresses
 
 
 @IP_VERSIONS

@@ -22,7 +22,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
 from noack.protocol.wire_format import Encoder, Flow, Message
-from noack.runtime.address import text_of
+from noack.runtime.address import address_text
 from noack.runtime.real_time_loop import run_loop
 from noack.runtime.telemetry import TelemetryBuffer
 from noack.runtime.udp_sockets import bind
@@ -216,13 +216,13 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
 
         channel = NetworkChannel(endpoint, ends, network=network, clock=clock, loops=1)
         with closing(channel) as shell:
-            run_loop(network, shell, clock, telemetry, end_ns=None, stop=stop, news=news)
+            run_loop(network, shell, clock, telemetry, end_ns=None, stop=stop, external_inputs=news)
             shell.finish(clock.now_ns(), telemetry)
             telemetry.flush()
             report = shell.report()
-        senders = {text_of(name_of(one)) for one in (sensor, other)}
+        senders = {address_text(name_of(one)) for one in (sensor, other)}
     assert [data for data, _ in received] == sent
-    assert {text_of(source) for _, source in received} == {report["local"]}
+    assert {address_text(source) for _, source in received} == {report["local"]}
     assert (report["sent"], report["send_errors"]) == (len(sent), {})
     assert report["rejected"] == {"source": foreign}
     assert report["received_from"].keys() == senders

@@ -20,7 +20,7 @@ from benchmarks.report import MeasurementError
 from netem.emulator_options import LINK_NAME
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
-from noack.runtime.address import text_of
+from noack.runtime.address import address_text
 from noack.runtime.udp_sockets import enlarge_buffer
 from tests.attacks.attacked import unread_bytes
 from tests.attacks.kinds import enter_namespace
@@ -106,7 +106,7 @@ def test_packets_refused_by_a_full_output_queue_are_counted(
     """Every datagram is in one counter, and the emulator does not claim the guarantee."""
     here, there = ("127.0.0.1", "::1")[version], hosts.addresses[1][version]
     with bound_in(hosts.names[1], there) as server, bound_in(hosts.names[0], here) as client:
-        to, listen = text_of((there, server.getsockname()[1])), text_of((here, 0))
+        to, listen = address_text((there, server.getsockname()[1])), address_text((here, 0))
         words = ("loss 20% mansd 2", *options)
         emulator = emulate(to, *words, listen=listen, inside=hosts.inside(0))
         for _ in range(MANY):

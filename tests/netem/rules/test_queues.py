@@ -9,7 +9,8 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-from hypothesis import given
+import pytest
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from netem.channel import Channel
@@ -18,12 +19,14 @@ from netem.tc_words import settings_of
 from noack.core.core_library import core
 from noack.impairments.disciplines.codel import Codel
 from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
+from noack.impairments.disciplines.maximum_error import MaximumError
 from noack.impairments.disciplines.priority import Priority
 from noack.impairments.feature import Scheduler
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.link_settings import LinkSettings
+from tests.netem.stepped_channel import send
 from tests.oracles.link import Link
 
 NS = 10**9
@@ -419,7 +422,10 @@ def test_copies_take_slots_and_a_changed_schedule_goes_on_after_those_that_are_t
 
 
 def chosen(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[list[int], list[int]]:
-    """Return the departures in ns, and the consecutive losses up to each packet, one by one."""
+    """Return the departures in ns, and the consecutive losses up to each packet, one by one.
+
+    The oldest of a flow is sent; by errors, a flow counts as the largest of what it has waiting.
+    """
     scheduler, free = rate.discipline, Fraction(0)
     assert isinstance(scheduler, Scheduler)
     waiting: list[tuple[int, int]] = []
@@ -428,12 +434,14 @@ def chosen(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[list[int], lis
     def serve(now_ns: int) -> None:
         nonlocal free
         while waiting and int(free) <= now_ns:
-            _, first = waiting.pop(waiting.index(min(waiting)))
-            arrival_ns, _, size = arrivals[first]
+            keys = {arrivals[one][1]: key for key, one in sorted(waiting, reverse=True)}
+            first = min((keys[arrivals[one][1]], one) for _, one in waiting)[1]
+            waiting[:] = [one for one in waiting if one[1] != first]
+            arrival_ns, _, size, _ = arrivals[first]
             free = max(free, Fraction(arrival_ns)) + Fraction(bits(rate, size) * NS, rate.rate_bps)
             found[first] = int(free)
 
-    for number, (now_ns, flow, _) in enumerate(arrivals):
+    for number, (now_ns, flow, size, level) in enumerate(arrivals):
         serve(now_ns)
         passes = burst[flow] == mansd or len(waiting) + (int(free) > now_ns) < rate.queue
         burst[flow] = 0 if passes else burst[flow] + 1
@@ -441,10 +449,15 @@ def chosen(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[list[int], lis
         if passes:
             key = scheduler.numbers[min(flow, len(scheduler.numbers) - 1)]
             key += now_ns if isinstance(scheduler, EarliestDeadline) else 0
+            key -= level if isinstance(scheduler, MaximumError) and size >= 32 else 0
             waiting.append((key, number))
         serve(now_ns)
     serve(2**60)
     return found, losses
+
+
+WAITING = (0, 9), (1, 1), (0, 200), (2, 8), (1, 127), (2, 3), (1, 128), (0, 255)
+"""Flows and error levels; some of what waits counts as what comes after it."""
 
 
 def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
@@ -453,44 +466,48 @@ def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
     channel = Channel([link], loops=4)
     numbers: dict[tuple[int, int], int] = {}
     found, losses = [-1] * len(arrivals), []
-    for number, (now_ns, flow, size) in enumerate([*arrivals, (2**60, 0, 0)]):
+    for number, (now_ns, flow, size, level) in enumerate([*arrivals, (2**60, 0, 0, 0)]):
         while (due_ns := channel.due_ns) <= now_ns:
             for one in channel.release(due_ns):
                 found[numbers[one.flow, one.number]] = due_ns
         if number < len(arrivals):
             numbers[flow, number] = number
-            channel.send(flow, number, size, now_ns)
+            send(channel, flow, number, size, now_ns, level)
             losses.append(link.flow(flow).consecutive_losses)
     assert link.core.in_flight == 0
     assert link.counters.delivered_out_of_order == 0
     return found, losses
 
 
+@pytest.mark.parametrize("kind", [Priority, EarliestDeadline, MaximumError])
 @given(
     st.sampled_from([1000, 9_600, 1_000_003, 10**9]),
     st.integers(1, 6),
     st.lists(st.integers(0, 3), min_size=1, max_size=4).map(tuple),
-    st.booleans(),
     st.lists(
         st.tuples(
             st.sampled_from([0, 0, 1, 1000, MS, 100 * MS, NS]),
             st.integers(0, 3),
-            st.sampled_from([0, 72, 1472]),
+            st.sampled_from([0, 31, 72, 1472]),
+            st.sampled_from([0, 1, 127, 128, 255]),
         ),
         max_size=60,
     ),
     st.sampled_from([None, 0, 1, 3]),
 )
+@example(9_600, 6, (1,), [(0, flow, 72, level) for flow, level in WAITING], None)
 def test_the_first_of_what_waits_is_sent_when_the_link_is_free(
-    rate_bps: int, queue: int, numbers: Any, times: bool, steps: Any, mansd: int | None
+    kind: type[Scheduler], rate_bps: int, queue: int, numbers: Any, steps: Any, mansd: int | None
 ) -> None:
     """Of each flow in order of arrival; at most mansd successive packets of a flow are lost."""
-    discipline: Scheduler = Priority(levels=numbers)
-    if times:
+    discipline: Scheduler = MaximumError()
+    if kind is Priority:
+        discipline = Priority(levels=numbers)
+    elif kind is EarliestDeadline:
         discipline = EarliestDeadline(deadlines_s=tuple(number * 0.05 for number in numbers))
     rate = Rate(rate_bps=rate_bps, queue=queue, discipline=discipline)
     now = np.cumsum([0, *(gap for gap, *_ in steps)])[1:].tolist()
-    arrivals = [(t, flow, size) for t, (_, flow, size) in zip(now, steps, strict=True)]
+    arrivals = [(t, *one) for t, (_, *one) in zip(now, steps, strict=True)]
     found = left(LinkSettings(impairments=(rate,), mansd=mansd), arrivals)
     assert found == chosen(rate, mansd, arrivals)
     for flow in range(4):

@@ -10,7 +10,7 @@ import tomli_w
 from hypothesis import assume, given
 
 from netem.relay_links import LinkSpec
-from netem.tc_words import LinksFile, json_schema, load_links, parse, settings_of, text_of
+from netem.tc_words import LinksFile, json_schema, load_links, parse, settings_of, words_of
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario import toml_file
 from tests.approved import compare_lines, lines_of_error
@@ -21,7 +21,7 @@ def test_words_are_the_approved_impairments() -> None:
     def impairments(words: str) -> list[str]:
         parsed, seed = parse(words)
         assert seed is None
-        assert settings_of(text_of(parsed)) == parsed
+        assert settings_of(words_of(parsed)) == parsed
         return [one.model_dump_json(exclude_unset=True) for one in parsed.impairments]
 
     compare_lines(Path(__file__).with_name("settings.txt"), impairments)
@@ -32,17 +32,17 @@ def test_settings_may_come_anywhere_and_impairments_keep_their_order() -> None:
     settings, seed = parse(words)
     assert (settings.mansd, settings.limit, settings.first_delivered, seed) == (4, 50, True, 7)
     assert [one.kind for one in settings.impairments] == ["delay", "loss", "delay"]
-    assert text_of(settings) == "delay 10ms loss 5% delay 1ms mansd 4 first limit 50"
+    assert words_of(settings) == "delay 10ms loss 5% delay 1ms mansd 4 first limit 50"
     text = "loss trace 'my file' mansd 4"
     for listed in (["loss", "trace", "my file", "mansd", "4"], ["loss trace 'my file'", "mansd 4"]):
         assert settings_of(listed) == settings_of(text)
-        assert text_of(settings_of(listed)) == text
+        assert words_of(settings_of(listed)) == text
 
 
 @given(settings)
 def test_all_settings_survive_being_written_and_read(settings: LinkSettings) -> None:
     assume(words_can_say(settings))  # another test covers refused settings
-    text = text_of(settings)
+    text = words_of(settings)
     assert settings_of(text) == settings
     assert "'" in text or settings_of(text.split()) == settings
 
@@ -102,7 +102,7 @@ def test_all_settings_can_be_written_as_a_table_or_in_words(settings: LinkSettin
     links = toml_file.validated(LinksFile, tomllib.loads(tomli_w.dumps({"link": [link]})), "here")
     assert links.link[0].forward == settings
     if words_can_say(settings):
-        link["forward"] = text_of(settings)
+        link["forward"] = words_of(settings)
         links = toml_file.validated(LinksFile, {"link": [link]}, "here")
         assert links.link[0].forward == settings
 

@@ -19,7 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.core import clock as host_clock
-from noack.core.clock import (
+from noack.core.clock import RunClock, clock_identity
+from noack.core.core_library import core, ffi
+from noack.runtime.host_clocks.clock_offset import (
     RELATIVE_RATE_PPB,
     SLEW_PPB,
     ClockOffset,
@@ -27,12 +29,9 @@ from noack.core.clock import (
     OffsetInterval,
     Restart,
     RestartCause,
-    RunClock,
     SlewedClock,
     SlewedRunClock,
-    clock_identity,
 )
-from noack.core.core_library import core, ffi
 
 EPOCH_NS = 123_456_789_012_345
 speeds = st.sampled_from([0.01, 0.5, 1.0, 2.0, 3.0, 10.0, 1000.0])

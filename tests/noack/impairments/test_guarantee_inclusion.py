@@ -5,7 +5,6 @@ from itertools import product
 import numpy as np
 import pytest
 
-from noack.impairments.guarantee_inclusion import find_pattern_beyond
 from noack.impairments.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
@@ -13,6 +12,7 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossHistory,
     LossRule,
+    find_pattern_beyond,
 )
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from controller_node.controller import Controller
 from noack.controllers.controller_settings import ControlFailedError
 from noack.controllers.linear_feedback import LinearFeedback
+from noack.core.clock import NEVER_NS
 from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Matrix, Vector, norm, product
 from noack.impairments.loss_guarantee import (
@@ -28,10 +29,10 @@ from noack.plants.plant_settings import SystemFailedError
 from noack.protocol.machine_interface import GENERATION, Notice, Output, Start
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import CodedPolicy, Policy, TriggerDecision
-from plant_server.plant import NEVER_NS, Disturbance, MeasurementModel, Plant, Watchdog
+from plant_server.plant import Disturbance, MeasurementModel, Plant, Watchdog
 from sensor_node.sensor import Observer, Sensor
+from tests.example_rules import TABLES, random_rule
 from tests.machine_parts import OneLoop, SteppedMachines
-from tests.trigger_rules import TABLES, random_rule
 from tests.wire_decoder import NO_VECTOR
 
 MS = 1_000_000
@@ -265,7 +266,7 @@ def driven(
     for _ in range(count):
         message, now_ns = inputs.next()
         if message is None:
-            loop = int(machines.core.heap[0])
+            loop = int(machines.core.heap[0].number)
             outputs = machines.on_timer(now_ns)
         else:
             loop, outputs = message.loop, machines.handle(message, now_ns)

@@ -23,6 +23,7 @@ from noack.scenario.scenario_file import validate
 from plant_server.plant import Plant
 from sensor_node.sensor import Sensor, sensors_of
 from tests.approved import compare_lines
+from tests.example_rules import TABLES
 from tests.machine_parts import OneLoop, SteppedMachines, machine
 from tests.noack.machines.any_machines import (
     MS,
@@ -38,7 +39,6 @@ from tests.noack.machines.any_machines import (
     sizes,
     text_of,
 )
-from tests.trigger_rules import TABLES
 
 Part = Plant | Sensor | Controller
 COUNT = 120

@@ -38,6 +38,7 @@ def datagram(
     version: int = 1,
     flow: int = 2,
     dimension: int | None = None,
+    error_level: int = 0,
     loop: int = 0,
     run_id: int = RUN,
     sequence: int = 0,
@@ -50,7 +51,8 @@ def datagram(
             magic,
             version.to_bytes(1, "little"),
             flow.to_bytes(1, "little"),
-            (len(values) if dimension is None else dimension).to_bytes(2, "little"),
+            (len(values) if dimension is None else dimension).to_bytes(1, "little"),
+            error_level.to_bytes(1, "little"),
             loop.to_bytes(2, "little"),
             run_id.to_bytes(8, "little"),
             sequence.to_bytes(8, "little"),
@@ -88,6 +90,7 @@ class Vector(NamedTuple):
     t_ns: int
     values: list[float]
     data: bytes
+    error_level: int
 
 
 def published_vector(block: str) -> Vector:
@@ -97,7 +100,8 @@ def published_vector(block: str) -> Vector:
     data = bytes.fromhex(fields["datagram"])
     loop = int(fields.get("loop", "0"))
     version = int(fields.get("version", "1"))
-    return Vector(version, fields["flow"].strip(), loop, run_id, sequence, t_ns, values, data)
+    level = int(fields.get("error level", "0"))
+    return Vector(version, fields["flow"].strip(), loop, run_id, sequence, t_ns, values, data, level)
 
 
 VECTORS = [published_vector(block) for block in re.findall(r"```vector\n(.*?)```", PAGE, re.DOTALL)]
@@ -111,14 +115,14 @@ def test_the_page_has_a_vector_for_every_flow_and_names_its_key() -> None:
 
 @pytest.mark.parametrize("vector", VECTORS, ids=lambda v: f"v{v.version}-{v.flow}-{v.loop}-{v.sequence}")
 def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
-    version, flow, loop, run_id, sequence, t_ns, values, data = vector
+    version, flow, loop, run_id, sequence, t_ns, values, data, level = vector
     by_hand = datagram(
         values, version=version, flow=FLOWS[flow], loop=loop, run_id=run_id, sequence=sequence,
-        t_ns=t_ns,
+        t_ns=t_ns, error_level=level,
     )  # fmt: skip
     encrypted = version == 2
     assert by_hand.hex() == data.hex()
-    message = Message(Flow(FLOWS[flow]), sequence, t_ns, np.array(values), loop)
+    message = Message(Flow(FLOWS[flow]), sequence, t_ns, np.array(values), loop, level)
     assert Encoder(run_id, KEY, encrypted=encrypted).encode(message).hex() == data.hex()
     decoder = Decoder(
         Flow(FLOWS[flow]), len(values), run_id, KEY, loop=loop, encrypted=encrypted
@@ -127,7 +131,8 @@ def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
     assert decoded is not None
     assert decoded[:3] == message[:3]
     assert decoded.vector.tobytes() == struct.pack(f"<{len(values)}d", *values)
-    header = Header(version, FLOWS[flow], len(values), loop, run_id, sequence, t_ns)
+    assert decoded.error_level == level
+    header = Header(version, FLOWS[flow], len(values), level, loop, run_id, sequence, t_ns)
     assert read_header(data) == header
     assert read_header(data[:31]) is read_header(b"x" + data) is None
 
@@ -139,28 +144,35 @@ def test_the_page_gives_the_reasons_in_the_order_of_the_tests() -> None:
     assert {reason for _, reason in listed} == {reason.value for reason in Rejection}
 
 
-@given(flows, loops, run_ids, sequences, times_ns, vectors, st.booleans())
+@given(flows, st.integers(0, 255), loops, run_ids, sequences, times_ns, vectors, st.booleans())
 @example(
-    Flow.UPDATE, 0, 0, 0, 0, [-0.0, 5e-324, -2.2250738585072014e-308, 1.7976931348623157e308], False
+    Flow.UPDATE, 0, 0, 0, 0, 0, [-0.0, 5e-324, -2.2250738585072014e-308, 1.7976931348623157e308], False
 )  # fmt: skip
 def test_encoded_messages_decode_unchanged(
-    flow: Flow, loop: int, run_id: int, sequence: int, t_ns: int, values: list[float],
+    flow: Flow, level: int, loop: int, run_id: int, sequence: int, t_ns: int, values: list[float],
     encrypted: bool,
 ) -> None:  # fmt: skip
     """Those of another loop are rejected; the tag covers the number of the loop."""
     values = [] if flow is Flow.ACKNOWLEDGEMENT else values
     encoder = Encoder(run_id, KEY, encrypted=encrypted)
-    data = encoder.encode(Message(flow, sequence, t_ns, np.array(values), loop))
+    data = encoder.encode(Message(flow, sequence, t_ns, np.array(values), loop, level))
     version = 1 + encrypted
     assert data == datagram(
-        values, version=version, flow=flow, loop=loop, run_id=run_id, sequence=sequence, t_ns=t_ns
+        values,
+        version=version,
+        flow=flow,
+        loop=loop,
+        run_id=run_id,
+        sequence=sequence,
+        t_ns=t_ns,
+        error_level=level,
     )
     assert loop_number(data) == loop
-    assert read_header(data) == Header(version, flow, len(values), loop, run_id, sequence, t_ns)
+    assert read_header(data) == Header(version, flow, len(values), level, loop, run_id, sequence, t_ns)
     decoder = Decoder(flow, len(values), run_id, KEY, loop=loop, encrypted=encrypted)
     message = decoder.decode(data)
     assert message is not None
-    assert (message[:3], message.loop) == ((flow, sequence, t_ns), loop)
+    assert (message[:3], message[4:]) == ((flow, sequence, t_ns), (loop, level))
     assert message.vector.dtype == np.float64
     assert message.vector.tobytes() == struct.pack(f"={len(values)}d", *values)
     assert decoder.accepted == 1
@@ -177,13 +189,13 @@ def reason_by_offset(offset: int) -> Rejection:
         return Rejection.VERSION  # magic and version
     if offset == 3:
         return Rejection.FLOW
-    if offset in (4, 5):
+    if offset == 4:
         return Rejection.LENGTH  # dimension
     if offset in (6, 7):
         return Rejection.LOOP
     if 8 <= offset < 16:
         return Rejection.RUN
-    return Rejection.TAG  # sequence number, time, vector, and the tag itself
+    return Rejection.TAG  # error level, sequence number, time, vector, and the tag itself
 
 
 @given(vectors, sequences, times_ns, st.booleans())
@@ -248,6 +260,8 @@ def test_an_acknowledgement_carries_no_vector() -> None:
 
 
 def test_a_key_or_a_vector_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match="does not fit its field"):
+        Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(1), error_level=256))
     with pytest.raises(ValueError, match="32 bytes, not 31"):
         Encoder(RUN, bytes(31))
     for shape in ((0,), (65,), (2, 2), (1, 3)):

@@ -24,9 +24,9 @@ BOUNDS: Table = {"not_before_ns": 100, "not_after_ns": 10**9}
 
 def made(
     flow: int = 2, sequence: int = 9, t_ns: int = 1000, values: tuple[float, ...] = (-0.25, 1.5),
-    loop: int = 3, run: int = RUN, key: bytes = KEY, encrypted: bool = False,
+    loop: int = 3, run: int = RUN, key: bytes = KEY, encrypted: bool = False, error_level: int = 0,
 ) -> bytes:  # fmt: skip
-    message = Message(Flow(flow), sequence, t_ns, np.array(values), loop)
+    message = Message(Flow(flow), sequence, t_ns, np.array(values), loop, error_level)
     return Encoder(run, key, encrypted=encrypted).encode(message)
 
 
@@ -55,19 +55,20 @@ def datagrams(*, encrypted: bool) -> Iterator[tuple[str, bytes, bool]]:
     yield "the other direction: an actuation", own(sequence=10, flow=3), True
     yield "of another loop", own(sequence=10, loop=4), True
     yield "under another key", own(sequence=10, key=bytes(32)), True
-    for at in (16, 24, 32, 63):
+    for at in (5, 16, 24, 32, 63):
         yield f"a bit flipped in byte {at}", flipped(own(sequence=10), at), True
     yield "from another address", own(sequence=10), False
     yield "before time 0", own(sequence=10, t_ns=-1), True
     yield "before not_before_ns", own(sequence=10, t_ns=99), True
     yield "at not_after_ns", own(sequence=10, t_ns=10**9), True
+    yield "with an error level", own(sequence=11, t_ns=10**9, error_level=142), True
     yield "after not_after_ns", own(sequence=11, t_ns=10**9 + 1), True
-    yield "an infinity", own(sequence=11, values=(1.0, math.inf)), True
-    yield "not a number", own(sequence=11, values=(math.nan, 1.0)), True
-    yield "the same number, finite", own(sequence=11, values=(-0.0, 5e-324)), True
+    yield "an infinity", own(sequence=12, values=(1.0, math.inf)), True
+    yield "not a number", own(sequence=12, values=(math.nan, 1.0)), True
+    yield "the same number, finite", own(sequence=12, values=(-0.0, 5e-324)), True
     yield "a number of 2^63", own(sequence=2**63), True
     yield "the largest number", own(sequence=2**63 - 1), True
-    yield "a smaller one", own(sequence=12), True
+    yield "a smaller one", own(sequence=13), True
 
 
 def by_the_core(*, encrypted: bool) -> Iterator[Table]:
@@ -82,6 +83,7 @@ def by_the_core(*, encrypted: bool) -> Iterator[Table]:
             yield entry | {"result": reason.value}
         else:
             own = {"sequence": str(message.sequence), "t_ns": str(message.t_ns)}
+            own |= {"error_level": message.error_level} if message.error_level else {}
             yield entry | {"result": "accepted", **own, "vector": message.vector.tolist()}
 
 
@@ -113,7 +115,7 @@ class PageReceiver:
         own = self._own
         if len(data) < 32:
             return "length", {}
-        magic, version, flow, n, loop, run_id, sequence, t_ns = struct.unpack_from("<2sBBHHQQq", data)
+        magic, version, flow, n, level, loop, run_id, sequence, t_ns = struct.unpack_from("<2sBBBBHQQq", data)
         tests = [
             ("version", magic == b"NA" and version == own["version"]),
             ("length", n == own["dimension"] and len(data) == 48 + 8 * n),
@@ -136,7 +138,8 @@ class PageReceiver:
             if not holds:
                 return reason, {}
         self._newest = sequence
-        return "accepted", {"sequence": str(sequence), "t_ns": str(t_ns), "vector": vector}
+        own = {"sequence": str(sequence), "t_ns": str(t_ns), "vector": vector}
+        return "accepted", own | ({"error_level": level} if level else {})
 
     def _opened(self, data: bytes, nonce: bytes) -> bytes | None:
         if self._own["version"] == 1:

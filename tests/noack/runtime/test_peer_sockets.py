@@ -13,7 +13,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow
 from noack.runtime import udp_sockets
-from noack.runtime.address import LOOPBACK, Address, family_of, parse_address, parse_destination, text_of
+from noack.runtime.address import LOOPBACK, Address, address_text, family_of, parse_address, parse_destination
 from noack.runtime.live_driver import LoopChannel
 from noack.runtime.udp_sockets import SHED, SourceCount, bind, enlarge_buffer, open_beside
 from tests.noack.runtime.live_loops import Live, measurement, scenario
@@ -61,9 +61,9 @@ def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(content: dict[st
             sent += 1000
             live.send(measurement(round_, [1.0, 0.0]))
             live.drive_until_accepted(round_ + 1)
-            live.channel.tend(0, live.rows)
+            live.channel.do_housekeeping(0, live.rows)
         while len(live.rows.notices) < 2:
-            live.channel.tend(0, live.rows)
+            live.channel.do_housekeeping(0, live.rows)
         live.channel.finish(0, live.rows)
         report = live.channel.report()
     rejected: Any = report["rejected"]
@@ -85,7 +85,7 @@ def test_datagrams_before_the_peer_sockets_are_read_first(content: dict[str, Any
 
     with closing(Live("sensor", [scenario(content, horizon_s=10.0)], early=before)) as live:
         live.send(measurement(early, [1.0, 0.0]))
-        live.channel.tend(0, live.rows)
+        live.channel.do_housekeeping(0, live.rows)
         assert live.driver.accepted == early
         live.drive_until_accepted(early + 1)
         assert not any(live.driver.rejected.values())
@@ -128,7 +128,7 @@ def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
 @given(st.one_of(st.ip_addresses(v=4), st.ip_addresses(v=6)), st.integers(0, 65_535))
 def test_addresses_survive_formatting_and_parsing(host: object, port: int) -> None:
     address = (str(host), port)
-    read = parse_address(text_of(address), "here")
+    read = parse_address(address_text(address), "here")
     family = family_of(address)
     assert socket.inet_pton(family, read[0]) == socket.inet_pton(family, address[0])
     assert read[1] == port

@@ -58,8 +58,8 @@ class Driven:
         self.until_ns.append(until_ns - self.clock.now_ns())
         sink.extend_table("table", np.zeros(len(self.until_ns), np.int64))
 
-    def tend(self, now_ns: int, sink: RecordSink) -> None:
-        self.steps.append("tend")
+    def do_housekeeping(self, now_ns: int, sink: RecordSink) -> None:
+        self.steps.append("housekeeping")
 
     def next_deadline_ns(self) -> int | None:
         return -5
@@ -79,10 +79,10 @@ def test_a_turn_of_housekeeping_follows_each_drive(busy: bool, monkeypatch: pyte
 
     late_ns = run_loop(
         one, one, one.clock, log, end_ns=None,
-        stop=lambda: one.steps.append("stop") or len(one.steps) > 11, news=news,
+        stop=lambda: one.steps.append("stop") or len(one.steps) > 11, external_inputs=news,
     )  # fmt: skip
-    turn = ["drive", "tend", "news", "clock", "stop"]
-    assert one.steps == ["clock", "news", "tend", *turn, *turn]
+    turn = ["drive", "housekeeping", "news", "clock", "stop"]
+    assert one.steps == ["clock", "news", "housekeeping", *turn, *turn]
     assert log.rows == [1, 2]
     assert log.lines == ["row", "line", *["row", "line", "flush"] * 2]
     assert all(period_ns <= 0.05e9 * 3.0 for period_ns in one.until_ns)

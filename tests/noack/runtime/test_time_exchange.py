@@ -19,12 +19,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.hosts import DrivenClocks
-from noack.core.clock import NS_PER_S, ClockOffset, RunClock
+from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Record
 from noack.protocol.record_tables import LOST_NS
 from noack.protocol.wire_format import Rejection
 from noack.runtime.address import Address
+from noack.runtime.host_clocks.clock_offset import ClockOffset
 from noack.runtime.host_clocks.reference_clock import (
     FOUND,
     LOST,
@@ -353,7 +354,7 @@ def test_rows_and_lines_of_the_log() -> None:
     ]
     clock = RunClock(0, 2.0, lambda: 0)
     record = ClockRecord("sensor", BEGINNING, clock, Scripted(reports), has_table=True)
-    outputs = [record.news(2 * one.now_ns) for one in list(reports)]
+    outputs = [record.compare(2 * one.now_ns) for one in list(reports)]
     rows = [one for each in outputs for one in each if isinstance(one, Record)]
     assert [one.table for one in rows] == ["sensor_clock"] * 5
     assert [one.row for one in rows] == [
@@ -373,7 +374,7 @@ def test_rows_and_lines_of_the_log() -> None:
 def test_the_coordinators_own_clock_has_no_error() -> None:
     record = ClockRecord("plant", BEGINNING, RunClock(time.monotonic_ns()), None, has_table=True)
     for number in range(3):
-        (one,) = record.news(0)
+        (one,) = record.compare(0)
         assert isinstance(one, Record)
         assert one.row[0] == number
         assert one.row[-2:] == (0, 0)

@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 from netem.channel import Channel
 from netem.link_state import LinkState
 from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
+from noack.impairments.disciplines.maximum_error import MaximumError
 from noack.impairments.disciplines.priority import Priority
 from noack.impairments.feature import Scheduler
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario.link_load import link_loads
 from noack.scenario.response_times import Sender, response_ns
+from tests.netem.stepped_channel import send
 from tests.shipped import shipped
 
 US = 1000
@@ -40,7 +42,8 @@ def test_the_published_response_times(own: Any, others: Any, expected_us: int) -
 def longest_ns(scheduler: Scheduler, sizes: Any, arrivals: Any) -> list[int]:
     """Return the longest delay of each flow's packets on a link that sends a byte in 1 us.
 
-    Of arrivals at the same time, in us, those with the least second number come first.
+    Of arrivals at the same time, in us, those with the least second number come first; their error
+    levels follow from it, too.
     """
     rate = Rate(rate_bps=8_000_000, overhead_bytes=0, discipline=scheduler)
     link = LinkState(LinkSettings(impairments=(rate,)), 0, "x", rows=len(sizes))
@@ -53,10 +56,10 @@ def longest_ns(scheduler: Scheduler, sizes: Any, arrivals: Any) -> list[int]:
                 own_ns = due_ns - sent_ns[one.flow][one.number]
                 longest[one.flow] = max(longest[one.flow], own_ns)
 
-    for t_us, _, flow in sorted(arrivals):
+    for t_us, second, flow in sorted(arrivals):
         let_out(t_us * US)
         sent_ns[flow].append(t_us * US)
-        channel.send(flow, len(sent_ns[flow]) - 1, sizes[flow], t_us * US)
+        send(channel, flow, len(sent_ns[flow]) - 1, sizes[flow], t_us * US, 7 * second % 256)
     let_out(2**60)
     return longest
 
@@ -74,8 +77,10 @@ def bounds_ns(scheduler: Scheduler, sizes: Any, least_us: Any) -> list[float]:
     return found
 
 
-def scheduler_of(numbers: Any, times: bool) -> Scheduler:
-    if times:
+def scheduler_of(numbers: Any, kind: type[Scheduler]) -> Scheduler:
+    if kind is MaximumError:
+        return MaximumError()
+    if kind is EarliestDeadline:
         return EarliestDeadline(deadlines_s=tuple(number * 40e-6 for number in numbers))
     return Priority(levels=tuple(numbers))
 
@@ -87,12 +92,12 @@ def scheduler_of(numbers: Any, times: bool) -> Scheduler:
         min_size=1,
         max_size=5,
     ),
-    st.booleans(),
+    st.sampled_from([Priority, EarliestDeadline, MaximumError]),
     st.data(),
 )
-def test_no_arrivals_exceed_the_bound(loops: Any, times: bool, data: st.DataObject) -> None:
+def test_no_arrivals_exceed_the_bound(loops: Any, kind: type[Scheduler], data: st.DataObject) -> None:
     sizes, least_us, numbers = zip(*loops, strict=True)
-    scheduler = scheduler_of(numbers, times)
+    scheduler = scheduler_of(numbers, kind)
     arrivals = []
     for flow, least in enumerate(least_us):
         gap_us = st.sampled_from([0, 0, 0, 1, 7]) | st.integers(0, 100)
@@ -114,10 +119,10 @@ def test_the_loops_of_each_bound_are_named() -> None:
     assert found.delay_bound_s is None
 
 
-@pytest.mark.parametrize("times", [False, True])
-def test_the_bound_is_reached_for_distinct_numbers(times: bool) -> None:
+@pytest.mark.parametrize("kind", [Priority, EarliestDeadline])
+def test_the_bound_is_reached_for_distinct_numbers(kind: type[Scheduler]) -> None:
     """Of 800 starts of three periodic flows, the worst one reaches each bound."""
-    sizes, least_us, scheduler = (30, 20, 50), (131, 173, 307), scheduler_of((1, 3, 5), times)
+    sizes, least_us, scheduler = (30, 20, 50), (131, 173, 307), scheduler_of((1, 3, 5), kind)
     worst = [0, 0, 0]
     for (second, third), order in product(product(range(0, 200, 10), repeat=2), (1, -1)):
         starts = (0, second, third)

@@ -19,6 +19,7 @@ from noack.theory.certificates.disturbed import solve_two_parts
 from noack.theory.certificates.scenario_certificates import own_plant
 from noack.theory.certificates.solution import completed_alone
 from tests.oracles.lossy_loops import (
+    DRIFTING,
     RUNS,
     STEPS,
     Matrix,
@@ -157,7 +158,7 @@ BROKEN: dict[str, tuple[Callable[[DisturbedLoop], DisturbedLoop], dict[str, Any]
         {"noise": 0.1, "push": 0.02, "beta": 0.01},
     ),
     "no floor": (
-        lambda loop: replace(loop, floor=0.0), {"floor": 0.5, "push": 0.02, "beta": 0.01},
+        lambda loop: replace(loop, floor=0.0), {"floor": 0.5, "push": 0.02, **DRIFTING},
     ),
     "the disturbance ends early": (
         lambda loop: replace(loop, duration_steps=(5,)), {"channels": 1, "push": 1.0},

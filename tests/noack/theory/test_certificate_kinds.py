@@ -7,7 +7,8 @@ import pytest
 
 from noack.theory.bounds.terms import NetworkConditions
 from tests.noack.theory.certificate_kinds.comparison import KINDS, examine
-from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, constants_of, dominated_by_errors
+from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, constants_of
+from tests.noack.theory.certificate_kinds.decaying import dominated_by_errors
 
 FEW, MOST = 6, 60
 LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 25, "continuous time": 15}
@@ -37,7 +38,7 @@ def test_a_broken_copy_of_each_kind_is_detected(name: str, mistake: str) -> None
 
 
 def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() -> None:
-    system, conditions = dominated_by_errors(np.ones((4, 2)), far=True), NetworkConditions(3)
+    system, conditions = dominated_by_errors(None, far=True), NetworkConditions(3)
     sharp = system.certify(conditions)
     plain = system.certify(conditions, structured=False)
     assert sharp.state < 0.6 * plain.state
@@ -49,7 +50,7 @@ def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() ->
 
 
 def test_the_flow_between_updates_makes_the_bounds_of_a_schedule_smaller() -> None:
-    system = dominated_by_errors(np.ones((4, 2)), far=True)
+    system = dominated_by_errors(None, far=True)
     system = replace(system, step_s=0.004, delay_steps=1, hold_steps=1)
     sharp, plain = system.certify(), system.certify(structured=False)
     assert sharp.state < 0.6 * plain.state

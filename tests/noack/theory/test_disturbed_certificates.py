@@ -128,7 +128,7 @@ def test_the_response_to_normal_disturbances_stays_within_its_radius() -> None:
 
 FIGURES: dict[str, dict[str, Any]] = {
     "lane_crosswind": {"state": 22.60, "delta": 2.416},
-    "pendulum_observed": {"state": 7.768, "delta": 2.1322, "estimation_error": 0.09161},
+    "pendulum_observed": {"state": 7.768, "delta": 2.1295, "estimation_error": 0.09161},
 }
 
 

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from noack.core.linear_systems import Matrix
-from noack.theory.margins.branch_and_bound import bound_by_products
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, exponential, inverse
 from noack.theory.margins.invariant_polytopes import InvariantPolytopes, PolytopeNorm
-from noack.theory.margins.joint_spectral_radius import joint_spectral_radius
+from noack.theory.margins.joint_spectral_radius import bound_by_products, joint_spectral_radius
 from noack.theory.margins.quadratic_norms import NormSearch, remembering
 from noack.theory.margins.switched_system import (
     Edge,

@@ -14,6 +14,7 @@ from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.paper import ErrorMonitor, Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 from noack.trigger.trigger_rule import TriggerRule
+from tests.example_rules import decaying_rule
 from tests.noack.theory.certificate_kinds.policies import INSTANT
 from tests.oracles.continuous_loops import simulate_continuous_time
 from tests.oracles.lossy_loops import (
@@ -26,7 +27,6 @@ from tests.oracles.lossy_loops import (
     systems,
     times_s,
 )
-from tests.trigger_rules import decaying_rule
 
 
 def norm(matrix: Matrix) -> float:

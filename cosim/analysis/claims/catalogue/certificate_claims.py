@@ -39,9 +39,10 @@ def controller_error_from_events(
     run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
 ) -> Findings:
     """‖e_c‖_W, given the number of missing events."""
-    if (bounds := run.known_state_bounds(certificate)) is None:
+    bounds, since = run.known_state_bounds(certificate), samples.since_event
+    if bounds is None or since is None:
         return Findings()
-    values = bounds.controller_error(samples.t_s, samples.since_event.missing)
+    values = bounds.controller_error(samples.t_s, since.missing)
     formula = "‖e_c‖ ≤ (1 + Σ_(i<j) sup_(τ≥iδ) ‖e^((H+αI)τ)‖) β̃e^(−αt), j events missing"
     void = run.violation_of(certificate)
     label, common = "bound, given the updates missing now", samples.in_common
@@ -126,10 +127,10 @@ def state_from_events(
     run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
 ) -> Findings:
     """‖x‖ from the newest event on, at which the sensor knows x."""
-    if (bounds := run.known_state_bounds(certificate)) is None:
+    bounds, since, t_s = run.known_state_bounds(certificate), samples.since_event, samples.t_s
+    if bounds is None or since is None:
         return Findings()
-    t_s, since = samples.t_s, samples.since_event
-    most = bounds.state_deviation(t_s, since.age_s, run.missing_events(samples, bounds))
+    most = bounds.state_deviation(t_s, since.age_s, run.missing_events(samples, since, bounds))
     predicted = row_norms(since.predicted)
     here = samples.with_x & ~np.isnan(since.age_s)
     deviation = row_norms(samples.true_x[here] - since.predicted[here])

@@ -16,7 +16,7 @@ from cosim.analysis.claims.claim_definition import (
     upper_shares,
 )
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
-from noack.core.linear_systems import row_norms, transition
+from noack.core.linear_systems import Propagator, row_norms
 
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
 _COMPLETE = "a complete record"
@@ -61,7 +61,7 @@ def _margin(run: RunEvidence) -> float:
     """
     loop, period_ns = run.record.loop, run.record.scenario.timing.measurement_period_ns
     longest_ns = run.facts.longest_update_ns
-    growth, age_ns, moved = 1.0, period_ns, transition(loop.H, period_ns)
+    growth, age_ns, moved = 1.0, period_ns, Propagator(loop.H).transition(period_ns)
     while age_ns <= longest_ns and growth < 1 / np.finfo(float).eps:
         growth = max(growth, float(np.linalg.norm(moved)))
         age_ns, moved = 2 * age_ns, moved @ moved

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosim.output.palette import Colour
+from cosim.output.figures.palette import Colour
 from cosim.output.viewer.pictures import picture as draw
 
 _LANE_M = 3.5

@@ -19,7 +19,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from cosim.output.palette import CONTROLLER, PLANT, SENSOR, Colour
+from cosim.output.figures.palette import CONTROLLER, PLANT, SENSOR, Colour
 from noack.core.linear_systems import Propagator
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario

@@ -25,8 +25,8 @@ from tests.cosim.simulation.batch.exact import (
     random_setting,
     reference,
 )
+from tests.example_rules import TABLES, decaying_rule, mixed_rule, quadratic_rule, random_rule
 from tests.shipped import resolved
-from tests.trigger_rules import TABLES, decaying_rule, mixed_rule, quadratic_rule, random_rule
 
 MS = 10**6
 SIZES = ((4, 2), (2, 1))

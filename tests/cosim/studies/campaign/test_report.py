@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import t as student
 
-from cosim.output.figure_files import inline
+from cosim.output.figures.figure_files import inline
 from cosim.shipped_files import find_shipped
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.studies.campaign import campaign_grid

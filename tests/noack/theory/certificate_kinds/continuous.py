@@ -4,7 +4,7 @@ The search for bad losses is that of :mod:`tests.noack.theory.certificate_kinds.
 broken copies are mistakes in the bounds from the flow between two deliveries, each as a context.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
@@ -13,7 +13,6 @@ from unittest.mock import patch
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
@@ -22,9 +21,9 @@ from noack.theory.certificates.delivery_flow import UNDISTURBED, DeliveryFlow, R
 from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
 from noack.theory.certificates.scheduled_flow import _ScheduledFlow
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificate_kinds.decaying import bounds_of, certified_by, search
+from tests.noack.theory.certificate_kinds.decaying import bounds_of, certified_by, dominated_by_errors, search
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time
-from tests.oracles.lossy_loops import System, random_system
+from tests.oracles.lossy_loops import DRIFTING, System, random_system
 
 
 def only_the_start() -> AbstractContextManager[Any]:
@@ -63,13 +62,6 @@ def no_age_of_inputs() -> AbstractContextManager[Any]:
     return patch.object(_ScheduledFlow, "_disturbed", lambda *_: UNDISTURBED)
 
 
-BROKEN_FLOWS: Mapping[str, Callable[[], AbstractContextManager[Any]]] = {
-    "the ellipsoid holds x(0) only": only_the_start,
-    "no lost updates at an event": no_lost_updates,
-    "no mismatch in the flow": no_mismatch,
-}
-
-
 _ROUNDED = 1e-12
 """E is computed from rounded matrices; it is not 0 where it should be."""
 
@@ -96,13 +88,13 @@ def _bounds(system: System) -> Bounds | None:
         return None
 
 
-def _without_one_loss(system: System) -> Bounds | None:
-    return _bounds(replace(system, mansd=system.mansd - 1))
-
-
-def _broken(mistake: Callable[[], AbstractContextManager[Any]], system: System) -> Bounds | None:
+def _broken(
+    certify: Callable[[System], Bounds | None],
+    mistake: Callable[[], AbstractContextManager[Any]],
+    system: System,
+) -> Bounds | None:
     with mistake():
-        return _bounds(system)
+        return certify(system)
 
 
 def _worst(system: System, trace: ContinuousTrace) -> dict[str, float]:
@@ -121,33 +113,21 @@ def _simulate(system: System, rng: np.random.Generator) -> Observed:
     return search(system, rng, simulate_continuous_time, _worst)
 
 
-_MISMATCH = partial(_draw, mismatch=0.5, window=(1, 1), recovery=0)
-
-
-def dominated_by_errors(near: Matrix, *, far: bool) -> System:
-    """An example in which errors drive x further than x(0) is away, with changed numbers."""
-    K = np.array([[-6.0, -3.0]]) * near[:1]
-    return System(
-        A=np.array([[0.0, 1.0], [2.0, -0.5] * near[1]]), B=np.array([[0.0], [1.0]]), K=K,
-        H=np.array([[0.1, 1.0], [-3.6, -3.4] * near[2]]),
-        weight=np.array([[2.0, 0.4], [0.0, 0.5]]),
-        x0=np.array([0.4, -0.2] if far else [0.01, 0.02]) * near[3],
-        alpha=0.3, beta=0.1, known_start=True, mansd=3, step_s=0.03, sample_steps=1,
-        delay_steps=0, hold_steps=0, lag_steps=0,
-    )  # fmt: skip
-
-
-def _near_the_example(rng: np.random.Generator) -> System:
-    """Half of the loops start near 0; the others' first events come soon."""
-    return dominated_by_errors(rng.uniform(0.9, 1.1, (4, 2)), far=rng.uniform() < 0.5)
-
-
 CONTINUOUS = Kind(
     "continuous time", _draw, _bounds, _simulate,
-    {"one loss less": Broken(_without_one_loss, partial(_MISMATCH, mansd=1, n=1))}
+    {
+        "one loss less": Broken(
+            lambda system: _bounds(replace(system, mansd=system.mansd - 1)),
+            partial(_draw, mansd=1, **DRIFTING),
+        )
+    }
     | {
-        name: Broken(partial(_broken, mistake), _near_the_example)
-        for name, mistake in BROKEN_FLOWS.items()
+        name: Broken(partial(_broken, _bounds, mistake), partial(dominated_by_errors, **where))
+        for name, mistake, where in (
+            ("the ellipsoid holds x(0) only", only_the_start, {"far": False}),
+            ("no lost updates at an event", no_lost_updates, {"far": True}),
+            ("no mismatch in the flow", no_mismatch, {"far": True, "mansd": 1}),
+        )
     },
 )  # fmt: skip
 
@@ -155,34 +135,30 @@ CONTINUOUS = Kind(
 _certified = certified_by(System.certify)
 
 
-def _broken_schedule(mistake: Callable[[], AbstractContextManager[Any]], system: System) -> Bounds | None:
-    with mistake():
-        return _certified(system)
-
-
-def _sampled(rng: np.random.Generator) -> System:
-    near = _near_the_example(rng)
+def _sampled(rng: np.random.Generator, far: bool) -> System:
+    near = dominated_by_errors(rng, far=far)
     return replace(near, step_s=0.02, delay_steps=1, hold_steps=1, known_start=rng.uniform() < 0.5)
 
 
 def _scheduled(rng: np.random.Generator) -> System:
     """Few steps in a time constant; half of the loops are like the example, with a schedule."""
-    return _sampled(rng) if rng.uniform() < 0.5 else random_system(rng, n=int(rng.integers(1, 5)))
+    if rng.uniform() < 0.5:
+        return _sampled(rng, far=rng.uniform() < 0.5)
+    return random_system(rng, n=int(rng.integers(1, 5)))
 
 
-_LATE = {"n": 1, "m": 1, "mansd": 0, "delay_steps": 4, "hold_steps": 0, "mismatch": 0.5}
-_HELD = {"n": 1, "m": 1, "mansd": 0, "delay_steps": 0, "hold_steps": 4}
-_LONG = {"beta": 0.01, "step_share": 0.03}
+_LONG = {"mansd": 0, "beta": 0.01, "step_share": 0.03}
 
 SCHEDULED = Kind(
     "schedule", _scheduled, _certified, search,
     {
-        name: Broken(partial(_broken_schedule, mistake), draw)
+        name: Broken(partial(_broken, _certified, mistake), draw)
         for name, mistake, draw in (
-            ("the ellipsoid holds x(0) only", only_the_start, _sampled),
-            ("no mismatch in the flow", no_mismatch, partial(random_system, **_LATE, **_LONG)),
+            ("the ellipsoid holds x(0) only", only_the_start, partial(_sampled, far=False)),
+            ("no mismatch in the flow", no_mismatch,
+             partial(random_system, **_LONG, **DRIFTING, delay_steps=4, hold_steps=0)),
             ("no age of inputs in the flow", no_age_of_inputs,
-             partial(random_system, **_HELD, **_LONG)),
+             partial(random_system, **_LONG, n=1, m=1, delay_steps=0, hold_steps=4)),
         )
     },
 )  # fmt: skip

@@ -6,7 +6,7 @@ have an event. Then random settings of each policy, and the broken copies, which
 of what a trigger does.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -18,6 +18,7 @@ from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
+from noack.theory.bounds import trigger_bounds as bounds_of_triggers
 from noack.theory.bounds.terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
@@ -27,6 +28,7 @@ from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
 from tests.noack.theory.certificate_kinds.shares import Case, shares_of
 from tests.oracles.lossy_loops import (
+    DRIFTING,
     EventRule,
     Flags,
     Reals,
@@ -300,7 +302,7 @@ class NoShares(TriggerBounds):
     @property
     def comparison(self) -> ComparisonBound | None:  # type: ignore[override]
         found = super().comparison
-        return None if found is None else found._replace(shares=())
+        return None if found is None else found._replace(shares=(), has_root=False)
 
 
 @dataclass(frozen=True)
@@ -314,7 +316,7 @@ class NoCrossTerm(TriggerBounds):
 @dataclass(frozen=True)
 class NoDwell(TriggerBounds):
     def bound(self, conditions: Conditions, level: float, reached: float | None) -> TriggerBound:
-        return super().bound(conditions, level, reached)._replace(untested_s=0.0)
+        return super().bound(conditions, level, reached)._replace(untested_s=0.0, also=())
 
 
 @dataclass(frozen=True)
@@ -324,6 +326,14 @@ class NoTimeOfTheArea(TriggerBounds):
     def bound(self, conditions: Conditions, level: float, reached: float | None) -> TriggerBound:
         found = super().bound(conditions, level, reached)
         return found._replace(ago_s=0.0, also=tuple(one._replace(ago_s=0.0) for one in found.also))
+
+
+@dataclass(frozen=True)
+class ShortChord(TriggerBounds):
+    """Takes a smaller share of x than that of the chord."""
+
+    def _slope(self, level: float) -> Mapping[str, float]:
+        return {name: slope / 4 for name, slope in super()._slope(level).items()}
 
 
 @dataclass(frozen=True)
@@ -355,6 +365,19 @@ def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], 
     return broken
 
 
+def patched(target: Any, name: str, wrong: Any) -> Callable[[Scenario, Conditions], Any]:
+    def broken(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
+        with patch.object(target, name, wrong), patch.object(scenario_certificates, "_TIMED_RATES", ()):
+            return certify(resolved, conditions)
+
+    return broken
+
+
+def youngest(bound: TriggerBound, sampling_s: float) -> Any:
+    """Ages of a mean, most of which are that of the last test."""
+    return np.append(np.full(9, 1e-9), 1.0) * (bound.ago_s + sampling_s) if bound.ago_s else None
+
+
 def without_one_loss(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
     return certify(resolved, conditions._replace(dropouts=conditions.dropouts - 1))
 
@@ -371,7 +394,7 @@ def without(name: str) -> Callable[[Scenario, Conditions], Any]:
 INSTANT = {"delay_steps": 0, "hold_steps": 0, "known_start": True, "window": (1, 1), "recovery": 0}
 LATE = {"n": 2, "m": 1, "known_start": True, "window": (1, 1), "recovery": 0, "lag_steps": 0,
         "sample_steps": 2, "mansd": 1}  # fmt: skip
-FAR = {"n": 1, "m": 1, "mismatch": 0.5, "step_share": 0.01, "sample_steps": 1, **INSTANT}
+FAR = {**DRIFTING, "step_share": 0.01, "sample_steps": 1, **INSTANT}
 
 BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dict[str, Any]]] = {
     **{
@@ -382,8 +405,8 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
     },
     "periodic, no age of the input": (
         "periodic", without("hold_s"), {
-            **LATE, "delay_steps": 0, "hold_steps": 3, "sample_steps": 3, "mansd": 6,
-            "mismatch": 0.0, "step_share": 0.03,
+            **LATE, "delay_steps": 0, "hold_steps": 1, "mansd": 6, "mismatch": 0.0,
+            "step_share": 0.03,
         },
     ),
     "self_triggered, no late update": (
@@ -402,13 +425,20 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
     "relative, no share": ("relative", with_trigger(NoShares), {**FAR, "mansd": 0}),
     "mixed, no share": ("mixed", with_trigger(NoShares), {**FAR, "mansd": 0, "beta": 0.01}),
     "quadratic, no cross term": (
-        "quadratic", with_trigger(NoCrossTerm), {**FAR, "mansd": 0, "beta": 0.01},
+        "quadratic", with_trigger(NoCrossTerm), {**FAR, "mansd": 0, "beta": 0.001},
     ),
     "dwell, no growth before the test": (
-        "dwell", with_trigger(NoDwell), {**FAR, "mansd": 0, "beta": 0.01},
+        "dwell", with_trigger(NoDwell), {**FAR, "mansd": 0, "beta": 0.001, "step_share": 0.03},
     ),
     "send_on_area, no growth after the average": (
         "send_on_area", with_trigger(NoTimeOfTheArea), {**FAR, "mansd": 0, "beta": 0.01},
+    ),
+    "send_on_area, a mean over the last moment": (
+        "send_on_area", patched(bounds_of_triggers, "_mean_ages_s", youngest),
+        {**FAR, "mansd": 0, "beta": 0.01},
+    ),
+    "mixed, a chord that is too short": (
+        "mixed", with_trigger(ShortChord), {**FAR, "mansd": 0, "beta": 0.01},
     ),
     "periodic, a third of the period": (
         "periodic", with_trigger(AThirdOfTheTime), {**FAR, "mansd": 0},

@@ -15,7 +15,7 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.terms import NoCertificateError
 from noack.theory.random_losses.moments import moments
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.oracles.lossy_loops import STEPS, System, random_system, simulate, times_s
+from tests.oracles.lossy_loops import DRIFTING, STEPS, System, random_system, simulate, times_s
 
 _RUNS = 300
 _ERRORS = 5
@@ -79,13 +79,13 @@ def _broken(certify: Callable[[RandomLoop], Bounds | None], **fixed: Any) -> Bro
 
 
 _EVENTFUL = {"beta": 0.01, "mismatch": 0.5, "step_share": 0.03}
-_SCALAR = {"n": 1, "m": 1, "alpha_share": 0.8, **_EVENTFUL}
+_SCALAR = {**DRIFTING, **_EVENTFUL}
 
 RANDOM_LOSSES = Kind(
     "random losses", draw, certify, simulate_runs,
     {
         "no losses": _broken(
-            partial(certify, share=0.0), probability=0.3, sample_steps=1, delay_steps=0,
+            partial(certify, share=0.0), probability=0.7, sample_steps=1, delay_steps=0,
             hold_steps=0, **_SCALAR,
         ),
         "no sampling period": _broken(

@@ -18,7 +18,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Self
 
-from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeResult, ProbeSender
+from cosim.measurement.probe_ends import ProbePlan, ProbeReceiver, ProbeResult, ProbeSender
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NeverStartedError, PeerError, why
 from noack.core.file_access import open_growing
@@ -30,7 +30,7 @@ from noack.protocol.probe_format import (
     PROBE_BYTES,
     SHORTEST_PERIOD_NS,
 )
-from noack.runtime.address import Address, family_of, parse_address, parse_destination, text_of
+from noack.runtime.address import Address, address_text, family_of, parse_address, parse_destination
 from noack.runtime.command_line import Signals, print_to_stderr
 from noack.runtime.host_clocks.time_exchange import Arrival, ArrivalSocket, HostClocks
 from noack.runtime.udp_sockets import drops_of, enlarge_buffer
@@ -108,7 +108,7 @@ def send_live(address: str, options: LiveOptions) -> ProbeResult:
     plan = ProbePlan(period_ns, planned, options.size_bytes, options.round_trip, wait_ns)
     to = parse_destination(address, "address")
     way = "round trip" if options.round_trip else "one way"
-    _log(f"{planned} datagrams to {text_of(to)}, one every {period_ns / 1e6:g} ms, {way}")
+    _log(f"{planned} datagrams to {address_text(to)}, one every {period_ns / 1e6:g} ms, {way}")
     return send(to, plan, options.save, _log)
 
 
@@ -148,7 +148,7 @@ class ProbeSocket:
         except OSError as error:
             self.endpoint.close()
             verb = "send to" if listen is None else "listen on"
-            raise CallerError(f"cannot {verb} {text_of(address)}: {why(error)}") from None
+            raise CallerError(f"cannot {verb} {address_text(address)}: {why(error)}") from None
         enlarge_buffer(self.endpoint)
         self.arrivals = ArrivalSocket(self.endpoint, MAX_PROBE_BYTES, HostClocks())
         self.receive(1)  # compares the clocks before the first arrival
@@ -209,13 +209,13 @@ def listen(address: Address, silence_s: float, save: Path | None, log: Callable[
     """
     socket = ProbeSocket(listen=address)
     with socket.endpoint, ProbeRows(save, log) as rows, Signals().handled() as signals:
-        log(f"listening on {text_of(socket.endpoint.getsockname())}")
+        log(f"listening on {address_text(socket.endpoint.getsockname())}")
         receiver = ProbeReceiver(host_number(), time.monotonic_ns(), int(silence_s * 1e9), log, rows.add)
         while signals.received is None:
             select.select([socket.endpoint], (), (), _LONGEST_WAIT_S)
             arrivals = socket.receive()
             for data, source, received_ns in arrivals:
-                answer = receiver.handle(data, text_of(source), received_ns)
+                answer = receiver.handle(data, address_text(source), received_ns)
                 if answer is not None:
                     socket.send(answer, source)
             rows.flush()
@@ -261,7 +261,7 @@ def send(address: Address, plan: ProbePlan, save: Path | None, log: Callable[[st
         if refused:
             reason = f"{refused} of {sender.sent} sends failed: {socket.last_send_error}"
             if refused == sender.sent:
-                raise PeerError(f"{text_of(address)}: {reason}; is a listener running there?")
+                raise PeerError(f"{address_text(address)}: {reason}; is a listener running there?")
             log(reason)
         result = _consistent(sender.finish, socket)
         assert result is not None

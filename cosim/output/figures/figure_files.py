@@ -9,10 +9,10 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from cosim.output.figure_description import FigureDescription
-from cosim.output.figure_drawing import draw
-from cosim.output.figure_format import FigureFiles, FigureFormat, figure_width_in
-from cosim.output.figure_layout import GRID, INK, PAPER, figure_width, settings
+from cosim.output.figures.figure_description import FigureDescription
+from cosim.output.figures.figure_drawing import draw
+from cosim.output.figures.figure_format import FigureFiles, FigureFormat, figure_width_in
+from cosim.output.figures.figure_layout import GRID, INK, PAPER, figure_width, settings
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
 

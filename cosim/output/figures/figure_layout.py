@@ -21,9 +21,9 @@ from typing import NamedTuple
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from cosim.output.figure_description import FigureDescription, Panel, Row
-from cosim.output.figure_format import SCREEN_IN
-from cosim.output.palette import Colour
+from cosim.output.figures.figure_description import FigureDescription, Panel, Row
+from cosim.output.figures.figure_format import SCREEN_IN
+from cosim.output.figures.palette import Colour
 
 # Warnings of no use here: that matplotlib cannot write its cache, and of the dates in fonts.
 for library in ("matplotlib", "fontTools"):

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from cosim.analysis.loop_statistics import latency_us, lateness_parts
 from cosim.analysis.value_reduction import QuantileSketch
-from cosim.output import palette
-from cosim.output.figure_description import (
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import (
     DASHES,
     TIME,
     Axis,
@@ -26,7 +26,7 @@ from cosim.output.figure_description import (
     one_panel,
     time_axis,
 )
-from cosim.output.palette import CONTROLLER, THRESHOLD
+from cosim.output.figures.palette import CONTROLLER, THRESHOLD
 from cosim.record.align import Reals
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S

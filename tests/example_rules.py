@@ -9,7 +9,7 @@ from noack.scenario.sections import POLICIES
 from noack.settings.section import Table
 from noack.trigger.mixed import mixed_rule as given_mixed_rule
 from noack.trigger.policy_settings import ModelMatrices
-from noack.trigger.trigger_rule import NEVER_NS, TriggerRule, error_form, quadratic_form, require_rule
+from noack.trigger.trigger_rule import TriggerRule, error_form, quadratic_form, require_rule
 
 EXAMPLES: dict[str, Table] = {
     name: example.model_dump(mode="json", exclude_none=True)
@@ -121,7 +121,7 @@ def quadratic_rule(
     Q: Matrix, period_ns: int, epsilon: float = 0.0, heartbeat: int = 0,
     weight: Matrix | None = None,
 ) -> TriggerRule:  # fmt: skip
-    longest_ns = heartbeat * period_ns if heartbeat else NEVER_NS
+    longest_ns = heartbeat * period_ns if heartbeat else np.inf
     return TriggerRule(
         quadratic_form(Q), floor=float(np.sqrt(epsilon)), grid_ns=period_ns, longest_ns=longest_ns,
         weight=weight,

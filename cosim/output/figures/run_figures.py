@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.analysis.fidelity import Fidelity
 from cosim.analysis.value_reduction import decimate_all
-from cosim.output import palette
-from cosim.output.figure_description import (
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import (
     DASHES,
     Axis,
     Bars,
@@ -37,8 +37,8 @@ from cosim.output.figure_description import (
     series_colour,
     time_axis,
 )
-from cosim.output.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD, Colour
-from cosim.output.timing_figures import (
+from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD, Colour
+from cosim.output.figures.timing_figures import (
     clock_errors,
     clocks_figure,
     largest_text,

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from cosim.analysis.network_summary import LoopsOverTime, loops_over_time, quantiles
 from cosim.analysis.summary_model import InFlightPart, RunSummary
-from cosim.output import palette
-from cosim.output.figure_description import (
+from cosim.output.figures import palette
+from cosim.output.figures.figure_description import (
     Axis,
     Band,
     ColourScale,
@@ -24,7 +24,7 @@ from cosim.output.figure_description import (
     plain,
     time_axis,
 )
-from cosim.output.run_figures import envelopes, run_figures
+from cosim.output.figures.run_figures import envelopes, run_figures
 from cosim.record.align import Reals
 from cosim.record.run_record import RecordedRun
 from noack.core.number_format import number

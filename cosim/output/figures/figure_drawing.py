@@ -22,7 +22,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter, MaxNLocator
 
 from cosim.analysis.value_reduction import decimate
-from cosim.output.figure_description import (
+from cosim.output.figures.figure_description import (
     LARGEST,
     Axis,
     Band,
@@ -39,7 +39,7 @@ from cosim.output.figure_description import (
     log_ends,
     near_ends,
 )
-from cosim.output.figure_layout import (
+from cosim.output.figures.figure_layout import (
     BAR_IN,
     PAPER,
     POINTS_PER_IN,
@@ -84,7 +84,7 @@ _ELSEWHERE = str.maketrans(
 
 
 def draw(described: FigureDescription) -> Figure:
-    """Draw a figure for the width of :func:`cosim.output.figure_layout.figure_width`."""
+    """Draw a figure for the width of :func:`cosim.output.figures.figure_layout.figure_width`."""
     with settings():
         return _drawn(described)
 

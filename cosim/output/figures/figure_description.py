@@ -1,7 +1,7 @@
 """The content of a figure as plain data: rows of panels, their axes and their items.
 
 Reports, pages of studies, files and notebooks draw a :class:`FigureDescription` by matplotlib
-(:mod:`cosim.output.figure_drawing`), the lab page in the browser (:mod:`cosim.lab.stage`).
+(:mod:`cosim.output.figures.figure_drawing`), the lab page in the browser (:mod:`cosim.lab.stage`).
 Arrays may have any length, including 0. Values that are not finite are drawn as gaps.
 """
 
@@ -13,8 +13,8 @@ from typing import Literal
 
 import numpy as np
 
-from cosim.output import palette
-from cosim.output.palette import Colour
+from cosim.output.figures import palette
+from cosim.output.figures.palette import Colour
 from cosim.record.align import Reals
 from noack.core.linear_systems import Matrix
 
