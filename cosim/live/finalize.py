@@ -396,9 +396,7 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
     """Write the recording of an earlier run, or of one of its loops.
 
     Raises:
-        CallerError: it is not a run directory, the run is still under way, or there is no such
-            loop.
-        MachineError: the recording cannot be written.
+        CallerError, MachineError: as :func:`run_report`.
     """
     require_viewer()
     summary, run = _opened(run_dir, loop, view=False)

@@ -179,7 +179,7 @@ def _worst_loop(report: Report) -> Content | None:
         return None
     loop, why = report.loop, report.why
     return {
-        "name": f"{loop.name} (number {loop.number})",
+        "name": loop.name,
         "why": f"{why[:1].upper()}{why[1:]}. Its time starts {seconds(loop.phase_s)} after that of the run.",
         "remarks": [remark.text for remark in remarks(report.detail)],
     }

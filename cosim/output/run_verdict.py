@@ -415,7 +415,7 @@ def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
         for why, count in reasons.most_common(_MOST_REASONS)
     ]
     if more := len(reasons) - len(lines):
-        lines.append(f"and {more} more reasons: the summaries of the loops have them")
+        lines.append(f"and {more} more reason{'s' * (more > 1)}: the summaries of the loops have them")
     return lines
 
 

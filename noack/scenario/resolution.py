@@ -69,7 +69,10 @@ def resolve(scenario: Scenario) -> Scenario:
     """
     loops = loops_of(scenario)
     if len(loops) > 1:
-        raise CallerError(f"{scenario.name}: it has {len(loops)} loops; give a scenario of one loop")
+        raise CallerError(
+            f"{scenario.name}: it has {len(loops)} loops; give a scenario of one loop; "
+            "a run of all of them has the certificates of each"
+        )
     return _resolved(loops)[0]
 
 

@@ -174,9 +174,8 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
         raise CallerError(f"{error}; {_FORMS}" if not Path(label).exists() else str(error)) from None
     for key, value in settings.items():
         scenario_file.put(content, key, value, f"--set {key}")
-    model = content.get("model")
-    if isinstance(model, dict):  # its gain does not matter, and may be missing
-        model |= {"allow_unstable": True}
+    if isinstance(model := content.get("model"), dict):  # its gain does not matter, and may be missing
+        model["allow_unstable"] = True
         if isinstance(B := model.get("B"), list) and B and isinstance(B[0], list):
             model.setdefault("gain", [[0.0] * len(B)] * len(B[0]))
     resolved = resolve(scenario_file.completed(content, path))

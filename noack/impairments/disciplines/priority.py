@@ -41,4 +41,4 @@ class Priority(Scheduler):
 
     def meaning(self) -> str:
         levels = numbers_text(self.levels)
-        return f"more are dropped; it sends first what is of the flow with the least of {levels}"
+        return f"more are dropped; the flow with the smallest number goes first, {levels} by flow"

@@ -323,7 +323,7 @@ def intervals_ns(resolved: Scenario) -> tuple[int, int]:
     rule, step_ns = rule_of(resolved), resolved.timing.measurement_period_ns
     if rule.longest_ns == math.inf:
         raise CallerError(
-            f'trigger.policy = "{resolved.trigger.policy}": the margin needs a longest time '
+            f'trigger.policy = "{resolved.trigger.policy}": this needs a longest time '
             "between two events, as periodic and deadline have; use e.g. "
             "--set 'trigger={policy=\"periodic\", period_s=0.5}'"
         )

@@ -107,8 +107,7 @@ def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
     scenario.write_text(given.replace("count = 10", "count = 9"))
     refused = invoke("report", run_dir, "--again")
     scenario.write_text(given)
-    assert refused.exit_code == 2
-    assert refused.stderr.endswith("summary.json has other loops than scenario.toml; one was changed\n")
+    assert (refused.exit_code, "has other loops than" in refused.stderr) == (2, True)
 
 
 def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:
