@@ -65,38 +65,38 @@ def states(run: noack.Run) -> np.ndarray:
     return np.column_stack([table["x_1"].to_numpy(), table["x_2"].to_numpy()])
 
 
-def test_a_plant_in_ros2_moves_as_the_same_plant_in_noack(port: int, tmp_path: Path) -> None:
-    own = noack.simulate(noack.load(LOOP), runs=tmp_path / "own")
+def test_a_plant_in_ros2_moves_as_the_same_plant_in_noack(port: int) -> None:
+    own = noack.simulate(noack.load(LOOP))
     with node(EXAMPLE, port):
-        run = noack.simulate(noack.load(in_ros2(port)), runs=tmp_path / "ros2")
+        run = noack.simulate(noack.load(in_ros2(port)))
     assert run.summary.loops[0].events == own.summary.loops[0].events > 1
     assert np.abs(states(run) - states(own)).max() < 1e-9
     assert run.replay().bit_exact
 
 
-def test_a_plant_in_ros2_takes_part_in_a_live_run(port: int, tmp_path: Path) -> None:
+def test_a_plant_in_ros2_takes_part_in_a_live_run(port: int) -> None:
     with node(EXAMPLE, port):
-        run = noack.run(noack.load(in_ros2(port)), runs=tmp_path)
+        run = noack.run(noack.load(in_ros2(port)))
     assert run.summary.exit.reason == "horizon"
     assert run.replay().bit_exact
 
 
-def test_a_controller_in_ros2_controls(port: int, tmp_path: Path) -> None:
-    own = noack.simulate(noack.load(LOOP), runs=tmp_path / "own")
+def test_a_controller_in_ros2_controls(port: int) -> None:
+    own = noack.simulate(noack.load(LOOP))
     given = LOOP | {"controller": {"rate_hz": 100.0} | peer(port)}
     with node(CONTROLLER, port):
-        run = noack.simulate(noack.load(given), runs=tmp_path / "ros2")
+        run = noack.simulate(noack.load(given))
     assert np.abs(states(run) - states(own)).max() < 1e-9
     assert run.replay().bit_exact
 
 
-def test_who_does_not_answer_is_named(port: int, tmp_path: Path) -> None:
+def test_who_does_not_answer_is_named(port: int) -> None:
     given = LOOP | {"controller": {"rate_hz": 100.0} | peer(port, start_timeout_s=0.3)}
     with pytest.raises(CallerError, match="no answer on /noack/controller/input"):
-        noack.simulate(noack.load(given), runs=tmp_path)
+        noack.simulate(noack.load(given))
     nowhere = peer(port, listen=False)
     with pytest.raises(CallerError, match="cannot reach a router of ROS 2"):
-        noack.simulate(noack.load(LOOP | {"controller": nowhere}), runs=tmp_path)
+        noack.simulate(noack.load(LOOP | {"controller": nowhere}))
     done = invoke("bridge", "lane_following", "--router", "nonsense")
     assert done.exit_code == 2
     assert "router nonsense: give it as tcp/127.0.0.1:7447" in done.output

@@ -151,8 +151,8 @@ def test_event_counts_agree_with_the_summary(simulated: noack.Run) -> None:
     assert intervals_s[1:].min() == pytest.approx(summary.inter_event_min_s)
 
 
-def test_a_damaged_table_gives_one_line(tmp_path: Path, scenario: noack.Scenario) -> None:
-    run = noack.simulate(noack.with_settings(scenario, {"horizon_s": 0.1}), runs=tmp_path)
+def test_a_damaged_table_gives_one_line(scenario: noack.Scenario) -> None:
+    run = noack.simulate(noack.with_settings(scenario, {"horizon_s": 0.1}))
     assert run.tables
     (run.directory / "record/plant_step.parquet").write_bytes(b"PAR1")
     with pytest.raises(noack.NoackError, match=r"plant_step\.parquet: cannot be read"):

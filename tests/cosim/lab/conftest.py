@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -47,7 +48,8 @@ class Served:
             self._process.kill()
             assert self._process.stdout is not None
             self._process.stdout.close()
-        errors = self.errors.read_text()
+        # nicegui says so if the machine stalls for 2 s; it then names those that have not ended: none.
+        errors = re.sub(r"Could not cancel \d+ tasks within timeout: \n", "", self.errors.read_text())
         assert not errors, errors
 
 

@@ -90,7 +90,7 @@ def test_the_written_model_is_a_network_with_the_fitted_parameters(chain_csv: Pa
     assert [one.kind for one in network.impairments] == ["loss", "delay"]
     assert "outages" in path.read_text()
     scenario = noack.load("lane_following", {"network": network.model_dump(exclude_none=True)})
-    assert noack.simulate(noack.with_settings(scenario, {"horizon_s": 1.0}), runs=tmp_path).summary
+    assert noack.simulate(noack.with_settings(scenario, {"horizon_s": 1.0})).summary
 
 
 def test_a_network_without_losses_is_measured(tmp_path: Path) -> None:

@@ -91,18 +91,17 @@ def test_the_table_of_times_marks_what_was_later_than_allowed(outcome: Outcome) 
     assert "12.5 ms" in row
 
 
-def test_at_a_set_point_the_state_is_the_distance_from_it(tmp_path: Path) -> None:
+def test_at_a_set_point_the_state_is_the_distance_from_it() -> None:
     scenario = noack.load("double_integrator", {"controller.setpoint": [3.0, 0.0]})
-    summary = noack.simulate(scenario, runs=tmp_path).summary
+    summary = noack.simulate(scenario).summary
     loop = summary.loops[0]
     assert loop.setpoint == [3.0, 0.0]
     assert loop.initial_state_norm == 2.0
     assert "stable, ‖x − x_r‖ fell from 2 to " in verdict(summary)[0].text
 
 
-def test_the_verdict_of_several_loops_counts_them(tmp_path: Path) -> None:
-    run = noack.simulate(noack.load("different_loops", {"horizon_s": 2.0}), runs=tmp_path)
-    summary = run.summary
+def test_the_verdict_of_several_loops_counts_them() -> None:
+    summary = noack.simulate(noack.load("different_loops", {"horizon_s": 2.0})).summary
     first, second, _ = verdict(summary)
     assert re.fullmatch(r"completed 2 s: \d of 4 loops (stable|bounded).*", first.text)
     assert re.fullmatch(r"guarantee kept in all 4 loops: \d+ claims held, none violated", second.text)
@@ -156,16 +155,16 @@ def test_the_longest_burst_is_shown_with_the_limit_of_all_rules(outcome: Outcome
     assert "longest loss burst (at most 3 allowed)" in dict(short_numbers(limited))
 
 
-def test_an_assumption_that_a_scenario_violates_is_a_warning(tmp_path: Path) -> None:
+def test_an_assumption_that_a_scenario_violates_is_a_warning() -> None:
     trigger = {"policy": "absolute", "delta": 0.02}
-    run = noack.simulate(noack.load("double_integrator", {"trigger": trigger}), runs=tmp_path)
+    run = noack.simulate(noack.load("double_integrator", {"trigger": trigger}))
     assert "warning:" in (text := printed(reopen(run.directory)))
     assert "assumption violated: the trigger is" in text
 
 
 @pytest.mark.parametrize("scenario", ["four_tank", "lane_acknowledged"])
-def test_the_table_fits_eighty_columns(scenario: str, tmp_path: Path) -> None:
-    run = noack.simulate(noack.load(scenario, {"horizon_s": 1.0}), runs=tmp_path)
+def test_the_table_fits_eighty_columns(scenario: str) -> None:
+    run = noack.simulate(noack.load(scenario, {"horizon_s": 1.0}))
     rows = short_numbers(run.summary)
     assert max(len(name) for name, _ in rows) + max(len(value) for _, value in rows) <= 73
     # There is no other value to compare with.

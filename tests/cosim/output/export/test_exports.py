@@ -26,15 +26,13 @@ SCENARIO: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
-    folder = tmp_path_factory.mktemp("runs")
-    return noack.simulate(noack.load("lane_following", SCENARIO), runs=folder)
+def run() -> noack.Run:
+    return noack.simulate(noack.load("lane_following", SCENARIO))
 
 
 @pytest.fixture(scope="module")
-def loops(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
-    folder = tmp_path_factory.mktemp("loops")
-    return noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2}), runs=folder)
+def loops() -> noack.Run:
+    return noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2}))
 
 
 def vector(table: pa.Table, name: str) -> np.ndarray:

@@ -41,7 +41,7 @@ def by_mcap_ros2(path: Path) -> dict[str, list[tuple[int, str, list[str], list[f
 
 
 def test_two_readers_find_the_record(tmp_path: Path) -> None:
-    run = noack.simulate(noack.load("lane_following", {"horizon_s": 1.0}), runs=tmp_path)
+    run = noack.simulate(noack.load("lane_following", {"horizon_s": 1.0}))
     _, path = run.export(tmp_path / "run.mcap")
     found = by_rosbags(path)
     assert found == by_mcap_ros2(path)
@@ -59,7 +59,7 @@ def test_two_readers_find_the_record(tmp_path: Path) -> None:
 
 
 def test_loops_have_namespaces(tmp_path: Path) -> None:
-    run = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.1}), runs=tmp_path)
+    run = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.1}))
     _, path = run.export(tmp_path / "run.mcap")
     topics = {topic for topic in by_rosbags(path) if topic.endswith("/state")}
     assert topics == {f"/noack/{name.replace('-', '_')}/state" for name in run.loops}

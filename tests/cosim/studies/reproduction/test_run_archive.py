@@ -34,9 +34,8 @@ Files = dict[str, bytes]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
-    folder = tmp_path_factory.mktemp("runs")
-    return noack.simulate(noack.load("lane_following", {"horizon_s": 3.0}), runs=folder)
+def run() -> noack.Run:
+    return noack.simulate(noack.load("lane_following", {"horizon_s": 3.0}))
 
 
 @pytest.fixture(scope="module")
