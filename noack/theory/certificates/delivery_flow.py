@@ -17,6 +17,10 @@ are those of :mod:`noack.theory.bounds.enclosure`, with s the left node. From th
 + e_c = e^{Hτ} ξ has decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D and
 ‖Λx‖ ≤ 1.
 
+Where bounds are largest, the conditions of several earlier times are used together. Up to the first
+event after the start x is known, so if inputs are neither delayed nor held, the ellipsoid need only
+contain x at the first delivery after it.
+
 **Delayed and held inputs.** This is so if inputs are neither delayed nor held. Otherwise z begins
 with an e_c that is not 0, and the age of inputs drives it; :class:`Disturbed` bounds both. What
 they change is added to the bounds; the flow is followed until it is a share of D.
@@ -47,6 +51,7 @@ from noack.theory.bounds.contraction import (
     largest_eigenvalues,
     logarithmic_norm,
     product,
+    spectral_norm,
     spectral_norms,
 )
 from noack.theory.bounds.enclosure import KernelBounds, response
@@ -58,7 +63,7 @@ _LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), 40.0)
 _ALONE = 40.0
 """λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
 _NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
-_AT_ONCE = 16
+_AT_ONCE, _MOST_JOINT = 16, 8
 _SHARES = np.array(
     [
         (first, (1 - first) * (1 - last), (1 - first) * last, 0.0)
@@ -71,9 +76,14 @@ _SHARES = np.array(
         for last in (0.4, 0.55, 0.7)
     ]
 )
-"""Of the four conditions that hold after the last node."""
-_WINDOWS = (1 / 6, 1 / 3, 2 / 3, 1.0)
+"""Of ‖x_c‖, of ‖e_c‖ at both ends, and of ‖Λx‖, after the last node: the first to be tried."""
+_WINDOWS = (1 / 6, 1 / 3, 2 / 3, 0.9, 1.0)
 """T' as shares of the last node."""
+_EARLIER = 8
+"""Earlier times whose conditions are used together."""
+_FOUR = [0, 1, 2 * _EARLIER + 1, 2]
+_OTHERS = 0.1
+"""Their share at first, beside the best two."""
 _HALVINGS = 12
 _TAYLOR_TERMS = 4
 ROUNDING = 1 + 1e-5
@@ -149,6 +159,38 @@ class DeliveryFlow:
         self.states = np.ascontiguousarray(self._propagators[:, :, : self.n])
         self.input_error = self.weight @ plant.input_matrix
         self.gain = error.split_K[1] @ self.inverse
+
+    @cached_property
+    def begun(self) -> tuple[Matrix, Vector]:
+        """e^{Fτ} (x(0), 0) at the nodes, (k + 1, 2n), and bounds of its second derivative, (k,)."""
+        z, steps_s, F = self.states @ self.start[:, 0], np.diff(self.edges_s), self.generator
+        term, bends = z[:-1] @ (F @ F).T, np.zeros(len(steps_s))
+        for order in range(1, _TAYLOR_TERMS + 1):
+            bends += np.linalg.norm(term, axis=1)
+            term = term @ F.T * (steps_s / order)[:, None]
+        with np.errstate(over="ignore"):
+            growth = np.exp(max(logarithmic_norm(F), 0.0) * steps_s)
+        return z, bends + growth * np.linalg.norm(term, axis=1)
+
+    def from_start(self, C: Matrix, limit: float, first: int = 0) -> float:
+        """Bound ‖C z‖ from a cell after the start on, until the first delivery, if ‖e_c‖_W ≤ D.
+
+        z is at most as large as that of x(0), and small enough for D at all earlier times.
+        """
+        z, bends = self.begun
+        errors = np.maximum.accumulate(np.linalg.norm(z[:-1, self.n :], axis=1))
+        shares = limit / np.maximum(errors, limit)
+        sizes = np.linalg.norm(z @ C.T, axis=1)
+        sags = np.diff(self.edges_s) ** 2 / 8 * bends * float(np.linalg.norm(C, 2))
+        cells = shares * (np.maximum(sizes[1:], sizes[:-1]) + sags)
+        return float(cells[first:].max()) * ROUNDING
+
+    def first_event(self, level: float) -> int:
+        """Return the first cell in which ‖e_s‖_W can reach a level after the start."""
+        z, bends = self.begun
+        sizes = np.linalg.norm(z[:, self.n :], axis=1)
+        highest = np.maximum(sizes[1:], sizes[:-1]) + np.diff(self.edges_s) ** 2 / 8 * bends
+        return int(np.argmax(np.append(highest[:-1] * ROUNDING >= level, True)))
 
     def cell_at(self, time_s: float) -> int:
         """Return the cell that contains a time."""
@@ -264,10 +306,27 @@ class Reach:
     by: Disturbed = UNDISTURBED
     followed: float = 1.0
     """e_c is followed until delay and hold may have changed it by this share of D."""
+    first: int = 0
+    """‖ΛWξ‖ ≤ c from this cell after the start on; before, x is that of the start."""
 
     def sup(self, C: Matrix) -> float:
         """Bound ‖C z‖ at all times, for C of shape (q, 2n)."""
-        return self._sup(_CellBounds(self.starts, C), 0)
+        return max(self._sup(_CellBounds(self.starts, C), 0), self._from_start(C))
+
+    def sup_state(self, C: Matrix) -> float:
+        """Bound ‖C W x‖ at all times, for C of shape (q, n)."""
+        size = self.size * float(spectral_norm(C @ self.starts.inverse)) * ROUNDING
+        return max(size, self._from_start(np.hstack([C, np.zeros_like(C)])))
+
+    def _from_start(self, C: Matrix) -> float:
+        return self.starts.flow.from_start(C, self.limit) if self.first else 0.0
+
+    def largest(self, since_s: float = 0.0) -> float:
+        """Bound ‖ΛWx‖ from a time after the start on."""
+        if not self.first:
+            return self.size
+        flow, C = self.starts.flow, self.starts.itself.C
+        return max(self.size, flow.from_start(C, self.limit, flow.cell_at(since_s)))
 
     def is_invariant(self) -> bool:
         """Return whether ‖Λx‖ ≤ c at a delivery implies the same at all times until the next.
@@ -290,6 +349,11 @@ class Reach:
         return self.by.sizes(flow.of_error) if not self.by.is_none else np.zeros(len(flow.edges_s) - 1)
 
     @cached_property
+    def _levels(self) -> Vector:
+        """Bounds of ‖ΛWx‖ over the cells, for c = 1."""
+        return 1 + self._changes(self.starts.itself) / self.size
+
+    @cached_property
     def _cells(self) -> int:
         """The cells that are followed."""
         return int(np.argmax(np.append(self._errors, np.inf) > self.followed * self.limit))
@@ -298,49 +362,75 @@ class Reach:
         # All is in proportion to c, for D/c.
         limits, changes = self.limit + self._errors, self._changes(bounds)
         cells = slice(first, self._cells)
-        near = bounds.sup(limits / self.size, changes / self.size, cells)
-        return float(self.size * max(near, self._afterwards(bounds)))
+        after = self._afterwards(bounds)
+        near = bounds.sup(limits / self.size, self._levels, changes / self.size, cells, after)
+        return float(self.size * max(near, after))
 
     def _afterwards(self, bounds: "_CellBounds") -> float:
         """Bound ‖C z‖ after the last node that is followed, for c = 1."""
-        errors = changes = np.zeros(bounds.cells)
+        changes = np.zeros(bounds.cells)
         if not self.by.is_none:
             held = self.by._replace(late=0.0)
-            errors, changes = held.sizes(self.starts.flow.of_error), held.sizes(bounds.disturbed)
-        return min(self._after_window(bounds.C, errors, changes, share) for share in _WINDOWS)
+            changes = held.sizes(bounds.disturbed)
+        found = []
+        for cell, moved, forms, roots in self._windows:
+            sizes = spectral_norms(bounds.C @ moved @ roots)
+            begin = np.full((1, len(forms)), _OTHERS / len(forms))
+            begin[0, _FOUR] += (1 - _OTHERS) * _SHARES[int(sizes.argmin())]
+            largest, _ = _largest(forms[None], (bounds.C @ moved)[None], 0.0, begin)
+            size = min(float(sizes.min()) * ROUNDING, float(largest[0]))
+            found.append(size + float(changes[cell]) / self.size)
+        return min(found)
 
-    def _after_window(self, C: Matrix, errors: Vector, changes: Vector, share: float) -> float:
-        """The same from ‖x + e_c‖ ≤ h, ‖Λx‖ ≤ 1 and ‖e_c‖ ≤ D, T' before, and ‖e_c‖ ≤ D now."""
-        flow, n = self.starts.flow, self.starts.flow.n
-        last_s = float(flow.edges_s[self._cells])
-        node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
-        since_s = last_s - float(flow.edges_s[node])
-        cell = flow.cell_at(since_s)
-        x_c = flow.states[node, :n] + flow.states[node, n:]
-        h = float(np.linalg.norm(x_c @ self.starts.inverse, 2))
-        h = flow.stretch * (h + float(np.linalg.norm(x_c, 2)) * self.by.late / self.size)
-        identity, none, limit = np.eye(n), np.zeros((n, n)), self.limit / self.size
-        moved = exponential(flow.generator * since_s)
-        moved = moved @ np.block([[identity, -identity], [none, identity]])
-        rows = [
-            np.hstack([identity, none]) / h,
-            np.hstack([none, identity]) / limit,
-            moved[n:] / (limit + errors[cell] / self.size),
-            self.starts.shape @ np.hstack([identity, -identity]),
-        ]
-        grams = np.array([row.T @ row for row in rows])
-        values, V = np.linalg.eigh(np.tensordot(_SHARES, grams, axes=1))
-        usable = values[:, 0] > 1e-12 * values[:, -1]  # others are too flat for their rounding
-        sizes = spectral_norms(C @ moved @ V[usable] / np.sqrt(values[usable])[:, None])
-        largest = float(sizes.min(initial=math.inf)) * ROUNDING + float(changes[cell]) / self.size
-        return largest if math.isfinite(largest) else math.inf
+    @cached_property
+    def _windows(self) -> list[tuple[int, Matrix, Stack, Stack]]:
+        """What holds of z a time T' ago, after the last node that is followed, for each T'.
+
+        T' as a cell, the flow in it, forms that are at most 1, all for c = 1 and in (x_c, e_c):
+        ‖x_c‖ ≤ h, and ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1 at several times; semi-axes for some of their sums.
+        """
+        flow, n, shape, found = self.starts.flow, self.starts.flow.n, self.starts.shape, []
+        last_s, limit, identity = float(flow.edges_s[self._cells]), self.limit / self.size, np.eye(n)
+        errors = np.zeros(len(flow.edges_s) - 1)
+        levels = np.ones(len(errors))
+        if not self.by.is_none:
+            held = self.by._replace(late=0.0)
+            errors = held.sizes(flow.of_error) / self.size
+            levels = levels + held.sizes(self.starts.itself.disturbed) / self.size
+        for share in _WINDOWS:
+            node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
+            since_s = last_s - float(flow.edges_s[node])
+            x_c = flow.states[node, :n] + flow.states[node, n:]
+            h = float(np.linalg.norm(x_c @ self.starts.inverse, 2))
+            h = h + float(np.linalg.norm(x_c, 2)) * self.by.late / self.size
+            if self.first:
+                h = max(h, float(np.linalg.norm(x_c @ flow.start)) / self.size)
+            level = 1.0 if node >= self.first else self.largest() / self.size
+            rows = [np.hstack([identity, np.zeros((n, n))]) / (flow.stretch * h)]
+            moved = np.block([[identity, -identity], [np.zeros((n, n)), identity]])
+            step = exponential(flow.generator * (since_s / _EARLIER))
+            for number in range(_EARLIER + 1):
+                cell = flow.cell_at(number * since_s / _EARLIER) if number else 0
+                added = (errors[cell], levels[cell] - 1) if number else (0.0, 0.0)
+                rows.append(moved[n:] / (limit + added[0]))
+                if number < _EARLIER:
+                    rows.append(shape @ moved[:n] / (level + added[1]))
+                    moved = step @ moved
+            turn = _balancing(np.array(rows)[None])[0]
+            turned = np.array(rows) @ turn
+            forms = turned.swapaxes(-1, -2) @ turned
+            values, V = np.linalg.eigh(np.tensordot(_SHARES, forms[_FOUR], axes=1))
+            usable = values[:, :1] > _CONDITION * values[:, -1:]  # others are too flat
+            roots = V / np.sqrt(np.where(usable, values, _CONDITION))[:, None]
+            found.append((flow.cell_at(since_s), moved @ turn, forms, roots))
+        return found
 
 
 class _CellBounds:
     """Bounds of ‖C z‖ over each cell, for ‖Λξ‖ ≤ 1."""
 
     def __init__(self, starts: Starts, C: Matrix) -> None:
-        self.C, self._singular, self._flow = C, starts.axes[0], starts.flow
+        self.C, self._singular, self._flow, self._starts = C, starts.axes[0], starts.flow, starts
         self.cells, n = self._singular.shape
         cells = self.cells
         ends, terms, rest = starts.followed
@@ -362,19 +452,29 @@ class _CellBounds:
         """See :meth:`DeliveryFlow.disturbed`."""
         return self._flow.disturbed(self.C)
 
-    def sup(self, limits: Vector, added: Vector, followed: slice) -> float:
-        """Bound ‖C z‖ over some cells, for a D of each cell, with what is added to each, (k,)."""
+    def sup(self, limits: Vector, levels: Vector, added: Vector, followed: slice, enough: float) -> float:
+        """Bound ‖C z‖ over some cells, given D and ‖Λx‖ for each, with what is added to each, (k,).
+
+        A bound below ``enough`` is not improved.
+        """
         loose = self.loose(limits, _LOGITS)
         if not np.isfinite(loose).all():
             return math.inf
         highest, logits = loose.min(axis=1) + added, _LOGITS[loose.argmin(axis=1)]
         highest[: followed.start] = 0.0
         highest[followed.stop :] = 0.0
-        rounds = np.zeros(len(highest), dtype=np.int64)
+        rounds, joint = np.zeros(len(highest), dtype=np.int64), 0
         while True:  # the highest bounds become better, until that of the highest is settled
             cells = np.argsort(highest)[-_AT_ONCE:]
-            if rounds[cells[-1]] == len(_WIDTHS):
+            is_last = rounds[cells[-1]] > len(_WIDTHS) or joint == _MOST_JOINT
+            if is_last or highest[cells[-1]] * ROUNDING <= enough:
                 return float(highest[cells[-1]]) * ROUNDING
+            settled = cells[rounds[cells] == len(_WIDTHS)]
+            if len(settled):
+                values = self._joint(limits, levels, settled, logits[settled, None])
+                highest[settled] = np.minimum(highest[settled], values + added[settled])
+                rounds[settled], joint = rounds[settled] + 1, joint + 1
+                continue
             cells = cells[rounds[cells] < len(_WIDTHS)]
             tried = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
             values = self._tight(limits, cells, tried)
@@ -401,6 +501,36 @@ class _CellBounds:
         bends = np.sqrt(d**2 @ self._squares[cells, :, 2:]).sum(axis=2)
         ends = np.sqrt(sizes.reshape(scaled.shape[:-2])).max(axis=2)
         return np.asarray(ends + self._sags_s2[cells, None] * bends)
+
+    def _joint(self, limits: Vector, levels: Vector, cells: NDArray[np.int64], logits: Stack) -> Vector:
+        """Return bounds by all conditions at several earlier nodes, (k,); the bends are as above."""
+        flow, n = self._flow, self._flow.n
+        times_s = flow.edges_s[cells, None] * (np.arange(1, _EARLIER + 1) / _EARLIER)
+        nodes = np.minimum(flow.edges_s.searchsorted(times_s, side="right") - 1, cells[:, None])
+        states, shape = flow.states[nodes], self._starts.shape
+        rows = np.concatenate(
+            [
+                np.broadcast_to(shape, (len(cells), 1, n, n)),
+                states[:, :, n:] / limits[nodes][..., None, None],
+                shape @ states[:, :, :n] / levels[nodes][..., None, None],
+            ],
+            axis=1,
+        )
+        share = 1 / (1 + np.exp(-logits[:, 0]))
+        begin = np.full(rows.shape[:2], _OTHERS / rows.shape[1])
+        begin[:, 0] += (1 - _OTHERS) * share
+        begin[:, _EARLIER] += (1 - _OTHERS) * (1 - share)
+        turn = _balancing(rows * np.sqrt(begin)[..., None, None])
+        rows = rows @ turn[:, None]
+        forms = rows.swapaxes(-1, -2) @ rows
+        ends = self.C @ np.array([flow.states[cells], flow.states[cells + 1]]) @ turn
+        bounds, weights = _largest(forms, ends[1], 0.0, begin, all_of_them=True)
+        inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
+        sizes = np.linalg.eigvalsh(ends @ inverse @ ends.swapaxes(-1, -2))[..., -1].max(axis=0)
+        sizes = np.where(np.isfinite(bounds), sizes.clip(min=0.0), np.inf)
+        d = _semi_axes(self._singular[cells] / limits[cells, None], logits)
+        bends = np.sqrt(d**2 @ self._squares[cells, :, 2:]).sum(axis=2)[:, 0]
+        return np.asarray(np.sqrt(sizes) + self._sags_s2[cells] * bends)
 
 
 def _semi_axes(singular: Vector, logits: Vector) -> Stack:
@@ -434,7 +564,8 @@ def errors_after_losses(
         kernel: of ‖e^{(H+αI)τ}‖_W.
         bend: that of e_s, see :func:`bend_of_error`.
     """
-    errors, since_s, flow = plain.copy(), -reach.by.late_s, reach.starts.flow
+    errors, since_s, flow, size_of_x = plain.copy(), -reach.by.late_s, reach.starts.flow, reach.size
+    first_s = float(flow.edges_s[reach.first]) if reach.first else math.inf
     most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
     if spacing_s >= most_s or len(plain) == 1:
         return errors
@@ -442,7 +573,7 @@ def errors_after_losses(
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
     for lost in range(len(plain)):
         earlier = float(errors[lost - 1]) if lost else max(_NOTHING * size, reach.by.late)
-        stage = _Stage(reach, min(max(since_s, 0.0), most_s), earlier, r_s, flows, kernel)
+        stage = _Stage(reach, min(max(since_s, 0.0), most_s), earlier, size_of_x, r_s, flows, kernel)
         if lost:
             added = size + kernel.sups(r_s) * earlier
             largest = max(stage.largest_error(size, added), float(added[-1]), earlier)
@@ -454,6 +585,9 @@ def errors_after_losses(
             most = (level or 0.0) - (0.0 if lost else flow.stretch * reach.by.late)
             later_s = stage.next_event_s(most, bend, _LATEST * spacing_s) if most > 0 else 0.0
             since_s += max(spacing_s, later_s)
+            if not lost:  # x(0) itself may be outside the ellipsoid
+                since_s = min(since_s, first_s)
+                size_of_x = reach.largest(first_s - since_s)
     return errors
 
 
@@ -485,6 +619,7 @@ class _Stage:
         reach: Reach,
         window_s: float,
         earlier: float,
+        size_of_x: float,
         r_s: Vector,
         flows: Stack,
         kernel: KernelBounds,
@@ -507,7 +642,7 @@ class _Stage:
             half[n:] / (earlier + half_way),
             (half @ half)[n:] / (earlier + at_event),
         ]
-        rows.append(reach.starts.shape @ identity[:n] / reach.size)
+        rows.append(reach.starts.shape @ identity[:n] / size_of_x)
         forms = np.array([row.T @ row for row in rows])
         self._forms = np.broadcast_to(forms, (len(r_s), *forms.shape))
         self._z = flows @ half @ half
@@ -552,6 +687,15 @@ class _Stage:
         return float(self._r_s[np.append(reached, True).argmax()])
 
 
+def _balancing(rows: Stack) -> Stack:
+    """Return coordinates in which the sum of the squares of rows is the identity, (j, m, m).
+
+    ``rows`` is (j, i, q, m). The squares themselves may be too different for their rounding.
+    """
+    together = rows.reshape(len(rows), -1, rows.shape[-1])
+    return np.asarray(np.linalg.inv(np.linalg.qr(together, mode="r")))
+
+
 def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
     """Return C_r: e_s a time after an event is C_r z."""
     rows = np.asarray(exponential(flow.generator * time_s)[flow.n :])
@@ -559,12 +703,15 @@ def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
     return rows
 
 
-def _largest(forms: Stack, Y: Stack, enough: float, *, all_of_them: bool = False) -> tuple[Vector, Stack]:
-    """Bound ‖Y z‖ for all z with forms of at most 1, (j,), by weights, (j, i).
+def _largest(
+    forms: Stack, Y: Stack, enough: float, begin: Stack | None = None, *, all_of_them: bool = False
+) -> tuple[Vector, Stack]:
+    """Bound ‖Y z‖ for all z with forms of at most 1, (j,), by weights, (j, i), from some on.
 
     None below ``enough`` is improved, and only the largest ones unless all of them are wanted.
     """
-    bounds, weights = np.full(len(forms), np.inf), np.full(forms.shape[:2], 1 / forms.shape[1])
+    bounds = np.full(len(forms), np.inf)
+    weights = np.full(forms.shape[:2], 1 / forms.shape[1]) if begin is None else begin
     active, best = np.arange(len(forms)), weights.copy()
     for _ in range(_ROUNDS):
         some = forms[active]

@@ -52,6 +52,9 @@ class InvariantEllipsoids:
     """The largest D, for which Λ is chosen."""
     age_gains: Mapping[Output, float] = field(default_factory=dict)
     """gain_C with ‖q‖ ≤ Σ gain_C sup‖C x_c‖, for which Λ is chosen; none if no input is held."""
+    level: float = 0.0
+    """‖e_s‖_W at an event, at least, if no input is held or late. Up to the first event x is that
+    of the start, which need not be in the ellipsoid then."""
 
     def within(
         self,
@@ -74,12 +77,15 @@ class InvariantEllipsoids:
             drift = self.plant.A + self.plant.alpha_per_s * np.eye(self.flow.n)
             begun = response_until(drift, self.plant.start, start_s)
             size = max(size, float(begun.through(starts.shape @ self.flow.weight).sup_on_grid()))
+        if self._first:  # the first delivery
+            Y = np.hstack([starts.shape, np.zeros_like(starts.shape)])
+            size = max(size, self.flow.from_start(Y, limit, self._first))
         if not math.isfinite(size):
             return None
         for margin in _MARGINS if disturbed is None else _WIDE_MARGINS:
             by = UNDISTURBED if disturbed is None else disturbed(starts, float(size * margin))
             for share in (1.0,) if disturbed is None else _FOLLOWED:
-                reach = Reach(starts, size * margin, limit, by, share)
+                reach = Reach(starts, float(size * margin), limit, by, share, self._first)
                 if reach.is_invariant():
                     return reach
         return None
@@ -88,6 +94,11 @@ class InvariantEllipsoids:
     def flow(self) -> DeliveryFlow:
         """The flow between two deliveries."""
         return DeliveryFlow(self.plant)
+
+    @cached_property
+    def _first(self) -> int:
+        """The cell of the first event after the start."""
+        return self.flow.first_event(self.level) if self.level else 0
 
     @cached_property
     def _starts(self) -> Starts | None:
@@ -183,7 +194,8 @@ class InvariantEllipsoids:
                 self._nodes[:, n:] @ factors[:, None] / limit,
             )
         )
-        largest = np.linalg.norm(shapes @ self.flow.start, 2, axis=(1, 2)) ** 2 * ROUNDING
+        first = self.flow.start[:, 0] if not self._first else self.flow.begun[0][self._first, :n]
+        largest = np.linalg.norm(shapes @ first, axis=1) ** 2 * ROUNDING
         which, nodes = np.nonzero(np.linalg.eigvalsh(image)[..., -1] >= 1)
         if len(which):
             image, error = image[which, nodes], error[which, nodes]

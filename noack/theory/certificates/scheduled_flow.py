@@ -108,7 +108,12 @@ class _ScheduledFlow:
     @cached_property
     def _ellipsoids(self) -> InvariantEllipsoids:
         largest = self.known.errors[Output.WEIGHTED]
-        return InvariantEllipsoids(self._part.plant, largest, self._step.age_gains)
+        level = self._part.bound.reached or 0.0 if self._is_ideal else 0.0
+        return InvariantEllipsoids(self._part.plant, largest, self._step.age_gains, level)
+
+    @property
+    def _is_ideal(self) -> bool:
+        return self._late_s == 0 and self._conditions.hold_s == 0
 
     def insert(self) -> None:
         """Insert bounds into the inequalities until they have settled."""
@@ -122,14 +127,14 @@ class _ScheduledFlow:
         """Make bounds smaller by the flow; return whether there is an ellipsoid."""
         known, conditions = self.known, self._conditions
         limit = known.errors[Output.WEIGHTED]
-        is_ideal = self._late_s == 0 and conditions.hold_s == 0
-        reach = self._ellipsoids.within(limit, None if is_ideal else self._disturbed, conditions.start_s)
+        disturbed = None if self._is_ideal else self._disturbed
+        reach = self._ellipsoids.within(limit, disturbed, conditions.start_s)
         if reach is None:
             return False
         known.signals[0] = min(known.signals[0], reach.by.held)
-        inverse = reach.size * self._part.plant.error.inverse_weight @ reach.starts.inverse
+        inverse = self._part.plant.error.inverse_weight
         for name, C in self._part.plant.outputs.items():
-            known.states[name] = min(known.states[name], float(spectral_norm(C @ inverse)) * ROUNDING)
+            known.states[name] = min(known.states[name], reach.sup_state(C @ inverse))
         gain = reach.starts.flow.gain
         size = max(reach.sup(np.hstack([0 * gain, gain])), float(spectral_norm(gain)) * reach.by.late)
         known.errors[Output.GAIN] = min(known.errors[Output.GAIN], size)

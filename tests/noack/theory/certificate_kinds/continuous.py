@@ -47,12 +47,13 @@ def no_lost_updates() -> AbstractContextManager[Any]:
     return patch.object(scheduled_flow, "errors_at_events", np.zeros_like)
 
 
-def no_mismatch() -> AbstractContextManager[Any]:
-    """The plant follows its model."""
+def no_mismatch(*, at_nodes: bool) -> AbstractContextManager[Any]:
+    """The plant follows its model, at the nodes of the flow, too, or from them on only."""
     exact = DeliveryFlow.__init__
 
     def without(flow: DeliveryFlow, plant: PlantGains) -> None:
-        exact(flow, replace(plant, A=plant.error.H - plant.B @ plant.error.K))
+        exact(flow, replace(plant, A=plant.error.H - plant.B @ plant.error.K) if at_nodes else plant)
+        flow.generator[flow.n :, : flow.n] = 0.0
 
     return patch.object(DeliveryFlow, "__init__", without)
 
@@ -126,7 +127,7 @@ CONTINUOUS = Kind(
         for name, mistake, where in (
             ("the ellipsoid holds x(0) only", only_the_start, {"far": False}),
             ("no lost updates at an event", no_lost_updates, {"far": True}),
-            ("no mismatch in the flow", no_mismatch, {"far": True, "mansd": 1}),
+            ("no mismatch in the flow", partial(no_mismatch, at_nodes=False), {"far": True, "mansd": 1}),
         )
     },
 )  # fmt: skip
@@ -155,7 +156,7 @@ SCHEDULED = Kind(
         name: Broken(partial(_broken, _certified, mistake), draw)
         for name, mistake, draw in (
             ("the ellipsoid holds x(0) only", only_the_start, partial(_sampled, far=False)),
-            ("no mismatch in the flow", no_mismatch,
+            ("no mismatch in the flow", partial(no_mismatch, at_nodes=True),
              partial(random_system, **_LONG, **DRIFTING, delay_steps=4, hold_steps=0)),
             ("no age of inputs in the flow", no_age_of_inputs,
              partial(random_system, **_LONG, n=1, m=1, delay_steps=0, hold_steps=4)),
