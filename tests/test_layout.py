@@ -17,41 +17,41 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 428
+MOST_MODULES = 429
 LINES = {
-    "noack/scenario": 4040,
-    "noack/controllers": 270,
-    "noack/core": 1580,
+    "noack/scenario": 4045,
+    "noack/controllers": 265,
+    "noack/core": 1325,
     "noack/disturbances": 220,
-    "noack/impairments": 4320,
+    "noack/impairments": 4340,
     "noack/machines": 400,
     "noack/observers": 385,
-    "noack/plants": 3225,
+    "noack/plants": 3220,
     "noack/protocol": 1240,
-    "noack/runtime": 5400,
+    "noack/runtime": 5655,
     "noack/settings": 585,
-    "noack/theory": 10675,
+    "noack/theory": 11040,
     "noack/traces": 1320,
-    "noack/trigger": 1070,
-    "netem": 6525,
-    "cosim/analysis": 8140,
-    "cosim/api": 1680,
-    "cosim/cli": 3325,
+    "noack/trigger": 1065,
+    "netem": 6500,
+    "cosim/analysis": 8230,
+    "cosim/api": 1675,
+    "cosim/cli": 3310,
     "cosim/doctor": 815,
     "cosim/interactive": 1625,
     "cosim/lab": 2115,
-    "cosim/live": 3975,
+    "cosim/live": 3980,
     "cosim/measurement": 2855,
-    "cosim/output": 8500,
-    "cosim/record": 3525,
+    "cosim/output": 8505,
+    "cosim/record": 3565,
     "cosim/simulation": 1895,
     "cosim/studies": 8865,
-    "plant_server": 425,
-    "sensor_node": 400,
-    "controller_node": 415,
-    "benchmarks": 4715,
-    "native": 10970,
-    "tests": 46125,
+    "plant_server": 420,
+    "sensor_node": 395,
+    "controller_node": 410,
+    "benchmarks": 4525,
+    "native": 11030,
+    "tests": 46270,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
@@ -60,7 +60,7 @@ says why.
 """
 
 MARKS = {
-    "benchmarks": (36, 9, 0),
+    "benchmarks": (32, 9, 0),
     "cosim": (2, 0, 0),
     "cosim/analysis": (8, 5, 0),
     "cosim/cli": (14, 0, 0),

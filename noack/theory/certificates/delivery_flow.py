@@ -63,7 +63,7 @@ _LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), 40.0)
 _ALONE = 40.0
 """λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
 _NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
-_AT_ONCE, _MOST_JOINT = 16, 8
+_AT_ONCE, _MOST_JOINT = 16, 3
 _SHARES = np.array(
     [
         (first, (1 - first) * (1 - last), (1 - first) * last, 0.0)

@@ -80,7 +80,7 @@ class InvariantEllipsoids:
         if self._first:  # the first delivery
             Y = np.hstack([starts.shape, np.zeros_like(starts.shape)])
             size = max(size, self.flow.from_start(Y, limit, self._first))
-        if not math.isfinite(size):
+        if not 0 < size < math.inf:
             return None
         for margin in _MARGINS if disturbed is None else _WIDE_MARGINS:
             by = UNDISTURBED if disturbed is None else disturbed(starts, float(size * margin))
