@@ -174,6 +174,17 @@ class ScenarioOptions:
 
 
 @option_group
+class OneLoopOptions(ScenarioOptions):
+    """The scenario of one loop; of a scenario with several, that of the loop named."""
+
+    loop: LoopOption = None
+
+    def load(self, *more: str) -> "Scenario":
+        """Load it, with more settings of the whole scenario as for ``--set``."""
+        return scenario.loop_named(load_scenario(self.scenario, [*(self.settings or ()), *more]), self.loop)
+
+
+@option_group
 class ExampleOptions(ScenarioOptions):
     """The same; the paper's example by default."""
 

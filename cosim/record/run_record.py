@@ -69,7 +69,7 @@ from noack.scenario.resolution import (
     run_tables,
     tables_of,
 )
-from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections, phases_ns
+from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, phases_ns
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
@@ -78,7 +78,6 @@ with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
 _NOTICES_FILE = "notices.jsonl"
 Notice = dict[str, Any]
 """A line of the run's log: t_ns, level, text, process, and the number of a loop if it has one."""
-_MOST_NAMES = 12
 _ROWS_PER_STEP, _MORE_ROWS = 4, 100_000
 """A table has at most this number of rows per step of the loops, and more for restarts."""
 _CLOCK_EXCHANGE_NS = 20_000_000
@@ -354,7 +353,7 @@ class RecordedRun:
 
 def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
     """Return the error for a name that none of a run's loops has, or for no name of several."""
-    few = ", ".join(names[:_MOST_NAMES]) + (", …" if len(names) > _MOST_NAMES else "")
+    few = few_of(names)
     if name is None:
         return CallerError(
             f"the run has {len(names)} loops: take one with --loop NAME, in Python "

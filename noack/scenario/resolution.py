@@ -16,7 +16,15 @@ from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observer_settings import EstimationModel, unobservable_mode
 from noack.protocol.record_tables import CLOCK_TABLES, LOOP, OWNER, RecordShape, entry_names, largest, tables
-from noack.scenario.scenario import Scenario, loop_scenario, loop_sections, loops_by_entry, loops_of
+from noack.scenario.scenario import (
+    Scenario,
+    few_of,
+    loop_names,
+    loop_scenario,
+    loop_sections,
+    loops_by_entry,
+    loops_of,
+)
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.sections import AnyObserver, ModelSection
 from noack.settings.section import rows_of
@@ -70,8 +78,8 @@ def resolve(scenario: Scenario) -> Scenario:
     loops = loops_of(scenario)
     if len(loops) > 1:
         raise CallerError(
-            f"{scenario.name}: it has {len(loops)} loops; give a scenario of one loop; "
-            "a run of all of them has the certificates of each"
+            f"{scenario.name}: it has {len(loops)} loops, and this is for one: give its file, or --loop NAME "
+            f"where there is this option; they are {few_of(loop_names(scenario))}"
         )
     return _resolved(loops)[0]
 

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import ValidationError, create_model, model_validator
 
 from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
 from noack.core.random_streams import named_stream_keys, stream
 from noack.scenario.run_sections import MOST_LOOPS, LoopSection, SeedsSection
 from noack.scenario.scenario_checks import check_changes, check_sections
@@ -47,6 +48,7 @@ _KINDS: Mapping[str, tuple[str, ...]] = {
     "controller": ("kind",),
 }
 """The tables of a loop, each with the keys that make it replace the table of the top level."""
+_MOST_NAMES = 12
 _DRAWN = ("plant", "initial_state", "disturbance", "noise")
 """The seeds that each loop has of its own."""
 
@@ -68,6 +70,24 @@ def loops_of(scenario: Scenario) -> tuple[Scenario, ...]:
     number. So a run with one entry of [[loops]] computes what the run without it does.
     """
     return tuple(loop for loops in loops_by_entry(scenario) for loop in loops)
+
+
+def loop_named(scenario: Scenario, name: str | None) -> Scenario:
+    """Return the scenario of the loop of a name, as if it were alone; without a name, the scenario.
+
+    Raises:
+        CallerError: there is no such loop.
+    """
+    if name is None:
+        return scenario
+    if name not in (names := loop_names(scenario)):
+        raise CallerError(f"--loop {name}: the loops of the scenario are {few_of(names)}")
+    return loops_of(scenario)[names.index(name)]
+
+
+def few_of(names: Sequence[str]) -> str:
+    """Return the names of loops in words, at most twelve."""
+    return ", ".join(names[:_MOST_NAMES]) + (", …" if len(names) > _MOST_NAMES else "")
 
 
 def loops_by_entry(scenario: Scenario) -> list[list[Scenario]]:

@@ -297,7 +297,7 @@ class DesignFiles:
 
 @cli.command(cli.CAMPAIGNS, 20, takes="up to a minute")
 def design(
-    given: opt.ScenarioOptions,
+    given: opt.OneLoopOptions,
     *,
     network: NetworkOptions,
     wanted: LimitOptions,

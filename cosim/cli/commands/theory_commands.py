@@ -25,7 +25,7 @@ with lazy_modules():
 
 @cli.command(cli.THEORY, 10, takes="about two seconds; half a minute where events are due after many tests")
 def certify(
-    given: opt.ScenarioOptions,
+    given: opt.OneLoopOptions,
     *,
     weight: str = "given",
     late: Annotated[int | None, Option(min=0, max=1000)] = None,
@@ -74,7 +74,7 @@ def certify(
 @cli.command(cli.THEORY, 30, takes="some seconds")
 def margin(
     context: typer.Context,
-    given: opt.ScenarioOptions,
+    given: opt.OneLoopOptions,
     *,
     most: Annotated[int, Option(min=1, max=1000)] = 16,
     accuracy: float = 2e-4,
@@ -132,7 +132,7 @@ def margin(
 
 @cli.command(cli.THEORY, 35, takes="a second")
 def cost(
-    given: opt.ScenarioOptions,
+    given: opt.OneLoopOptions,
     *,
     weights: opt.CostOptions,
     tables: opt.TablesOption = None,
@@ -170,7 +170,7 @@ class AdversaryAim(StrEnum):
 
 @cli.command(cli.THEORY, 20, takes="some 20 s")
 def adversary(
-    given: opt.ScenarioOptions,
+    given: opt.OneLoopOptions,
     *,
     objective: AdversaryAim = AdversaryAim.ALL,
     horizon: float | None = None,
