@@ -14,7 +14,7 @@ from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
 from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run, worst_loop
-from cosim.analysis.replay.alike_replay import replay_in_turn
+from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
 from cosim.analysis.run_summary import Outcome, linearisation, summarise
 from cosim.analysis.summary_model import (
@@ -234,7 +234,7 @@ def _judged_loops(
     """Judge some loops, of which expectations may be known; ``beside`` replays the only one."""
     records = run.together(block)
     expected = known or _expectations([one.scenario for one in records])
-    replayed = replay_in_turn(records) if run.kind == "live" and len(run.loops) > 1 else {}
+    shared = SharedMachines(records if len(block) > 1 else ())
     judged, claims = [], [*map(claims_of, records)]
     for one, own in zip(claims, expected, strict=True):
         one.certificates = own.certificates
@@ -247,7 +247,7 @@ def _judged_loops(
         if len(run.loops) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
-        judged.append(_with_results(run, summary, claims[0], replayed, beside))
+        judged.append(_with_results(run, summary, claims[0], shared, beside))
         del claims[0]  # with its samples
     return judged
 
@@ -287,7 +287,7 @@ def _with_results(
     run: RecordedRun,
     summary: LoopSummary,
     claims: RunClaims,
-    known: Mapping[RunRecord, ReplayPart],
+    shared: SharedMachines,
     beside: ReplayBeside | None,
 ) -> _Judged:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
@@ -302,7 +302,7 @@ def _with_results(
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
     if record.kind == "live":
-        replayed = (beside and beside.part()) or known.get(record) or _replay(record)
+        replayed = (beside and beside.part()) or _replay(record, shared)
         results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
     over_time = None
     with suppress(Exception):  # the recording reports it
@@ -332,9 +332,9 @@ def _schedule(conditions: NetworkConditions | None) -> SchedulePart | None:
     return SchedulePart(**{name: getattr(conditions, name) for name in SchedulePart.model_fields})
 
 
-def _replay(record: RunRecord) -> ReplayPart:
+def _replay(record: RunRecord, shared: SharedMachines | None = None) -> ReplayPart:
     try:
-        return replay(record).verdict()
+        return replay(record, shared).verdict()
     except Exception as error:  # the run itself did not fail
         return ReplayPart(bit_exact=None, error=repr(error))
 

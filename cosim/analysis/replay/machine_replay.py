@@ -18,6 +18,7 @@ from cosim.record.processes import Life, split_by_life
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import Channel, channel_of
+from noack.core.cached_method import cached_method
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi, pointer_to
 from noack.core.errors import CallerError
@@ -47,7 +48,7 @@ _ROLES = {"plant": 0, "sensor": 1, "controller": 2, "netem": 3}
 _TIMERS = (PLANT_STEP, CONTROLLER_STEP, NETEM_RELEASE)
 _ANSWERS = {PLANT_STEP: "x", CONTROLLER_STEP: "u"}
 """The column with the answer of a plant or controller outside of noack."""
-DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
+_DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
 _HEADER_WORDS = 3
 SEQUENCE, TIME, VECTOR = 0, 1, 2
@@ -119,7 +120,7 @@ class InputReplay:
                 else:
                     self._recall(place_of)
                     self._machine.answer(reason)
-        except DAMAGE as error:
+        except _DAMAGE as error:
             self._explain(place_of)
             self._note(place_of, replay.next, f"the machine cannot take this input: {error}")
         self._explain(place_of)
@@ -305,9 +306,27 @@ _MACHINES: Mapping[str, Callable[..., LoopMachines]] = {
 }
 
 
-def machines_of(role: str, scenarios: Sequence[Scenario], start: Start) -> LoopMachines:
-    """Return new machines of a role for some loops."""
-    return _MACHINES[role](scenarios, start=start)
+class SharedMachines:
+    """The first machines of several loops without changes of settings, which are made at once.
+
+    Args:
+        records: the records of the loops, each in memory as a whole.
+    """
+
+    def __init__(self, records: Sequence[RunRecord]) -> None:
+        self._loops = [
+            record for record in records if record.is_short and not any(record.count(one) for one in SETTINGS)
+        ]
+
+    def place(self, record: RunRecord) -> int | None:
+        """Return the place of a loop among the machines; None if they do not have it."""
+        numbers = [one.number for one in self._loops]
+        return numbers.index(record.number) if record.number in numbers else None
+
+    @cached_method
+    def of(self, role: str) -> LoopMachines:
+        """Return the machines of a role."""
+        return _MACHINES[role]([one.scenario for one in self._loops], start=Start(0))
 
 
 class MachineReplay:
@@ -316,10 +335,10 @@ class MachineReplay:
     Each machine gets its recorded inputs, up to the first gap, and its rows are compared.
     """
 
-    def __init__(self, role: str, record: RunRecord) -> None:
+    def __init__(self, role: str, record: RunRecord, shared: SharedMachines) -> None:
         self._tables = record.owned_by(role)
         self._begun = record.begun_lives(role)
-        self._lives = [_LifeReplay(role, record, life) for life in record.row_counts(role)]
+        self._lives = [_LifeReplay(role, record, life, shared) for life in record.row_counts(role)]
         self.newest: list[InputReplay] = []
         """The replays of the newest part; they have what was sent."""
 
@@ -345,8 +364,8 @@ class MachineReplay:
 class _LifeReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, record: RunRecord, life: Life) -> None:
-        self._role, self._record, self._life = role, record, life
+    def __init__(self, role: str, record: RunRecord, life: Life, shared: SharedMachines) -> None:
+        self._role, self._record, self._life, self._shared = role, record, life, shared
         self._run: InputReplay | None = None
         self._count = sum(life.rows.values())
         report = life.report
@@ -376,11 +395,14 @@ class _LifeReplay:
     def _begin(self, owned: Slice) -> InputReplay:
         """Return the replay of a new machine."""
         role, scenario, generation = self._role, self._record.scenario, self._life.generation
-        start, sizes = _start(generation, owned), sent_sizes(role, scenario)
+        start, sizes = _start(generation, owned), _sizes(role, scenario)
         if role == "netem":
             channel = channel_of(scenario, start, loops=len(loops_of(scenario)))
             return InputReplay(role, channel, sizes)
-        return InputReplay(role, machines_of(role, (scenario,), start), sizes)
+        place = None if generation else self._shared.place(self._record)
+        if place is not None:
+            return InputReplay(role, self._shared.of(role), sizes, place)
+        return InputReplay(role, _MACHINES[role]((scenario,), start=start), sizes)
 
     def result(self) -> ProcessReplay:
         generation = self._life.generation
@@ -434,7 +456,7 @@ class _LifeReplay:
         )
 
 
-def sent_sizes(role: str, scenario: Scenario) -> Mapping[Flow, int]:
+def _sizes(role: str, scenario: Scenario) -> Mapping[Flow, int]:
     """Return the entries of the vectors that a machine sends, by flow."""
     if role == "netem":
         return {}

@@ -17,6 +17,7 @@ from cosim.analysis.replay.machine_replay import (
     VECTOR,
     MachineReplay,
     Numbers,
+    SharedMachines,
     received_words,
 )
 from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, Replay, difference, first_entry
@@ -54,7 +55,7 @@ class MessageComparison:
         network = record.scenario.network.flows
         self._hops = [
             _Hop(leg, table, machines[ENDS[flow].sender], flow, record.number, network)
-            for leg, table, flow in hops(network)
+            for leg, table, flow in _hops(network)
         ]
 
     def take(self, part: Slice) -> None:
@@ -78,7 +79,7 @@ class MessageComparison:
         return (*found, *_compare_changes(self._record))
 
 
-def hops(network: Sequence[Flow]) -> Iterator[tuple[str, str, Flow]]:
+def _hops(network: Sequence[Flow]) -> Iterator[tuple[str, str, Flow]]:
     """Yield the name of each hop, the receiver's table, and the flow."""
     for flow, table in _RECEIVED.items():
         sender, receiver = ENDS[flow]
@@ -325,14 +326,17 @@ class _Hop:
 Result = TypeVar("Result", ProcessReplay, MessagesReplay)
 
 
-def replay(record: RunRecord) -> Replay:
+def replay(record: RunRecord, shared: SharedMachines | None = None) -> Replay:
     """Replay a run and compare it with its record; a process is replayed up to its first gap.
+
+    ``shared`` has the machines of several loops, if they are replayed in turn.
 
     In a run of several loops, the network is replayed once, for all of them: ``record`` is that of
     the network, or that of a loop, whose network is not replayed. The record is read part by part,
     so that memory does not grow with the length of the run.
     """
-    machines = {role: MachineReplay(role, record) for role in record.roles}
+    shared = shared or SharedMachines(())
+    machines = {role: MachineReplay(role, record, shared) for role in record.roles}
     messages = MessageComparison(record, machines) if "sensor" in machines else None
     with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
         for part in record.slices():

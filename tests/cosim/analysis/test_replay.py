@@ -14,8 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.analysis.replay import replay
-from cosim.analysis.replay.alike_replay import replay_in_turn
-from cosim.record.run_record import RunRecord, loop_roles
+from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import (
@@ -125,25 +124,6 @@ def test_a_flipped_bit_of_a_loop_of_another_kind_is_found(
         for column in columns:
             found = replay(flipped(record, table, int(rows[len(rows) // 2]), column, 0))
             assert found.first_difference is not None, column
-
-
-@pytest.mark.parametrize("record", RECORDS)
-@settings(max_examples=25)
-@given(st.data())
-def test_loops_in_turn_have_the_results_of_each_alone(record: RunRecord, data: st.DataObject) -> None:
-    loop = changed(record, roles=loop_roles(2))
-    table = data.draw(st.sampled_from([one for one in loop.tables if len(loop[one])]))
-    column = data.draw(st.sampled_from(loop[table].dtype.names))
-    row = data.draw(st.integers(0, len(loop[table]) - 1))
-    bit = data.draw(st.integers(0, 8 * loop[table].dtype[column].itemsize - 1))
-    other = flipped(loop, table, row, column, bit)
-    fewer = changed(loop, {table: np.delete(loop[table], row)})
-    last = changed(loop)
-    found = replay_in_turn([loop, other, fewer, last])
-    assert found[loop] == found[last] == replay(loop).verdict()
-    for one in (other, fewer):
-        alone = replay(one).verdict()
-        assert found.get(one, alone) == alone
 
 
 @pytest.mark.parametrize("table", FILLED)

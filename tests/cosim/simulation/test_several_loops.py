@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.analysis.replay.alike_replay import replay_in_turn
+from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, SENSOR_MEASUREMENT, Fate
@@ -100,10 +100,10 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     shared = run(crowded, {"name": "a", "count": 3}, {"name": "b", "mode": "zoh"})
     found = replay(shared.network)
     assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 1)
-    in_turn = replay_in_turn(shared.loops)
+    machines = SharedMachines(shared.loops)
     for record in shared.loops:
-        found = replay(record)
-        assert in_turn[record] == found.verdict()
+        found = replay(record, machines)
+        assert found == replay(record)
         assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 3)
         assert all(hop.compared > 20 for hop in found.messages)
     packets = shared.network[NETEM_PACKET].copy()
@@ -115,7 +115,7 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     packets["head"][3] = bytes(head)
     other = changed(shared.loops[2], {NETEM_PACKET: packets})
     found = replay(other)
-    assert other not in replay_in_turn([*shared.loops[:2], other])
+    assert found == replay(other, SharedMachines([*shared.loops[:2], other]))
     assert found.first_difference is not None
     assert found.first_difference.column == "head"
 
