@@ -34,7 +34,7 @@ LINES = {
     "noack/traces": 1320,
     "noack/trigger": 1065,
     "netem": 6500,
-    "cosim/analysis": 8230,
+    "cosim/analysis": 8135,
     "cosim/api": 1675,
     "cosim/cli": 3325,
     "cosim/doctor": 815,
@@ -51,7 +51,7 @@ LINES = {
     "controller_node": 410,
     "benchmarks": 4525,
     "native": 11030,
-    "tests": 46270,
+    "tests": 46250,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

@@ -181,7 +181,7 @@ class OneLoopOptions(ScenarioOptions):
 
     def load(self, *more: str) -> "Scenario":
         """Load it, with more settings of the whole scenario as for ``--set``."""
-        return scenario.loop_named(load_scenario(self.scenario, [*(self.settings or ()), *more]), self.loop)
+        return scenario.loop_named(super().load(*more), self.loop)
 
 
 @option_group
