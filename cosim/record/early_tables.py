@@ -16,9 +16,9 @@ import numpy as np
 
 from cosim.record.record_source import BATCH_ROWS, Rows, joined
 from cosim.record.run_record import scenarios_of, vector_names
-from cosim.record.spool_conversion import spool_parts
+from cosim.record.spool_conversion import spool_batches
 from cosim.record.table_files import table_writer
-from noack.core.process_limits import be_idle
+from noack.core.process_limits import be_idle, cores
 from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import RECORDER
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
@@ -37,7 +37,7 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
         By table: the bytes of its spool whose rows the file has. Without a whole slice, it has none.
 
     Raises:
-        ValueError: rows of a loop are not in order, or a table is long.
+        ValueError: rows are missing or not in order, a batch is incomplete, or a table is long.
         OSError: a file cannot be read or written.
     """
     ended = run_dir / SPOOL / EARLY / EARLY_ENDED
@@ -46,9 +46,8 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
             tables = thread.submit(_opened, run_dir, stack).result()
             thread.submit(_follow, tables, ended).result()
         ended.unlink()
-        for one in tables:
-            while one.bytes and one.advance(ended=True):
-                pass
+        with ThreadPoolExecutor(cores()) as threads:
+            [*threads.map(_EarlyTable.finish, tables)]
     return {one.table: one.bytes for one in tables if one.bytes}
 
 
@@ -88,6 +87,8 @@ class _EarlyTable:
     ) -> None:
         self.table, self.bytes = spool.stem, 0
         self._spool, self._dtype, self._write = spool, dtype, write
+        self._next, self._waiting = 0, dict[int, Rows]()
+        """The number of the next row, and later batches, by the number of their first row."""
         self._newest = np.full(loops, -1, np.int64)
         """The newest input of each loop."""
         self._groups: Iterator[Rows] = iter(())
@@ -95,28 +96,45 @@ class _EarlyTable:
 
     def advance(self, *, ended: bool) -> bool:
         """Write the next row group, if there is one: the last slice can be short."""
-        if (rows := next(self._groups, None)) is None:
-            waiting = self._spool.stat().st_size - self.bytes
-            if waiting < (1 if ended else _SLICE_BYTES):
+        while (rows := next(self._groups, None)) is None:
+            if self._spool.stat().st_size - self.bytes < (1 if ended else _SLICE_BYTES):
                 return False
             self._groups = self._slice()
-            rows = next(self._groups, None)
-        if rows is not None:
-            self._write(rows)
-        return rows is not None
+        self._write(rows)
+        return True
 
-    def _slice(self) -> Iterator[Rows]:
-        """Yield the next rows of the spool, loop after loop."""
-        parts, begin = [], self.bytes
+    def finish(self) -> None:
+        """Write the rest of a table that has been begun."""
+        while self.bytes and self.advance(ended=True):
+            pass
+        if self._waiting:
+            raise ValueError("rows are missing")
+
+    def _consecutive(self) -> Iterator[Rows]:
+        """Yield the next rows of the spool, in which a batch that was sent again comes late."""
+        begin = self.bytes
         if begin >= _MOST_SLICES * _SLICE_BYTES:
             raise ValueError("the table is long")
-        for _, end, rows in spool_parts(self._spool, self._dtype, begin):
-            parts.append(rows)
+        if sum(map(len, self._waiting.values())) * self._dtype.itemsize > _SLICE_BYTES:
+            raise ValueError("rows are missing")
+        for _, end, batches in spool_batches(self._spool, self._dtype, begin):
+            self._waiting |= {first: np.frombuffer(rows, self._dtype) for first, rows in batches}
             self.bytes = end
             if end - begin >= _SLICE_BYTES:
                 break
-        rows = joined(parts, self._dtype)
-        del parts  # as large as the rows
+        if self.bytes == begin:
+            raise ValueError("a batch is incomplete")
+        for first in sorted(self._waiting):
+            if first > self._next:
+                break
+            rows = self._waiting.pop(first)
+            if first == self._next:  # otherwise it came twice
+                self._next += len(rows)
+                yield rows
+
+    def _slice(self) -> Iterator[Rows]:
+        """Yield the next rows of the spool, loop after loop."""
+        rows = joined([*self._consecutive()], self._dtype)
         rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
         loops, inputs = rows[LOOP].astype(np.int64), rows["input"]
         firsts = np.flatnonzero(np.diff(loops, prepend=-1))

@@ -57,6 +57,14 @@ def spool_parts(
 
     The last one may be incomplete: it is left out.
     """
+    for first, last, batches in spool_batches(path, dtype, begin, end):
+        yield first, last, np.frombuffer(b"".join(rows for _, rows in batches), dtype)
+
+
+def spool_batches(
+    path: Path, dtype: np.dtype[np.void], begin: int = 0, end: int | None = None
+) -> Iterator[tuple[int, int, list[tuple[int, memoryview]]]]:
+    """Yield the same, the rows batch by batch, each with the number of its first row."""
     with path.open("rb", buffering=0) as file:
         end = file.seek(0, os.SEEK_END) if end is None else end
         while begin < end:
@@ -70,8 +78,8 @@ def spool_parts(
                 file.seek(begin)
                 batches, complete = batches_in(memoryview(file.read(length)))
             # Rows of a damaged batch cannot be located.
-            whole = [rows for rows in batches if len(rows) % dtype.itemsize == 0]
-            yield begin, begin + complete, np.frombuffer(b"".join(whole), dtype)
+            whole = [batch for batch in batches if len(batch[1]) % dtype.itemsize == 0]
+            yield begin, begin + complete, whole
             begin += complete
 
 

@@ -132,11 +132,17 @@ def spool_files(folder: Path, table: str) -> list[Path]:
     return sorted(folder.glob(f"{table}.*"))
 
 
-def batches_in(data: memoryview) -> tuple[list[memoryview], int]:
-    """Return the rows of the complete batches at the begin of some data, and their length."""
+def batches_in(data: memoryview) -> tuple[list[tuple[int, memoryview]], int]:
+    """Return the complete batches at the begin of some data, and their length.
+
+    Of each batch: the number of its first row, and the rows.
+    """
     found, begin, rows = [], 0, _CHUNK.size
-    while rows <= len(data) and (end := rows + _CHUNK.unpack_from(data, begin)[1]) <= len(data):
-        found.append(data[rows:end])
+    while rows <= len(data):
+        first, length = _CHUNK.unpack_from(data, begin)
+        if (end := rows + length) > len(data):
+            break
+        found.append((first, data[rows:end]))
         begin, rows = end, end + _CHUNK.size
     return found, begin
 
