@@ -55,7 +55,7 @@ class EndHelpers:
         """What is still to be prepared."""
         self._found: dict[int, Expectations] = {}
         self._ended: Path | None = None
-        """Says that the run has ended to who writes tables; see ``cosim.record.early_tables``."""
+        """Says that the run has ended to who writes tables; see ``cosim.record.spool_conversion``."""
         self._writer: Thread | None = None
         """Waits for them."""
         self.early: Mapping[str, int] = {}
@@ -90,7 +90,7 @@ class EndHelpers:
 
     def _write_early(self, run_dir: Path) -> None:
         self._ended, self._writer = run_dir / SPOOL / EARLY / EARLY_ENDED, current_thread()
-        written = self.submit(called, "cosim.record.early_tables", "write_early", run_dir).result()
+        written = self.submit(called, "cosim.record.spool_conversion", "write_early", run_dir).result()
         self.early = cast("Mapping[str, int]", written)
 
     def _tell_writer(self) -> bool:
