@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.condition_reader import read_conditions
-from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
+from cosim.analysis.summary.summary_model import FidelityPart, NoFidelityPart
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.continuous import (

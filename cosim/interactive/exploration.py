@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary.run_summary import summarise
 from cosim.analysis.value_reduction import decimate_all
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord

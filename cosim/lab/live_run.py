@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from cosim.interactive.draft import Draft
 from cosim.live.launcher import launch
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
 from cosim.output.viewer.rerun_program import is_installed
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.summary_model import ExitPart
+from cosim.analysis.summary.summary_model import ExitPart
 from cosim.interactive.draft import differences, leaf, value_text
 from cosim.interactive.exploration import LIVE, RECORDED, Exploration, of_record
 from cosim.interactive.scenario_guarantee import CERTIFIED, VOID, Guarantee

@@ -12,12 +12,12 @@ import numpy as np
 from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, claims_of
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
-from cosim.analysis.loop_statistics import list_violations
-from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run, worst_loop
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
-from cosim.analysis.run_summary import Outcome, linearisation, summarise
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.loop_statistics import list_violations
+from cosim.analysis.summary.network_summary import LoopOverTime, loop_over_time, summarise_run, worst_loop
+from cosim.analysis.summary.run_summary import Outcome, linearisation, summarise
+from cosim.analysis.summary.summary_model import (
     ConditionsPart,
     ExitPart,
     LoopSummary,
@@ -26,8 +26,8 @@ from cosim.analysis.summary_model import (
     SchedulePart,
     read_summary,
 )
-from cosim.live.end_helpers import EndHelpers, PreparedEnding
-from cosim.live.progress import work_bar
+from cosim.live.monitoring.progress import work_bar
+from cosim.live.processes.end_helpers import EndHelpers, PreparedEnding
 from cosim.output.viewer.rerun_program import is_installed, require_viewer
 from cosim.record.run_directory import (
     ENDING_FILE,

@@ -19,11 +19,11 @@ from queue import SimpleQueue
 from threading import Thread
 
 from cosim.lazy_modules import lazy_modules
-from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
 from cosim.live.coordinator import Coordinator
-from cosim.live.end_helpers import PreparedEnding, lasting_helpers
-from cosim.live.fork_server import ForkServer, fork_server
-from cosim.live.run_watcher import Watcher, joint_watcher
+from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
+from cosim.live.processes.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
+from cosim.live.processes.end_helpers import PreparedEnding, lasting_helpers
+from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.record.run_directory import (
     LEAST_FREE_BYTES,
     PROCESSES_FILE,

@@ -13,8 +13,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from cosim.analysis.network_summary import worst_loop
-from cosim.analysis.summary_model import LoopSummary, RunSummary
+from cosim.analysis.summary.network_summary import worst_loop
+from cosim.analysis.summary.summary_model import LoopSummary, RunSummary
 from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.network_figures import network_figures
 from cosim.output.figures.run_figures import envelopes, run_figures

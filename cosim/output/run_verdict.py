@@ -19,8 +19,8 @@ from rich.text import Text
 
 from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE
 from cosim.analysis.fidelity import Fidelity, SignalDifference
-from cosim.analysis.run_summary import Outcome
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.run_summary import Outcome
+from cosim.analysis.summary.summary_model import (
     AssumptionPart,
     Claim,
     ExitPart,

@@ -29,7 +29,7 @@ from cosim.analysis.claims import catalogue
 from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, ClaimDefinition, Envelope, Findings
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, RunPart, Samples, late_certificates
-from cosim.analysis.summary_model import Claim, ClaimVerdict
+from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.analysis.value_reduction import decimate
 from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord

@@ -28,7 +28,7 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
-from cosim.analysis.loop_statistics import SampleFacts, SampleFactsReader, signal_statistics
+from cosim.analysis.summary.loop_statistics import SampleFacts, SampleFactsReader, signal_statistics
 from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Matrix, Propagator, all_entries, row_norms, spectral_abscissa

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
-from cosim.analysis.summary_model import ReplayDifference
+from cosim.analysis.summary.summary_model import ReplayDifference
 from cosim.record.processes import Life, split_by_life
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.summary_model import ReplayDifference, ReplayPart, SummaryPart
+from cosim.analysis.summary.summary_model import ReplayDifference, ReplayPart, SummaryPart
 from noack.protocol.record_tables import entry_names
 
 Value = float | int | str | None

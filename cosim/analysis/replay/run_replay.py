@@ -21,7 +21,7 @@ from cosim.analysis.replay.machine_replay import (
     received_words,
 )
 from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, Replay, difference, first_entry
-from cosim.analysis.summary_model import ReplayPart
+from cosim.analysis.summary.summary_model import ReplayPart
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from noack.protocol.record_tables import (

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.network_summary import (
+from cosim.analysis.summary.network_summary import (
     INTERVALS,
     add_link_bytes,
     counts_inside,

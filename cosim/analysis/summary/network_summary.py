@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.run_summary import change_parts
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.run_summary import change_parts
+from cosim.analysis.summary.summary_model import (
     Claim,
     DeadlinesPart,
     ExitPart,

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
 from noack.core.clock import NS_PER_S
 from noack.runtime.control_messages import RunProgress
 from noack.runtime.join_ticket import DEFAULT_SESSION

@@ -17,7 +17,7 @@ import numpy as np
 import zenoh
 from zenoh.handlers import RingChannel
 
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
 from cosim.record.run_directory import SCENARIO_FILE
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.core.process_limits import python_command
@@ -132,7 +132,7 @@ def bridge_process(router: str, domain: int, *, listen: bool) -> Iterator[Watche
         CallerError: it cannot join the graph of ROS 2; its process has printed why.
     """
     ros2.require_installed("noack bridge")
-    words = python_command("-m", "cosim.live.bridge.ros2_bridge", router, domain, int(listen))
+    words = python_command("-m", "cosim.live.monitoring.ros2_bridge", router, domain, int(listen))
     pipe = subprocess.PIPE
     with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdin is not None

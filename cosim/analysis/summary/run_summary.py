@@ -13,7 +13,7 @@ from typing import Any, SupportsFloat, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cosim.analysis.loop_statistics import (
+from cosim.analysis.summary.loop_statistics import (
     disturbances,
     drops_by_cause,
     from_controller,
@@ -25,7 +25,7 @@ from cosim.analysis.loop_statistics import (
     unintended_losses,
     watchdog_actions,
 )
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.summary_model import (
     AssumptionPart,
     ChangePart,
     ExitPart,

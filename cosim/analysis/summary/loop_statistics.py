@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import DROPOUTS, AssumptionViolation
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.summary_model import (
     DisturbancePart,
     EstimationPart,
     FlowPart,

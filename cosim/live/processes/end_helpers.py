@@ -17,7 +17,7 @@ from pathlib import Path
 from threading import Thread, current_thread
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from cosim.live.process_pool import at_idle_priority, called, process_starts, processes
+from cosim.live.processes.process_pool import at_idle_priority, called, process_starts, processes
 from cosim.record.run_directory import RunEnding
 from noack.core.process_limits import cores
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
