@@ -17,12 +17,12 @@ from noack.settings.section import Table
 
 _STEPS = 200
 _DECADE = 10.0
-_MOST_LOSSES = 20
-_MOST_WINDOW = 40
+_MOST_LOSSES, _MOST_WINDOW = 20, 40
 _BELOW = 0.99
 """The largest share of a limit that must not be reached."""
 _SEEDS = 200
 _MOST_MODEL_ERROR = 20.0
+_NUMBERS = ("number", "integer")
 _LOSSES: Mapping[str, Mapping[str, object]] = {
     "bernoulli": {"probability": 0.5},
     "gilbert_elliott": {"mean_loss": 0.5, "mean_burst": 3.0},
@@ -74,9 +74,9 @@ class Slider:
         value = min(max(value, self.low), self.high)
         return math.log10(value) if self.logarithmic else value
 
-    def value_at(self, place: float) -> float | int:
+    def value_at(self, position: float) -> float | int:
         """Return the value at a place: whole, a multiple, or with three significant digits."""
-        value = 10.0**place if self.logarithmic else place
+        value = 10.0**position if self.logarithmic else position
         value = min(max(value, self.low), self.high)
         if self.multiple_of:
             return float(f"{max(round(value / self.multiple_of), 1) * self.multiple_of:.9g}")
@@ -157,7 +157,7 @@ def _choices(scenario: Scenario) -> tuple[Choice, ...]:
 
 def _is_window(scenario: Scenario) -> bool:
     """Whether the only further constraint is at most m losses in any K packets."""
-    return [one.kind for one in scenario.network.constraints] == [_WINDOW["kind"]]
+    return [constraint.kind for constraint in scenario.network.constraints] == [_WINDOW["kind"]]
 
 
 def chosen(draft: Draft, key: str, value: str) -> Draft:
@@ -177,7 +177,7 @@ def dragged(draft: Draft, slider: Slider, value: float) -> Draft:
     for key in slider.scaled:
         matrix = np.array(base.value(key), dtype=np.float64)
         draft = draft.with_value(
-            key, [[float(f"{value * one:.6g}") for one in row] for row in matrix.tolist()]
+            key, [[float(f"{value * entry:.6g}") for entry in row] for row in matrix.tolist()]
         )
     return draft
 
@@ -205,7 +205,7 @@ def _loss_sliders(scenario: Scenario) -> list[Slider]:
     values = loss.model_dump(mode="json", exclude_none=True)
     # The mean loss and burst are those of Gilbert's chain, which loses in the bad state only.
     fixed = ("loss_in_good", "loss_in_bad") if "mean_loss" in values else ()
-    found = []
+    sliders = []
     for name, value in values.items():
         key, label = f"network.loss.{name}", f"loss: {_words(name)}"
         if name in fixed or not isinstance(value, float):
@@ -217,8 +217,8 @@ def _loss_sliders(scenario: Scenario) -> list[Slider]:
             slider = _decades(key, label, value, value)
         else:
             continue
-        found.append(_within_field(slider, type(loss), name))
-    return found
+        sliders.append(_within_field(slider, type(loss), name))
+    return sliders
 
 
 def _guarantee_sliders(scenario: Scenario) -> list[Slider]:
@@ -247,7 +247,7 @@ def _guarantee_sliders(scenario: Scenario) -> list[Slider]:
 
 def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
     trigger, usual = scenario.trigger, base.trigger
-    found = []
+    sliders = []
     for key in trigger_parameters(trigger):
         name = key.removeprefix("trigger.")
         value = getattr(trigger, name)
@@ -258,8 +258,8 @@ def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
             if name == "period_s":
                 period_s = scenario.timing.measurement_period_ns / NS_PER_S
                 slider = replace(slider, multiple_of=period_s)
-            found.append(_within_field(slider, type(trigger), name))
-    return found
+            sliders.append(_within_field(slider, type(trigger), name))
+    return sliders
 
 
 def _within_field(slider: Slider, section: type[BaseModel], name: str) -> Slider:
@@ -275,7 +275,7 @@ def _limits(section: type[BaseModel], name: str) -> tuple[float, float]:
     schema = section.model_json_schema()
     properties = schema.get("$defs", {}).get(section.__name__, schema)["properties"]
     kinds = properties[name].get("anyOf", [properties[name]])
-    number: Mapping[str, float] = next((one for one in kinds if one.get("type") in ("number", "integer")), {})
+    number: Mapping[str, float] = next((kind for kind in kinds if kind.get("type") in _NUMBERS), {})
     below = _BELOW * number.get("exclusiveMaximum", math.inf)
     return number.get("minimum", -math.inf), min(number.get("maximum", math.inf), below)
 
@@ -284,16 +284,16 @@ def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
     """Return the slider of the box around the model from which the plant is drawn."""
     if scenario.plant.draw not in ("uniform", "vertex"):
         return []
-    found = {}
+    factors = {}
     for name in ("uncertainty_A", "uncertainty_B"):
         usual = np.array(getattr(base.plant, name) or [[]], dtype=np.float64)
         now = np.array(getattr(scenario.plant, name) or [[]], dtype=np.float64)
         if usual.any() and usual.shape == now.shape:
-            place = np.unravel_index(np.argmax(np.abs(usual)), usual.shape)
-            found[f"plant.{name}"] = float(now[place] / usual[place])
-    if not found:
+            largest = np.unravel_index(np.argmax(np.abs(usual)), usual.shape)
+            factors[f"plant.{name}"] = float(now[largest] / usual[largest])
+    if not factors:
         return []
-    value = max(found.values())
+    value = max(factors.values())
     return [
         Slider(
             "plant.uncertainty",
@@ -302,7 +302,7 @@ def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
             0.0,
             max(_MOST_MODEL_ERROR, value),
             0.1,
-            scaled=tuple(found),
+            scaled=tuple(factors),
         ),
     ]
 

@@ -79,14 +79,14 @@ class Group:
     def all_fields(self) -> Iterator[Field]:
         """Yield the fields of this group and of those in it."""
         yield from self.fields
-        for one in self.groups:
-            yield from one.all_fields()
+        for group in self.groups:
+            yield from group.all_fields()
 
     def all_groups(self) -> Iterator["Group"]:
         """Yield this group and those in it."""
         yield self
-        for one in self.groups:
-            yield from one.all_groups()
+        for group in self.groups:
+            yield from group.all_groups()
 
 
 def form_of(draft: Draft) -> Group:
@@ -114,8 +114,8 @@ def filled(draft: Draft, field: Field, text: str) -> Draft:
         if (example := example_of(draft, field.selects, text)) is not None:
             return draft.with_value(field.selects, example)
     changed = draft.with_value(field.key, text)
-    group = next(one for one in form_of(changed).all_groups() if one.key == field.selects)
-    keys = (*(one.key for one in group.fields), *(one.key for one in group.groups))
+    group = next(inner for inner in form_of(changed).all_groups() if inner.key == field.selects)
+    keys = (*(inner.key for inner in group.fields), *(inner.key for inner in group.groups))
     known = {key.rpartition(".")[2] for key in keys}
     table = changed.value(group.key)
     assert isinstance(table, dict)
@@ -125,17 +125,17 @@ def filled(draft: Draft, field: Field, text: str) -> Draft:
 
 def by_field(form: Group, mistakes: list[Mistake]) -> dict[str, str]:
     """Return the texts of mistakes by the key of the field to which they belong."""
-    keys = {one.key for one in form.all_fields()}
-    found: dict[str, str] = {}
+    keys = {field.key for field in form.all_fields()}
+    texts: dict[str, str] = {}
     for mistake in mistakes:
         parts = mistake.key.split(".")
         for length in range(len(parts), 0, -1):  # a mistake inside a list belongs to the list
             key = ".".join(parts[:length])
             if key in keys:
                 text = _VALUE.sub("", mistake.text.removeprefix(mistake.key))
-                found[key] = "; ".join(filter(None, (found.get(key), text)))
+                texts[key] = "; ".join(filter(None, (texts.get(key), text)))
                 break
-    return found
+    return texts
 
 
 @cache
@@ -149,7 +149,7 @@ def _resolved(schema: Schema) -> Schema:
         name = schema["$ref"].rpartition("/")[2]
         return {**_schema()["$defs"][name], **{k: v for k, v in schema.items() if k != "$ref"}}
     if "anyOf" in schema:
-        given = [one for one in schema["anyOf"] if one.get("type") != "null"]
+        given = [alternative for alternative in schema["anyOf"] if alternative.get("type") != "null"]
         if len(given) == 1:
             rest = {key: value for key, value in schema.items() if key != "anyOf"}
             return _resolved({**given[0], **rest})
@@ -163,7 +163,7 @@ def _group(key: str, schema: Schema, help_: str, content: object, default: objec
     fields, groups = [], []
     name, kinds = _kinds(schema)
     if kinds:
-        optional = [kind for kind, one in kinds.items() if name not in one.get("required", ())]
+        optional = [kind for kind, described in kinds.items() if name not in described.get("required", ())]
         usual = default.get(name, optional[0] if len(optional) == 1 else None)
         chosen = content.get(name, usual)
         fields.append(
@@ -175,23 +175,23 @@ def _group(key: str, schema: Schema, help_: str, content: object, default: objec
         if part == name:
             continue
         value, usual = content.get(part), described.get("default", default.get(part))
-        told = str(inner.get("description", ""))
+        description = str(inner.get("description", ""))
         if "oneOf" in inner or "properties" in inner:
-            groups.append(_group(path, inner, told, value, usual))
+            groups.append(_group(path, inner, description, value, usual))
         else:
-            fields.append(_field(path, part, inner, told, usual))
+            fields.append(_field(path, part, inner, description, usual))
     return Group(key, help_, tuple(fields), tuple(groups))
 
 
 def _kinds(schema: Schema) -> tuple[str, dict[str, Schema]]:
     """Return the key that chooses the kind, and the schema of each kind; none: there are none."""
-    found: dict[str, Schema] = {}
+    kinds: dict[str, Schema] = {}
     name = ""
     for reference in schema.get("oneOf", ()):
-        one = _resolved(reference)
-        name, described = next((name, part) for name, part in one["properties"].items() if "const" in part)
-        found[described["const"]] = one
-    return name, found
+        kind = _resolved(reference)
+        name, described = next((name, part) for name, part in kind["properties"].items() if "const" in part)
+        kinds[described["const"]] = kind
+    return name, kinds
 
 
 def _field(key: str, label: str, schema: Schema, help_: str, default: object) -> Field:

@@ -160,33 +160,33 @@ class _Page:
         await self._client.connected()
         self._is_dark = await ui.run_javascript("labBegin()", timeout=ANSWER_S)
         self._text.show_dark(dark=self._is_dark)
-        steps = [{"title": one.title, "text": one.text, "drag": one.drag} for one in STEPS]
+        steps = [{"title": step.title, "text": step.text, "drag": step.drag} for step in STEPS]
         await self._parts.show(source=EXPLORE, steps=steps)
         await self._session.change(self._session.draft)
 
     async def _take(self, event: GenericEventArguments) -> None:
         """Take what the visitor does with elements that are not the framework's."""
-        said = event.args
-        match said["what"]:
+        message = event.args
+        match message["what"]:
             case "slide":
                 sliders = self._controls.sliders if self._controls else ()
-                if slider := next((one for one in sliders if one.key == said["key"]), None):
-                    value = slider.value_at(float(said["place"]))
+                if slider := next((slider for slider in sliders if slider.key == message["key"]), None):
+                    value = slider.value_at(float(message["place"]))
                     self._moved = [slider.key, value_text(value)]
                     await self._apply(lambda draft: dragged(draft, slider, value), slider.key)
             case "fill":
-                found = (one for one in self._form.all_fields() if one.key == said["key"])
-                field, text = next(found), str(said["text"]).strip()
+                fields = (field for field in self._form.all_fields() if field.key == message["key"])
+                field, text = next(fields), str(message["text"]).strip()
                 if text != field.text(self._session.draft):
                     await self._apply(lambda draft: filled(draft, field, text), field.key)
             case "choose":
-                key, kind = said["key"], str(said["value"])
+                key, kind = message["key"], str(message["value"])
                 await self._apply(lambda draft: chosen(draft, key, kind), key)
             case "state":
-                self._state = int(said["number"])
+                self._state = int(message["number"])
                 await self._show()
             case "step":
-                step = STEPS[int(said["number"])]
+                step = STEPS[int(message["number"])]
                 draft = open_draft(step.scenario)
                 for name, setting in step.settings.items():
                     draft = draft.with_value(name, setting)
@@ -201,7 +201,7 @@ class _Page:
             self._controls = controls_of(self._session.draft)
         parts = self._drawing(shown) | {"note": self._note(shown), "verdict": self._verdict()}
         if self._controls is not None:
-            wrong = {one.key for one in self._session.mistakes}
+            wrong = {mistake.key for mistake in self._session.mistakes}
             parts["controls"] = controls_part(self._controls, wrong, live=self._live.is_running)
         if shown is not None:
             run = shown.run

@@ -296,10 +296,10 @@ class _Run:
         silent = [role for role in ROLES if not self._coordinator.has_ended(role)]
         # The recorder waits for the others.
         silent = [role for role in silent if role != RECORDER] or silent
-        what = f"no report from {', '.join(silent)}"
+        failure = f"no report from {', '.join(silent)}"
         if not silent:
-            what = f"{', '.join(self._children.running())} reported the end, but did not exit"
-        return f"the run did not end at its horizon: {what}, {self._limit.explain_end()}"
+            failure = f"{', '.join(self._children.running())} reported the end, but did not exit"
+        return f"the run did not end at its horizon: {failure}, {self._limit.explain_end()}"
 
 
 def _signalled(signals: Signals) -> Failure | None:

@@ -51,11 +51,11 @@ class Ros2Bridge:
         self._types, self._phases_ns = run_tables(scenario), phases_ns(scenario)
         loops = resolved_loops(scenario)
         self._names = [loop.name for loop in loops]
-        self._entries = [(loop_of(one).state_names, loop_of(one).input_names) for one in loops]
-        topics = [topic for found in ros2.TOPICS.values() for topic in found]
+        self._entries = [(loop_of(loop).state_names, loop_of(loop).input_names) for loop in loops]
+        topics = [topic for names in ros2.TOPICS.values() for topic in names]
         self._publishers: list[dict[str, Publisher]] = [
             {topic: node.publisher(f"{prefix}/{topic}") for topic in topics}
-            for prefix in (ros2.namespace(one, is_only=len(loops) == 1) for one in self._names)
+            for prefix in (ros2.namespace(name, is_only=len(loops) == 1) for name in self._names)
         ]
         self.sent = 0
         """Number of published messages."""
@@ -93,7 +93,7 @@ def bridge_run(run: OpenRun, node: Node) -> int:
                 return bridge.sent
             if time.monotonic() - looked_s > _LOOK_S:
                 looked_s = time.monotonic()
-                is_active = any(one.name == run.name for one in run_registry.active_runs())
+                is_active = any(active.name == run.name for active in run_registry.active_runs())
             time.sleep(_POLL_S)
 
 
