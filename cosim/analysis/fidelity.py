@@ -107,9 +107,9 @@ def live_run(record: RunRecord) -> LiveRun:
     measured[sensor["t_ns"] // period_ns] = True
     origins, accepted = _ticks(ticks, deliveries)
     latched = _latched(steps["actuation"], origins)
-    seen = read_conditions(record)
+    observed = read_conditions(record)
     _require(
-        not (len(seen.watchdog.t_s) or len(seen.safe_input.t_s)),
+        not (len(observed.watchdog.t_s) or len(observed.safe_input.t_s)),
         "the ideal loop has no watchdog and no safe input, which this run applied for a time",
     )
     events = sensor[sensor["event"] != NO_SEQUENCE]

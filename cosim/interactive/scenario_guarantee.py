@@ -125,8 +125,8 @@ def margin_of(scenario: Scenario) -> Margin:
     except CallerError as error:
         return Margin(str(error), (), defined=False)
     rows = tuple(
-        (str(cap.m), f"{number(cap.found.lower, 5)} – {number(cap.found.upper, 5)}", cap.found.verdict)
-        for cap in margin.caps
+        (str(m), f"{number(stability.lower, 5)} – {number(stability.upper, 5)}", stability.verdict)
+        for m, stability in margin.caps
     )
     return Margin(margin.verdict, rows, defined=True)
 
