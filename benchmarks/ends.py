@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.programs import execute
 from benchmarks.report import Goal, MeasurementError, Peer, Row, benchmark, say
 from cosim.analysis.replay import run_replay
-from cosim.analysis.summary_model import ReplayPart
+from cosim.analysis.summary.summary_model import ReplayPart
 from cosim.cli import find_scenario
 from cosim.live import finalize
 from cosim.live.simulated_run import simulate_run

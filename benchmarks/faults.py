@@ -19,13 +19,13 @@ import psutil
 from benchmarks.flood_sender import Flood
 from benchmarks.programs import imported_s, processes_of, udp_port
 from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, benchmark, median, say
-from cosim.analysis.loop_statistics import lateness_us
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary.loop_statistics import lateness_us
+from cosim.analysis.summary.run_summary import summarise
 from cosim.cli import find_scenario
-from cosim.live.child_processes import MODULES
 from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
+from cosim.live.processes.child_processes import MODULES
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector

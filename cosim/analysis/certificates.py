@@ -155,14 +155,14 @@ class Certificates:
         trigger's norm, and followed from there by ‖V e^{(H+αI)τ} W^{−1}‖. None if W is the
         scenario's own, if there is no certificate, and under disturbances.
         """
-        found = self.schedule.constants
-        if self.weight is None or found is None or self.schedule.persistent_constants is not None:
+        constants = self.schedule.constants
+        if self.weight is None or constants is None or self.schedule.persistent_constants is not None:
             return None
-        error = error_gains(loop_of(self.scenario), found.rate_per_s)
+        error = error_gains(loop_of(self.scenario), constants.rate_per_s)
         kernel = response(error.scaled_H, error.inverse_weight).through(self._given)
         now = float(norm_bounds(self._given, error.inverse_weight[None])[0])
-        missing = sum_of_sups(kernel, found.missing_events, found.inter_event_s or 0.0)
-        return min(now * found.delta, (now + float(missing)) * found.overshoot)
+        missing = sum_of_sups(kernel, constants.missing_events, constants.inter_event_s or 0.0)
+        return min(now * constants.delta, (now + float(missing)) * constants.overshoot)
 
     @property
     def limits(self) -> NetworkLimits:
@@ -201,7 +201,7 @@ class Certificates:
                 "assumptions": [a._asdict() for a in assumptions(self.scenario)],
                 "theorem_2": None if self.theorem_2 is None else self.theorem_2._asdict(),
             },
-            "certificates": [{"under": under, **one.to_json()} for under, one in self],
+            "certificates": [{"under": under, **certificate.to_json()} for under, certificate in self],
             "stability": None if self.stability is None else self.stability._asdict(),
             "unlimited_losses": None if self.unlimited is None else self.unlimited.to_json(),
             "limits": {scope: limits._asdict() for scope, limits in self.limits_by_scope.items()},
@@ -216,14 +216,15 @@ class Certificates:
             return None, str(error)
 
     def _covering(self, plants: str, conditions: str) -> ScenarioCertificate | None:
-        return next((one for one in self._of(conditions) if one.scope == plants), None)
+        fitting = (certificate for certificate in self._of(conditions) if certificate.scope == plants)
+        return next(fitting, None)
 
     def _of(self, conditions: str) -> list[ScenarioCertificate]:
-        return [one for under, one in self if under == conditions]
+        return [certificate for under, certificate in self if under == conditions]
 
     def _rows(self) -> Rows:
-        heads = [f"{under}, {plants_of(one)}" for under, one in self]
-        certificates = [one for _, one in self]
+        heads = [f"{under}, {plants_of(certificate)}" for under, certificate in self]
+        certificates = [certificate for _, certificate in self]
         rows = [[label, *values] for label, values, _ in constant_rows(certificates, None, 0.0)]
         return [[self.scenario.name, *heads], *rows]
 
@@ -247,7 +248,7 @@ def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2
 
 def with_weight(
     resolved: Scenario,
-    which: str,
+    norm_name: str,
     late_periods: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Scenario, Matrix | None]:
@@ -257,17 +258,17 @@ def with_weight(
         CallerError: the choice is unknown, or no weight can be chosen for this scenario.
     """
     weight: Matrix | None = None
-    if which == "given":
+    if norm_name == "given":
         return resolved, None
-    if which not in ("identity", "chosen"):
-        raise CallerError(f'weight: given, identity or chosen, not "{which}"')
+    if norm_name not in ("identity", "chosen"):
+        raise CallerError(f'weight: given, identity or chosen, not "{norm_name}"')
     trigger = resolved.trigger
     if not isinstance(trigger, DecayingSettings):
         raise CallerError(
-            f'weight {which}: only for the paper\'s trigger, "decaying"; '
+            f'weight {norm_name}: only for the paper\'s trigger, "decaying"; '
             f'the policy of this scenario is "{trigger.policy}"'
         )
-    if which == "chosen":
+    if norm_name == "chosen":
         try:
             weight = choose_weight(
                 loop_of(resolved),
@@ -324,17 +325,17 @@ def certificates_of(
 
 
 def in_chosen_norm(
-    scenario: Scenario, found: Certificates, progress: Callable[[float], None] = lambda share: None
+    scenario: Scenario, certificates: Certificates, progress: Callable[[float], None] = lambda share: None
 ) -> Certificates | None:
     """Return the certificates in a norm that noack chooses, if there are any for the schedule.
 
     Args:
         scenario: as loaded.
-        found: its certificates in the given norm, of which there are none for the schedule.
+        certificates: its certificates in the given norm, of which there are none for the schedule.
         progress: called with the completed share of the choice.
     """
     with contextlib.suppress(CallerError):  # no weight can be chosen for this scenario
-        chosen = certificates_of(scenario, "chosen", found.late_periods, progress, of_model=True)
+        chosen = certificates_of(scenario, "chosen", certificates.late_periods, progress, of_model=True)
         return chosen if chosen.schedule.constants is not None else None
     return None
 
@@ -365,8 +366,8 @@ def constant_rows(
     def constant(name: str) -> list[str]:
         return row(lambda c: getattr(c.constants, name))
 
-    def after(name: str, which: str) -> list[str]:
-        return row(lambda c: getattr(getattr(c, which), name, None))
+    def after(name: str, norm_name: str) -> list[str]:
+        return row(lambda c: getattr(getattr(c, norm_name), name, None))
 
     delta_2 = state_2 = spacing_2 = NONE
     if theorem is not None:
@@ -378,8 +379,8 @@ def constant_rows(
         return
     yield "decay rate, 1/s", constant("rate_per_s"), number(theorem_rate, 4)
     yield "undelivered updates", constant("missing_events"), NONE
-    unit = next((f"/{one.unit}" for one in certificates if one.unit), "")
-    w = "W " if any(one.weighted for one in certificates) else ""
+    unit = next((f"/{certificate.unit}" for certificate in certificates if certificate.unit), "")
+    w = "W " if any(certificate.weighted for certificate in certificates) else ""
     yield f"Δ, bound of ‖{w}e_c‖{unit}", constant("delta"), delta_2
     yield f"bound of ‖{w}e_s‖{unit}", constant("overshoot"), "1"
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE

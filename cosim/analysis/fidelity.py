@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.condition_reader import read_conditions
-from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
+from cosim.analysis.summary.summary_model import FidelityPart, NoFidelityPart
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.continuous import (
@@ -107,9 +107,9 @@ def live_run(record: RunRecord) -> LiveRun:
     measured[sensor["t_ns"] // period_ns] = True
     origins, accepted = _ticks(ticks, deliveries)
     latched = _latched(steps["actuation"], origins)
-    seen = read_conditions(record)
+    observed = read_conditions(record)
     _require(
-        not (len(seen.watchdog.t_s) or len(seen.safe_input.t_s)),
+        not (len(observed.watchdog.t_s) or len(observed.safe_input.t_s)),
         "the ideal loop has no watchdog and no safe input, which this run applied for a time",
     )
     events = sensor[sensor["event"] != NO_SEQUENCE]

@@ -42,7 +42,7 @@ class ComparedGuarantee(NamedTuple):
 
     meaning: str
     """The guarantee in words."""
-    found: Stability
+    stability: Stability
 
 
 class GuaranteeComparison(NamedTuple):
@@ -83,17 +83,17 @@ def compare_guarantees(
         (i, j): find_pattern_beyond(guarantees[i], guarantees[j])
         for i, j in permutations(range(len(guarantees)), 2)
     }
-    found = [examine(guarantee) for guarantee in guarantees]
+    stabilities = [examine(guarantee) for guarantee in guarantees]
     for (i, j), pattern in beyond.items():
         if pattern is None:
-            found[i] = found[i].with_upper_of(found[j])
-            found[j] = found[j].with_lower_of(found[i])
+            stabilities[i] = stabilities[i].with_upper_of(stabilities[j])
+            stabilities[j] = stabilities[j].with_lower_of(stabilities[i])
     meanings = [guarantee.meaning for guarantee in guarantees]
     relations = tuple(
         _relation((meanings[i], beyond[i, j]), (meanings[j], beyond[j, i]))
         for i, j in combinations(range(len(guarantees)), 2)
     )
-    return GuaranteeComparison(tuple(map(ComparedGuarantee, meanings, found)), relations)
+    return GuaranteeComparison(tuple(map(ComparedGuarantee, meanings, stabilities)), relations)
 
 
 def _relation(one: tuple[str, Pattern | None], other: tuple[str, Pattern | None]) -> str:
@@ -118,13 +118,13 @@ def _implication(meaning: str, implied: str, beyond: Pattern) -> str:
 _NOT_COMPARED = GuaranteeComparison()
 
 
-def undecided_text(found: Stability, effort: float) -> str:
+def undecided_text(stability: Stability, effort: float) -> str:
     """Return the bounds of an undecided growth, and what more time would give."""
-    lower, upper, needed = found.lower, found.upper, max(found.needed_effort, 2 * effort)
+    lower, upper, needed = stability.lower, stability.upper, max(stability.needed_effort, 2 * effort)
     text = f"growth between {lower:.6g} and {upper:.6g}, gap {upper - lower:.2g}; if it is the "
     if not needed < _LARGEST_EFFORT:
         return f"{text}lower bound, no effort up to {_LARGEST_EFFORT:g} is estimated to prove it"
-    about = duration(found.took_s * needed / effort)
+    about = duration(stability.took_s * needed / effort)
     return f"{text}lower bound, --effort {needed:.2g} is estimated to prove it, in about {about}"
 
 
@@ -133,7 +133,7 @@ class LossCap(NamedTuple):
 
     m: int
     """M; at most M − 1 consecutive losses."""
-    found: Stability
+    stability: Stability
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -142,15 +142,15 @@ class LossCap(NamedTuple):
         Raises:
             CallerError: the times between the updates of the pattern differ.
         """
-        pattern = self.found.pattern
-        if not self.found.is_periodic:
+        pattern = self.stability.pattern
+        if not self.stability.is_periodic:
             raise CallerError(
                 "--play: the times between the updates of the pattern differ, so no trigger "
                 "policy transmits at them"
             )
         lost = [number for number, delivered in enumerate(pattern) if not delivered]
         script = f'{{model="scripted", lost={lost}, repeat_every={len(pattern)}}}'
-        trigger = f'{{policy="periodic", period_s={self.found.intervals_s[0]!r}}}'
+        trigger = f'{{policy="periodic", period_s={self.stability.intervals_s[0]!r}}}'
         return f"network.mansd={self.m - 1}", f"network.loss={script}", f"trigger={trigger}"
 
 
@@ -163,18 +163,18 @@ class PeriodLimit(NamedTuple):
     """The next longer period that was examined; it is not proven stable. None: none was found."""
     is_longest: bool
     """The period is the longest time between two updates; shorter times are possible."""
-    found: Stability | None
+    stability: Stability | None
     """What is known about ``unstable_s``."""
 
     @property
     def text(self) -> str:
         """The limit in words."""
         apart = "updates at most" if self.is_longest else "an update every"
-        if self.found is None:
+        if self.stability is None:
             return f"stable for every pattern with {apart} {self.stable_s:g} s, the longest examined"
-        longer = f"{apart} {self.unstable_s:g} s: undecided, {undecided_text(self.found, 1.0)}"
-        if self.found.verdict == "destabilised":
-            longer = f"{apart} {self.unstable_s:g} s: this pattern destabilises: {self.found.text}"
+        longer = f"{apart} {self.unstable_s:g} s: undecided, {undecided_text(self.stability, 1.0)}"
+        if self.stability.verdict == "destabilised":
+            longer = f"{apart} {self.unstable_s:g} s: this pattern destabilises: {self.stability.text}"
         if self.stable_s is None:
             return f"no stable period was found; {longer}"
         return f"stable for every pattern with {apart} {self.stable_s:g} s; {longer}"
@@ -219,14 +219,14 @@ class MarginResult:
     @property
     def stable_m(self) -> int | None:
         """The largest M with which every pattern is proven stable; None if there is none."""
-        stable = [cap.m for cap in self.caps if cap.found.verdict == "stable"]
+        stable = [cap.m for cap in self.caps if cap.stability.verdict == "stable"]
         return max(stable, default=None)
 
     @property
     def destabilised(self) -> LossCap | None:
         """The smallest M with a destabilising pattern, if one was found."""
         last = self.caps[-1]
-        return last if last.found.verdict == "destabilised" else None
+        return last if last.stability.verdict == "destabilised" else None
 
     @property
     def verdict(self) -> str:
@@ -238,17 +238,17 @@ class MarginResult:
         elif most is not None:
             parts = [f"stable for every pattern with M ≤ {most}"]
         parts += [
-            f"{one.meaning}: undecided, {undecided_text(one.found, self.effort)}"
-            for one in self.compared.guarantees
-            if one.found.verdict == "undecided"
+            f"{guarantee.meaning}: undecided, {undecided_text(guarantee.stability, self.effort)}"
+            for guarantee in self.compared.guarantees
+            if guarantee.stability.verdict == "undecided"
         ]
         parts += [
-            f"M = {cap.m} is undecided: {undecided_text(cap.found, self.effort)}"
+            f"M = {cap.m} is undecided: {undecided_text(cap.stability, self.effort)}"
             for cap in self.caps  # of fewer losses all are stable
-            if cap.found.verdict == "undecided" and cap.m > (most or 0)
+            if cap.stability.verdict == "undecided" and cap.m > (most or 0)
         ]
         if (last := self.destabilised) is not None:
-            parts.append(f"this pattern destabilises M = {last.m}: {last.found.text}")
+            parts.append(f"this pattern destabilises M = {last.m}: {last.stability.text}")
         return "; ".join(parts)
 
     def __repr__(self) -> str:
@@ -260,35 +260,36 @@ class MarginResult:
     @property
     def random_text(self) -> str:
         """What holds for random losses without the guarantee, as a sentence."""
-        found = self.without_guarantee
-        return f"without the guarantee: {found if isinstance(found, str) else found.text}"
+        without = self.without_guarantee
+        return f"without the guarantee: {without if isinstance(without, str) else without.text}"
 
     def to_json(self) -> dict[str, object]:
         """Return all fields and the verdicts for JSON."""
-        period = None
-        if self.period is not None:
-            period = self.period._asdict() | {"text": self.period.text}
-            period["found"] = None if self.period.found is None else stability_document(self.period.found)
-        found = self.without_guarantee
+        period: dict[str, object] | None = None
+        if (limit := self.period) is not None:
+            period = limit._asdict() | {"text": limit.text}
+            del period["stability"]
+            period["found"] = None if limit.stability is None else stability_document(limit.stability)
+        without = self.without_guarantee
         return vars(self) | {
             "verdict": self.verdict,
             "stable_m": self.stable_m,
-            "caps": [{"m": cap.m, **stability_document(cap.found)} for cap in self.caps],
+            "caps": [{"m": cap.m, **stability_document(cap.stability)} for cap in self.caps],
             "compared": [
-                {"guarantee": one.meaning, **stability_document(one.found)}
-                for one in self.compared.guarantees
+                {"guarantee": guarantee.meaning, **stability_document(guarantee.stability)}
+                for guarantee in self.compared.guarantees
             ],
             "relations": self.compared.relations,
             "period": period,
-            "without_guarantee": found if isinstance(found, str) else found._asdict(),
+            "without_guarantee": without if isinstance(without, str) else without._asdict(),
         }
 
 
-def stability_document(found: Stability) -> dict[str, object]:
+def stability_document(stability: Stability) -> dict[str, object]:
     """Return what is known of a guarantee as JSON; the same in each run."""
-    needed = found.needed_effort if math.isfinite(found.needed_effort) else None
-    known = {"pattern": found.text, "verdict": found.verdict, "needed_effort": needed}
-    document = found._asdict() | known
+    needed = stability.needed_effort if math.isfinite(stability.needed_effort) else None
+    known = {"pattern": stability.text, "verdict": stability.verdict, "needed_effort": needed}
+    document = stability._asdict() | known
     document.pop("took_s")
     return document
 
@@ -325,16 +326,16 @@ def find_margin(
         raise CallerError(f"effort {effort:g}: expected a factor of the work up to 1e6, e.g. 10")
     margin, network = LossMargin(resolved), resolved.network
     others_read = [read_guarantee(words) for words in guarantees]
-    others = LossGuarantee(
+    other_rules = LossGuarantee(
         tuple(rule for rule in network.guarantee.rules if not isinstance(rule, LongestBurst))
     )
     caps: list[LossCap] = []
     every_m = False
     for m in range(1, most_m + 1):
         progress(f"M = {m}")
-        caps.append(LossCap(m, margin.stability(capped(others, m - 1), accuracy, effort=effort)))
-        every_m = others.longest_burst is not None and others.longest_burst < m
-        if every_m or caps[-1].found.verdict == "destabilised":
+        caps.append(LossCap(m, margin.stability(capped(other_rules, m - 1), accuracy, effort=effort)))
+        every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
+        if every_m or caps[-1].stability.verdict == "destabilised":
             break
 
     def examine(guarantee: LossGuarantee) -> Stability:

@@ -62,21 +62,21 @@ class MeanCost:
         """Return all fields for JSON."""
         document: dict[str, object] = dict(vars(self))
         for name in ("with_guarantee", "without_guarantee"):
-            found = getattr(self, name)
-            if isinstance(found, CostUnder):
-                stationary = found.stationary and found.stationary._asdict()
-                document[name] = vars(found) | {"stationary": stationary}
+            cost = getattr(self, name)
+            if isinstance(cost, CostUnder):
+                stationary = cost.stationary and cost.stationary._asdict()
+                document[name] = vars(cost) | {"stationary": stationary}
         return document
 
     def __repr__(self) -> str:
         """Return what holds with the guarantee, in words."""
-        found = self.with_guarantee
-        if isinstance(found, str):
-            return found
-        text = f"mean cost until {self.horizon_s:g} s: {found.horizon_cost:.6g}"
-        if found.stationary is None:
-            return f"{text}; the second moments grow by {found.growth:.6g} per period"
-        return f"{text}; stationary: {found.stationary.cost_per_s:.6g} /s"
+        cost = self.with_guarantee
+        if isinstance(cost, str):
+            return cost
+        text = f"mean cost until {self.horizon_s:g} s: {cost.horizon_cost:.6g}"
+        if cost.stationary is None:
+            return f"{text}; the second moments grow by {cost.growth:.6g} per period"
+        return f"{text}; stationary: {cost.stationary.cost_per_s:.6g} /s"
 
 
 def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None = None) -> MeanCost:
@@ -125,19 +125,19 @@ def _under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarantee) -
     if resolved.network.initial_sync == "known_state":  # nothing is sent at t = 0
         outcomes = outcomes.after_pause()
     moments, start = LoopMoments(periods, outcomes), start_of(resolved, outcomes)
-    stationary, n = moments.stationary(), loop_of(resolved).n
-    found = None
-    if stationary is not None:
-        means, at = stationary[1], np.diag(stationary[0].moments.sum(axis=0))
+    fixed_point, n = moments.stationary(), loop_of(resolved).n
+    stationary = None
+    if fixed_point is not None:
+        means, at = fixed_point[1], np.diag(fixed_point[0].moments.sum(axis=0))
         roots = np.sqrt(np.maximum(np.concatenate([means[:-1], at[:n]]), 0.0)).tolist()
-        found = Stationary(tuple(roots[:n]), tuple(roots[-n:]), tuple(roots[n:-n]), float(means[-1]))
+        stationary = Stationary(tuple(roots[:n]), tuple(roots[-n:]), tuple(roots[n:-n]), float(means[-1]))
     with np.errstate(over="ignore"):
         _, until = moments.until(start, resolved.timing.horizon_ns)
     transient = moments.transient(start)
     return CostUnder(
         guarantee.meaning,
         moments.growth,
-        found,
+        stationary,
         float(until[-1]),
         None if transient is None else float(transient[-1]),
     )

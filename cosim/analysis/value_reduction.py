@@ -34,10 +34,10 @@ class QuantileSketch:
     @classmethod
     def of(cls, parts: Iterable[NDArray[np.float64]]) -> Self:
         """Return a sketch of values in parts."""
-        found = cls()
+        sketch = cls()
         for values in parts:
-            found.add(values)
-        return found
+            sketch.add(values)
+        return sketch
 
     def add(self, values: NDArray[np.float64]) -> None:
         """Add values, (k,); those that are not finite are ignored."""
@@ -53,8 +53,8 @@ class QuantileSketch:
                 return
             values, self._values = np.concatenate(self._values), None
         places, counts = np.unique(_bins(values), return_counts=True)
-        for place, count in zip(places.tolist(), counts.tolist(), strict=True):
-            self._counts[place] = self._counts.get(place, 0) + count
+        for bin_number, count in zip(places.tolist(), counts.tolist(), strict=True):
+            self._counts[bin_number] = self._counts.get(bin_number, 0) + count
 
     def quantiles(self, *shares: float) -> list[float | None]:
         """Return the values below which some shares of all values are; None without values."""
@@ -72,7 +72,7 @@ class QuantileSketch:
             values = np.sort(np.concatenate([np.zeros(0), *self._values]))
             return values[self.count - np.asarray(ranks, np.intp)]
         places = np.array(sorted(self._counts))
-        below = np.cumsum([self._counts[place] for place in places.tolist()])
+        below = np.cumsum([self._counts[bin_number] for bin_number in places.tolist()])
         at = np.searchsorted(below, self.count - np.asarray(ranks), side="right")
         values = _middle(places[at.clip(max=len(places) - 1)])
         values = np.where(np.asarray(ranks) <= 1, self._high, values)
@@ -160,9 +160,9 @@ def decimate_all(t: Reals, values: Reals, columns: int) -> Indices:
 def _where_first(extreme: Reals, y: Reals, column: Indices, first: Indices, last: Indices) -> Indices:
     """Return the index of each column's first value that equals its extreme."""
     equal = np.flatnonzero(y == np.repeat(extreme, last - first + 1))
-    _, which = np.unique(column[equal], return_index=True)
-    found: Indices = equal[which]
-    return found
+    _, first_index = np.unique(column[equal], return_index=True)
+    indices: Indices = equal[first_index]
+    return indices
 
 
 def is_long(scenario: Scenario) -> bool:

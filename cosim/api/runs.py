@@ -22,10 +22,10 @@ from noack.scenario.scenario import Scenario
 with lazy_modules():
     import cosim.analysis.replay.run_replay as run_replay
     from cosim.analysis import fidelity as fidelity_analysis
-    from cosim.analysis import run_summary
+    from cosim.analysis.summary import run_summary
     from cosim.live import finalize as run_end
     from cosim.live import launcher, simulated_run
-    from cosim.live import progress as progress_display
+    from cosim.live.monitoring import progress as progress_display
     from cosim.output import export as exports
     from cosim.output import result_tables, run_tables
     from cosim.output.figures import figure_drawing, figure_files, figure_format, network_figures, run_figures
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from cosim.analysis.replay import Replay
-    from cosim.analysis.summary_model import Claim, RunSummary
+    from cosim.analysis.summary.summary_model import Claim, RunSummary
     from cosim.output.figures.figure_description import FigureDescription
 
 Folder = str | PathLike[str]

@@ -33,7 +33,7 @@ from noack.theory.margins.joint_spectral_radius import ACCURACY
 from noack.traces.trace_formats import find_trace
 
 with lazy_modules():
-    from cosim.live import progress as progress_display
+    from cosim.live.monitoring import progress as progress_display
     from cosim.measurement import measurement_outputs
     from cosim.output import certificate_report, result_tables
     from cosim.output.figures import figure_drawing

@@ -13,7 +13,7 @@ from noack.runtime.command_line import failed, stoppable_imports
 
 with lazy_modules():
     from cosim.cli import command
-    from cosim.live import fork_server
+    from cosim.live.processes import fork_server
 
 if TYPE_CHECKING:
     from cosim.cli.command import app, find_scenario

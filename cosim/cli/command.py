@@ -33,7 +33,8 @@ from noack.runtime.command_line import StopRequestError, failed, stop_requests_r
 with lazy_modules():
     from importlib import metadata
 
-    from cosim.live import fork_server, progress
+    from cosim.live.monitoring import progress
+    from cosim.live.processes import fork_server
     from cosim.output import result_tables
     from noack.core import core_library
 
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     from rich.status import Status
     from typer._click.core import Command, Context, Parameter
     from typer._click.formatting import HelpFormatter
-
 
 NAME = "noack"
 _COMPLETION = ("install_completion", "show_completion")

@@ -19,7 +19,9 @@ from noack.core.errors import CallerError, PeerError
 from noack.runtime.command_line import LogFormat, log_format, print_to_stderr
 
 with lazy_modules():
-    from cosim.live import finalize, fork_server, launcher, progress, remote_access, run_metrics, run_watcher
+    from cosim.live import finalize, launcher, remote_access
+    from cosim.live.monitoring import progress, run_metrics, run_watcher
+    from cosim.live.processes import fork_server
     from cosim.output import run_verdict
     from cosim.output.viewer import rerun_program
     from cosim.record import run_directory

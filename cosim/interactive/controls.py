@@ -1,42 +1,28 @@
-"""What can be set of a scenario: sliders and choices, and a form with a field for every key.
+"""The settings of a scenario that are worth dragging: sliders and choices, with their ranges."""
 
-The sliders and choices are those worth dragging, with their ranges. The form follows the JSON
-schema, in groups as its tables: it knows no key by name, so that a new key of the schema has its
-field at once. A table with kinds (``trigger.policy``, ``network.loss.model``) has a choice, and the
-fields of its kind.
-"""
-
-import functools
 import math
-import re
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from functools import cache
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
-from cosim.interactive.draft import Draft, DraftError, Mistake, value_text
+from cosim.interactive.draft import Draft
 from noack.core.clock import NS_PER_S
-from noack.core.errors import NoackError
-from noack.scenario import toml_file
 from noack.scenario.runtime_parameters import trigger_parameters
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import value_of
 from noack.scenario.sections import POLICIES
 from noack.settings.section import Table
 
 _STEPS = 200
 _DECADE = 10.0
-_MOST_LOSSES = 20
-_MOST_WINDOW = 40
+_MOST_LOSSES, _MOST_WINDOW = 20, 40
 _BELOW = 0.99
 """The largest share of a limit that must not be reached."""
 _SEEDS = 200
 _MOST_MODEL_ERROR = 20.0
+_NUMBERS = ("number", "integer")
 _LOSSES: Mapping[str, Mapping[str, object]] = {
     "bernoulli": {"probability": 0.5},
     "gilbert_elliott": {"mean_loss": 0.5, "mean_burst": 3.0},
@@ -88,9 +74,9 @@ class Slider:
         value = min(max(value, self.low), self.high)
         return math.log10(value) if self.logarithmic else value
 
-    def value_at(self, place: float) -> float | int:
+    def value_at(self, position: float) -> float | int:
         """Return the value at a place: whole, a multiple, or with three significant digits."""
-        value = 10.0**place if self.logarithmic else place
+        value = 10.0**position if self.logarithmic else position
         value = min(max(value, self.low), self.high)
         if self.multiple_of:
             return float(f"{max(round(value / self.multiple_of), 1) * self.multiple_of:.9g}")
@@ -145,12 +131,8 @@ def controls_of(draft: Draft) -> Controls:
         *_guarantee_sliders(scenario),
         *_trigger_sliders(scenario, base),
         *_plant_sliders(scenario, base),
-        Slider(
-            "seeds.loss", "random seed of the losses", _seed(scenario.seeds.loss), 0, _SEEDS, 1, whole=True
-        ),
-        Slider(
-            "seeds.plant", "random seed of the plant", _seed(scenario.seeds.plant), 0, _SEEDS, 1, whole=True
-        ),
+        _seed("seeds.loss", "random seed of the losses", scenario.seeds.loss),
+        _seed("seeds.plant", "random seed of the plant", scenario.seeds.plant),
         _decades("horizon_s", "horizon [s]", scenario.horizon_s, base.horizon_s, live=False),
     )
     return Controls(_choices(scenario), sliders)
@@ -175,7 +157,7 @@ def _choices(scenario: Scenario) -> tuple[Choice, ...]:
 
 def _is_window(scenario: Scenario) -> bool:
     """Whether the only further constraint is at most m losses in any K packets."""
-    return [one.kind for one in scenario.network.constraints] == [_WINDOW["kind"]]
+    return [constraint.kind for constraint in scenario.network.constraints] == [_WINDOW["kind"]]
 
 
 def chosen(draft: Draft, key: str, value: str) -> Draft:
@@ -195,7 +177,7 @@ def dragged(draft: Draft, slider: Slider, value: float) -> Draft:
     for key in slider.scaled:
         matrix = np.array(base.value(key), dtype=np.float64)
         draft = draft.with_value(
-            key, [[float(f"{value * one:.6g}") for one in row] for row in matrix.tolist()]
+            key, [[float(f"{value * entry:.6g}") for entry in row] for row in matrix.tolist()]
         )
     return draft
 
@@ -223,7 +205,7 @@ def _loss_sliders(scenario: Scenario) -> list[Slider]:
     values = loss.model_dump(mode="json", exclude_none=True)
     # The mean loss and burst are those of Gilbert's chain, which loses in the bad state only.
     fixed = ("loss_in_good", "loss_in_bad") if "mean_loss" in values else ()
-    found = []
+    sliders = []
     for name, value in values.items():
         key, label = f"network.loss.{name}", f"loss: {_words(name)}"
         if name in fixed or not isinstance(value, float):
@@ -235,8 +217,8 @@ def _loss_sliders(scenario: Scenario) -> list[Slider]:
             slider = _decades(key, label, value, value)
         else:
             continue
-        found.append(_within_field(slider, type(loss), name))
-    return found
+        sliders.append(_within_field(slider, type(loss), name))
+    return sliders
 
 
 def _guarantee_sliders(scenario: Scenario) -> list[Slider]:
@@ -265,7 +247,7 @@ def _guarantee_sliders(scenario: Scenario) -> list[Slider]:
 
 def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
     trigger, usual = scenario.trigger, base.trigger
-    found = []
+    sliders = []
     for key in trigger_parameters(trigger):
         name = key.removeprefix("trigger.")
         value = getattr(trigger, name)
@@ -276,8 +258,8 @@ def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
             if name == "period_s":
                 period_s = scenario.timing.measurement_period_ns / NS_PER_S
                 slider = replace(slider, multiple_of=period_s)
-            found.append(_within_field(slider, type(trigger), name))
-    return found
+            sliders.append(_within_field(slider, type(trigger), name))
+    return sliders
 
 
 def _within_field(slider: Slider, section: type[BaseModel], name: str) -> Slider:
@@ -293,7 +275,7 @@ def _limits(section: type[BaseModel], name: str) -> tuple[float, float]:
     schema = section.model_json_schema()
     properties = schema.get("$defs", {}).get(section.__name__, schema)["properties"]
     kinds = properties[name].get("anyOf", [properties[name]])
-    number: Mapping[str, float] = next((one for one in kinds if one.get("type") in ("number", "integer")), {})
+    number: Mapping[str, float] = next((kind for kind in kinds if kind.get("type") in _NUMBERS), {})
     below = _BELOW * number.get("exclusiveMaximum", math.inf)
     return number.get("minimum", -math.inf), min(number.get("maximum", math.inf), below)
 
@@ -302,16 +284,16 @@ def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
     """Return the slider of the box around the model from which the plant is drawn."""
     if scenario.plant.draw not in ("uniform", "vertex"):
         return []
-    found = {}
+    factors = {}
     for name in ("uncertainty_A", "uncertainty_B"):
         usual = np.array(getattr(base.plant, name) or [[]], dtype=np.float64)
         now = np.array(getattr(scenario.plant, name) or [[]], dtype=np.float64)
         if usual.any() and usual.shape == now.shape:
-            place = np.unravel_index(np.argmax(np.abs(usual)), usual.shape)
-            found[f"plant.{name}"] = float(now[place] / usual[place])
-    if not found:
+            largest = np.unravel_index(np.argmax(np.abs(usual)), usual.shape)
+            factors[f"plant.{name}"] = float(now[largest] / usual[largest])
+    if not factors:
         return []
-    value = max(found.values())
+    value = max(factors.values())
     return [
         Slider(
             "plant.uncertainty",
@@ -320,7 +302,7 @@ def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
             0.0,
             max(_MOST_MODEL_ERROR, value),
             0.1,
-            scaled=tuple(found),
+            scaled=tuple(factors),
         ),
     ]
 
@@ -343,195 +325,5 @@ def _words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _seed(seed: int) -> int:
-    return min(seed, _SEEDS)
-
-
-Schema = Mapping[str, Any]
-_VALUE = re.compile(r'^(?: = (?:"(?:[^"\\]|\\.)*"|[^:]*))?: ')
-"""What a mistake says before its reason; the field shows it."""
-
-
-class FieldKind(StrEnum):
-    """How a field is filled in."""
-
-    CHOICE = "choice"
-    TEXT = "text"
-    TOML = "toml"
-    """A number, or a list or table on one line."""
-
-
-@dataclass(frozen=True)
-class Field:
-    """A key of the scenario, and what is known of it."""
-
-    key: str
-    label: str
-    help: str
-    kind: FieldKind
-    default: str
-    """As text; empty if there is none."""
-    options: tuple[str, ...] = ()
-    """Of a CHOICE."""
-    selects: str = ""
-    """The table whose kind the field chooses; else empty."""
-
-    def text(self, draft: Draft) -> str:
-        """Return the value that a draft gives, as text; empty if it gives none."""
-        value = draft.value(self.key)
-        if value is None:
-            return ""
-        return value if isinstance(value, str) else value_text(value)
-
-    def value(self, text: str) -> object:
-        """Return the value of a text; what is no TOML stays text, so that validation names it."""
-        if self.kind is FieldKind.TEXT:
-            return text
-        try:
-            return value_of(text, self.key)
-        except NoackError:
-            return text
-
-
-@dataclass(frozen=True)
-class Group:
-    """A table of the scenario."""
-
-    key: str
-    """Empty for the whole scenario."""
-    help: str
-    fields: tuple[Field, ...]
-    groups: tuple["Group", ...]
-
-    def all_fields(self) -> Iterator[Field]:
-        """Yield the fields of this group and of those in it."""
-        yield from self.fields
-        for one in self.groups:
-            yield from one.all_fields()
-
-    def all_groups(self) -> Iterator["Group"]:
-        """Yield this group and those in it."""
-        yield self
-        for one in self.groups:
-            yield from one.all_groups()
-
-
-def form_of(draft: Draft) -> Group:
-    """Return the form of a draft, whose kinds decide which fields there are.
-
-    Raises:
-        DraftError: the text is not TOML.
-    """
-    return _group("", _schema(), "", draft.content, {})
-
-
-def filled(draft: Draft, field: Field, text: str) -> Draft:
-    """Return the draft with another text in a field; an empty one restores the default.
-
-    Another kind of a table keeps what both kinds have.
-
-    Raises:
-        NoackError: a part of the key is no table.
-    """
-    if not text:
-        return draft.without(field.selects or field.key)
-    if not field.selects:
-        return draft.with_value(field.key, field.value(text))
-    with suppress(DraftError):
-        if (example := example_of(draft, field.selects, text)) is not None:
-            return draft.with_value(field.selects, example)
-    changed = draft.with_value(field.key, text)
-    group = next(one for one in form_of(changed).all_groups() if one.key == field.selects)
-    keys = (*(one.key for one in group.fields), *(one.key for one in group.groups))
-    known = {key.rpartition(".")[2] for key in keys}
-    table = changed.value(group.key)
-    assert isinstance(table, dict)
-    kept = {key: value for key, value in table.items() if key in known}
-    return changed.with_value(group.key, kept)
-
-
-def by_field(form: Group, mistakes: list[Mistake]) -> dict[str, str]:
-    """Return the texts of mistakes by the key of the field to which they belong."""
-    keys = {one.key for one in form.all_fields()}
-    found: dict[str, str] = {}
-    for mistake in mistakes:
-        parts = mistake.key.split(".")
-        for length in range(len(parts), 0, -1):  # a mistake inside a list belongs to the list
-            key = ".".join(parts[:length])
-            if key in keys:
-                text = _VALUE.sub("", mistake.text.removeprefix(mistake.key))
-                found[key] = "; ".join(filter(None, (found.get(key), text)))
-                break
-    return found
-
-
-@functools.cache
-def _schema() -> Schema:
-    return toml_file.json_schema(Scenario)
-
-
-def _resolved(schema: Schema) -> Schema:
-    """Return a schema without reference, and without the alternative null."""
-    if "$ref" in schema:
-        name = schema["$ref"].rpartition("/")[2]
-        return {**_schema()["$defs"][name], **{k: v for k, v in schema.items() if k != "$ref"}}
-    if "anyOf" in schema:
-        given = [one for one in schema["anyOf"] if one.get("type") != "null"]
-        if len(given) == 1:
-            rest = {key: value for key, value in schema.items() if key != "anyOf"}
-            return _resolved({**given[0], **rest})
-    return schema
-
-
-def _group(key: str, schema: Schema, help_: str, content: object, default: object) -> Group:
-    """Return the group of a table: of the kind that the content has, if there are kinds."""
-    content = content if isinstance(content, Mapping) else {}
-    default = default if isinstance(default, Mapping) else {}
-    fields, groups = [], []
-    name, kinds = _kinds(schema)
-    if kinds:
-        optional = [kind for kind, one in kinds.items() if name not in one.get("required", ())]
-        usual = default.get(name, optional[0] if len(optional) == 1 else None)
-        chosen = content.get(name, usual)
-        fields.append(
-            Field(f"{key}.{name}", name, help_, FieldKind.CHOICE, _text(usual), tuple(kinds), selects=key)
-        )
-        schema = kinds.get(chosen, {}) if isinstance(chosen, str) else {}
-    for part, described in schema.get("properties", {}).items():
-        inner, path = _resolved(described), f"{key}.{part}".removeprefix(".")
-        if part == name:
-            continue
-        value, usual = content.get(part), described.get("default", default.get(part))
-        told = str(inner.get("description", ""))
-        if "oneOf" in inner or "properties" in inner:
-            groups.append(_group(path, inner, told, value, usual))
-        else:
-            fields.append(_field(path, part, inner, told, usual))
-    return Group(key, help_, tuple(fields), tuple(groups))
-
-
-def _kinds(schema: Schema) -> tuple[str, dict[str, Schema]]:
-    """Return the key that chooses the kind, and the schema of each kind; none: there are none."""
-    found: dict[str, Schema] = {}
-    name = ""
-    for reference in schema.get("oneOf", ()):
-        one = _resolved(reference)
-        name, described = next((name, part) for name, part in one["properties"].items() if "const" in part)
-        found[described["const"]] = one
-    return name, found
-
-
-def _field(key: str, label: str, schema: Schema, help_: str, default: object) -> Field:
-    options = tuple(map(_text, schema.get("enum", ())))
-    kind = FieldKind.CHOICE if options else FieldKind.TOML
-    if schema.get("type") == "boolean":
-        kind, options = FieldKind.CHOICE, ("true", "false")
-    elif schema.get("type") == "string" and not options:
-        kind = FieldKind.TEXT
-    return Field(key, label, " ".join(help_.split()), kind, _text(default), options)
-
-
-def _text(value: object) -> str:
-    if value is None:
-        return ""
-    return value if isinstance(value, str) else value_text(value)
+def _seed(key: str, label: str, seed: int) -> Slider:
+    return Slider(key, label, min(seed, _SEEDS), 0, _SEEDS, 1, whole=True)

@@ -50,8 +50,8 @@ class DraftError(CallerError):
 
 
 def _mistake(line: str) -> Mistake:
-    found = _LINE.match(line)
-    return Mistake("" if found is None else found[1], line.removeprefix(f"{_SOURCE}: "))
+    match = _LINE.match(line)
+    return Mistake("" if match is None else match[1], line.removeprefix(f"{_SOURCE}: "))
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ class Draft:
 
     def value(self, key: str) -> object:
         """Return the value of a key in the text; None if it is not given."""
-        found = leaf(self.content, key)
-        return None if found is _ABSENT else found
+        value = leaf(self.content, key)
+        return None if value is _ABSENT else value
 
     def with_value(self, key: str, value: object) -> "Draft":
         """Return the draft with another value of a key; comments are kept where possible."""
@@ -119,7 +119,7 @@ class Draft:
         if "text" in self.__dict__:
             made = replace(self, before=self.text, edits={key: change})
         else:
-            earlier = {one: edit for one, edit in self.edits.items() if one != key}
+            earlier = {edited: edit for edited, edit in self.edits.items() if edited != key}
             made = replace(self, edits={**earlier, key: change})
         made.__dict__["content"] = content
         return made
@@ -151,14 +151,14 @@ def leaf(content: ReadTable, key: str) -> object:
 def differences(base: object, content: object, key: str = "") -> list[tuple[str, str]]:
     """Return the keys that differ, with their values as TOML; empty for a key that is gone."""
     if isinstance(base, Mapping) and isinstance(content, Mapping):
-        found = []
+        changed = []
         for part in [*base, *(part for part in content if part not in base)]:
             inner = f"{key}.{part}" if key else str(part)
             if part not in content:
-                found.append((inner, ""))
+                changed.append((inner, ""))
             else:
-                found += differences(base.get(part, _ABSENT), content[part], inner)
-        return found
+                changed += differences(base.get(part, _ABSENT), content[part], inner)
+        return changed
     return [] if base == content else [(key, value_text(content))]
 
 
@@ -216,7 +216,7 @@ def draft_of_query(query: str, default: str, known: Mapping[str, str]) -> Draft:
 
 def _code(content: ReadTable) -> list[object]:
     """Return the tables that name code."""
-    tables = [leaf(content, place) for place in PLACES]
+    tables = [leaf(content, key) for key in PLACES]
     return [
         table
         for table in tables
@@ -257,7 +257,7 @@ def changed_text(text: str, wanted: ReadTable, change: Callable[[Table], object]
 def value_text(value: object) -> str:
     """Return a value as TOML on one line; tables are inline tables."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {value_text(one)}" for key, one in value.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {value_text(entry)}" for key, entry in value.items()) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(value_text, value)) + "]"
     return str(tomlkit.item(value).as_string())

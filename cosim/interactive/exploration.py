@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary.run_summary import summarise
 from cosim.analysis.value_reduction import decimate_all
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
@@ -245,10 +245,10 @@ def of_record(record: RunRecord, kind: str, diverged_at_s: float | None = None) 
     resolved, parts = record.scenario, []
     columns = _COLUMNS if record.is_short else max(record.slice_columns // 10, 1)
     for part in aligned_parts(record):
-        one, known = part.aligned, part.aligned.since_delivery(resolved)
-        x_c = np.where(known[:, None], one.x_c, np.nan)
-        norms = (one.e_s_norm, np.where(known, one.e_c_norm, np.nan), one.threshold)
-        curves = np.column_stack([one.t_ns / NS_PER_S, one.x, one.x_s, x_c, *norms])
+        run, known = part.aligned, part.aligned.since_delivery(resolved)
+        x_c = np.where(known[:, None], run.x_c, np.nan)
+        norms = (run.e_s_norm, np.where(known, run.e_c_norm, np.nan), run.threshold)
+        curves = np.column_stack([run.t_ns / NS_PER_S, run.x, run.x_s, x_c, *norms])
         parts.append(curves[decimate_all(curves[:, 0], curves[:, 1:], columns)])
     curves, n = np.concatenate(parts), record.loop.n
     t_s, x, x_s, x_c, sizes = np.split(curves, np.cumsum([1, n, n, n]), axis=1)
@@ -319,7 +319,7 @@ def explore_ensemble(scenario: Scenario, draws: int = DRAWS) -> Ensemble:
     weight = setting.trigger.weight
     with np.errstate(all="ignore"):
         weighted = e_c if weight is None else e_c @ weight.T
-        x_norm, e_c_norm = (_band(np.linalg.norm(one, axis=2)) for one in (x, weighted))
+        x_norm, e_c_norm = (_band(np.linalg.norm(vectors, axis=2)) for vectors in (x, weighted))
     sent = rows["transmissions"][used]
     low, middle, high = np.quantile(sent, (LOW, 0.5, HIGH)) if len(sent) else (np.nan,) * 3
     return Ensemble(
@@ -365,7 +365,7 @@ def trajectories(
         horizon_s=setting.horizon_s,
         known_start=setting.known_start,
     )
-    found = []
+    samples = []
     for A, B, x0, own in zip(*population[:3], events, strict=True):
         rest = np.zeros_like(x0)
         start = [x0, rest, rest if setting.known_start else -x0]
@@ -373,5 +373,5 @@ def trajectories(
         after[:, 1] = 0.0
         after[own.delivered, 2] = 0.0
         times_s, states = np.append(0.0, own.event_s), np.concatenate([[start], after])
-        found.append(core.sample(A, B, times_s, states, t_s))
-    return np.array(found).reshape(-1, len(t_s), 3, len(setting.H))
+        samples.append(core.sample(A, B, times_s, states, t_s))
+    return np.array(samples).reshape(-1, len(t_s), 3, len(setting.H))

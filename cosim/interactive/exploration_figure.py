@@ -252,11 +252,11 @@ class DraftResults:
         run = [*self.run.numbers, *(() if bands is None else bands.numbers)]
         groups = {f"this run ({self.run.kind})": run}
         if CERTIFICATE in self.known:
-            found = self.certificate
+            certificate = self.certificate
             groups["certificate"] = [
-                ("certificate", f"{found.verdict}: {found.reason}"),
-                *found.rows,
-                *((what, f"{verdict} ({why})") for verdict, what, why in found.assumptions),
+                ("certificate", f"{certificate.verdict}: {certificate.reason}"),
+                *certificate.rows,
+                *((assumption, f"{verdict} ({why})") for verdict, assumption, why in certificate.assumptions),
             ]
         if MARGIN in self.known:
             groups["margin"] = [

@@ -72,9 +72,9 @@ def certify(scenario: Scenario) -> Guarantee:
         return Guarantee(NOT_COVERED, str(error), (), (), t_s, nothing, nothing, nothing)
     reason = _reason(certificate)
     assumptions = tuple(
-        (str(one.verdict), one.what, one.why)
-        for one in certificate.assumptions
-        if one.verdict != AssumptionStatus.HOLDS and one.why != reason
+        (str(assumption.verdict), assumption.what, assumption.why)
+        for assumption in certificate.assumptions
+        if assumption.verdict != AssumptionStatus.HOLDS and assumption.why != reason
     )
     rows = () if certificate.constants is None else constant_rows([certificate], None, 0)
     with np.errstate(all="ignore"):
@@ -101,13 +101,13 @@ def _certificate(resolved: Scenario) -> ScenarioCertificate:
 
 
 def _reason(certificate: ScenarioCertificate) -> str:
-    found = certificate.constants
-    if found is None:
+    constants = certificate.constants
+    if constants is None:
         return certificate.void or "no bounds were found"
     patterns = "every loss pattern allowed by M"
-    if found.rate_per_s == 0:
+    if constants.rate_per_s == 0:
         return f"{patterns}: all errors stay bounded"
-    rate = f"decay at the rate {number(found.rate_per_s)} /s"
+    rate = f"decay at the rate {number(constants.rate_per_s)} /s"
     if certificate.persistent_constants is not None:
         return f"{patterns}: all errors stay bounded; what the start causes {rate}"
     return f"{patterns}: all errors {rate}"
@@ -121,14 +121,14 @@ def margin_of(scenario: Scenario) -> Margin:
     """
     resolved = resolve(scenario)
     try:
-        found = find_margin(resolved, accuracy=1e-3, with_period=False)
+        margin = find_margin(resolved, accuracy=1e-3, with_period=False)
     except CallerError as error:
         return Margin(str(error), (), defined=False)
     rows = tuple(
-        (str(cap.m), f"{number(cap.found.lower, 5)} – {number(cap.found.upper, 5)}", cap.found.verdict)
-        for cap in found.caps
+        (str(m), f"{number(stability.lower, 5)} – {number(stability.upper, 5)}", stability.verdict)
+        for m, stability in margin.caps
     )
-    return Margin(found.verdict, rows, defined=True)
+    return Margin(margin.verdict, rows, defined=True)
 
 
 def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None) -> str:

@@ -1,5 +1,5 @@
 /* Draws the figure: one panel below another, each with its title and legend as text, its axes as an
-   SVG, and its curves on a canvas above them. Nothing here knows what is drawn: cosim/lab/stage.py
+   SVG, and its curves on a canvas above them. Nothing here knows what is drawn: cosim/lab/page_parts.py
    describes panels, axes and items, and sends all numbers as one array.
 
    While a slider is dragged, only the canvases change. They are drawn by the processor: a browser

@@ -1,7 +1,7 @@
 """The page as a visitor sees it: the figure, what is said of it, and a drawer with the settings.
 
 The figure shows one of three sources: the explored run, the live run, or a recorded one. What the
-browser is sent are the parts of :class:`cosim.lab.stage.Stage`.
+browser is sent are the parts of :class:`cosim.lab.page_parts.PageParts`.
 """
 
 import asyncio
@@ -20,15 +20,15 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 from pyarrow import csv
 
-from cosim.interactive.controls import Controls, by_field, chosen, controls_of, dragged, filled, form_of
+from cosim.interactive.controls import Controls, chosen, controls_of, dragged
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.exploration_figure import CERTIFICATE, Shown, exploration_figure
-from cosim.lab.comparison import Reference, compare, verdict_of
+from cosim.interactive.form import by_field, filled, form_of
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
-from cosim.lab.settings_panel import TextPanel, controls_part, form_part, value_text
+from cosim.lab.page_parts import PageParts, TextPanel, controls_part, figure_part, form_part, value_text
+from cosim.lab.run_views import Reference, compare, verdict_of
 from cosim.lab.sources import LiveSource, RecordedSource, report_address
-from cosim.lab.stage import Stage, figure_part
 from cosim.output.figures.figure_format import FigureFormat, figure_width_in
 from cosim.output.page_kit import TERMS
 from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, VerdictLine
@@ -71,7 +71,7 @@ class _Page:
         self._services, self._client = services, ui.context.client
         self._calls = PageCalls(services)
         self._session = Session(self._calls, draft, self._drawn, self._settle)
-        self._stage = Stage(self._client)
+        self._parts = PageParts(self._client)
         self._dark = ui.dark_mode(None)
         self._is_dark = False
         self._source, self._state, self._comparing = EXPLORE, 0, True
@@ -160,33 +160,33 @@ class _Page:
         await self._client.connected()
         self._is_dark = await ui.run_javascript("labBegin()", timeout=ANSWER_S)
         self._text.show_dark(dark=self._is_dark)
-        steps = [{"title": one.title, "text": one.text, "drag": one.drag} for one in STEPS]
-        await self._stage.show(source=EXPLORE, steps=steps)
+        steps = [{"title": step.title, "text": step.text, "drag": step.drag} for step in STEPS]
+        await self._parts.show(source=EXPLORE, steps=steps)
         await self._session.change(self._session.draft)
 
     async def _take(self, event: GenericEventArguments) -> None:
         """Take what the visitor does with elements that are not the framework's."""
-        said = event.args
-        match said["what"]:
+        message = event.args
+        match message["what"]:
             case "slide":
                 sliders = self._controls.sliders if self._controls else ()
-                if slider := next((one for one in sliders if one.key == said["key"]), None):
-                    value = slider.value_at(float(said["place"]))
+                if slider := next((slider for slider in sliders if slider.key == message["key"]), None):
+                    value = slider.value_at(float(message["place"]))
                     self._moved = [slider.key, value_text(value)]
                     await self._apply(lambda draft: dragged(draft, slider, value), slider.key)
             case "fill":
-                found = (one for one in self._form.all_fields() if one.key == said["key"])
-                field, text = next(found), str(said["text"]).strip()
+                fields = (field for field in self._form.all_fields() if field.key == message["key"])
+                field, text = next(fields), str(message["text"]).strip()
                 if text != field.text(self._session.draft):
                     await self._apply(lambda draft: filled(draft, field, text), field.key)
             case "choose":
-                key, kind = said["key"], str(said["value"])
+                key, kind = message["key"], str(message["value"])
                 await self._apply(lambda draft: chosen(draft, key, kind), key)
             case "state":
-                self._state = int(said["number"])
+                self._state = int(message["number"])
                 await self._show()
             case "step":
-                step = STEPS[int(said["number"])]
+                step = STEPS[int(message["number"])]
                 draft = open_draft(step.scenario)
                 for name, setting in step.settings.items():
                     draft = draft.with_value(name, setting)
@@ -201,7 +201,7 @@ class _Page:
             self._controls = controls_of(self._session.draft)
         parts = self._drawing(shown) | {"note": self._note(shown), "verdict": self._verdict()}
         if self._controls is not None:
-            wrong = {one.key for one in self._session.mistakes}
+            wrong = {mistake.key for mistake in self._session.mistakes}
             parts["controls"] = controls_part(self._controls, wrong, live=self._live.is_running)
         if shown is not None:
             run = shown.run
@@ -214,7 +214,7 @@ class _Page:
             parts["states"] = {"names": run.state_names, "chosen": shown.state}
         name = self._live.report if live else self._recorded.chosen * (self._source == RECORDED)
         pending = {EXPLORE: self._session.pending, RECORDED: self._recorded.note}
-        await self._stage.show(
+        await self._parts.show(
             pending=pending.get(self._source, ""),
             progress=self._live.progress if live else None,
             report=name and report_address(name),
@@ -236,7 +236,7 @@ class _Page:
         first = session.mistakes[0].text if session.mistakes else ""
         more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
         note = first + more or session.note
-        is_old = note and shown is None and self._stage.has_figure
+        is_old = note and shown is None and self._parts.has_figure
         return f"{note}. The figure shows the settings before" if is_old else note
 
     def _shown(self) -> Shown | None:
@@ -300,7 +300,7 @@ class _Page:
         if self._source != EXPLORE or shown is None:
             await self._show()
             return
-        await self._stage.show(slider=self._moved, **self._drawing(shown))
+        await self._parts.show(slider=self._moved, **self._drawing(shown))
 
     async def _settle(self) -> None:
         """Bring up to date what need not follow while a slider is dragged."""
@@ -312,7 +312,7 @@ class _Page:
                 with suppress(DraftError):  # the text is no TOML; the form stays
                     self._form = form_of(draft)
                     form = form_part(self._form, draft, by_field(self._form, mistakes))
-                    await self._stage.show(query=f"?{draft.query()}", form=form)
+                    await self._parts.show(query=f"?{draft.query()}", form=form)
                 if not mistakes:
                     await self._live.change(draft, keys)
             await self._show()

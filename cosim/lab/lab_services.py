@@ -120,18 +120,18 @@ class LabServices:
                 continue
             live.watched, began_s = False, time.perf_counter()
             with suppress(NoackError, OSError, ValueError):  # the run ends, and its spool goes
-                live.seen = await self.compute(live_view, live.run_dir) or live.seen
+                live.exploration = await self.compute(live_view, live.run_dir) or live.exploration
                 live.version += 1
             took_s = time.perf_counter() - began_s
         if live.verdict and live.run_dir is not None:
-            live.seen = (await self.compute(recorded_view, live.run_dir, None)).run
+            live.exploration = (await self.compute(recorded_view, live.run_dir, None)).run
             live.version += 1
 
     def recorded(self) -> list[str]:
         """Return the names of the run directories, the newest first."""
         with suppress(OSError):
-            found = [path for path in self.runs.iterdir() if (path / "scenario.toml").is_file()]
-            return sorted((one.name for one in found if not one.is_symlink()), reverse=True)
+            folders = [path for path in self.runs.iterdir() if (path / "scenario.toml").is_file()]
+            return sorted((folder.name for folder in folders if not folder.is_symlink()), reverse=True)
         return []
 
     def has_ended(self, name: str) -> bool:
@@ -285,19 +285,19 @@ class Session:
             self.note, self.pending = str(error), ""
         await self.on_rest()
 
-    async def _compute(self, what: str, function: Callable[[Scenario], T], scenario: Scenario) -> T:
+    async def _compute(self, quantity: str, function: Callable[[Scenario], T], scenario: Scenario) -> T:
         """Compute a result, and say so; if it does not come soon, that it waits."""
 
         async def say_waiting() -> None:
             await asyncio.sleep(_SLOW_S)
-            self.pending = f"{what}: waiting for the processor"
+            self.pending = f"{quantity}: waiting for the processor"
             await self.on_rest()
 
-        self.pending = f"computing: {what}"
+        self.pending = f"computing: {quantity}"
         waiting = asyncio.create_task(say_waiting())
         try:
-            found = await self.calls.compute(function, scenario)
+            result = await self.calls.compute(function, scenario)
         finally:
             waiting.cancel()
         self.pending = ""
-        return found
+        return result

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from cosim.interactive.draft import Draft
 from cosim.live.launcher import launch
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
 from cosim.output.viewer.rerun_program import is_installed
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command
@@ -54,7 +54,7 @@ class LiveRun:
     verdict: list[tuple[str, str]] = field(default_factory=list)
     """At the end: lines, each with its style as :mod:`cosim.output.run_verdict` names it."""
     ok: bool | None = None
-    seen: "Exploration | None" = None
+    exploration: "Exploration | None" = None
     """What is drawn of it: what was recorded when a page last asked for it."""
     watched: bool = False
     """Whether a page has shown the run since then."""
@@ -131,32 +131,32 @@ class LiveRun:
 
     def _take(self, line: str) -> None:
         try:
-            said = json.loads(line)
-            what = said.pop("what")
+            message = json.loads(line)
+            event = message.pop("what")
         except (ValueError, AttributeError, KeyError, TypeError):
             self._add(line)  # a message of a library, or of the compiler
             return
-        match what:
+        match event:
             case "started":
-                self.state, self.run_dir = "running", Path(said["run_dir"])
+                self.state, self.run_dir = "running", Path(message["run_dir"])
                 self._add("all processes run")
             case "progress":
                 self._progress(parse_message(RunProgress, line))
             case "failed":
-                self._add(f"{said['why']} at {said['t_s']:.1f} s; it is restarted")
+                self._add(f"{message['why']} at {message['t_s']:.1f} s; it is restarted")
             case "restarted":
-                self._add(f"{said['role']} runs again at {said['t_s']:.1f} s")
+                self._add(f"{message['role']} runs again at {message['t_s']:.1f} s")
             case "finalising":
                 self.state = "finalising"
-                self._add(f"ended: {said['reason']}; replaying it and checking its claims")
+                self._add(f"ended: {message['reason']}; replaying it and checking its claims")
             case "ended":
-                self.state, self.ok = "ended", said["ok"]
-                self.run_dir = Path(said["run_dir"])
-                self.verdict = [(text, style) for text, style in said["verdict"]]
+                self.state, self.ok = "ended", message["ok"]
+                self.run_dir = Path(message["run_dir"])
+                self.verdict = [(text, style) for text, style in message["verdict"]]
                 self._add(f"recorded in {self.run_dir}")
             case _:
                 self.state, self.ok = "failed", False
-                self._add(said.get("text", line))
+                self._add(message.get("text", line))
 
     def _progress(self, report: RunProgress) -> None:
         before = self.progress
@@ -164,8 +164,8 @@ class LiveRun:
             self._add(text)
         for text in report.changes[len(before.changes) if before else 0 :]:
             self._add(f"changed: {text}")
-        if self.viewer is None and (found := _ADDRESS.search(report.live or "")):
-            self.viewer = found[0]
+        if self.viewer is None and (match := _ADDRESS.search(report.live or "")):
+            self.viewer = match[0]
         self.progress = report
 
     def _add(self, line: str) -> None:
@@ -184,11 +184,11 @@ def _descendants(pid: int) -> list[int]:
             with suppress(OSError, ValueError, IndexError):
                 stat = (folder / "stat").read_text().rpartition(")")[2].split()
                 parents[int(folder.name)] = int(stat[1])
-    found, new = set[int](), {pid}
+    descendants, new = set[int](), {pid}
     while new:
-        new = {child for child, parent in parents.items() if parent in new} - found
-        found |= new
-    return sorted(found)
+        new = {child for child, parent in parents.items() if parent in new} - descendants
+        descendants |= new
+    return sorted(descendants)
 
 
 def _title(pid: int) -> str:
@@ -228,9 +228,9 @@ def main() -> int:
     return outcome.status
 
 
-def _say(what: str, **fields: object) -> None:
+def _say(event: str, **fields: object) -> None:
     with suppress(BrokenPipeError):  # the page has ended; the run is recorded all the same
-        print(json.dumps({"what": what, **fields}), flush=True)
+        print(json.dumps({"what": event, **fields}), flush=True)
 
 
 if __name__ == "__main__":

@@ -79,7 +79,7 @@ class LiveSource:
         if (live := self._services.live) is None:
             return None
         live.watched = True
-        return live.seen
+        return live.exploration
 
     @property
     def is_running(self) -> bool:
@@ -130,7 +130,7 @@ class LiveSource:
         for button, enabled in (
             (self._start, live.is_over),
             (self._stop, not live.is_over),
-            *((one, live.state == "running") for one in self._kill),
+            *((button, live.state == "running") for button in self._kill),
             (self._viewer, live.state == "running" and live.viewer is not None),
         ):
             button.set_enabled(enabled)
@@ -144,7 +144,7 @@ class LiveSource:
         live = self._services.live
         if not self.is_running or live is None or live.run_dir is None:
             return
-        known = {one.key for one in controls_of(draft).sliders if one.live} & keys
+        known = {slider.key for slider in controls_of(draft).sliders if slider.live} & keys
         if not known:
             return
         try:
@@ -194,10 +194,10 @@ class LiveSource:
 def _words(live: LiveRun) -> str:
     if (progress := live.progress) is None:
         return live.state
-    found = f"{live.state}: {progress.t_s:.1f} of {live.horizon_s:g} s"
+    state = f"{live.state}: {progress.t_s:.1f} of {live.horizon_s:g} s"
     if progress.x_norm is not None:
-        found += f", ‖x‖ {number(progress.x_norm, 3)}"
-    return f"{found}, longest loss burst {progress.longest_loss_burst}"
+        state += f", ‖x‖ {number(progress.x_norm, 3)}"
+    return f"{state}, longest loss burst {progress.longest_loss_burst}"
 
 
 class RecordedSource:

@@ -180,8 +180,8 @@ class Coordinator:
 
     def failures(self) -> Mapping[str, str]:
         """Roles of which the process is over before its work was done, and why."""
-        found = {role: member.failure() for role, member in self._members.items()}
-        return {role: f"{role} {why}" for role, why in found.items() if why is not None}
+        failures = {role: member.failure() for role, member in self._members.items()}
+        return {role: f"{role} {why}" for role, why in failures.items() if why is not None}
 
     def is_over(self, role: str) -> bool:
         """Whether the process of a role has joined, and has ended or is lost."""
@@ -286,12 +286,12 @@ class Coordinator:
 
     def _require_pass(self, role: str, shown: str) -> None:
         """Raise PeerError unless a pass admits a role now."""
-        found = self.passes.get(shown)
-        if found is None:
+        admission = self.passes.get(shown)
+        if admission is None:
             raise PeerError("its ticket or invitation is not of this run")
-        if role not in found.roles:
-            raise PeerError(f"its invitation is for the {', '.join(found.roles)} only")
-        if time.monotonic() > found.until_s:
+        if role not in admission.roles:
+            raise PeerError(f"its invitation is for the {', '.join(admission.roles)} only")
+        if time.monotonic() > admission.until_s:
             raise PeerError("its invitation has expired")
 
     def _join(self, role: str, query: zenoh.Query) -> None:

@@ -12,12 +12,12 @@ import numpy as np
 from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, claims_of
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
-from cosim.analysis.loop_statistics import list_violations
-from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run, worst_loop
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
-from cosim.analysis.run_summary import Outcome, linearisation, summarise
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.loop_statistics import list_violations
+from cosim.analysis.summary.network_summary import LoopOverTime, loop_over_time, summarise_run, worst_loop
+from cosim.analysis.summary.run_summary import Outcome, linearisation, summarise
+from cosim.analysis.summary.summary_model import (
     ConditionsPart,
     ExitPart,
     LoopSummary,
@@ -26,8 +26,8 @@ from cosim.analysis.summary_model import (
     SchedulePart,
     read_summary,
 )
-from cosim.live.end_helpers import EndHelpers, PreparedEnding
-from cosim.live.progress import work_bar
+from cosim.live.monitoring.progress import work_bar
+from cosim.live.processes.end_helpers import EndHelpers, PreparedEnding
 from cosim.output.viewer.rerun_program import is_installed, require_viewer
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -176,8 +176,8 @@ def _judged(
     with work_bar(f"claims of {loops} loops") as show, helpers.shared(_blocks(run), there, show) as judge:
         if run.kind == "live" and loops > 1:
             replayed = _replay(run.network)
-        found = judge(here)
-    judged = [loop for block in sorted(found, key=min) for loop in found[block]]
+        judged_blocks = judge(here)
+    judged = [loop for block in sorted(judged_blocks, key=min) for loop in judged_blocks[block]]
     summary = _summary(run, ending, [loop.summary for loop in judged])
     if replayed is not None:
         network = summary.network.model_copy(update={"replay": replayed})
@@ -233,11 +233,11 @@ def _judged_loops(
 ) -> list[_Judged]:
     """Judge some loops, of which expectations may be known; ``beside`` replays the only one."""
     records = run.together(block)
-    expected = known or _expectations([one.scenario for one in records])
+    expected = known or _expectations([record.scenario for record in records])
     shared = SharedMachines(records if len(block) > 1 else ())
     judged, claims = [], [*map(claims_of, records)]
-    for one, own in zip(claims, expected, strict=True):
-        one.certificates = own.certificates
+    for claims_of_loop, own in zip(claims, expected, strict=True):
+        claims_of_loop.certificates = own.certificates
     with suppress(Exception):  # the claims of the loop concerned report it
         certify_late(claims)
     for record, own in zip(records, expected, strict=True):
@@ -259,7 +259,7 @@ def expectations_of(run_dir: Path, block: range) -> Sequence[Expectations]:
 
 def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:
     """Return what to expect of some loops; equal loops share it."""
-    keys = [one.model_dump_json(exclude={"name", "seeds"}) for one in scenarios]
+    keys = [scenario.model_dump_json(exclude={"name", "seeds"}) for scenario in scenarios]
     distinct = dict(zip(keys, scenarios, strict=True))
     certificates: Sequence[Sequence[ScenarioCertificate] | None] = [None] * len(distinct)
     with suppress(Exception):
@@ -366,11 +366,11 @@ def reopen(run_dir: Path, *, view: bool = True) -> Outcome:
     return finalize(ending or unknown, view=view, again=True)
 
 
-def _ending(run_dir: Path, found: Mapping[str, Any]) -> RunEnding | None:
+def _ending(run_dir: Path, content: Mapping[str, Any]) -> RunEnding | None:
     """Return how a run ended by its launcher's file; None if it is not there."""
     with suppress(LookupError, TypeError, ValueError):
-        status, reason = ExitStatus(found["exit"]["status"]), str(found["exit"]["reason"])
-        return RunEnding(run_dir, 0, status, reason, found["startup_s"])
+        status, reason = ExitStatus(content["exit"]["status"]), str(content["exit"]["reason"])
+        return RunEnding(run_dir, 0, status, reason, content["startup_s"])
     return None
 
 
@@ -406,7 +406,7 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
 def _opened(run_dir: Path, loop: str | None, *, view: bool = True) -> tuple[RunSummary, RecordedRun]:
     """Return summary and record of an earlier run, which has this loop."""
     summary, run = reopen(run_dir, view=view).summary, load_run(run_dir)
-    if run.names != [one.name for one in summary.loops]:
+    if run.names != [loop.name for loop in summary.loops]:
         raise CallerError(f"{run_dir}: {SUMMARY_FILE} has other loops than {SCENARIO_FILE}; one was changed")
     if loop is not None:
         run.number_of(loop)  # refuses an unknown name

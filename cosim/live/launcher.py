@@ -19,11 +19,11 @@ from queue import SimpleQueue
 from threading import Thread
 
 from cosim.lazy_modules import lazy_modules
-from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
 from cosim.live.coordinator import Coordinator
-from cosim.live.end_helpers import PreparedEnding, lasting_helpers
-from cosim.live.fork_server import ForkServer, fork_server
-from cosim.live.run_watcher import Watcher, joint_watcher
+from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
+from cosim.live.processes.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
+from cosim.live.processes.end_helpers import PreparedEnding, lasting_helpers
+from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.record.run_directory import (
     LEAST_FREE_BYTES,
     PROCESSES_FILE,
@@ -296,10 +296,10 @@ class _Run:
         silent = [role for role in ROLES if not self._coordinator.has_ended(role)]
         # The recorder waits for the others.
         silent = [role for role in silent if role != RECORDER] or silent
-        what = f"no report from {', '.join(silent)}"
+        failure = f"no report from {', '.join(silent)}"
         if not silent:
-            what = f"{', '.join(self._children.running())} reported the end, but did not exit"
-        return f"the run did not end at its horizon: {what}, {self._limit.explain_end()}"
+            failure = f"{', '.join(self._children.running())} reported the end, but did not exit"
+        return f"the run did not end at its horizon: {failure}, {self._limit.explain_end()}"
 
 
 def _signalled(signals: Signals) -> Failure | None:

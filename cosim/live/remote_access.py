@@ -23,8 +23,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from cosim.live.child_processes import Host, load_hosts
 from cosim.live.coordinator import AdmissionPass, Coordinator
+from cosim.live.processes.child_processes import Host, load_hosts
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, address_text, family_of, parse_address
@@ -89,9 +89,9 @@ def listen_address(text: str, option: str = "--listen") -> Address:
     if text.startswith(":") or not text:
         raise CallerError(f"{option}: expected an address of this host")
     host, port = parse_address(text, option)
-    found = ipaddress.ip_address(host.partition("%")[0])
-    mapped = isinstance(found, ipaddress.IPv6Address) and found.ipv4_mapped is not None
-    if found.is_unspecified or found.is_multicast or found.is_link_local or mapped:
+    address = ipaddress.ip_address(host.partition("%")[0])
+    mapped = isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None
+    if address.is_unspecified or address.is_multicast or address.is_link_local or mapped:
         raise CallerError(
             f"{option}: {host} is not an address at which other hosts can reach this one; "
             "give one of `ip address`"

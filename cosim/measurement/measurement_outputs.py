@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from cosim.live.progress import error_console
+from cosim.live.monitoring.progress import error_console
 from cosim.measurement.chain_fits import ChainFit
 from cosim.measurement.loss_bursts import LEVEL, Estimate, histogram, most_losses
 from cosim.measurement.network_measurement import CertificateTime, Measurement

@@ -25,43 +25,43 @@ from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
 from noack.theory.random_losses.moments import UnlimitedLosses
 
 
-def print_certificates(console: Console, found: Certificates, chosen: Certificates | None = None) -> None:
+def print_certificates(console: Console, results: Certificates, chosen: Certificates | None = None) -> None:
     """Print the tables, and what is certified in a norm that noack chose instead."""
-    constants, *limits = certificate_tables(found)
-    if found.nonlinear is not None:
-        region = found.schedule_region
+    constants, *limits = certificate_tables(results)
+    if results.nonlinear is not None:
+        region = results.schedule_region
         if region is None or region.constants is None:
             why = "" if region is None else f": {region.void}"
             own = f". The plant itself has no certificate from its x(0){why}"
         else:
             own = ", except under “region”: that is certified for the plant itself"
         console.print(
-            f"[yellow]the plant is not linear[/] ({escape(found.nonlinear)}): what follows is "
+            f"[yellow]the plant is not linear[/] ({escape(results.nonlinear)}): what follows is "
             f"certified for the linear plant ẋ = Âx + B̂u in its place{escape(own)}"
         )
     console.print(terminal_table(constants))
-    _print_notes(console, found)
-    if any(found.setpoint or ()):
+    _print_notes(console, results)
+    if any(results.setpoint or ()):
         console.print(
             "[dim]x is the distance from the set-point, x − x_r. If the plant does not rest there, "
             "A x_r + B u_r is a disturbance: a step at the state.[/]"
         )
     for table in limits:
         console.print(terminal_table(table))
-    if (outside := outside_box(found.scenario)) is not None:
+    if (outside := outside_box(results.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
     console.print("assumptions of the certificates for the schedule:")
-    print_assumptions(console, (found.schedule_region or found.schedule).assumptions)
+    print_assumptions(console, (results.schedule_region or results.schedule).assumptions)
     console.print("assumptions of the paper's theorems:")
-    print_assumptions(console, assumptions(found.scenario))
-    print_unlimited(console, found.unlimited, found.unpredictable)
-    for sentence in (*_in_words(found), *_stability_in_words(found)):
+    print_assumptions(console, assumptions(results.scenario))
+    print_unlimited(console, results.unlimited, results.unpredictable)
+    for sentence in (*_in_words(results), *_stability_in_words(results)):
         console.print(sentence, markup=False, highlight=False)
-    exists = found.schedule.constants is not None
-    if found.weight is not None and exists:
-        _print_weight(console, found, found.weight)
+    exists = results.schedule.constants is not None
+    if results.weight is not None and exists:
+        _print_weight(console, results, results.weight)
     if not exists and chosen is None:
-        share = "trigger.sigma, " if hasattr(found.scenario.trigger, "sigma") else ""
+        share = "trigger.sigma, " if hasattr(results.scenario.trigger, "sigma") else ""
         console.print(
             "[yellow]no certificate for the schedule[/], nor in another norm: raise "
             f"plant.rate_hz and controller.rate_hz, or lower {share}network.mansd, the network's "
@@ -89,13 +89,13 @@ def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> Non
     )
 
 
-def _in_words(found: Certificates) -> Iterator[str]:
+def _in_words(results: Certificates) -> Iterator[str]:
     """Yield sentences with the certified bounds for the scenario's schedule."""
-    for under, certificate in found:
+    for under, certificate in results:
         constants = certificate.constants
         if under != SCHEDULE or constants is None:
             continue
-        own = "the scenario's plant" if found.nonlinear is None else "the model as the plant"
+        own = "the scenario's plant" if results.nonlinear is None else "the model as the plant"
         plants = {BOX: "every plant of the box", REGION: REGION}.get(certificate.scope, own)
         apart = ""
         if (spacing_s := certificate.inter_event_s) is not None:
@@ -107,11 +107,11 @@ def _in_words(found: Certificates) -> Iterator[str]:
         )
 
 
-def _stability_in_words(found: Certificates) -> Iterator[str]:
+def _stability_in_words(results: Certificates) -> Iterator[str]:
     """Yield what is known exactly about the stability of a time-triggered loop."""
-    if (known := found.stability) is None:
+    if (known := results.stability) is None:
         return
-    patterns = f"patterns with {found.scenario.network.guarantee.meaning}"
+    patterns = f"patterns with {results.scenario.network.guarantee.meaning}"
     growth = f"growth per period {known.lower:.4g} to {known.upper:.4g}"
     text = {
         "stable": f"all {patterns} are stable: {growth}",
@@ -122,41 +122,41 @@ def _stability_in_words(found: Certificates) -> Iterator[str]:
     yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
 
 
-def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
+def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
     """Yield the certified constants, and the largest certified times of the schedule."""
-    trigger = found.scenario.trigger
+    trigger = results.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     # A void region has a line below the table, and no column.
-    columns = [(under, one) for under, one in found if one.constants or one.scope != REGION]
+    columns = [entry for entry in results if entry[1].constants or entry[1].scope != REGION]
     certificates = [certificate for _, certificate in columns]
     guarantee = certificates[0].conditions.guarantee  # its longest burst counts all rules
     title = (
-        f"{found.scenario.name}: certified bounds, "
+        f"{results.scenario.name}: certified bounds, "
         f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
     headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in columns)]
-    printed = found.theorem_2 is not None
+    printed = results.theorem_2 is not None
     headings += ["paper's\nTheorem 2"] if printed else []
     rows = [
         (label, *values, *([of_theorem] if printed else []))
         for label, values, of_theorem in constant_rows(
-            certificates, found.theorem_2, policy_of(found.scenario).fading_per_s
+            certificates, results.theorem_2, policy_of(results.scenario).fading_per_s
         )
     ]
     yield ResultTable("certificates", title, headings, rows)
     if any(certificate.constants for certificate in certificates):
         caption = (
-            f"{found.scenario.name}: how far each setting of the {SCHEDULE} can go alone before "
+            f"{results.scenario.name}: how far each setting of the {SCHEDULE} can go alone before "
             "the certificate is lost"
         )
-        limits = [(scope, *map(_limit, one)) for scope, one in found.limits_by_scope.items()]
+        limits = [(scope, *map(_limit, limits)) for scope, limits in results.limits_by_scope.items()]
         yield ResultTable("limits", caption, LIMIT_HEADINGS, limits)
 
 
-def _print_notes(console: Console, found: Certificates) -> None:
+def _print_notes(console: Console, results: Certificates) -> None:
     """Explain the rows of the constants, and say why certificates are void."""
-    certificates = [one for _, one in found]
-    if any(one.constants for one in certificates):
+    certificates = [certificate for _, certificate in results]
+    if any(certificate.constants for certificate in certificates):
         console.print(
             "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
             "no hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
@@ -164,28 +164,28 @@ def _print_notes(console: Console, found: Certificates) -> None:
             "updates not yet delivered (lost or in flight), maximum. none undelivered: the bound "
             "while every update has arrived. inter-event time: minimum.[/]"
         )
-    if any(one.persistent_constants for one in certificates):
+    if any(certificate.persistent_constants for certificate in certificates):
         console.print(
             "[dim]The rows with + are added: they are the bounds from disturbances, noise, and the "
             "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ "
             "and x_c − x̂.[/]"
         )
-    if any(one.other for one in certificates):
+    if any(certificate.other for certificate in certificates):
         console.print(
             "[dim]More than one bound holds at all times. The table has the one that tends to the "
             "smallest value; all are in the words below.[/]"
         )
-    for under, certificate in found:
+    for under, certificate in results:
         if certificate.void:
             console.print(f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}")
         if certificate.region is not None:
-            loop, region = loop_of(found.scenario), certificate.region
+            loop, region = loop_of(results.scenario), certificate.region
             limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
             text = ", ".join(f"|{name}| ≤ {limit:.4g}" for name, limit in limits)
             console.print(f"[green]region[/] ({under}): {escape(text)}", highlight=False)
-    policy = found.scenario.trigger.policy
-    exists = found.schedule.constants is not None  # else another norm is tried
-    if exists and found.weight is None and policy == "decaying" and any(c.void for c in certificates):
+    policy = results.scenario.trigger.policy
+    exists = results.schedule.constants is not None  # else another norm is tried
+    if exists and results.weight is None and policy == "decaying" and any(c.void for c in certificates):
         console.print("--weight chosen searches for a norm in which more is certified")
 
 
@@ -220,8 +220,8 @@ def margin_title(margin: MarginResult) -> str:
 
 def margin_rows(margin: MarginResult) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of the bounds."""
-    for m, found in margin.caps:
-        yield str(m), str(m - 1), f"{found.lower:.9f}", f"{found.upper:.9f}", found.verdict
+    for m, growth in margin.caps:
+        yield str(m), str(m - 1), f"{growth.lower:.9f}", f"{growth.upper:.9f}", growth.verdict
 
 
 def print_margin(console: Console, margin: MarginResult) -> None:
@@ -247,19 +247,19 @@ def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
     yield ResultTable("margin", margin_title(margin), MARGIN_HEADINGS, rows)
     if margin.compared.guarantees:
         rows = [
-            (meaning, f"{found.lower:.9f}", f"{found.upper:.9f}", found.text, found.verdict)
-            for meaning, found in margin.compared.guarantees
+            (meaning, f"{growth.lower:.9f}", f"{growth.upper:.9f}", growth.text, growth.verdict)
+            for meaning, growth in margin.compared.guarantees
         ]
         title = f"{margin.scenario}: the scenario's guarantee, and others"
         yield ResultTable("guarantees", title, _COMPARED_HEADINGS, rows)
 
 
-def print_mean_cost(console: Console, found: MeanCost) -> None:
+def print_mean_cost(console: Console, cost: MeanCost) -> None:
     """Print the moments and costs with and without the guarantee."""
-    for table in mean_cost_tables(found):
+    for table in mean_cost_tables(cost):
         console.print(terminal_table(table))
     for name in ("with_guarantee", "without_guarantee"):
-        if isinstance(reason := getattr(found, name), str):
+        if isinstance(reason := getattr(cost, name), str):
             console.print(f"[yellow]{name.replace('_', ' the ')}:[/] {escape(reason)}")
     console.print(
         "[dim]The cost is ∫ xᵀQx + uᵀRu dt, between the samples, too; u: of the controller. "
@@ -268,21 +268,21 @@ def print_mean_cost(console: Console, found: MeanCost) -> None:
     )
 
 
-def mean_cost_tables(found: MeanCost) -> Iterator[ResultTable]:
+def mean_cost_tables(costs: MeanCost) -> Iterator[ResultTable]:
     """Yield the moments and costs with and without the guarantee."""
-    both = (found.with_guarantee, found.without_guarantee)
-    known = [one for one in dict.fromkeys(both) if isinstance(one, CostUnder)]
-    mode = "model-based" if found.mode == "model" else "zero-order hold"
-    title = f"{found.scenario}: moments and cost, with an update every {found.period_s:g} s, {mode}"
-    headings = ["", *(one.guarantee for one in known)]
-    rows = [("growth of √E‖z‖² per period", *(f"{one.growth:.6g}" for one in known))]
+    both = (costs.with_guarantee, costs.without_guarantee)
+    known = [cost for cost in dict.fromkeys(both) if isinstance(cost, CostUnder)]
+    mode = "model-based" if costs.mode == "model" else "zero-order hold"
+    title = f"{costs.scenario}: moments and cost, with an update every {costs.period_s:g} s, {mode}"
+    headings = ["", *(cost.guarantee for cost in known)]
+    rows = [("growth of √E‖z‖² per period", *(f"{cost.growth:.6g}" for cost in known))]
     for rms, names, where in (
-        ("state_rms", found.state_names, ""),
-        ("state_rms_at_transmissions", found.state_names, " at transmissions"),
-        ("input_rms", found.input_names, ""),
+        ("state_rms", costs.state_names, ""),
+        ("state_rms_at_transmissions", costs.state_names, " at transmissions"),
+        ("input_rms", costs.input_names, ""),
         ("cost_per_s", None, ""),
     ):
-        values = [one.stationary and getattr(one.stationary, rms) for one in known]
+        values = [cost.stationary and getattr(cost.stationary, rms) for cost in known]
         if names is None:
             cells = ("∞" if v is None else f"{number(v, 6)} /s" for v in values)
             rows.append(("mean cost, stationary", *cells))
@@ -290,9 +290,9 @@ def mean_cost_tables(found: MeanCost) -> Iterator[ResultTable]:
         for i, name in enumerate(names):
             cells = ("∞" if v is None else number(v[i], 6) for v in values)
             rows.append((f"rms of {name}{where}", *cells))
-    until = (number(one.horizon_cost, 6) for one in known)
-    rows.append((f"mean cost from x(0) until {found.horizon_s:g} s", *until))
-    transient = ("∞" if (v := one.transient_cost) is None else number(v, 6) for one in known)
+    until = (number(cost.horizon_cost, 6) for cost in known)
+    rows.append((f"mean cost from x(0) until {costs.horizon_s:g} s", *until))
+    transient = ("∞" if (v := cost.transient_cost) is None else number(v, 6) for cost in known)
     rows.append(("mean cost from x(0), without disturbances and noise", *transient))
     yield ResultTable("cost", title, headings, rows)
 
@@ -302,65 +302,66 @@ _RARE = 1e-4
 _MOMENT = {1: "mean", 2: "root mean square"}
 
 
-def print_unlimited(console: Console, found: UnlimitedLosses | None, unpredictable: str | None) -> None:
+def print_unlimited(console: Console, unlimited: UnlimitedLosses | None, unpredictable: str | None) -> None:
     """Print what holds although the network does not limit the losses."""
     if unpredictable is not None:
         console.print(f"[yellow]no statement without the guarantee:[/] {unpredictable}")
-    if found is None:
+    if unlimited is None:
         return
-    likely = [one for one in found.bursts if one.probability < 1 - _RARE]
+    likely = [burst for burst in unlimited.bursts if burst.probability < 1 - _RARE]
     if (
-        shown := [one for one in likely if one.probability > _RARE]
-        + [one for one in found.bursts if one not in likely][:1]
+        shown := [burst for burst in likely if burst.probability > _RARE]
+        + [burst for burst in unlimited.bursts if burst not in likely][:1]
     ):
         table = ResultTable(
             "bursts",
             "without the guarantee: a run's longest burst of losses, and the bounds that "
-            f"hold as long as none is longer; runs of {found.horizon_s:g} s",
+            f"hold as long as none is longer; runs of {unlimited.horizon_s:g} s",
             ("longest burst", "P(longer burst)", "events", "Δ", "X"),
             [
                 (
-                    f"{one.most}",
-                    f"≤ {number(1 - one.probability, 3)}",
-                    f"≤ {one.events}",
-                    number(one.delta, 4),
-                    number(one.state, 4),
+                    f"{burst.most}",
+                    f"≤ {number(1 - burst.probability, 3)}",
+                    f"≤ {burst.events}",
+                    number(burst.delta, 4),
+                    number(burst.state, 4),
                 )
-                for one in shown
+                for burst in shown
             ],
         )
         console.print(terminal_table(table, left=()))
-    for sentence in sentences(found):
+    for sentence in sentences(unlimited):
         console.print(sentence, markup=False, highlight=False)
 
 
-def sentences(found: UnlimitedLosses) -> Iterator[str]:
+def sentences(unlimited: UnlimitedLosses) -> Iterator[str]:
     """Yield what is certified about moments, and almost surely."""
-    p = f"{found.largest_probability:.4g}"
+    p = f"{unlimited.largest_probability:.4g}"
     losses = f"independent losses with probability {p}"
-    if not found.is_independent:
+    if not unlimited.is_independent:
         losses = f"losses with probability at most {p} given any past"
-    for one in found.moments:
-        decay = f" e^(−{one.rate_per_s:.3g}t)" if one.rate_per_s else ""
+    for moment in unlimited.moments:
+        decay = f" e^(−{moment.rate_per_s:.3g}t)" if moment.rate_per_s else ""
         yield (
-            f"Without the guarantee, {losses}: at every time t, the {_MOMENT[one.order]} of ‖x‖ is "
-            f"at most {one.state:.4g}{decay}, that of ‖e_c‖ at most "
-            f"{one.controller_error:.4g}{decay}."
+            f"Without the guarantee, {losses}: at every time t, the {_MOMENT[moment.order]} of ‖x‖ is "
+            f"at most {moment.state:.4g}{decay}, that of ‖e_c‖ at most "
+            f"{moment.controller_error:.4g}{decay}."
         )
-    if found.void is not None:
-        order = _MOMENT[len(found.moments) + 1]
-        yield f"Without the guarantee no {order} is certified: {found.void}."
-    if found.sure_rate_per_s is not None:
-        yield f"x decays almost surely: decay rate {found.sure_rate_per_s:.3g} /s."
-    if found.paper_rate_per_s is not None:
+    if unlimited.void is not None:
+        order = _MOMENT[len(unlimited.moments) + 1]
+        yield f"Without the guarantee no {order} is certified: {unlimited.void}."
+    if unlimited.sure_rate_per_s is not None:
+        yield f"x decays almost surely: decay rate {unlimited.sure_rate_per_s:.3g} /s."
+    if unlimited.paper_rate_per_s is not None:
         at = ", ".join(
-            f"{_MOMENT[order]} at most {value:.4g}" for order, value in enumerate(found.at_events, start=1)
+            f"{_MOMENT[order]} at most {value:.4g}"
+            for order, value in enumerate(unlimited.at_events, start=1)
         )
         yield (
             f"Under the paper's conditions ‖e_c‖ e^(αt)/β at events has a {at}, and x decays "
-            f"almost surely, at every rate below {found.paper_rate_per_s:.3g} /s."
+            f"almost surely, at every rate below {unlimited.paper_rate_per_s:.3g} /s."
         )
-    if found.moments or found.bursts:
+    if unlimited.moments or unlimited.bursts:
         yield (
             "These are statements about many runs: one run cannot violate a mean. The "
             "probabilities are bounds; a campaign shows the frequencies."

@@ -13,8 +13,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from cosim.analysis.network_summary import worst_loop
-from cosim.analysis.summary_model import LoopSummary, RunSummary
+from cosim.analysis.summary.network_summary import worst_loop
+from cosim.analysis.summary.summary_model import LoopSummary, RunSummary
 from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.network_figures import network_figures
 from cosim.output.figures.run_figures import envelopes, run_figures
@@ -121,9 +121,9 @@ def write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str
         scenario_toml=(run_dir / SCENARIO_FILE).read_text(encoding="utf-8"),
         environment=read_object(run_dir / ENVIRONMENT_FILE),
         links={
-            one.name: quote(file)
-            for one in shown.loops
-            if (run_dir / (file := file_of_loop(REPORT_FILE, one.name))).is_file()
+            loop.name: quote(file)
+            for loop in shown.loops
+            if (run_dir / (file := file_of_loop(REPORT_FILE, loop.name))).is_file()
         },
     )
     return write_whole(run_dir / file_of_loop(REPORT_FILE, loop), page(report))
@@ -195,7 +195,7 @@ def _numbers(report: Report) -> Content:
 
 @section
 def _signals(report: Report) -> Content:
-    return {"figures": [one for one in report.figures if one.name not in TIMING_FIGURES]}
+    return {"figures": [figure for figure in report.figures if figure.name not in TIMING_FIGURES]}
 
 
 @section
@@ -211,7 +211,7 @@ def _assumptions(report: Report) -> Content | None:
 
 @section
 def _timing(report: Report) -> Content | None:
-    figures = [one for one in report.figures if one.name in TIMING_FIGURES]
+    figures = [figure for figure in report.figures if figure.name in TIMING_FIGURES]
     table = timing_table(report.loop)
     return {"table": table, "figures": figures} if table.rows or figures else None
 
@@ -251,7 +251,7 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "norm of errors", "‖e‖₂" if trigger.weight is None else "‖W e‖₂, W from the scenario"
     yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
     if network.constraints:
-        yield "constraints on losses", ", ".join(one.text() for one in network.constraints)
+        yield "constraints on losses", ", ".join(rule.text() for rule in network.constraints)
     yield "loss", f"{model} ({details})" if details else model
     if scenario.protocol.acknowledges:
         timeout_ms = 1e-6 * scenario.timing.acknowledgement_timeout_ns

@@ -86,7 +86,7 @@ def terminal_table(
         shown.add_column(escape(heading), justify="left" if i in left else "right", min_width=least)
         shown.columns[-1].no_wrap = dense and i not in left
     for *cells, last in table.rows:
-        style = next((one for word, one in (styles or {}).items() if last.startswith(word)), "")
+        style = next((style for word, style in (styles or {}).items() if last.startswith(word)), "")
         shown.add_row(*map(escape, cells), Text(last, style))
     return shown
 
@@ -147,30 +147,30 @@ def _with_units_in_heads(table: ResultTable) -> ResultTable:
     if tuple(table.headings) == KEY_VALUE:
         rows = []
         for label, value in table.rows:
-            found = _MEASURED.fullmatch(value)
-            rows.append((f"{label} [{found[2]}]", found[1]) if found else (label, value))
+            match = _MEASURED.fullmatch(value)
+            rows.append((f"{label} [{match[2]}]", match[1]) if match else (label, value))
         return table._replace(rows=rows)
     columns: list[list[str]] = []
     headings: list[str] = []
     for heading, *column in zip(table.headings, *table.rows, strict=True):
         measured = [_MEASURED.fullmatch(cell) for cell in column]
-        units = {one[2] for one in measured if one}
+        units = {match[2] for match in measured if match}
         pairs = list(zip(measured, column, strict=True))
-        if len(units) == 1 and all(one or cell in (NONE, "") for one, cell in pairs):
+        if len(units) == 1 and all(match or cell in (NONE, "") for match, cell in pairs):
             heading = f"{heading} [{units.pop()}]"
-            column = [one[1] if one else cell for one, cell in pairs]
+            column = [match[1] if match else cell for match, cell in pairs]
         headings.append(heading)
         columns.append(column)
     return table._replace(headings=headings, rows=list(zip(*columns, strict=True)))
 
 
-def _kind(column: Sequence[str], place: int) -> str:
+def _kind(column: Sequence[str], number: int) -> str:
     """Return the kind of a column: numbers at the right, long texts in lines."""
     filled = [cell for cell in column if cell]
-    if place and filled and 2 * sum(bool(_NUMERIC.fullmatch(one)) for one in filled) > len(filled):
+    if number and filled and 2 * sum(bool(_NUMERIC.fullmatch(cell)) for cell in filled) > len(filled):
         return "r"
     longest = max(map(len, column), default=0)
-    return _LINES if longest > _WIDE and place else "l"
+    return _LINES if longest > _WIDE and number else "l"
 
 
 def _heading(heading: str, kind: str) -> str:
@@ -190,11 +190,11 @@ def _words(cell: str, kind: str) -> str:
 
 def _aligned(column: Sequence[str]) -> list[str]:
     """Align decimal points by invisible digits; other cells stay at the right."""
-    found = [_NUMBER.fullmatch(cell) for cell in column]
-    decimals = [len(one[1] or "") for one in found if one]
+    matches = [_NUMBER.fullmatch(cell) for cell in column]
+    decimals = [len(match[1] or "") for match in matches if match]
     most = max(decimals, default=0)
     cells = []
-    for cell, number in zip(column, found, strict=True):
+    for cell, number in zip(column, matches, strict=True):
         if number is None:
             cells.append("--" if cell == NONE else latex_text(cell))
             continue
@@ -212,24 +212,24 @@ def latex_text(text: str, depth: int = 0) -> str:
     superscript. A character that pdfLaTeX does not have becomes a question mark.
     """
     parts, end = [], 0
-    for found in _TYPESET.finditer(text):
-        if found.start() < end:  # inside a superscript
+    for match in _TYPESET.finditer(text):
+        if match.start() < end:  # inside a superscript
             continue
-        begin, until = found.span("letter")
+        begin, until = match.span("letter")
         rest = until
-        if found["power"]:
-            mantissa = found["mantissa"].replace("−", "-")
-            power = found["power"].removeprefix("+")
-            typeset, rest = rf"\ensuremath{{{mantissa}\times10^{{{int(power)}}}}}", found.end()
+        if match["power"]:
+            mantissa = match["mantissa"].replace("−", "-")
+            power = match["power"].removeprefix("+")
+            typeset, rest = rf"\ensuremath{{{mantissa}\times10^{{{int(power)}}}}}", match.end()
         else:
-            if found["letter"] is None:
-                begin = found.end()
+            if match["letter"] is None:
+                begin = match.end()
                 if depth == _DEEPEST or (until := _closing(text, begin)) < 0:
                     continue
                 rest = until + 1
-            command = "superscript" if text[found.start()] == "^" else "subscript"
+            command = "superscript" if text[match.start()] == "^" else "subscript"
             typeset = rf"\text{command}{{{latex_text(text[begin:until], depth + 1)}}}"
-        parts += [_plain(text[end : found.start()]), typeset]
+        parts += [_plain(text[end : match.start()]), typeset]
         end = rest
     return "".join(parts) + _plain(text[end:])
 
@@ -237,10 +237,10 @@ def latex_text(text: str, depth: int = 0) -> str:
 def _closing(text: str, begin: int) -> int:
     """Return the place of the parenthesis that closes the one before ``begin``, or −1."""
     depth = 1
-    for place in range(begin, min(len(text), begin + _LONGEST_SCRIPT)):
-        depth += {"(": 1, ")": -1}.get(text[place], 0)
+    for index in range(begin, min(len(text), begin + _LONGEST_SCRIPT)):
+        depth += {"(": 1, ")": -1}.get(text[index], 0)
         if not depth:
-            return place
+            return index
     return -1
 
 
@@ -248,13 +248,13 @@ def _plain(text: str) -> str:
     return "".join(map(_character, _WITH_ACCENTS.findall(text)))
 
 
-def _character(one: str) -> str:
+def _character(character: str) -> str:
     """Return a character, with the combining ones that follow it, for LaTeX."""
-    base, accents = one[0], one[1:]
+    base, accents = character[0], character[1:]
     if accents:
         text = _SYMBOLS.get(base, base if base.isascii() and base.isalnum() else "")
         if not text or set(accents) - _ACCENTS.keys():
-            return _character(unicodedata.normalize("NFC", one)[0])
+            return _character(unicodedata.normalize("NFC", character)[0])
         for accent in accents:
             text = f"{_ACCENTS[accent]}{{{text}}}"
         return rf"\ensuremath{{{text}}}"

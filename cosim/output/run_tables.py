@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from cosim.analysis.fidelity import is_against
-from cosim.analysis.run_summary import linearisation_rows
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.run_summary import linearisation_rows
+from cosim.analysis.summary.summary_model import (
     ChangePart,
     Claim,
     DeadlinesPart,
@@ -91,7 +91,7 @@ def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
     """Return what a run was, how it ended, and its results, in a few lines."""
     loop, shared = summary.loops[0], shares_network(summary)
     mode = f"{len(summary.loops)} loops" if shared else mode_words(loop.mode)
-    verdicts = Counter(str(claim.verdict) for one in summary.loops for claim in one.claims)
+    verdicts = Counter(str(claim.verdict) for loop in summary.loops for claim in loop.claims)
     norms = (loop.initial_state_norm, loop.final_state_norm)
     of_loop = [
         (
@@ -214,15 +214,15 @@ def _record(loop: LoopSummary) -> Iterator[tuple[str, str]]:
     yield "lost elsewhere (kernel)", str(loop.unintended_losses)
     if loop.conditions is not None and (error_s := loop.conditions.clock_error_s):
         yield "largest bound of a clock's error", duration(error_s)
-    for one in loop.restarts:
-        yield f"{one.process} was restarted", away(one)
+    for restart in loop.restarts:
+        yield f"{restart.process} was restarted", away(restart)
     yield from changes_in(loop.changes)
 
 
 def _lateness(loop: LoopSummary) -> Iterator[tuple[str, str]]:
     """Yield the latency of updates and the missed deadlines of a live run."""
     if latency := loop.latency_us:
-        quantiles = " / ".join(whole(one) for one in (latency.p50, latency.p99))
+        quantiles = " / ".join(whole(value) for value in (latency.p50, latency.p99))
         yield "sensor-to-controller latency p50 / p99", f"{quantiles} µs"
     if late := loop.lateness_us:
         worst = max(late, key=lambda role: late[role].late_steps)
@@ -235,8 +235,8 @@ def _lateness(loop: LoopSummary) -> Iterator[tuple[str, str]]:
 
 def changes_in(changes: Sequence[ChangePart]) -> Iterator[tuple[str, str]]:
     """Yield changes of settings during the run, each with its time."""
-    for one in changes:
-        yield f"changed at {one.t_s:.3f} s", one.what
+    for change in changes:
+        yield f"changed at {change.t_s:.3f} s", change.what
 
 
 def interval_text(claim: Claim) -> str:
@@ -255,21 +255,21 @@ def away(restart: RestartPart) -> str:
     return f"{when}: {why}" if why else when
 
 
-def _watchdog(found: WatchdogPart) -> Iterator[tuple[str, str]]:
-    if trips := found.trips:
+def _watchdog(watchdog: WatchdogPart) -> Iterator[tuple[str, str]]:
+    if trips := watchdog.trips:
         times = "once" if trips == 1 else f"{trips} times"
-        first, total = seconds(found.first_s), seconds(found.total_s)
+        first, total = seconds(watchdog.first_s), seconds(watchdog.total_s)
         yield "watchdog: newest actuation too old", f"{times}, first at {first}, {total} in total"
-        yield "  policy applied", found.policy
+        yield "  policy applied", watchdog.policy
 
 
 def _estimation(loop: LoopSummary) -> Iterator[tuple[str, str]]:
-    if (found := loop.estimation) is not None:
-        what = f"estimated ({found.observer})" if found.observer else "measured with noise"
-        rms = number(found.rms_second_half)
-        yield f"state {what}: RMS ‖x̂ − x‖ in the second half", rms
-        yield "  predicted for an exact model", number(found.expected_rms)
-        yield "maximum ‖x̂ − x‖, ‖x_c − x‖", f"{number(found.max)}, {number(found.sup_e_c_norm)}"
+    if (estimation := loop.estimation) is not None:
+        source = f"estimated ({estimation.observer})" if estimation.observer else "measured with noise"
+        rms = number(estimation.rms_second_half)
+        yield f"state {source}: RMS ‖x̂ − x‖ in the second half", rms
+        yield "  predicted for an exact model", number(estimation.expected_rms)
+        yield "maximum ‖x̂ − x‖, ‖x_c − x‖", f"{number(estimation.max)}, {number(estimation.sup_e_c_norm)}"
     for disturbance in loop.disturbances:
         sizes = f"{number(disturbance.rms)}, {number(disturbance.max)}"
         yield f"disturbance at the {disturbance.at}: RMS, maximum", sizes
@@ -322,13 +322,13 @@ def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
     """Yield the table of the times on which certificates depend, if the loop can have any."""
     if (allowed := loop.allowed) is None or (observed := loop.conditions) is None:
         return
-    exists = any("certificate" in one.source and one.bound != "none" for one in loop.claims)
+    exists = any("certificate" in claim.source and claim.bound != "none" for claim in loop.claims)
     covered = (loop.certified_for or allowed) if exists else None
     rows = []
     for name, words in _SCHEDULE.items():
         times_s = [getattr(part, name) if part else None for part in (allowed, observed, covered)]
         # After a change a certificate needs no first input: it is 0 there.
-        cells = [duration(one) if one else NONE for one in times_s]
+        cells = [duration(time_s) if time_s else NONE for time_s in times_s]
         if (times_s[1] or 0.0) > (times_s[0] or 0.0):
             cells[1] += " (late)"
         rows.append((words, *cells))
@@ -349,8 +349,8 @@ def timing_table(loop: LoopSummary) -> ResultTable:
     return ResultTable("timing", caption, _TIMING_HEADINGS, rows)
 
 
-def _quantiles(found: Quantiles) -> tuple[str, ...]:
-    return tuple(map(whole, (found.p50, found.p99, found.p999, found.max)))
+def _quantiles(quantiles: Quantiles) -> tuple[str, ...]:
+    return tuple(map(whole, (quantiles.p50, quantiles.p99, quantiles.p999, quantiles.max)))
 
 
 # The network and all loops
@@ -390,12 +390,12 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
         used = f"{100 * network.utilisation:.3g} % of {network.rate_bps:,} bit/s"
         rows.append(("link used", used.replace(",", " ")))
     loops = summary.loops
-    if flows := [one.actuations for one in loops if one.actuations is not None]:
-        sent, lost = (sum(getattr(one, key) for one in flows) for key in ("sent", "lost"))
+    if flows := [loop.actuations for loop in loops if loop.actuations is not None]:
+        sent, lost = (sum(getattr(flow, key) for flow in flows) for key in ("sent", "lost"))
         rows.append(("actuations of all loops", f"{sent} ({sent / reached_s:.4g} /s)"))
-        burst = max(one.longest_loss_burst for one in flows)
+        burst = max(flow.longest_loss_burst for flow in flows)
         rows.append(("  lost, longest loss burst", f"{lost} ({ratio(lost, sent)}), {burst}"))
-    if trips := [one.watchdog.trips for one in loops if one.watchdog.trips]:
+    if trips := [loop.watchdog.trips for loop in loops if loop.watchdog.trips]:
         rows.append(("watchdog acted", f"{sum(trips)} times, in {len(trips)} loops"))
     if deadlines := summary.deadlines:
         rows.append(("deadlines missed", _missed(deadlines)))
@@ -405,17 +405,18 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
     if (replay := network.replay) is not None:
         exact = {True: "bit-exact", False: "differs", None: "not possible"}[replay.bit_exact]
         rows.append(("replay of the network", exact))
-        count = sum(one.replay is not None and one.replay.bit_exact is True for one in loops)
+        count = sum(loop.replay is not None and loop.replay.bit_exact is True for loop in loops)
         rows.append(("replay of the loops", f"bit-exact: {count} of {len(loops)}"))
         missing, lost = (
-            sum(getattr(one, key) for one in loops) for key in ("missing_samples", "unintended_losses")
+            sum(getattr(loop, key) for loop in loops) for key in ("missing_samples", "unintended_losses")
         )
         rows.append(("missing samples, unintended losses", f"{missing}, {lost}"))
     return [*rows, *changes_in(summary.changes)]
 
 
 def _missed(deadlines: Mapping[str, DeadlinesPart]) -> str:
-    missed = [f"{role} {one.late_steps} of {one.steps}" for role, one in deadlines.items() if one.late_steps]
+    late = [(role, part.late_steps, part.steps) for role, part in deadlines.items() if part.late_steps]
+    missed = [f"{role} {late_steps} of {steps}" for role, late_steps, steps in late]
     return ", ".join(missed) or "none"
 
 

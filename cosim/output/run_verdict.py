@@ -19,8 +19,8 @@ from rich.text import Text
 
 from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE
 from cosim.analysis.fidelity import Fidelity, SignalDifference
-from cosim.analysis.run_summary import Outcome
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.run_summary import Outcome
+from cosim.analysis.summary.summary_model import (
     AssumptionPart,
     Claim,
     ExitPart,
@@ -78,11 +78,11 @@ class VerdictLine(NamedTuple):
 def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
     """Return how the run ended and its state, whether its guarantee was kept, its transmissions."""
     loops = summary.loops
-    events, delivered = sum(one.events for one in loops), sum(one.deliveries for one in loops)
+    events, delivered = sum(loop.events for loop in loops), sum(loop.deliveries for loop in loops)
     ideal = None
     if isinstance(loops[0].fidelity, FidelityPart) and not shares_network(summary):
         ideal = loops[0].fidelity.events_ideal
-    diverged = any(one.diverged_at_s is not None for one in loops)
+    diverged = any(loop.diverged_at_s is not None for loop in loops)
     return (
         ending_line(
             summary.exit,
@@ -139,13 +139,13 @@ def state_text(
 
 
 def _states(loops: Sequence[LoopSummary]) -> str:
-    states = [(one.sup_state_norm, one.final_state_norm, one.diverged_at_s) for one in loops]
+    states = [(loop.sup_state_norm, loop.final_state_norm, loop.diverged_at_s) for loop in loops]
     if len(states) == 1:
         return state_text(loops[0].initial_state_norm, *states[0], state_norm(loops[0]))
     counts = Counter(filter(None, (state_of(*state) for state in states)))
-    (first, *others) = counts.most_common() or [("", 0)]
+    (first, *rest) = counts.most_common() or [("", 0)]
     words = [f"{first[1]} of {len(loops)} loops {first[0]}"] if first[1] else []
-    return ", ".join([*words, *(f"{count} {word}" for word, count in others)])
+    return ", ".join([*words, *(f"{count} {word}" for word, count in rest)])
 
 
 def transmission_line(events: int, deliveries: int, ideal: int | None = None) -> VerdictLine:
@@ -173,7 +173,7 @@ def guarantee_of(loop: LoopSummary) -> Guarantee:
     lateness of the run, lateness breaks nothing.
     """
     violated = [claim for claim in loop.claims if claim.verdict == "violated"]
-    broken = [(one.t_s, one.what) for one in loop.assumption_violations if one.cause not in CAUSES]
+    broken = [(part.t_s, part.what) for part in loop.assumption_violations if part.cause not in CAUSES]
     if violated:
         named = list(dict.fromkeys(claim.what for claim in violated))
         more = [f"{len(named) - _NAMED} more"] if len(named) > _NAMED else []
@@ -212,7 +212,7 @@ def guarantee_of(loop: LoopSummary) -> Guarantee:
 
 def _lateness(loop: LoopSummary) -> list[str]:
     """Return how the loop was later than its scenario allows."""
-    return [one.what for one in loop.assumption_violations if one.cause in SCHEDULE]
+    return [part.what for part in loop.assumption_violations if part.cause in SCHEDULE]
 
 
 def _is_late(loop: LoopSummary, claim: Claim) -> bool:
@@ -223,31 +223,32 @@ def _is_late(loop: LoopSummary, claim: Claim) -> bool:
 def _covers_lateness(loop: LoopSummary) -> bool:
     """Whether certificates of its lateness cover the whole run."""
     void = [claim for claim in loop.claims if claim.verdict == "void"]
-    return loop.certified_for is not None and not any(_is_late(loop, one) for one in void)
+    return loop.certified_for is not None and not any(_is_late(loop, claim) for claim in void)
 
 
 def _guarantee_line(loops: Sequence[LoopSummary]) -> VerdictLine:
     """Return whether the guarantee was kept in the loops, the worst first."""
-    found = [(guarantee_of(loop), loop) for loop in loops]
+    guarantees = [(guarantee_of(loop), loop) for loop in loops]
     held = sum(claim.verdict == "held" for loop in loops for claim in loop.claims)
     claims = f"{held} {'claim' if held == 1 else 'claims'} held, none violated"
-    worst = next((style for style in (BAD, DOUBTFUL) if any(one.style == style for one, _ in found)), GOOD)
-    concerned = [(one, loop) for one, loop in found if one.style == worst]
-    one, loop = min(concerned, key=lambda pair: pair[0].since_s if pair[0].why else math.inf)
+    styles = {kept.style for kept, _ in guarantees}
+    worst = next((style for style in (BAD, DOUBTFUL) if style in styles), GOOD)
+    concerned = [(kept, loop) for kept, loop in guarantees if kept.style == worst]
+    kept, loop = min(concerned, key=lambda pair: pair[0].since_s if pair[0].why else math.inf)
     name, count = "" if len(loops) == 1 else f"{loop.name}: ", f"{len(concerned)} of {len(loops)}"
-    why = f": {name}{one.why}" if one.why else ""
-    since = f"{one.since_s:.3f} s"
+    why = f": {name}{kept.why}" if kept.why else ""
+    since = f"{kept.since_s:.3f} s"
     if worst == GOOD:
         where = "" if len(loops) == 1 else f" in all {len(loops)} loops"
-        others = sum(bool(other.why) for other, _ in concerned) - 1
-        more = f" (and {others} more {'loop' if others == 1 else 'loops'})" if others > 0 else ""
-        text = f"guarantee kept{where}: {claims}" + (f"; {name}{one.why}{more}" if one.why else "")
+        more_loops = sum(bool(other.why) for other, _ in concerned) - 1
+        more = f" (and {more_loops} more {'loop' if more_loops == 1 else 'loops'})" if more_loops > 0 else ""
+        text = f"guarantee kept{where}: {claims}" + (f"; {name}{kept.why}{more}" if kept.why else "")
     elif worst == BAD:
         where = "" if len(loops) == 1 else f" in {count} loops,"
         text = f"guarantee broken{where} since {since}{why}"
     elif len(loops) > 1:
         text = f"guarantee not checkable in {count} loops{why}"
-    elif one.since_s > 0:
+    elif kept.since_s > 0:
         text = f"guarantee kept until {since}, then not checkable{why}"
     else:
         text = f"guarantee not checkable{why}"
@@ -269,22 +270,22 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
     (loop,) = summary.loops
     stated = guarantee_of(loop).why  # by the verdict
     violations = [
-        one
-        for one in loop.assumption_violations
-        if one.what not in stated and not (one.cause in SCHEDULE and _covers_lateness(loop))
+        violation
+        for violation in loop.assumption_violations
+        if violation.what not in stated and not (violation.cause in SCHEDULE and _covers_lateness(loop))
     ]
-    for one in violations[:_MOST_VIOLATIONS]:
-        where = f"t = {one.t_s:.3f} s (reported by {one.process})"
-        severe = one.cause not in CAUSES  # the guarantee, or a change
-        yield Remark(f"assumption violated at {where}: {one.what}", severe=severe)
+    for violation in violations[:_MOST_VIOLATIONS]:
+        where = f"t = {violation.t_s:.3f} s (reported by {violation.process})"
+        severe = violation.cause not in CAUSES  # the guarantee, or a change
+        yield Remark(f"assumption violated at {where}: {violation.what}", severe=severe)
     if (more := len(violations) - _MOST_VIOLATIONS) > 0:
         plural = "s" * (more > 1)
         yield Remark(f"{more} more violation{plural} of an assumption", severe=True)
     if loop.replay is not None and loop.replay.bit_exact is False:
         yield Remark("the replay of the run differs from its record", severe=True)
     yield from map(Remark, _warnings(summary, loop))
-    for when, what in changes_in(loop.changes):
-        yield Remark(f"{when}: {what}", neutral=True)
+    for when, change in changes_in(loop.changes):
+        yield Remark(f"{when}: {change}", neutral=True)
 
 
 def _has_clocks(loop: LoopSummary) -> bool:
@@ -293,9 +294,9 @@ def _has_clocks(loop: LoopSummary) -> bool:
 
 
 def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
-    for one in loop.assumptions:
-        if one.verdict == AssumptionStatus.VIOLATED:
-            yield f"assumption violated: {one.what} ({one.source}): {one.why}"
+    for part in loop.assumptions:
+        if part.verdict == AssumptionStatus.VIOLATED:
+            yield f"assumption violated: {part.what} ({part.source}): {part.why}"
     plant = loop.lateness_us.get("plant")
     if plant and plant.late_steps > _MOST_LATE * plant.steps:
         share = 100 * plant.late_steps / plant.steps
@@ -327,9 +328,9 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         yield "no bound is certified: noack certify says what would have to change"
     unchecked = any(claim.verdict == "void" and _is_late(loop, claim) for claim in loop.claims)
     if unchecked and not loop.missing_samples and summary.kind == "live" and not loop.restarts:
-        what = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
+        culprit = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
         yield (
-            f"{what} was later than any certificate of this loop allows, so some claims were not "
+            f"{culprit} was later than any certificate of this loop allows, so some claims were not "
             "checked to the end: use a less busy machine, or a lower speed"
         )
     if _has_clocks(loop) and loop.replay is not None and not loop.replay.complete:
@@ -406,7 +407,7 @@ def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> Non
 
 def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
     """Return why claims are void, with the number of loops; nothing if the verdict says it."""
-    void = [{one.why for one in loop.claims if one.verdict == "void"} for loop in loops]
+    void = [{claim.why for claim in loop.claims if claim.verdict == "void"} for loop in loops]
     reasons = Counter(why for whys in void for why in sorted(whys))
     if len(reasons) == 1:
         return []
@@ -455,10 +456,10 @@ def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> No
 def print_assumptions(console: Console, assumptions: Sequence[Assumption | AssumptionPart]) -> None:
     """Print assumptions with their verdicts."""
     table = Table.grid(padding=(0, 2))
-    for one in assumptions:
-        source = one.source if one.source.startswith("(") else f"({one.source})"
-        text = escape(f"{one.what} {source}: {one.why}")
-        table.add_row(Text(one.verdict, _ASSUMPTION_STYLES.get(one.verdict, "")), text)
+    for assumption in assumptions:
+        source = assumption.source if assumption.source.startswith("(") else f"({assumption.source})"
+        text = escape(f"{assumption.what} {source}: {assumption.why}")
+        table.add_row(Text(assumption.verdict, _ASSUMPTION_STYLES.get(assumption.verdict, "")), text)
     console.print(table)
 
 
@@ -486,7 +487,7 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
     )
     ideal = ("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
     caption = f"{fidelity.scenario}: difference in x to the ideal loop"
-    differences = [(one.name, one.difference) for one in fidelity.stages]
+    differences = [(stage.name, stage.difference) for stage in fidelity.stages]
     by_state = [
         (name, *(f"{value:.2e}" for value in difference.rms_by_state))
         for name, difference in [*differences, ("total", fidelity.total)]

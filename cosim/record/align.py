@@ -210,8 +210,8 @@ def _at(
     x_c[known] = track.x_c[index[known]]
     older = np.flatnonzero(known & (dt_ns != 0))  # few: mostly the model is advanced to these times
     for step_ns in np.unique(dt_ns[older]):
-        which = older[dt_ns[older] == step_ns]
-        x_c[which] = flow.propagate.rows(x_c[which], int(step_ns))
+        behind = older[dt_ns[older] == step_ns]
+        x_c[behind] = flow.propagate.rows(x_c[behind], int(step_ns))
     return x_c, received
 
 
@@ -268,7 +268,7 @@ def _aligned(record: RunRecord) -> Iterator[AlignedPart]:
 
 def align_tables(record: RunRecord) -> AlignedRun:
     """Align a whole run; for a long run, see :func:`aligned_parts`."""
-    parts = [one.aligned for one in aligned_parts(record)]
+    parts = [part.aligned for part in aligned_parts(record)]
     return parts[0] if len(parts) == 1 else AlignedRun(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -304,10 +304,10 @@ def _bounded(record: RunRecord) -> Iterator[BoundedPart]:
     for part in aligned_parts(record):
         rows, aligned = part.rows, part.aligned
         e_s = rows["x_s"] - rows["x"]
-        found = monitor.take(rows["t_ns"], e_s, rows["event"], aligned.received)
+        errors = monitor.take(rows["t_ns"], e_s, rows["event"], aligned.received)
         shared = shares_update(scenario, aligned)
-        identity, printed = (np.where(shared, one, np.nan) for one in (found.identity, found.printed))
-        residual = identity_residual(scenario, aligned, found.missed)
+        identity, printed = (np.where(shared, bound, np.nan) for bound in (errors.identity, errors.printed))
+        residual = identity_residual(scenario, aligned, errors.missed)
         yield BoundedPart(part, shared, (identity, printed), residual)
 
 
@@ -337,12 +337,12 @@ def true_states(steps: Rows, t_ns: NDArray[np.int64], column: str = "x") -> Real
 
     ``column`` of ``plant_step`` is ``x``, or ``z`` for the whole state of a nonlinear plant.
     """
-    found = np.full((len(t_ns), steps[column].shape[1]), np.nan)
+    states = np.full((len(t_ns), steps[column].shape[1]), np.nan)
     if len(steps):
-        place = np.searchsorted(steps["t_ns"], t_ns).clip(max=len(steps) - 1)
-        there = steps["t_ns"][place] == t_ns
-        found[there] = steps[column][place[there]]
-    return found
+        row = np.searchsorted(steps["t_ns"], t_ns).clip(max=len(steps) - 1)
+        recorded = steps["t_ns"][row] == t_ns
+        states[recorded] = steps[column][row[recorded]]
+    return states
 
 
 def expected_rms(resolved: Scenario) -> float:

@@ -125,7 +125,7 @@ def _take(kept: Path, run_dir: Path, source: str) -> list[str]:
     Raises:
         PeerError: a file is not of a process that kept its secret there.
     """
-    processes = {one.writer: one for one in _joined(run_dir)}
+    processes = {process.writer: process for process in _joined(run_dir)}
     types = run_tables(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
     roles = set()
     for path in sorted(kept.glob("*.*")):
@@ -150,9 +150,9 @@ def _take(kept: Path, run_dir: Path, source: str) -> list[str]:
 
 def _joined(run_dir: Path) -> Iterator[_Process]:
     """Yield the processes that joined a run."""
-    for writer, one in read_object(run_dir / PROCESSES_FILE).items():
-        if isinstance(one, dict) and one.get("process") in LOOP_ROLES:
-            yield _Process(one["process"], int(one.get("generation", 0)), writer)
+    for writer, entry in read_object(run_dir / PROCESSES_FILE).items():
+        if isinstance(entry, dict) and entry.get("process") in LOOP_ROLES:
+            yield _Process(entry["process"], int(entry.get("generation", 0)), writer)
 
 
 def _has_secret(kept: Path, process: _Process, source: str) -> bool:
@@ -180,7 +180,7 @@ def _chunks(path: Path, name: str) -> Iterator[Chunk]:
 
 
 def _require_own(table: str, process: _Process, types: Mapping[str, np.dtype[np.void]], name: str) -> None:
-    own = [one for one in types if OWNER[one] == process.role]
+    own = [name_of_table for name_of_table in types if OWNER[name_of_table] == process.role]
     if table not in (*own, notices_of(process.role), KEPT_REPORT):
         raise PeerError(f"{name}: the {process.role} has no table of this name")
 
@@ -199,8 +199,8 @@ def _checked_chunks(
                 report = parse_message(ProcessReport, chunk.rows).fields()
             except PeerError as error:
                 raise PeerError(f"{name}: {error}") from None
-            found = (report.get("process"), report.get("generation", 0), report.get("instance"))
-            if found != (process.role, process.generation, process.writer):
+            sender = (report.get("process"), report.get("generation", 0), report.get("instance"))
+            if sender != (process.role, process.generation, process.writer):
                 raise PeerError(f"{name} is the report of another process")
         elif table in types:
             if len(chunk.rows) % types[table].itemsize:

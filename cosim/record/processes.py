@@ -63,9 +63,9 @@ def add_kept_reports(run_dir: Path) -> None:
         MachineError: they cannot be written.
     """
     content = read_object(run_dir / REPORTS_FILE)
-    known = [one for one in content.get(_EARLIER, ()) if isinstance(one, dict)]
+    known = [report for report in content.get(_EARLIER, ()) if isinstance(report, dict)]
     known += [content[role] for role in LOOP_ROLES if isinstance(content.get(role), dict)]
-    instances = {one.get("instance") for one in known}
+    instances = {report.get("instance") for report in known}
     kept = []
     for _, text in read_chunks(run_dir / SPOOL, KEPT_REPORT):
         with contextlib.suppress(PeerError):  # damaged
@@ -85,30 +85,30 @@ def report_entries(run_dir: Path) -> Entries:
     try:
         content = read_object(run_dir / REPORTS_FILE)
         entries = [(role, content[role]) for role in LOOP_ROLES if role in content]
-        return entries + [(one["process"], one) for one in content.get(_EARLIER, ())]
+        return entries + [(report["process"], report) for report in content.get(_EARLIER, ())]
     except (LookupError, TypeError):
         return []
 
 
-def entries_of_loop(entries: Entries, number: int, others: Callable[[int, str, int], int]) -> Entries:
+def entries_of_loop(entries: Entries, number: int, rows_of_others: Callable[[int, str, int], int]) -> Entries:
     """Return the reports as of one loop: with its own rows, and its own counters of datagrams.
 
     ``others(number, table, generation)`` returns how many rows of a table of the network are of
     other loops. Rows of the network that are missing in the record are missing in every loop.
     """
-    found = []
+    reports = []
     for role, report in entries:
         with contextlib.suppress(LookupError, TypeError, ValueError, AttributeError):  # damaged
-            found.append((role, _of_loop(report, number, others)))
-    return found
+            reports.append((role, _of_loop(report, number, rows_of_others)))
+    return reports
 
 
-def _of_loop(report: Report, number: int, others: Callable[[int, str, int], int]) -> Report:
+def _of_loop(report: Report, number: int, rows_of_others: Callable[[int, str, int], int]) -> Report:
     written = dict(report["rows"])
     for table, by_loop in report.get("rows_by_loop", {}).items():
         written[table] = by_loop[number] if number < len(by_loop) else 0
     for table in written.keys() & network_tables().keys():  # there are rows of notices, too
-        written[table] -= others(number, table, report.get("generation", 0))
+        written[table] -= rows_of_others(number, table, report.get("generation", 0))
     channel = dict(report["channel"])
     of_loops = channel.pop("loops", [])
     rejected = Counter[str](channel.get("rejected"))
@@ -127,20 +127,20 @@ def _of_loop(report: Report, number: int, others: Callable[[int, str, int], int]
 
 def joint_reports(network: Mapping[str, Report], loops: Sequence[Mapping[str, Report]]) -> dict[str, Report]:
     """Return the reports of a run from those of its loops; the emulator's are of all loops."""
-    found: dict[str, Report] = {}
+    reports: dict[str, Report] = {}
     if "netem" in network:
         own = loops[0].get("netem", network["netem"])["rows"]  # also those of its clock
-        found["netem"] = network["netem"] | {"rows": own | network["netem"]["rows"]}
-    for role in [one for one in loops[0] if one != "netem"]:
-        of_loops = [one[role] for one in loops]
-        tables = dict.fromkeys(table for one in of_loops for table in one["rows"])
-        by_loop = {table: [one["rows"].get(table, 0) for one in of_loops] for table in tables}
-        found[role] = of_loops[0] | {
+        reports["netem"] = network["netem"] | {"rows": own | network["netem"]["rows"]}
+    for role in [loop_role for loop_role in loops[0] if loop_role != "netem"]:
+        of_loops = [loop[role] for loop in loops]
+        tables = dict.fromkeys(table for report in of_loops for table in report["rows"])
+        by_loop = {table: [report["rows"].get(table, 0) for report in of_loops] for table in tables}
+        reports[role] = of_loops[0] | {
             "rows": {table: sum(counts) for table, counts in by_loop.items()},
             "rows_by_loop": by_loop,
-            "channel": {"loops": [one["channel"] for one in of_loops]},
+            "channel": {"loops": [report["channel"] for report in of_loops]},
         }
-    return found
+    return reports
 
 
 def valid_reports(
@@ -270,14 +270,14 @@ def lives_of(
     return [
         Life(
             generation,
-            one.rows,
+            count.rows,
             reports.get(generation),
-            one.first_ns,
-            one.last_ns,
-            one.hole_ns,
-            one.missing_inputs,
+            count.first_ns,
+            count.last_ns,
+            count.hole_ns,
+            count.missing_inputs,
         )
-        for generation, one in zip(begun, counts, strict=True)
+        for generation, count in zip(begun, counts, strict=True)
     ]
 
 

@@ -50,8 +50,8 @@ def joined(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
     if any(rows.dtype != dtype for rows in parts):
         return np.concatenate([np.zeros(0, dtype), *parts])
     raw = np.dtype((np.void, dtype.itemsize))
-    found = np.concatenate([np.zeros(0, raw), *(rows.view(raw) for rows in parts)])
-    return found.view(dtype)
+    content = np.concatenate([np.zeros(0, raw), *(rows.view(raw) for rows in parts)])
+    return content.view(dtype)
 
 
 def parts_by_loop(rows: Rows, numbers: NDArray[np.integer]) -> Iterator[tuple[int, Rows]]:
@@ -178,18 +178,18 @@ class _TableReader:
 
     def until(self, end_ns: int) -> Rows:
         """Return the next rows, up to the first one that is not before ``end_ns``."""
-        found: list[Rows] = []
+        parts: list[Rows] = []
         while self.next_ns() is not None:
             later = self._rows["now_ns"] >= end_ns
             count = int(np.argmax(later)) if later.any() else len(later)
             if count:  # a part of its own need not be copied
-                found.append(self._rows[:count])
+                parts.append(self._rows[:count])
             self._rows = self._rows[count:]
             if len(self._rows):
                 break
-        if not found:
+        if not parts:
             return self._rows[:0]
-        return joined(found, found[0].dtype)
+        return joined(parts, parts[0].dtype)
 
 
 if TYPE_CHECKING:
@@ -204,28 +204,28 @@ def with_loop(rows: Rows, number: int, dtype: np.dtype[np.void]) -> Rows:
     """Return rows of a loop as rows of a run, whose vectors may be longer: their rest is NaN."""
     if rows.dtype == dtype:
         return rows
-    found = np.zeros(len(rows), dtype)
+    converted = np.zeros(len(rows), dtype)
     for name in rows.dtype.names or ():
         kind = dtype[name]
         if kind == rows.dtype[name]:
-            found[name] = rows[name]
+            converted[name] = rows[name]
         else:
-            found[name] = np.nan
-            found[name][:, : rows.dtype[name].shape[0]] = rows[name]
+            converted[name] = np.nan
+            converted[name][:, : rows.dtype[name].shape[0]] = rows[name]
     if LOOP in (dtype.names or ()):
-        found[LOOP] = number
-    return found
+        converted[LOOP] = number
+    return converted
 
 
 def packed(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
     """Return the columns of a type without gaps, of a vector the first entries."""
     if rows.dtype == dtype:
         return rows
-    found = np.empty(len(rows), dtype)
+    converted = np.empty(len(rows), dtype)
     for name in dtype.names or ():
         size = dtype[name].shape
-        found[name] = rows[name][:, : size[0]] if size else rows[name]
-    return found
+        converted[name] = rows[name][:, : size[0]] if size else rows[name]
+    return converted
 
 
 def rows_by_loop(
@@ -310,14 +310,14 @@ class NetworkRows:
         mine = [np.sort(np.concatenate([*map(np.take, self._inputs.values(), places)])) for places in every]
         first = 0
         for rows in self._source.batches(table):
-            found = []
+            by_loop = []
             for number, inputs in zip(numbers, mine, strict=True):
                 places = self._places[table][number]
                 begin, end = np.searchsorted(places, (first, first + len(rows)))
                 chosen = rows.take(places[begin:end] - first)
                 chosen["input"] -= self._numbered_before(chosen["input"], inputs)
-                found.append(_of_loop(chosen, number, self._phases_ns))
-            yield found
+                by_loop.append(_of_loop(chosen, number, self._phases_ns))
+            yield by_loop
             first += len(rows)
 
     def _numbered_before(self, numbers: NDArray[np.int64], mine: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -106,21 +106,21 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
     """
     common = dict(user_files.file_tables(scenario))
 
-    def copied(within: str, one: "Scenario", folder: str) -> dict[str, "FileSettings"]:
-        found = {}
-        for place, table in user_files.file_tables(one):
-            if within and table == common.get(place):
+    def copied(within: str, within_scenario: "Scenario", folder: str) -> dict[str, "FileSettings"]:
+        copies = {}
+        for key, table in user_files.file_tables(within_scenario):
+            if within and table == common.get(key):
                 continue  # the entry does not set it
-            file = user_files.unchanged(table, f"{within}{place}")
-            name = f"{place.split('.')[0]}/{within.replace('.', '_')}{file.name}"
+            file = user_files.unchanged(table, f"{within}{key}")
+            name = f"{key.split('.')[0]}/{within.replace('.', '_')}{file.name}"
             if not (run_dir / name).is_file():
                 (run_dir / name).parent.mkdir(exist_ok=True)
                 copy_whole(file, run_dir / name)
-            found[place] = table.model_copy(update={"file": f"{folder}{name}"})
-        return found
+            copies[key] = table.model_copy(update={"file": f"{folder}{name}"})
+        return copies
 
     def located(folder: str) -> "Scenario":
-        moved = scenarios.with_loop_tables(scenario, lambda place, one: copied(f"{place}.", one, folder))
+        moved = scenarios.with_loop_tables(scenario, lambda entry, loop: copied(f"{entry}.", loop, folder))
         return user_files.with_tables(moved, copied("", scenario, folder))
 
     write_whole(run_dir / SCENARIO_FILE, scenario_file.dumps(located("")))
@@ -300,8 +300,8 @@ class EndingFile:
     def store(self, status: ExitStatus, reason: str, startup_s: float | None = None) -> None:
         """Store how the run ended, under the keys of its summary."""
         self._is_blank = False
-        found = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
-        text = json.dumps(found).encode().ljust(_RESERVED_BYTES)
+        content = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
+        text = json.dumps(content).encode().ljust(_RESERVED_BYTES)
         with contextlib.suppress(OSError):  # the terminal also shows the ending
             self._file.seek(0)
             self._file.write(text)

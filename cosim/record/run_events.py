@@ -85,17 +85,17 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
     has the settings of the network alone.
     """
     since: dict[int, dict[str, int]] = {}
-    found: dict[int, ParameterChange] = {}
-    for table in (one for one in SETTINGS if one in record.tables):
+    changes: dict[int, ParameterChange] = {}
+    for table in (name for name in SETTINGS if name in record.tables):
         for change, since_ns in _changes_in(record[table]):
-            found.setdefault(change.number, change)
+            changes.setdefault(change.number, change)
             since.setdefault(change.number, {}).setdefault(OWNER[table], since_ns)
     made: list[RecordedChange] = []
-    if not found:
+    if not changes:
         return made
     scenario = record.scenario
     schedule = ChangeSchedule[None](scenario)
-    for number, change in sorted(found.items(), key=lambda one: (one[1].t_ns, one[0])):
+    for number, change in sorted(changes.items(), key=lambda numbered: (numbered[1].t_ns, numbered[0])):
         if _add(schedule, change, change.t_ns):
             (taken,) = schedule.take(change.t_ns)
             made.append(RecordedChange(change, since[number], taken.scenario))
@@ -127,19 +127,19 @@ def model_flow_of(record: RunRecord) -> ModelFlow:
 
 
 def _changes_in(rows: Rows) -> list[tuple[ParameterChange, int]]:
-    found = []
+    changes = []
     for row in rows[np.argsort(rows["input"], kind="stable")]:
         try:
             settings = settings_of(row["change"].tobytes())
         except ValueError:
             continue
-        found.append(
+        changes.append(
             (
                 ParameterChange(int(row["sequence"]), int(row["t_ns"]), settings),
                 int(row["since_ns"]),
             )
         )
-    return found
+    return changes
 
 
 def _add(schedule: ChangeSchedule[None], change: ParameterChange, since_ns: int) -> bool:
@@ -215,11 +215,11 @@ def _outcomes(
 ) -> PacketOutcome:
     rows, sequence, event_ns = updates_in(packets, flow)
     # Of a datagram and its copy, the first intact one counts; it may be the copy.
-    which = (rows["bit"] >= 0).astype(np.int64)
-    numbers = 2 * rows["sequence"] + which
+    copy = (rows["bit"] >= 0).astype(np.int64)
+    numbers = 2 * rows["sequence"] + copy
     effectively = effective(rows["fate"])
     stale = np.isin(numbers, forwarded[was_stale]) if was_stale.any() else np.zeros(len(numbers), np.bool_)
-    due_ns = np.maximum(np.where(which == 1, rows["copy_ns"], rows["release_ns"]), rows["now_ns"])
+    due_ns = np.maximum(np.where(copy == 1, rows["copy_ns"], rows["release_ns"]), rows["now_ns"])
     in_flight = effectively & (due_ns > rows["now_ns"])
     in_flight[in_flight] = ~np.isin(numbers[in_flight], forwarded)
     fate, lost = rows["fate"].astype(np.int8), ~effectively | stale
@@ -273,20 +273,20 @@ def divergence(
     tenth, seventh, ninth = (round(share * count) for share in (0.1, 0.7, 0.9))
     early = middle = last = highest = 0.0
     peaks: list[tuple[float, float]] = []  # each ‖x‖ above all before, with its time
-    place = 0
+    samples = 0
     for t_s, x in parts:
         lost = np.flatnonzero(~all_entries(np.isfinite(x)))
         if len(lost):
             at_s = float(t_s[lost[0]])
             return Divergence(at_s, f"diverged: x is not finite at {at_s:g} s")
         norms = row_norms(x)
-        early = float(norms[: max(tenth - place, 0)].max(initial=early))
-        middle = float(norms[: max(seventh - place, 0)].max(initial=middle))
-        last = float(norms[max(ninth - place, 0) :].max(initial=last))
+        early = float(norms[: max(tenth - samples, 0)].max(initial=early))
+        middle = float(norms[: max(seventh - samples, 0)].max(initial=middle))
+        last = float(norms[max(ninth - samples, 0) :].max(initial=last))
         before = np.maximum.accumulate(np.append(highest, norms))
         above = np.flatnonzero(norms > before[:-1])
         peaks += zip(t_s[above].tolist(), norms[above].tolist(), strict=True)
-        highest, place = float(before[-1]), place + len(norms)
+        highest, samples = float(before[-1]), samples + len(norms)
     if count < _LEAST_SAMPLES:
         return None
     scale = max(early, *map(_scale, scenarios))
@@ -311,7 +311,7 @@ class GrowthMonitor:
 
     def __init__(self, loops: Sequence[Scenario]) -> None:
         self._early_ns = loops[0].timing.horizon_ns // 10
-        self._scales = np.array([_scale(one) for one in loops])
+        self._scales = np.array([_scale(loop) for loop in loops])
         self._found = np.zeros(len(loops), np.bool_)
         sizes = np.array([loop.model.dimensions[0] for loop in loops])
         self._entries = np.arange(sizes.max()) < sizes[:, None]
@@ -331,13 +331,13 @@ class GrowthMonitor:
         limits = GROWTH * self._scales[loops]
         beyond = np.flatnonzero(lost | (~early & (limits > 0) & (norms > limits)))
         new = []
-        for place in beyond[~self._found[loops[beyond]]].tolist():
-            if self._found[loop := int(loops[place])]:
+        for row in beyond[~self._found[loops[beyond]]].tolist():
+            if self._found[loop := int(loops[row])]:
                 continue
             self._found[loop] = True
-            passed = f"‖x‖ passed {limits[place]:.3g} ({GROWTH:g} times its expected size)"
-            text = "x is not finite" if lost[place] else passed
-            new.append((loop, int(t_ns[place]), text))
+            passed = f"‖x‖ passed {limits[row]:.3g} ({GROWTH:g} times its expected size)"
+            text = "x is not finite" if lost[row] else passed
+            new.append((loop, int(t_ns[row]), text))
         return new
 
 
@@ -345,11 +345,15 @@ def _scale(scenario: Scenario) -> float:
     """Return the magnitude of ‖x‖ to expect from a scenario's disturbances and set-point."""
     loop = loop_of(scenario)
     carried = 0.0
-    for one in scenario.plant.disturbances:
-        if isinstance(one, StepDisturbance):
-            push = loop.B @ np.array(one.amplitude) if one.at == "input" else one.amplitude
-            until_s = min(one.until_s or scenario.horizon_s, scenario.horizon_s)
-            carried += float(np.linalg.norm(push)) * max(until_s - one.from_s, 0.0)
+    for disturbance in scenario.plant.disturbances:
+        if isinstance(disturbance, StepDisturbance):
+            push = (
+                loop.B @ np.array(disturbance.amplitude)
+                if disturbance.at == "input"
+                else disturbance.amplitude
+            )
+            until_s = min(disturbance.until_s or scenario.horizon_s, scenario.horizon_s)
+            carried += float(np.linalg.norm(push)) * max(until_s - disturbance.from_s, 0.0)
     setpoint = 0.0 if loop.setpoint is None else float(np.linalg.norm(loop.setpoint))
     threshold = policy_of(scenario).largest_threshold
     if loop.weight is not None:

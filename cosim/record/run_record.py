@@ -170,11 +170,11 @@ class RunRecord:
         numbers = left["sequence"] * count + left["flow"]
         order = np.argsort(numbers)
         wanted, known = packets["sequence"] * count + packets["flow"], numbers[order]
-        place = np.searchsorted(known, wanted)
-        has_left = np.append(known, -1)[place] == wanted
+        row = np.searchsorted(known, wanted)
+        has_left = np.append(known, -1)[row] == wanted
         waits = ~has_left & (packets["release_ns"] > packets["now_ns"])
         packets = packets.copy()
-        packets["release_ns"][has_left] = left["t_ns"][order][place[has_left]]
+        packets["release_ns"][has_left] = left["t_ns"][order][row[has_left]]
         packets["release_ns"][waits] = np.maximum(packets["release_ns"][waits], left["t_ns"].max(initial=-1))
         return packets
 
@@ -217,10 +217,10 @@ class RunRecord:
 
     def last_ns(self, table: str) -> int | None:
         """Return the nominal time of the last row of a table; None if it has none."""
-        found = None
+        last_ns = None
         for rows in self.source.batches(table, ("t_ns",)):
-            found = int(rows["t_ns"][-1]) if len(rows) else found
-        return found
+            last_ns = int(rows["t_ns"][-1]) if len(rows) else last_ns
+        return last_ns
 
     def derived(self, scenario: Scenario, derive: Callable[[str, Rows], Rows]) -> "RunRecord":
         """Return a record with another scenario, and with rows derived from those of this one.
@@ -260,8 +260,8 @@ class RunRecord:
     def is_complete(self, role: str) -> bool:
         """Whether the record has all rows that a process reported, of all its generations."""
         return all(
-            one.report is not None and one.report["rows"].items() >= one.rows.items()
-            for one in self.row_counts(role)
+            table.report is not None and table.report["rows"].items() >= table.rows.items()
+            for table in self.row_counts(role)
         )
 
     def _reports_of(self, role: str) -> Mapping[int, Report]:
@@ -273,13 +273,13 @@ class RunRecord:
     @cached_method
     def begun_lives(self, role: str) -> list[int]:
         """The numbers of the recorded generations of a process, ascending."""
-        again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
+        again = any((notice["process"], notice["level"]) == (role, RESTART) for notice in self.notices)
         return generations(self.source, self.owned_by(role)) if again else [0]
 
     def owned_by(self, role: str) -> list[str]:
         """Return the tables with the inputs of a process's machine."""
-        found = [table for table in self.tables if OWNER[table] == role]
-        return [table for table in found if table not in CLOCK_TABLES]
+        owned = [table for table in self.tables if OWNER[table] == role]
+        return [table for table in owned if table not in CLOCK_TABLES]
 
     def restarted(self) -> str | None:
         """A role whose process was restarted; None if there is none."""
@@ -387,7 +387,7 @@ class StoredLoops(Sequence[RunRecord]):
     def __getitem__(self, number: slice) -> list[RunRecord]: ...
     def __getitem__(self, number: int | slice) -> RunRecord | list[RunRecord]:
         if isinstance(number, slice):
-            return [self[one] for one in range(len(self))[number]]
+            return [self[index] for index in range(len(self))[number]]
         number = range(len(self))[number]
         if self._newest is None or self._newest.number != number:
             self._newest = self._record_of(number)
@@ -400,8 +400,8 @@ class StoredLoops(Sequence[RunRecord]):
             having = [record for record in records if table in record.tables]
             types = [record.tables[table] for record in having]
             loops = [record.number for record in having]
-            for place, rows in self._stored.of_loops(table, loops, types):
-                having[place].source.keep(table, rows)
+            for position, rows in self._stored.of_loops(table, loops, types):
+                having[position].source.keep(table, rows)
         for table, dtype in network_tables().items():
             parts = zip(*self._shared.of_loops(table, numbers), strict=True)
             for record, own in zip(records, parts, strict=False):  # none if there are no rows
@@ -526,14 +526,14 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
             threads.submit(table_files.write_table, folder / f"{table}.parquet", rows(table), dtype, names)
             for table, dtype in types.items()
         ]
-        for one in written:
-            one.result()
+        for writing in written:
+            writing.result()
 
 
 def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
     """Return the names of states and inputs, if they are the same in all loops."""
-    models = [resolve(loop_scenario(scenario, one)).model for one in loop_sections(scenario)]
-    names = {(one.state_names or (), one.input_names or ()) for one in models}
+    models = [resolve(loop_scenario(scenario, section)).model for section in loop_sections(scenario)]
+    names = {(model.state_names or (), model.input_names or ()) for model in models}
     if len(names) > 1:
         return {}
     ((states, inputs),) = names

@@ -83,17 +83,17 @@ class StoredTables(RecordSource):
             yield from self.batches(table, dtype.names or ())
             return
         groups = self._groups_with(table, number, number)
-        alone = [place for place, is_alone in groups.items() if is_alone]
+        alone = [group for group, is_alone in groups.items() if is_alone]
         own, known = self._files[table].batches(dtype, alone), self._newest.pop(table, {})
         # The loops are usually read in turn: the next one is in the same groups.
-        newest = self._newest[table] = {one: known[one] for one in groups if one in known}
-        for place, is_alone in groups.items():
+        newest = self._newest[table] = {group: known[group] for group in groups if group in known}
+        for group, is_alone in groups.items():
             if is_alone:
                 yield next(own)
             else:
-                if place not in newest:
-                    (newest[place],) = self._files[table].batches(groups=[place])
-                rows = newest[place]
+                if group not in newest:
+                    (newest[group],) = self._files[table].batches(groups=[group])
+                rows = newest[group]
                 yield packed(rows.compress(rows[LOOP] == number), dtype)
 
     def of_loops(
@@ -102,14 +102,14 @@ class StoredTables(RecordSource):
         """Yield place and rows of each of some loops, as rows of its type; a group is read once."""
         within = [*self._groups_with(table, loops[0], loops[-1])]
         for dtype in dict.fromkeys(types):
-            found: dict[int, list[Rows]] = {
+            parts_of: dict[int, list[Rows]] = {
                 number: [] for number, own in zip(loops, types, strict=True) if own == dtype
             }
             for numbers, rows in self._files[table].batches_by_loop(dtype, within):
                 for number, part in parts_by_loop(rows, numbers):
-                    if number in found:
-                        found[number].append(part)
-            for number, parts in found.items():
+                    if number in parts_of:
+                        parts_of[number].append(part)
+            for number, parts in parts_of.items():
                 yield loops.index(number), joined(parts, dtype)
 
     def count_of_loop(self, table: str, number: int) -> int:
@@ -124,7 +124,7 @@ class StoredTables(RecordSource):
         counts, groups = np.zeros(MAX_LOOPS + 1, np.int64), self._files[table].groups
         for group in groups:
             counts[group.first] += group.rows * (group.first == group.last)
-        mixed = [place for place, group in enumerate(groups) if group.first != group.last]
+        mixed = [number for number, group in enumerate(groups) if group.first != group.last]
         dtype = with_columns(self.types[table], (LOOP,))
         for rows in self._files[table].batches(dtype, mixed):
             counts += np.bincount(rows[LOOP], minlength=len(counts))
@@ -133,8 +133,8 @@ class StoredTables(RecordSource):
     def _groups_with(self, table: str, first: int, last: int) -> dict[int, bool]:
         """Return the groups that may have rows of some loops: whether they have those of one."""
         return {
-            place: group.first == group.last
-            for place, group in enumerate(self._files[table].groups)
+            number: group.first == group.last
+            for number, group in enumerate(self._files[table].groups)
             if group.first <= last and first <= group.last
         }
 
@@ -187,10 +187,10 @@ class TableFile:
             raise CallerError(
                 f"{path}: has {largest:,} rows in one part; at most {_MOST_GROUP_ROWS:,} are read"
             )
-        places = {name: place for place, name in enumerate(metadata.schema.names)}
+        places = {name: index for index, name in enumerate(metadata.schema.names)}
         for name in [name for name, _ in _columns(dtype)]:
-            found = [group.column(places[name]).statistics for group in groups]
-            if any(statistics is not None and statistics.null_count for statistics in found):
+            all_statistics = [group.column(places[name]).statistics for group in groups]
+            if any(statistics is not None and statistics.null_count for statistics in all_statistics):
                 raise CallerError(f"{path}: column {name} has holes")
         self.groups = [_group(group, places) for group in groups]
 
@@ -218,7 +218,7 @@ class TableFile:
             table.validate(full=True)
         for column, _ in _columns(self._dtype):
             _require_whole(self._path, column, table.column(column))
-        in_turn = all(one.last <= after.first for one, after in pairwise(self.groups))
+        in_turn = all(group.last <= after.first for group, after in pairwise(self.groups))
         if in_turn or LOOP not in table.column_names:
             return table
         table = table.combine_chunks()
@@ -395,15 +395,15 @@ def _readable(path: Path) -> Iterator[None]:
 
 def _require_columns(path: Path, schema: pa.Schema, dtype: RowType) -> None:
     for column, kind in _columns(dtype):
-        found = schema.get_all_field_indices(column)
-        if not found and column == LOOP:
+        indices = schema.get_all_field_indices(column)
+        if not indices and column == LOOP:
             raise CallerError(
                 f"{path}: has no column {LOOP}: an earlier version of noack recorded this run, "
                 "which this version does not read"
             )
-        if not found:
+        if not indices:
             raise CallerError(f"{path}: has no column {column}, which this scenario's runs have")
-        if len(found) > 1 or schema.field(found[0]).type != kind:
+        if len(indices) > 1 or schema.field(indices[0]).type != kind:
             raise CallerError(f"{path}: column {column} is not one of {kind}")
 
 

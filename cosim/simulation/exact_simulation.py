@@ -163,7 +163,7 @@ class ExactSimulation:
             core.noack_exact_runs(
                 self.core,
                 part.stop - begin,
-                *(pointer_to(one[part], "double *") for one in (A, B, x0)),
+                *(pointer_to(population[part], "double *") for population in (A, B, x0)),
                 ffi.NULL if keys is None else pointer_to(keys[part], "int64_t *"),
                 pointer_to(rows[part], "noack_exact_row *"),
             )
@@ -179,7 +179,7 @@ class ExactSimulation:
     ) -> Segments:
         """Follow a plant from k states, (k, 3, n), just after events at times (k,)."""
         k = len(t_s)
-        found = Segments(
+        segments = Segments(
             np.array(t_s, np.float64),
             np.array(states, np.float64, order="C"),
             np.zeros(k) if auxiliaries is None else np.array(auxiliaries, np.float64),
@@ -190,8 +190,8 @@ class ExactSimulation:
         )
         plant = (pointer_to(np.ascontiguousarray(part, np.float64), "double *") for part in (A, B))
         kinds = ["double *"] * 3 + ["int64_t *"] + ["double *"] * 2 + ["int64_t *"]
-        core.noack_exact_segments(self.core, *plant, k, *map(pointer_to, found, kinds))
-        return found
+        core.noack_exact_segments(self.core, *plant, k, *map(pointer_to, segments, kinds))
+        return segments
 
     def sample(
         self, A: Matrix, B: Matrix, start_s: Vector, starts: NDArray[np.float64], t_s: Vector
@@ -233,7 +233,9 @@ def vanished(from_s: float) -> CallerError:
 
 def timeless(settings: LinkSettings) -> LinkSettings:
     """Return the settings of a link that apply in the paper's loop: losses and corruption."""
-    kept = tuple(one for one in settings.impairments if isinstance(one, LossOf | Corrupt))
+    kept = tuple(
+        impairment for impairment in settings.impairments if isinstance(impairment, LossOf | Corrupt)
+    )
     return settings.model_copy(update={"impairments": kept})
 
 

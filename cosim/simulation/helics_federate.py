@@ -140,10 +140,10 @@ class _Network:
         known = self._helics.helicsQueryExecute(query, self._federate)
         for route in self.routes:
             if route.destination not in known:
-                own = {f"{self._federate.name}/{one.destination}" for one in self.routes}
-                others = ", ".join(sorted({*known} - own)) or "none"
+                own = {f"{self._federate.name}/{endpoint.destination}" for endpoint in self.routes}
+                existing = ", ".join(sorted({*known} - own)) or "none"
                 raise CallerError(
-                    f"--endpoint {route.destination}: the federation has no such endpoint; it has {others}"
+                    f"--endpoint {route.destination}: the federation has no such endpoint; it has {existing}"
                 )
 
     def run(self) -> None:
@@ -155,7 +155,7 @@ class _Network:
             granted_s = helics.helicsFederateRequestTime(self._federate, wanted_s)
             if granted_s >= end_s:
                 return
-            for time_ns, flow, message in sorted(self._received(), key=lambda one: one[:2]):
+            for time_ns, flow, message in sorted(self._received(), key=lambda received: received[:2]):
                 self._take(time_ns, flow, message)
             self._leave(self._channel.release(round(granted_s * NS_PER_S)), granted_s)
 
@@ -164,9 +164,9 @@ class _Network:
         helics = self._helics
         for flow, endpoint in enumerate(self._endpoints):
             while helics.helicsEndpointHasMessage(endpoint):
-                one = helics.helicsEndpointGetMessage(endpoint)
-                content = _Waiting(helics.helicsMessageGetBytes(one), one.original_source, 0)
-                yield round(one.time * NS_PER_S), flow, content
+                message = helics.helicsEndpointGetMessage(endpoint)
+                content = _Waiting(helics.helicsMessageGetBytes(message), message.original_source, 0)
+                yield round(message.time * NS_PER_S), flow, content
         helics.helicsFederateClearMessages(self._federate)
 
     def _take(self, now_ns: int, flow: int, message: _Waiting) -> None:

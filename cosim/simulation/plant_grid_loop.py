@@ -114,11 +114,11 @@ class PlantGridLoop:
             measured = np.flatnonzero(schedule.measured[following])
             if in_common:
                 block = states[following][measured]
-                found = trigger.test((step + 1 + measured) * period_ns, block, x_s_block[measured] - block)
+                first = trigger.test((step + 1 + measured) * period_ns, block, x_s_block[measured] - block)
             else:
-                found = 0 if len(measured) else None
-            event = found is not None
-            taken = until - step - 1 if found is None else int(measured[found])
+                first = 0 if len(measured) else None
+            event = first is not None
+            taken = until - step - 1 if first is None else int(measured[first])
             x_s = x_s_block[taken]
             step += 1 + taken
 
@@ -132,7 +132,7 @@ class PlantGridLoop:
         now_ns, newest = step * self._schedule.period_ns, updates[0]
         for update in updates[1:]:
             x = self._followed(x, newest, now_ns, np.array([(update.acts_ns - now_ns) * 1e-9]))[0]
-            newest, now_ns = max(newest, update, key=lambda one: one.number), update.acts_ns
+            newest, now_ns = max(newest, update, key=lambda candidate: candidate.number), update.acts_ns
         if len(updates) == 1:
             return self._followed(x, newest, now_ns, self._steps_s[1 : until - step + 1])
         end_ns = until * self._schedule.period_ns

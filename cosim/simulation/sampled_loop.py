@@ -195,20 +195,20 @@ class SampledLoop:
         """Make the events of runs: x_s = y, and send the update of the delivered ones, (N,)."""
         runs.x_s[:] = runs.y
         rows = np.flatnonzero(delivered)
-        place = (runs.sent[rows] >= 0).sum(axis=1)
-        runs.sent[rows, place] = runs.step[rows]
-        runs.updates[rows, place] = runs.y[rows]
+        column = (runs.sent[rows] >= 0).sum(axis=1)
+        runs.sent[rows, column] = runs.step[rows]
+        runs.updates[rows, column] = runs.y[rows]
 
     def follow(self, runs: Runs, scales: Scales, last: Numbers, *, tests: bool = True) -> None:
         """Advance runs in place to their next events, at most to their steps ``last``, (N,).
 
         Without ``tests`` there are no events.
         """
-        _, sensor, controller = (one.machines[0] for one in self._machines)
+        _, sensor, controller = (machines.machines[0] for machines in self._machines)
         if len(self._gains):
             sensor.observer.kind = core.NOACK_LUENBERGER
         weight = _dense(scales.weight)
-        levels = [_dense(one) for one in (scales.error, scales.state)]
+        levels = [_dense(level) for level in (scales.error, scales.state)]
         scratch = np.zeros(3 * self.matrices.n)
         segments = ffi.new("noack_segments *", {
             "plant": self._plant, "sensor": ffi.addressof(sensor),
@@ -241,12 +241,12 @@ def pushes_of(resolved: Scenario) -> Matrix:
     if disturbance is None:
         return np.zeros((0, n))
     through = through_of(resolved)
-    found = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
-    d, w = disturbance.values(range(len(found)))
+    pushes = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
+    d, w = disturbance.values(range(len(pushes)))
     for part, at in ((d, through[:, :m]), (w, through[:, m:])):
         if part.shape[1]:
-            found += part @ at.T
-    return found
+            pushes += part @ at.T
+    return pushes
 
 
 def noise_of(resolved: Scenario) -> Matrix:

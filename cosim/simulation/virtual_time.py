@@ -120,7 +120,7 @@ class RecordCollector:
         """Return the notices of a loop or, of None, those about the whole run, by their times."""
         return [
             notice._replace(loop=None).line() | {"process": role}
-            for notice, role in sorted(self._notices, key=lambda one: one[0].t_ns)
+            for notice, role in sorted(self._notices, key=lambda entry: entry[0].t_ns)
             if notice.loop in (None, loop)
         ]
 

@@ -24,7 +24,7 @@ from rich.text import Text
 
 from cosim.analysis.replay import replay
 from cosim.analysis.replay.replay_result import difference, rows_differ
-from cosim.analysis.summary_model import ReplayDifference
+from cosim.analysis.summary.summary_model import ReplayDifference
 from cosim.live.finalize import finalize, reopen
 from cosim.live.simulated_run import simulate_run
 from cosim.output.result_tables import ResultTable, terminal_table

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.summary_model import FidelityPart, LoopSummary, RunSummary
+from cosim.analysis.summary.summary_model import FidelityPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (

@@ -126,7 +126,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim", "tools")
 SHADOWED = ("socket", "logging", "multiprocessing", "http", "pickle", "concurrent", "fcntl")
 POOL = """
-from cosim.live.process_pool import processes
+from cosim.live.processes.process_pool import processes
 if __name__ == "__main__":
     with processes(2) as pool:
         print(pool.submit(pow, 2, 5).result())

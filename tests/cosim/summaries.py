@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from cosim.analysis.network_summary import summarise_run
-from cosim.analysis.run_summary import summarise
-from cosim.analysis.summary_model import ExitPart, LoopSummary, RunSummary
+from cosim.analysis.summary.network_summary import summarise_run
+from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.summary_model import ExitPart, LoopSummary, RunSummary
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
 
 

@@ -16,8 +16,8 @@ from scipy.linalg import eigvals, solve_continuous_are
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.run_evidence import scheduled_certificates
-from cosim.analysis.run_summary import linearisation, linearisation_rows, summarise
-from cosim.analysis.summary_model import ClaimVerdict, LinearisationPart, NoLinearisationPart
+from cosim.analysis.summary.run_summary import linearisation, linearisation_rows, summarise
+from cosim.analysis.summary.summary_model import ClaimVerdict, LinearisationPart, NoLinearisationPart
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.core.linear_systems import Matrix

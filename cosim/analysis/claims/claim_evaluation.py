@@ -29,7 +29,7 @@ from cosim.analysis.claims import catalogue
 from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, ClaimDefinition, Envelope, Findings
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, RunPart, Samples, late_certificates
-from cosim.analysis.summary_model import Claim, ClaimVerdict
+from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.analysis.value_reduction import decimate
 from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
@@ -70,15 +70,15 @@ def definitions(kind: type[_Kind]) -> list[_Kind]:
 
     Certified claims are those of a certificate; the others need none.
     """
-    names = sorted(found.name for found in pkgutil.iter_modules(catalogue.__path__))
+    names = sorted(module.name for module in pkgutil.iter_modules(catalogue.__path__))
     modules = [importlib.import_module(f"{catalogue.__name__}.{name}") for name in names]
     return [claim for module in modules for claim in vars(module).values() if isinstance(claim, kind)]
 
 
-def void_claim(what: str, source: str, since_s: float, why: str, until_s: float | None = None) -> Claim:
+def void_claim(claimed: str, source: str, since_s: float, why: str, until_s: float | None = None) -> Claim:
     """Return a claim that cannot be checked because there is no bound."""
     return Claim(
-        what=what, source=source, bound="none", certified=None, observed=None, ratio=None,
+        what=claimed, source=source, bound="none", certified=None, observed=None, ratio=None,
         verdict=ClaimVerdict.VOID, since_s=since_s, why=why, from_s=since_s, until_s=until_s,
     )  # fmt: skip
 
@@ -191,19 +191,19 @@ class ClaimEvaluation(RunEvidence):
             return []
         void = partial(void_claim, since_s=self.part.from_s, until_s=_end_s(self.part))
         if self.record.scenario.protocol.acknowledges:
-            what = "x_c − x_s is the sum of the missed jumps"
-            return [void(what, "(I1)", why=_ACKNOWLEDGED)]
-        found: list[Claim] = []
+            claimed = "x_c − x_s is the sum of the missed jumps"
+            return [void(claimed, "(I1)", why=_ACKNOWLEDGED)]
+        claims: list[Claim] = []
         for certificate in (None, *self.certificates):
             if certificate is not None and certificate.constants is None:
-                what = f"a certificate for {certificate.scope}"
-                found.append(void(what, certificate.source, why=certificate.void or ""))
-            found += [
+                claimed = f"a certificate for {certificate.scope}"
+                claims.append(void(claimed, certificate.source, why=certificate.void or ""))
+            claims += [
                 instance.check.result()
                 for instance in self._checked
                 if instance.certificate is certificate and instance.check.is_claimed
             ]
-        return found
+        return claims
 
     @cached_property
     def _checked(self) -> list[_Instance]:
@@ -221,9 +221,9 @@ class ClaimEvaluation(RunEvidence):
             if (constants := certificate.constants) is None:
                 continue
             outside = outside_box(scenario) if certificate.scope == BOX else None
-            for one in definitions(CertifiedClaim):
-                check = ClaimCheck(one.statement, certificate.source, self.part)
-                find = partial(one.find, certificate=certificate, constants=constants)
+            for claim in definitions(CertifiedClaim):
+                check = ClaimCheck(claim.statement, certificate.source, self.part)
+                find = partial(claim.find, certificate=certificate, constants=constants)
                 yield _Instance(find, check, [], certificate, outside)
         for claim in definitions(ClaimDefinition):
             unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
@@ -291,11 +291,11 @@ class RunClaims:
         offset = _offset(record.scenario)
         until_s = _until_s(first_ns, 0)
         part = RunPart(record, 0.0, until_s, start_error, void, certificates, offset)
-        found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
+        parts: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
-            found.append(self._after(made, until_ns))
-        return found
+            parts.append(self._after(made, until_ns))
+        return parts
 
     @property
     def _is_judged(self) -> bool:
@@ -323,32 +323,33 @@ class RunClaims:
     @property
     def certified_for(self) -> NetworkConditions | None:
         """The wider schedule that the certificates of the run's first late part cover."""
-        parts = (one.certified_for for one in self.parts if not isinstance(one, Claim))
-        return next((one for one in parts if one is not None), None)
+        parts = (part.certified_for for part in self.parts if not isinstance(part, Claim))
+        return next((conditions for conditions in parts if conditions is not None), None)
 
     def violations(self) -> list[AssumptionViolation]:
         """The assumptions that the run violated: in each part, the first violation of each."""
-        found = []
-        for one in self.parts:
-            if not isinstance(one, Claim):
-                from_s = one.part.from_s
-                found += [each._replace(t_s=each.t_s + from_s) for each in one.violations()]
-        return sorted(found, key=lambda one: one.t_s)
+        violations = []
+        for part in self.parts:
+            if not isinstance(part, Claim):
+                from_s = part.part.from_s
+                violations += [one._replace(t_s=one.t_s + from_s) for one in part.violations()]
+        return sorted(violations, key=lambda violation: violation.t_s)
 
     def judge(self) -> list[Claim]:
         """Every claim with its verdict, in the run's time."""
-        return [claim for one in self.parts for claim in ([one] if isinstance(one, Claim) else one.judge())]
+        judged = ([part] if isinstance(part, Claim) else part.judge() for part in self.parts)
+        return [claim for claims in judged for claim in claims]
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds, each over its own part of the run."""
         if self.record.scenario.plant.system.runs_user_code and not self._is_judged:
             self.certificates = ()  # reading a finished run does not run the code of its plant
-        found: list[Envelope] = []
-        for one in self.parts:
+        envelopes: list[Envelope] = []
+        for evaluation in self.parts:
             # Other bounds hold for deviations from another set-point, or start later.
-            if not isinstance(one, Claim) and one.part.from_s == 0 and self._setpoint is None:
-                found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
-        return found
+            if not isinstance(evaluation, Claim) and evaluation.part.from_s == 0 and self._setpoint is None:
+                envelopes += [_until(curve, evaluation.part.until_s) for curve in evaluation.envelopes()]
+        return envelopes
 
     def _after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
         """The claims about the part of the run that follows a change."""
@@ -387,9 +388,9 @@ def _offset(scenario: Scenario) -> float:
 
 def certify_late(claims: Sequence[RunClaims]) -> None:
     """Search together for the certificates of the runs that were later than allowed."""
-    firsts = [first for one in claims if isinstance(first := one.parts[0], ClaimEvaluation)]
-    for first, found in zip(firsts, late_certificates(firsts), strict=True):
-        first.wider = found
+    firsts = [first for run_claims in claims if isinstance(first := run_claims.parts[0], ClaimEvaluation)]
+    for first, certificates in zip(firsts, late_certificates(firsts), strict=True):
+        first.wider = certificates
 
 
 @lru_cache(maxsize=1)
@@ -444,8 +445,8 @@ def _part_of(record: RunRecord, scenario: Scenario, origin_ns: int, sequence: in
     if sequence is not None:
         # The part begins with the plant's state at the event, which noise may hide from the sensor.
         table = SENSOR_MEASUREMENT if scenario.coverage.knows_state else PLANT_STEP
-        found = filter(len, (derive(table, rows) for rows in record.source.batches(table)))
-        x_0 = next((rows["x"][0] for rows in found), x_0)
+        derived = filter(len, (derive(table, rows) for rows in record.source.batches(table)))
+        x_0 = next((rows["x"][0] for rows in derived), x_0)
     scenario = about_setpoint(scenario)
     update = {
         "plant": scenario.plant.model_copy(update={"initial_state": tuple(x_0.tolist())}),
@@ -522,7 +523,7 @@ def common_end_ns(record: RunRecord) -> int | None:
     if all(report.get("ended") == HORIZON for report in reports):
         return None
     reached_ns = [report.get("reached_ns") for report in reports]
-    known_ns = [int(one) for one in reached_ns if one is not None]
+    known_ns = [int(t_ns) for t_ns in reached_ns if t_ns is not None]
     measured_ns = record.last_ns(SENSOR_MEASUREMENT)
     if len(known_ns) < len(reports) or measured_ns is None:
         return None
@@ -540,8 +541,8 @@ def up_to_common_end(record: RunRecord) -> RunRecord:
         return record
     before: dict[str, int] = {}
     for role, (pace, column) in _PACES.items():
-        found = (rows["input"][rows[column] > end_ns] for rows in record.source.batches(pace))
-        first = next(filter(len, found), None)
+        later = (rows["input"][rows[column] > end_ns] for rows in record.source.batches(pace))
+        first = next(filter(len, later), None)
         before[role] = int(np.iinfo(np.int64).max if first is None else first[0])
 
     def derive(table: str, rows: Rows) -> Rows:

@@ -87,13 +87,13 @@ class Clocks:
 
     def observed(self) -> dict[str, Any]:
         """Return what was added since the last call, as fields of ``ObservedConditions``."""
-        found: dict[str, SampledSeries] = {}
+        errors: dict[str, SampledSeries] = {}
         for role in LOOP_ROLES:
             t_ns, error_ns = columns(self._rows.pop(role, []), 2)
             t_s, error_s, lost = t_ns * 1e-9, error_ns / NS_PER_S, error_ns == LOST_NS
-            found[clock_cause(role)] = SampledSeries(t_s[~lost], error_s[~lost]).in_order()
-            found[lost_cause(role)] = SampledSeries(t_s[lost], 0 * t_s[lost]).in_order()
-        return {"clocks": found, "largest_clock_error_s": self._largest_s}
+            errors[clock_cause(role)] = SampledSeries(t_s[~lost], error_s[~lost]).in_order()
+            errors[lost_cause(role)] = SampledSeries(t_s[lost], 0 * t_s[lost]).in_order()
+        return {"clocks": errors, "largest_clock_error_s": self._largest_s}
 
 
 class Receipts(NamedTuple):
@@ -210,8 +210,8 @@ class Inputs:
         sent_ns = self._model_ns(newest)
         model_ns = sent_ns + ahead_ns[:count]
         highest = np.maximum.accumulate(np.append(self._latched, newest))
-        there = newest != NO_SEQUENCE
-        controlled = there & (highest[1:] >= self._first_with_state(highest[1:]))
+        is_input = newest != NO_SEQUENCE
+        controlled = is_input & (highest[1:] >= self._first_with_state(highest[1:]))
         began = np.logical_or.accumulate(np.append(self.started, controlled))[:-1]
         if count:
             self.classified_ns = int(t_ns[-1])
@@ -224,7 +224,7 @@ class Inputs:
         age_ns = np.maximum(t_ns + self._period_ns - model_ns, model_ns - t_ns)
         replaced = controlled & self._replaces & too_old(t_ns, sent_ns, self._timeout_ns)
         # Until the first input with a state, the certificates assume that the input is 0.
-        safe = there & ~controlled & (began | ~(sizes == 0))
+        safe = is_input & ~controlled & (began | ~(sizes == 0))
         step_s, held = t_ns * 1e-9, controlled & ~replaced
         return (
             SampledSeries(step_s[held], age_ns[held] * 1e-9),
@@ -234,17 +234,17 @@ class Inputs:
 
     def _first_with_state(self, ticks: Times) -> Times:
         """The first tick with a state, of the same generation of the controller."""
-        found, of = np.full(len(ticks), NEVER), ticks // GENERATION
+        first_tick, of = np.full(len(ticks), NEVER), ticks // GENERATION
         for number, first in self._first_state.items():
-            found[of == number] = first
-        return found
+            first_tick[of == number] = first
+        return first_tick
 
     def _model_ns(self, newest: Times) -> Times:
         """Return the model time of each actuation; 0 if the actuation is not recorded."""
         sequence, t_ns = columns(self._actuations, 2)
-        found = np.searchsorted(sequence, newest)
-        there = np.append(sequence, NO_SEQUENCE)[found] == newest
-        model_ns = np.where(there & (newest != NO_SEQUENCE), np.append(t_ns, 0)[found], 0)
+        index = np.searchsorted(sequence, newest)
+        is_recorded = np.append(sequence, NO_SEQUENCE)[index] == newest
+        model_ns = np.where(is_recorded & (newest != NO_SEQUENCE), np.append(t_ns, 0)[index], 0)
         # A later step has the newest of these actuations, or a later one.
         used = int(np.searchsorted(sequence, newest[-1])) if len(newest) else 0
         self._actuations = [(sequence[used:], t_ns[used:])]
@@ -333,16 +333,16 @@ class _Updates:
         losses: list[tuple[int, float]] = []
         delays: list[tuple[int, int]] = []
         while self._events:
-            found = self._fate(*self._events[0], end_ns)
-            if found is None:
+            fate = self._fate(*self._events[0], end_ns)
+            if fate is None:
                 break
-            replaced_s, acts_ns = found
+            replaced_s, acts_ns = fate
             self._resolved, t_ns = self._events.popleft()
             losses.append((t_ns, replaced_s))
             # A delay before the first input is part of the start.
             if acts_ns is not None and acts_ns * 1e-9 > start_s:
                 delays.append((t_ns, max(acts_ns - t_ns, 0)))
-        for sequence in [one for one in self._passed if one <= self._resolved]:
+        for sequence in [passed for passed in self._passed if passed <= self._resolved]:
             del self._passed[sequence]
         lost, late = np.array(losses).reshape(-1, 2), np.array(delays).reshape(-1, 2)
         return (
@@ -511,10 +511,10 @@ class AssumptionMonitor:
         """Return the assumptions that were violated for the first time since the last call."""
         if self.stopped is not None:
             return []
-        found = self._new_violations(self._reader.observed())
+        violations = self._new_violations(self._reader.observed())
         if self.waiting > _MOST_WAITING:
             self.stop("a process has sent no rows for too long")
-        return found
+        return violations
 
     def end(self) -> list[AssumptionViolation]:
         """Return the violations from the rows that were still waiting; no more rows follow."""
@@ -526,8 +526,8 @@ class AssumptionMonitor:
         return self._reader.waiting
 
     @np.errstate(all="ignore")  # a run may diverge
-    def _new_violations(self, seen: ObservedConditions) -> list[AssumptionViolation]:
-        found = seen.violations(self._conditions, self._causes, self._states)
-        new = [one for one in found if one.t_s < self._until_s]
-        self._causes -= {one.cause for one in new}
+    def _new_violations(self, observed: ObservedConditions) -> list[AssumptionViolation]:
+        violations = observed.violations(self._conditions, self._causes, self._states)
+        new = [violation for violation in violations if violation.t_s < self._until_s]
+        self._causes -= {violation.cause for violation in new}
         return new

@@ -100,12 +100,12 @@ class SampledSeries(NamedTuple):
 
         Of these series, the first value above any limit and the largest value are the same.
         """
-        found = []
+        records = []
         for part in (self.t_s < since_s, self.t_s >= since_s):
             t_s, value = self.t_s[part], self.value[part]
             before = np.append(-np.inf, np.fmax.accumulate(value)[:-1]) if len(value) else value
-            found.append((t_s[value > before], value[value > before]))
-        (early_s, early), (late_s, late) = found
+            records.append((t_s[value > before], value[value > before]))
+        (early_s, early), (late_s, late) = records
         return SampledSeries(np.append(early_s, late_s), np.append(early, late))
 
 
@@ -185,7 +185,7 @@ class ObservedConditions(NamedTuple):
         ``states`` has the rules' states before the first event, by name, and receives those after
         the last; by default the run begins here.
         """
-        found: list[AssumptionViolation] = []
+        violations: list[AssumptionViolation] = []
         states = {} if states is None else states
         for rule in conditions.guarantee.rules:
             if causes is not None and rule.name not in causes:
@@ -195,7 +195,7 @@ class ObservedConditions(NamedTuple):
             if (excess := values.excess(rule.limit)) is not None:
                 first_s, worst = excess
                 text = rule.violation(worst)
-                found.append(AssumptionViolation(first_s, rule.name, worst, text))
+                violations.append(AssumptionViolation(first_s, rule.name, worst, text))
         start = SampledSeries(np.zeros(1), np.array([self.start_s]))
         every: dict[str, tuple[SampledSeries, float]] = {
             "sampling": (self.sampling, conditions.sampling_s),
@@ -215,25 +215,21 @@ class ObservedConditions(NamedTuple):
             if (excess := series.excess(limit)) is not None:
                 first_s, worst = excess
                 text = (_NO_INPUT if worst == np.inf else CAUSES[cause]).format(worst, limit)
-                found.append(AssumptionViolation(first_s, cause, worst, text))
-        return found
+                violations.append(AssumptionViolation(first_s, cause, worst, text))
+        return violations
 
     def first_violation(
         self, conditions: NetworkConditions, causes: Collection[str] | None = None
     ) -> VoidFrom | None:
         """Return the time at which the run first violated a condition; None if never."""
-        return earliest(VoidFrom(one.t_s, one.text) for one in self.violations(conditions, causes))
+        return earliest(VoidFrom(first.t_s, first.text) for first in self.violations(conditions, causes))
 
     def later_times(self, allowed: NetworkConditions) -> list[float]:
         """Return when the run became later than ``allowed``, and later than it had been so far."""
         start = SampledSeries(np.zeros(1), np.array([self.start_s]))
-        every = (
-            (self.delay, allowed.delay_s),
-            (self.hold, allowed.hold_s),
-            (start, allowed.start_s),
-        )
+        every = ((self.delay, allowed.delay_s), (self.hold, allowed.hold_s), (start, allowed.start_s))
         peaks = [(series.peaks(), limit_s + _TOLERANCE_S) for series, limit_s in every]
-        return sorted({t_s for one, most_s in peaks for t_s in one.t_s[one.value > most_s].tolist()})
+        return sorted({t_s for series, most_s in peaks for t_s in series.t_s[series.value > most_s].tolist()})
 
     def widened(self, allowed: NetworkConditions, until_s: float = np.inf) -> NetworkConditions:
         """Return conditions that the run's schedule meets up to a time.
@@ -262,7 +258,7 @@ class ObservedConditions(NamedTuple):
             "delay_s": self.delay.largest(),
             "hold_s": self.hold.largest(),
             "start_s": self.start_s if np.isfinite(self.start_s) else None,
-            "clock_error_s": max((one for one in clocks if one is not None), default=None),
+            "clock_error_s": max((error_s for error_s in clocks if error_s is not None), default=None),
         }
 
 
@@ -275,23 +271,23 @@ def combined(parts: Sequence[ObservedConditions]) -> ObservedConditions:
         return np.concatenate(t_s), np.concatenate(values)
 
     return last._replace(
-        losses=PacketLosses(*joined(one.losses for one in parts)),
-        sampling=SampledSeries(*joined(one.sampling for one in parts)).peaks(),
-        delay=SampledSeries(*joined(one.delay for one in parts)).peaks(),
-        hold=SampledSeries(*joined(one.hold for one in parts)).peaks(),
-        watchdog=SampledSeries(*joined(one.watchdog for one in parts)).peaks(),
-        safe_input=SampledSeries(*joined(one.safe_input for one in parts)).peaks(last.start_s),
-        restarts=SampledSeries(*joined(one.restarts for one in parts)),
+        losses=PacketLosses(*joined(part.losses for part in parts)),
+        sampling=SampledSeries(*joined(part.sampling for part in parts)).peaks(),
+        delay=SampledSeries(*joined(part.delay for part in parts)).peaks(),
+        hold=SampledSeries(*joined(part.hold for part in parts)).peaks(),
+        watchdog=SampledSeries(*joined(part.watchdog for part in parts)).peaks(),
+        safe_input=SampledSeries(*joined(part.safe_input for part in parts)).peaks(last.start_s),
+        restarts=SampledSeries(*joined(part.restarts for part in parts)),
         clocks={
-            cause: SampledSeries(*joined(one.clocks[cause] for one in parts)).in_order().peaks()
+            cause: SampledSeries(*joined(part.clocks[cause] for part in parts)).in_order().peaks()
             for cause in last.clocks
         },
     )
 
 
-def earliest(found: Iterable[VoidFrom | None]) -> VoidFrom | None:
+def earliest(candidates: Iterable[VoidFrom | None]) -> VoidFrom | None:
     """The first of several; None if there is none."""
-    return min(filter(None, found), default=None)
+    return min(filter(None, candidates), default=None)
 
 
 def causes_of(scenario: Scenario) -> Collection[str]:

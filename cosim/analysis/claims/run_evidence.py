@@ -28,7 +28,7 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
-from cosim.analysis.loop_statistics import SampleFacts, SampleFactsReader, signal_statistics
+from cosim.analysis.summary.loop_statistics import SampleFacts, SampleFactsReader, signal_statistics
 from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Matrix, Propagator, all_entries, row_norms, spectral_abscissa
@@ -188,15 +188,15 @@ class RunEvidence:
         widest = self.observed.widened(allowed, until_s)
         if not times_s or widest == allowed:
             return None
-        found: Sequence[ScenarioCertificate] = yield widest
-        if any(map(_exists, found)):
-            return found
+        certificates: Sequence[ScenarioCertificate] = yield widest
+        if any(map(_exists, certificates)):
+            return certificates
         best, kept, beyond = None, 0, len(times_s)
         while beyond - kept > 1:
             middle = (kept + beyond) // 2
-            found = yield self.observed.widened(allowed, times_s[middle])
-            if any(map(_exists, found)):
-                best, kept = found, middle
+            certificates = yield self.observed.widened(allowed, times_s[middle])
+            if any(map(_exists, certificates)):
+                best, kept = certificates, middle
             else:
                 beyond = middle
         return best
@@ -213,19 +213,19 @@ class RunEvidence:
         This is the scenario's schedule; or a wider one, if the run was later than allowed and there
         is a certificate nevertheless.
         """
-        found, void = [], self.part.void
-        for one, late in zip(self._scheduled, self.wider or self._scheduled, strict=True):
-            used = late if _exists(late) else one
-            if one.scope in void:
-                used = replace(one, constants=None, floor_constants=None, void=void[one.scope])
-            found.append(used)
-        return found
+        certificates, void = [], self.part.void
+        for scheduled, late in zip(self._scheduled, self.wider or self._scheduled, strict=True):
+            used = late if _exists(late) else scheduled
+            if scheduled.scope in void:
+                used = replace(scheduled, constants=None, floor_constants=None, void=void[scheduled.scope])
+            certificates.append(used)
+        return certificates
 
     @property
     def certified_for(self) -> NetworkConditions | None:
         """The wider schedule, if a certificate of it is used."""
-        used = [one.conditions for one in self.certificates if _exists(one)]
-        late = [one.conditions for one in self.wider or () if one.conditions in used]
+        used = [certificate.conditions for certificate in self.certificates if _exists(certificate)]
+        late = [certificate.conditions for certificate in self.wider or () if certificate.conditions in used]
         return late[0] if late else None
 
     @cached_property
@@ -235,14 +235,14 @@ class RunEvidence:
     @cached_property
     def observed(self) -> ObservedConditions:
         """The conditions under which the run took place."""
-        found = self._as_read
+        conditions = self._as_read
         if self.part.start_error is None:
-            return found
+            return conditions
         # The certificate's start error covers the inputs before the part's first one.
-        safe, restarts = found.safe_input, found.restarts
-        later, restarted = safe.t_s >= found.start_s, restarts.t_s > 0
-        return found._replace(
-            start_s=0.0 if np.isfinite(found.start_s) else found.start_s,
+        safe, restarts = conditions.safe_input, conditions.restarts
+        later, restarted = safe.t_s >= conditions.start_s, restarts.t_s > 0
+        return conditions._replace(
+            start_s=0.0 if np.isfinite(conditions.start_s) else conditions.start_s,
             safe_input=SampledSeries(safe.t_s[later], safe.value[later]),
             restarts=SampledSeries(restarts.t_s[restarted], restarts.value[restarted]),
         )
@@ -261,10 +261,10 @@ class RunEvidence:
         """The assumptions that the run violated, the guarantee included, each at the first time."""
         scenario = self.record.scenario
         rules = {*guarantee_causes(scenario)}
-        found = self.observed.violations(self.allowed, {*causes_of(scenario)} - rules)
+        violations = self.observed.violations(self.allowed, {*causes_of(scenario)} - rules)
         # An update that a newer one replaced within the certified delay is not lost.
-        found += self.observed.violations(self.certified_for or self.allowed, rules)
-        return [one for one in found if one.t_s < self.part.until_s]
+        violations += self.observed.violations(self.certified_for or self.allowed, rules)
+        return [violation for violation in violations if violation.t_s < self.part.until_s]
 
     @cached_property
     def first_gap(self) -> VoidFrom | None:
@@ -273,7 +273,7 @@ class RunEvidence:
         The record is incomplete, or the error of a process's clock is not bounded as required.
         """
         limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
-        found = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
+        gaps = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
         whole = self.part.whole or self.record
         for role in LOOP_ROLES:
             if whole.is_complete(role):
@@ -281,11 +281,11 @@ class RunEvidence:
             gaps_ns = filter(None, (life.hole_ns for life in whole.lives(role)))
             times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
             why = f"rows of {role} are missing from the record"
-            found += [VoidFrom(t_s, why) for t_s in times_s if t_s >= 0]
+            gaps += [VoidFrom(t_s, why) for t_s in times_s if t_s >= 0]
         if (gap_s := self.facts.gap_s) is not None:
             why = "the controller's error is not on record, or not finite"
-            found.append(VoidFrom(gap_s, why))
-        return earliest(found)
+            gaps.append(VoidFrom(gap_s, why))
+        return earliest(gaps)
 
     @cached_property
     def paper_violation(self) -> VoidFrom | None:
@@ -371,11 +371,11 @@ def _exists(certificate: ScenarioCertificate) -> bool:
 
 def late_certificates(runs: Sequence[RunEvidence]) -> list[Sequence[ScenarioCertificate] | None]:
     """Return the certificates under the widest of the late schedules of each run, if any."""
-    found: list[Sequence[ScenarioCertificate] | None] = [None] * len(runs)
+    certificates_of: list[Sequence[ScenarioCertificate] | None] = [None] * len(runs)
     due: list[tuple[int, LateSchedules, Sequence[ScenarioCertificate] | None]] = [
-        (number, one.late_schedules(), None)
-        for number, one in enumerate(runs)
-        if one.record.scenario.coverage.can_be_certified
+        (number, run.late_schedules(), None)
+        for number, run in enumerate(runs)
+        if run.record.scenario.coverage.can_be_certified
     ]
     while due:
         tried: list[tuple[int, LateSchedules, NetworkConditions]] = []
@@ -384,14 +384,14 @@ def late_certificates(runs: Sequence[RunEvidence]) -> list[Sequence[ScenarioCert
                 conditions = next(search) if certificates is None else search.send(certificates)
                 tried.append((number, search, conditions))
             except StopIteration as best:
-                found[number] = best.value
+                certificates_of[number] = best.value
         answers = certificates_together(
             [runs[number].record.scenario for number, *_ in tried],
             [runs[number].part.start_error for number, *_ in tried],
             [conditions for *_, conditions in tried],
         )
-        due = [(*one[:2], answer) for one, answer in zip(tried, answers, strict=True)]
-    return found
+        due = [(*search[:2], answer) for search, answer in zip(tried, answers, strict=True)]
+    return certificates_of
 
 
 def scheduled_certificates(scenario: Scenario, start_error: float | None = None) -> list[ScenarioCertificate]:
@@ -399,8 +399,8 @@ def scheduled_certificates(scenario: Scenario, start_error: float | None = None)
 
     A part of a run that starts with an input of the part before has a ``start_error``.
     """
-    (found,) = certificates_together([scenario], [start_error])
-    return found
+    (certificates,) = certificates_together([scenario], [start_error])
+    return certificates
 
 
 def certificates_together(
@@ -424,10 +424,10 @@ def certificates_together(
         for scope in scopes(scenario, error):
             searches.append(scope.search(limits))
             numbers.append(number)
-    found: list[list[ScenarioCertificate]] = [[] for _ in scenarios]
+    by_scenario: list[list[ScenarioCertificate]] = [[] for _ in scenarios]
     for number, certificate in zip(numbers, completed(searches), strict=True):
-        found[number].append(certificate)
-    return found
+        by_scenario[number].append(certificate)
+    return by_scenario
 
 
 class _Start(NamedTuple):
@@ -461,11 +461,11 @@ def trajectory_delta(record: RunRecord, until_s: float = math.inf) -> float | No
             first += 1
         if first <= index and start.received != NO_SEQUENCE:
             stretches[first] = index + 1
-    found = [
+    deltas = [
         theorem_1(loop.H, trigger.alpha_per_s, missed_s)
         for missed_s in undominated([longest_s[first:end] for first, end in stretches.items()])
     ]
-    delta = max(found, default=1.0)
+    delta = max(deltas, default=1.0)
     return delta if math.isfinite(delta) else None
 
 
@@ -479,10 +479,10 @@ def undominated(stretches: Sequence[Sequence[float]]) -> list[Sequence[float]]:
     for row, stretch in zip(reaches, stretches, strict=True):
         row[: len(stretch)] = np.cumsum(stretch[::-1])[::-1]
     largest: list[int] = []
-    for place in np.argsort(-reaches.sum(axis=1), kind="stable").tolist():
-        if not (reaches[largest] >= reaches[place]).all(axis=1).any():
-            largest.append(place)
-    return [stretches[place] for place in largest]
+    for index in np.argsort(-reaches.sum(axis=1), kind="stable").tolist():
+        if not (reaches[largest] >= reaches[index]).all(axis=1).any():
+            largest.append(index)
+    return [stretches[index] for index in largest]
 
 
 def _model_decay(record: RunRecord) -> float:
@@ -512,16 +512,16 @@ def _intervals(record: RunRecord, until_s: float) -> Iterator[tuple[_Start, Inte
         before = len(t_ns)
         t_ns, x = np.append(t_ns, joined.t_ns), np.concatenate([x, joined.x])
         first = 0
-        for place in np.flatnonzero(event != NO_SEQUENCE).tolist():
+        for row in np.flatnonzero(event != NO_SEQUENCE).tolist():
             if start is not None:
                 yield (
                     start,
-                    interval(t_ns[first : before + place + 1], x[first : before + place + 1]),
+                    interval(t_ns[first : before + row + 1], x[first : before + row + 1]),
                 )
-            start, first = None, before + place
-            if joined.t_ns[place] * 1e-9 >= until_s:
+            start, first = None, before + row
+            if joined.t_ns[row] * 1e-9 >= until_s:
                 return
-            start = _Start(int(event[place]), int(joined.received[place]))
+            start = _Start(int(event[row]), int(joined.received[row]))
         if start is None:
             first = len(t_ns)
         t_ns, x = t_ns[first:], x[first:]

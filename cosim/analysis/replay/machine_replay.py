@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
-from cosim.analysis.summary_model import ReplayDifference
+from cosim.analysis.summary.summary_model import ReplayDifference
 from cosim.record.processes import Life, split_by_life
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
@@ -99,10 +99,10 @@ class InputReplay:
         """
         replay = self._core
         tables = {table: np.ascontiguousarray(rows) for table, rows in owned.items()}
-        for place, table in enumerate(tables):
-            replay.tables[place] = _recorded_table(table, tables[table])
-        for place in range(len(tables), 4):
-            replay.tables[place].count = 0
+        for number, table in enumerate(tables):
+            replay.tables[number] = _recorded_table(table, tables[table])
+        for number in range(len(tables), 4):
+            replay.tables[number].count = 0
         order = np.ascontiguousarray(order, np.int64)
         self._sent = np.empty(((1 + self._is_network) * len(order), replay.sent_width), np.int64)
         replay.order, replay.count = pointer_to(order, "int64_t *"), len(order)
@@ -173,8 +173,8 @@ class InputReplay:
             replayed[LOOP] = recorded[LOOP]
         if replay.difference == core.NOACK_EQUAL and replayed.tobytes() != recorded.tobytes():
             self._explain(place_of)
-            found = rows_differ(table, place_of.number(table, row), recorded, replayed)
-            self.difference = self.difference or found
+            first_difference = rows_differ(table, place_of.number(table, row), recorded, replayed)
+            self.difference = self.difference or first_difference
         replay.before_ns = int(recorded["now_ns"])
         replay.next += 1
 
@@ -201,12 +201,12 @@ class InputReplay:
             number = place_of.number(table, row)
             self.difference = rows_differ(table, number, rows[row], replayed[0])
 
-    def _note(self, place_of: "_Places", at: int, what: str, column: str = "", *values: int | None) -> None:
+    def _note(self, place_of: "_Places", at: int, text: str, column: str = "", *values: int | None) -> None:
         """Keep a difference at an input, if it is the first one."""
         table, row, rows = place_of(at)
         number, now_ns = place_of.number(table, row), int(rows["now_ns"][row])
         if self.difference is None:
-            self.difference = difference(table, number, now_ns, what, column, *values)
+            self.difference = difference(table, number, now_ns, text, column, *values)
 
 
 class _Places:
@@ -225,12 +225,12 @@ class _Places:
         return self._before[table] + row
 
 
-def table_and_row(owned: Slice, place: int) -> tuple[str, int]:
+def table_and_row(owned: Slice, row: int) -> tuple[str, int]:
     """Return table and row of a place among the rows of all tables."""
     for table, rows in owned.items():
-        if place < len(rows):
-            return table, place
-        place -= len(rows)
+        if row < len(rows):
+            return table, row
+        row -= len(rows)
     raise IndexError("the tables have fewer rows")
 
 
@@ -315,18 +315,18 @@ class SharedMachines:
 
     def __init__(self, records: Sequence[RunRecord]) -> None:
         self._loops = [
-            record for record in records if record.is_short and not any(record.count(one) for one in SETTINGS)
+            record for record in records if record.is_short and not any(map(record.count, SETTINGS))
         ]
 
     def place(self, record: RunRecord) -> int | None:
         """Return the place of a loop among the machines; None if they do not have it."""
-        numbers = [one.number for one in self._loops]
+        numbers = [loop.number for loop in self._loops]
         return numbers.index(record.number) if record.number in numbers else None
 
     @cached_method
     def of(self, role: str) -> LoopMachines:
         """Return the machines of a role."""
-        return _MACHINES[role]([one.scenario for one in self._loops], start=Start(0))
+        return _MACHINES[role]([loop.scenario for loop in self._loops], start=Start(0))
 
 
 class MachineReplay:
@@ -369,7 +369,7 @@ class _LifeReplay:
         self._run: InputReplay | None = None
         self._count = sum(life.rows.values())
         report = life.report
-        self._written = None if report is None else sum(report["rows"][one] for one in life.rows)
+        self._written = None if report is None else sum(report["rows"][table] for table in life.rows)
         ends_early = self._written is not None and self._written > self._count
         self._missing_from = self._count if ends_early else None
         self._damage: ReplayDifference | None = None
@@ -399,22 +399,22 @@ class _LifeReplay:
         if role == "netem":
             channel = channel_of(scenario, start, loops=len(loops_of(scenario)))
             return InputReplay(role, channel, sizes)
-        place = None if generation else self._shared.place(self._record)
-        if place is not None:
-            return InputReplay(role, self._shared.of(role), sizes, place)
+        position = None if generation else self._shared.place(self._record)
+        if position is not None:
+            return InputReplay(role, self._shared.of(role), sizes, position)
         return InputReplay(role, _MACHINES[role]((scenario,), start=start), sizes)
 
     def result(self) -> ProcessReplay:
         generation = self._life.generation
         differs = None if self._run is None else self._run.difference
-        found = [one for one in (differs, self._damage) if one is not None]
+        differences = [first for first in (differs, self._damage) if first is not None]
         return ProcessReplay(
             process=f"{self._role} ({generation + 1})" if generation else self._role,
             inputs=self._count,
             compared=self._compared,
             missing_from=self._missing_from,
             end_known=self._life.report is not None,
-            difference=min(found, key=lambda one: one.now_ns, default=None),
+            difference=min(differences, key=lambda difference: difference.now_ns, default=None),
         )
 
     def _in_order(self, owned: Slice) -> Numbers:

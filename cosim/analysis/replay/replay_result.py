@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.summary_model import ReplayDifference, ReplayPart, SummaryPart
+from cosim.analysis.summary.summary_model import ReplayDifference, ReplayPart, SummaryPart
 from noack.protocol.record_tables import entry_names
 
 Value = float | int | str | None
@@ -20,7 +20,7 @@ def difference(
     table: str,
     row: int,
     now_ns: int,
-    what: str,
+    description: str,
     column: str = "",
     recorded: object = None,
     replayed: object = None,
@@ -35,7 +35,7 @@ def difference(
         recorded_hex=first_hex,
         replayed=second,
         replayed_hex=second_hex,
-        what=what,
+        what=description,
         now_ns=now_ns,
     )
 
@@ -45,9 +45,9 @@ def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> R
     now_ns = int(recorded["now_ns"])
     for name in recorded.dtype.names or ():
         if (entry := first_entry(recorded[name], replayed[name])) is not None:
-            place, *values = entry
+            index, *values = entry
             width = np.size(recorded[name])
-            column = entry_names(name, width)[place] if np.ndim(recorded[name]) else name
+            column = entry_names(name, width)[index] if np.ndim(recorded[name]) else name
             return difference(table, row, now_ns, "the row differs", column, *values)
     raise ValueError("the rows are equal")
 
@@ -129,9 +129,9 @@ class Replay(SummaryPart):
     @property
     def first_difference(self) -> ReplayDifference | None:
         """The earliest difference by recorded time; at equal times messages come before rows."""
-        found = [messages.difference for messages in self.messages]
-        found += [process.difference for process in self.processes]
-        return min(filter(None, found), key=lambda one: one.now_ns, default=None)
+        differences = [messages.difference for messages in self.messages]
+        differences += [process.difference for process in self.processes]
+        return min(filter(None, differences), key=lambda difference: difference.now_ns, default=None)
 
     @property
     def bit_exact(self) -> bool | None:
@@ -158,20 +158,20 @@ class Replay(SummaryPart):
         return verdict | {"gaps": self.gaps} | self.model_dump()
 
 
-def print_replay(console: Console, found: Replay, changed: Sequence[str]) -> None:
+def print_replay(console: Console, replay: Replay, changed: Sequence[str]) -> None:
     """Print the result of a replay, and what ``changed`` since the run on its computer."""
     table = Table(title="replay, compared bit for bit")
     for heading in ("process or link", "recorded", "compared", "verdict"):
         table.add_column(heading, justify="left" if heading == "process or link" else "right")
-    rows = [(one.process, one.inputs, one.compared, one.difference) for one in found.processes]
-    rows += [(one.leg, one.received, one.compared, one.difference) for one in found.messages]
+    rows = [(node.process, node.inputs, node.compared, node.difference) for node in replay.processes]
+    rows += [(link.leg, link.received, link.compared, link.difference) for link in replay.messages]
     for name, recorded, compared, difference in rows:
         table.add_row(name, f"{recorded:,}", f"{compared:,}", _verdict(compared, difference))
     console.print(table)
-    lines = [f"[bold yellow]record incomplete:[/] {escape(gap)}" for gap in found.gaps]
-    if (first := found.first_difference) is None:
-        word = f"bit-exact: {found.inputs:,} inputs" if found.inputs else "nothing to compare"
-        lines.append(word + (" so far as the record goes" if found.gaps else ""))
+    lines = [f"[bold yellow]record incomplete:[/] {escape(gap)}" for gap in replay.gaps]
+    if (first := replay.first_difference) is None:
+        word = f"bit-exact: {replay.inputs:,} inputs" if replay.inputs else "nothing to compare"
+        lines.append(word + (" so far as the record goes" if replay.gaps else ""))
     else:
         lines.append(f"[bold red]first difference:[/] {escape(str(first))}")
         lines += [
@@ -185,6 +185,6 @@ def print_replay(console: Console, found: Replay, changed: Sequence[str]) -> Non
 
 def _verdict(compared: int, difference: ReplayDifference | None) -> str:
     if difference is not None:
-        place = f"{difference.table}[{difference.row}].{difference.column}".rstrip(".")
-        return f"[red]≠[/] {escape(place)}"
+        cell = f"{difference.table}[{difference.row}].{difference.column}".rstrip(".")
+        return f"[red]≠[/] {escape(cell)}"
     return "bit-exact" if compared else "-"

@@ -21,7 +21,7 @@ from cosim.analysis.replay.machine_replay import (
     received_words,
 )
 from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, Replay, difference, first_entry
-from cosim.analysis.summary_model import ReplayPart
+from cosim.analysis.summary.summary_model import ReplayPart
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from noack.protocol.record_tables import (
@@ -65,7 +65,7 @@ class MessageComparison:
             packets = part[NETEM_PACKET][part[NETEM_PACKET]["release_ns"] >= 0]
             forwarded = [(packets["flow"], packets["head"])]
         else:
-            forwarded = [one.forwarded() for one in netem.newest]
+            forwarded = [packets.forwarded() for packets in netem.newest]
         survivors = [(flows, headers_of(heads)) for flows, heads in forwarded]
         for hop in self._hops:
             hop.take(part, survivors)
@@ -75,8 +75,8 @@ class MessageComparison:
         netem = self._machines.get("netem")
         # A killed emulator may have forwarded messages whose rows are missing.
         whole = self._record.is_complete("netem") if netem is None else netem.whole
-        found = [hop.result(network_is_whole=whole) for hop in self._hops]
-        return (*found, *_compare_changes(self._record))
+        results = [hop.result(network_is_whole=whole) for hop in self._hops]
+        return (*results, *_compare_changes(self._record))
 
 
 def _hops(network: Sequence[Flow]) -> Iterator[tuple[str, str, Flow]]:
@@ -92,21 +92,21 @@ def _hops(network: Sequence[Flow]) -> Iterator[tuple[str, str, Flow]]:
 
 def _compare_changes(record: RunRecord) -> Iterator[MessagesReplay]:
     """Compare the changes that the processes received, if there were any."""
-    first: dict[int, tuple[object, ...]] = {}
-    compared, found = 0, None
+    received_first: dict[int, tuple[object, ...]] = {}
+    compared, first = 0, None
     for table in SETTINGS:
-        for place, row in enumerate(record[table]):
+        for index, row in enumerate(record[table]):
             number = int(row["sequence"])
             change = (int(row["t_ns"]), row["change"].tobytes())
-            compared += number in first
-            known = first.setdefault(number, change)
-            for column, one, other in zip(("t_ns", "change"), change, known, strict=True):
-                if one != other and found is None:
-                    what = "another process received another change"
-                    found = difference(table, place, int(row["now_ns"]), what, column, one, other)
+            compared += number in received_first
+            known = received_first.setdefault(number, change)
+            for column, value, other in zip(("t_ns", "change"), change, known, strict=True):
+                if value != other and first is None:
+                    at_ns, text = int(row["now_ns"]), "another process received another change"
+                    first = difference(table, index, at_ns, text, column, value, other)
     received = sum(len(record[table]) for table in SETTINGS)
     if received:
-        yield MessagesReplay(leg="coordinator → all", received=received, compared=compared, difference=found)
+        yield MessagesReplay(leg="coordinator → all", received=received, compared=compared, difference=first)
 
 
 def headers_of(heads: NDArray[np.void]) -> Rows:
@@ -169,8 +169,8 @@ class _Hop:
         By its receiver's clock, a message may be received before it was sent by its sender's, if
         they are on different hosts, and so in the part before.
         """
-        for one in self._sender.newest:
-            self._add(one.sent_in(self._flow))
+        for packets in self._sender.newest:
+            self._add(packets.sent_in(self._flow))
         if self._was_forwarded:
             for flows, headers in survivors:
                 mine = headers[(flows == self._direction) & (headers["magic"] == MAGIC)]
@@ -208,11 +208,11 @@ class _Hop:
         counts = {_SENT: self._sender.whole, _FORWARDED: network_is_whole}
         kinds = [kind for kind in (_CONTENT, _SENT, _FORWARDED) if counts.get(kind, True)]
         firsts = [self._first[kind] for kind in kinds if kind in self._first]
-        first, found = min(firsts, key=lambda one: one.row, default=None), None
+        first, first_difference = min(firsts, key=lambda difference: difference.row, default=None), None
         if first is not None:
-            found = difference(self._table, *first[1:])
+            first_difference = difference(self._table, *first[1:])
         return MessagesReplay(
-            leg=self._leg, received=self._received, compared=self._compared, difference=found
+            leg=self._leg, received=self._received, compared=self._compared, difference=first_difference
         )
 
     def _add(self, sent: Numbers) -> None:
@@ -255,8 +255,8 @@ class _Hop:
             elif t_ns != (sent_ns := int(sent[row, TIME])):
                 self._differs(row, "differs from the message sent", "t_ns", t_ns, sent_ns)
             elif entry := first_entry(*(of[row, VECTOR:].view(np.float64) for of in (words, sent))):
-                place, *values = entry
-                self._differs(row, "differs from the message sent", entries[place], *values)
+                index, *values = entry
+                self._differs(row, "differs from the message sent", entries[index], *values)
 
     def _compare_heads(self) -> None:
         """Compare the part of a datagram that netem records: its first bytes and its size."""
@@ -283,14 +283,14 @@ class _Hop:
         differs = first_bytes(headers) != first_bytes(expected)
         for row in np.flatnonzero(differs.any(axis=1) | (sizes != size_bytes)).tolist():
             head, size = self._rows["head"][row].tobytes(), int(sizes[row])
-            what = "differs from the message sent"
+            description = "differs from the message sent"
             if not known[row]:
                 kind = _CONTENT if sequences[row] < 0 else _SENT
                 self._differs(row, "was never sent", "head", head, kind=kind)
             elif differs[row].any():
-                self._differs(row, what, "head", head, expected[row].tobytes())
+                self._differs(row, description, "head", head, expected[row].tobytes())
             else:
-                self._differs(row, what, "size_bytes", size, size_bytes)
+                self._differs(row, description, "size_bytes", size, size_bytes)
 
     def _compare_flows(self) -> None:
         """Check that only the sensor's flow was forwarded."""
@@ -302,13 +302,13 @@ class _Hop:
         """Check that the network forwarded every received message."""
         for row, sequence in enumerate(self._rows["sequence"].tolist()):
             if sequence not in self._survivors:
-                what = "netem did not forward it"
-                self._differs(row, what, "sequence", sequence, kind=_FORWARDED)
+                description = "netem did not forward it"
+                self._differs(row, description, "sequence", sequence, kind=_FORWARDED)
 
     def _differs(
         self,
         row: int,
-        what: str,
+        description: str,
         column: str,
         recorded: object,
         replayed: object = None,
@@ -317,9 +317,9 @@ class _Hop:
     ) -> None:
         known = self._first.get(kind)
         if known is None or self._received + row < known.row:
-            place, now_ns = self._read + int(self._at[row]), int(self._rows["now_ns"][row])
+            row_read, now_ns = self._read + int(self._at[row]), int(self._rows["now_ns"][row])
             self._first[kind] = _Difference(
-                self._received + row, place, now_ns, what, column, recorded, replayed
+                self._received + row, row_read, now_ns, description, column, recorded, replayed
             )
 
 
@@ -344,7 +344,7 @@ def replay(record: RunRecord, shared: SharedMachines | None = None) -> Replay:
                 machine.take(part)
             if messages is not None:
                 messages.take(part)
-    results = tuple(result for one in machines.values() for result in one.results)
+    results = tuple(result for machine in machines.values() for result in machine.results)
     return Replay(processes=results, messages=() if messages is None else messages.results())
 
 
@@ -356,10 +356,10 @@ def replay_run(run: RecordedRun, loop: str | None = None) -> Replay:
     """
     if loop is not None or len(run.loops) == 1:
         return replay(run.loop(loop))
-    found = [replay(run.network), *map(replay, run.loops)]
+    replays = [replay(run.network), *map(replay, run.loops)]
     # A restarted process has a result of its own.
-    processes = _by_name((one.process, one) for each in found for one in each.processes)
-    messages = _by_name((one.leg, one) for each in found for one in each.messages)
+    processes = _by_name((result.process, result) for replayed in replays for result in replayed.processes)
+    messages = _by_name((result.leg, result) for replayed in replays for result in replayed.messages)
     in_order = sorted(processes, key=lambda name: LOOP_ROLES.index(name.split()[0]))
     return Replay(
         processes=tuple(_added(processes[name]) for name in in_order),
@@ -373,20 +373,20 @@ def stored_verdict(run_dir: Path) -> ReplayPart:
 
 
 def _by_name(named: Iterable[tuple[str, Result]]) -> dict[str, list[Result]]:
-    found: dict[str, list[Result]] = {}
-    for name, one in named:
-        found.setdefault(name, []).append(one)
-    return found
+    by_name: dict[str, list[Result]] = {}
+    for name, result in named:
+        by_name.setdefault(name, []).append(result)
+    return by_name
 
 
-def _added(found: Sequence[Result]) -> Result:
+def _added(results: Sequence[Result]) -> Result:
     """Return the results of a process, or of a link, of all loops as one."""
-    differences = filter(None, (one.difference for one in found))
-    sums = {"inputs", "compared", "received"} & vars(found[0]).keys()
-    update: dict[str, object] = {name: sum(getattr(one, name) for one in found) for name in sums}
-    update["difference"] = min(differences, key=lambda one: one.now_ns, default=None)
-    if isinstance(found[0], ProcessReplay):
-        missing = (one.missing_from for one in found if one.missing_from is not None)
+    differences = filter(None, (result.difference for result in results))
+    sums = {"inputs", "compared", "received"} & vars(results[0]).keys()
+    update: dict[str, object] = {name: sum(getattr(result, name) for result in results) for name in sums}
+    update["difference"] = min(differences, key=lambda difference: difference.now_ns, default=None)
+    if isinstance(results[0], ProcessReplay):
+        missing = (result.missing_from for result in results if result.missing_from is not None)
         update["missing_from"] = next(missing, None)
-        update["end_known"] = all(one.end_known for one in found)
-    return found[0].model_copy(update=update)
+        update["end_known"] = all(result.end_known for result in results)
+    return results[0].model_copy(update=update)

@@ -20,7 +20,7 @@ with lazy_modules():
     import cosim.analysis.replay.run_replay as run_replay
     import cosim.api.runs as run_library
     from cosim.analysis import fidelity as fidelity_analysis
-    from cosim.analysis import run_summary
+    from cosim.analysis.summary import run_summary
     from cosim.live import finalize
     from cosim.output import result_tables, run_tables, run_verdict
     from cosim.output.figures import figure_files, run_figures

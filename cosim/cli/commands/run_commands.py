@@ -14,9 +14,9 @@ from noack.core.errors import CallerError
 from noack.core.number_format import number
 
 with lazy_modules():
-    from cosim.analysis import summary_model
-    from cosim.live import progress, remote_access, simulated_run
-    from cosim.live.bridge import ros2_bridge
+    from cosim.analysis.summary import summary_model
+    from cosim.live import remote_access, simulated_run
+    from cosim.live.monitoring import progress, ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict
     from cosim.simulation import continuous
     from noack.runtime import control_messages, run_registry

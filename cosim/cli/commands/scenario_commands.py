@@ -21,8 +21,9 @@ from noack.core.file_access import new_file
 
 with lazy_modules():
     from controller_node import controller
-    from cosim.analysis import run_summary
-    from cosim.live import child_processes, launcher
+    from cosim.analysis.summary import run_summary
+    from cosim.live import launcher
+    from cosim.live.processes import child_processes
     from cosim.output import run_verdict
     from cosim.studies.campaign import campaign_file
     from cosim.studies.new_loop import linear_model, new_scenario

@@ -20,7 +20,7 @@ from noack.core.file_access import write_whole
 from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
-    from cosim.live import progress
+    from cosim.live.monitoring import progress
     from cosim.output import result_tables
     from cosim.studies.campaign import campaign_file, campaign_grid, campaign_report
     from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result

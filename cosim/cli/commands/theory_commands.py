@@ -16,7 +16,7 @@ with lazy_modules():
     import cosim.analysis.adversary.worst_run as worst_run
     from cosim.analysis import adversary as adversary_search
     from cosim.analysis import certificates, margin_search, mean_cost
-    from cosim.live import progress
+    from cosim.live.monitoring import progress
     from cosim.output import certificate_report
     from cosim.output.export import mat_export
     from noack.scenario import resolution

@@ -18,7 +18,7 @@ from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_obje
 from noack.core.errors import CallerError
 
 with lazy_modules():
-    from cosim.analysis import summary_model
+    from cosim.analysis.summary import summary_model
     from cosim.record import run_record
 
 if TYPE_CHECKING:

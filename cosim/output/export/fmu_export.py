@@ -152,7 +152,7 @@ def _archive(resolved: Scenario, role: str) -> bytes:
         identifier=identifier,
         stop_s=resolved.timing.horizon_ns / NS_PER_S,
         step_s=resolved.timing.plant_period_ns / NS_PER_S,
-        variables="\n".join(_element(role, ref, *one) for ref, one in variables.items()),
+        variables="\n".join(_element(role, ref, *variable) for ref, variable in variables.items()),
         structure="\n".join(
             f'    <{tag} valueReference="{reference}"/>'
             for tag in ("Output", "InitialUnknown")
@@ -219,34 +219,34 @@ class _Image:
         self.head.values[reference] = (len(numbers), is_real, is_input, at)
 
     def add_structure(
-        self, found: CData, rows: Mapping[str, int], places: Mapping[str, int] | None = None
+        self, structure: CData, rows: Mapping[str, int], places: Mapping[str, int] | None = None
     ) -> int:
         """Append a copy of a structure and of its arrays; return its place.
 
         Args:
-            found: a pointer to it.
+            structure: a pointer to it.
             rows: the number of rows of each array, by the name of the pointer; a dot separates the
                 names of inner structures.
             places: where the targets of other pointers are.
         """
-        kind, place, targets = ffi.typeof(found).item, self._add(found), dict(places or {})
+        kind, offset, targets = ffi.typeof(structure).item, self._add(structure), dict(places or {})
         for name, count in rows.items():
-            array = found
+            array = structure
             for part in name.split("."):
                 array = getattr(array, part)
             if array != ffi.NULL:
                 targets[name] = self._add(array, count * ffi.sizeof(ffi.typeof(array).item))
         for name, target in targets.items():
             fields = (int(part) if part.isdigit() else part for part in name.split("."))
-            pointer_at = place + ffi.offsetof(kind, *fields)
+            pointer_at = offset + ffi.offsetof(kind, *fields)
             self._pointers.append((pointer_at, target))
             self._data[pointer_at : pointer_at + 8] = target.to_bytes(8, sys.byteorder)
-        return place
+        return offset
 
     def _add(self, rows: CData, size: int = -1) -> int:
-        place, content = len(self._data), bytes(ffi.buffer(rows, size))
+        offset, content = len(self._data), bytes(ffi.buffer(rows, size))
         self._data += content + bytes(-len(content) % 8)
-        return place
+        return offset
 
 
 def _add_channel(image: _Image, resolved: Scenario) -> int:

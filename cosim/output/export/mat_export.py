@@ -51,17 +51,17 @@ def save_mat(content: Mapping[str, object], path: Path) -> list[Path]:
 
 def _content(run: ExportedRun, *, certificates: bool) -> dict[str, object]:
     record = run.record
-    found: dict[str, object] = {table: _columns(record[table]) for table in record.tables}
-    found["summary"] = run.summary
-    found["scenario"] = record.scenario.model_dump(mode="json", exclude_none=True)
-    found["environment"] = run.environment
+    content: dict[str, object] = {table: _columns(record[table]) for table in record.tables}
+    content["summary"] = run.summary
+    content["scenario"] = record.scenario.model_dump(mode="json", exclude_none=True)
+    content["environment"] = run.environment
     if record.is_network:
-        found["loops"] = {loop.name: _content(loop, certificates=certificates) for loop in run.inner}
-        return found
+        content["loops"] = {loop.name: _content(loop, certificates=certificates) for loop in run.inner}
+        return content
     for name, table in (("samples", samples(record)), ("events", events(record))):
-        found[name] = {column: _array(table[column].to_numpy()) for column in table.column_names}
+        content[name] = {column: _array(table[column].to_numpy()) for column in table.column_names}
     loop = record.loop
-    found["loop"] = {
+    content["loop"] = {
         "A": loop.A,
         "B": loop.B,
         "K": loop.K,
@@ -71,8 +71,8 @@ def _content(run: ExportedRun, *, certificates: bool) -> dict[str, object]:
         "input_names": list(loop.input_names),
     }
     if certificates:
-        found["certificates"] = _certificates(record.scenario)
-    return found
+        content["certificates"] = _certificates(record.scenario)
+    return content
 
 
 def _certificates(scenario: Scenario) -> dict[str, object]:
@@ -85,13 +85,13 @@ def _certificates(scenario: Scenario) -> dict[str, object]:
 
 def _columns(rows: Rows) -> dict[str, object]:
     """Return the columns of a table: (k, 1), vectors (k, n), bytes (k, width)."""
-    found: dict[str, object] = {}
+    columns: dict[str, object] = {}
     for name in rows.dtype.names or ():
         column = rows[name]
         if column.dtype.kind == "V":
             column = np.frombuffer(column.tobytes(), np.uint8).reshape(len(rows), column.itemsize)
-        found[name] = column
-    return found
+        columns[name] = column
+    return columns
 
 
 def _array(values: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -99,10 +99,10 @@ def _array(values: NDArray[np.generic]) -> NDArray[np.generic]:
 
 
 def _fields(content: Mapping[str, object]) -> dict[str, object]:
-    found: dict[str, object] = {}
+    fields: dict[str, object] = {}
     for key, entry in content.items():
-        found[_free_name(_name(key), found)] = _structure(entry)
-    return found
+        fields[_free_name(_name(key), fields)] = _structure(entry)
+    return fields
 
 
 def _structure(value: object) -> object:
@@ -118,16 +118,16 @@ def _structure(value: object) -> object:
 
 def _array_or_cells(values: Sequence[object]) -> NDArray[np.generic]:
     """Return numbers as an array; anything else as a cell array."""
-    numeric = [isinstance(one, int | float) and not isinstance(one, bool) for one in values]
+    numeric = [isinstance(value, int | float) and not isinstance(value, bool) for value in values]
     if values and all(numeric):
         return np.array(values, dtype=np.float64)
-    if values and all(isinstance(one, list | tuple) and one for one in values):
-        rows = [_array_or_cells(one) for one in values if isinstance(one, list | tuple)]
+    if values and all(isinstance(value, list | tuple) and value for value in values):
+        rows = [_array_or_cells(value) for value in values if isinstance(value, list | tuple)]
         if all(row.dtype == np.float64 and row.shape == rows[0].shape for row in rows):
             return np.array(rows)
     cells = np.empty((len(values), 1), dtype=object)
-    for i, one in enumerate(values):
-        cells[i, 0] = _structure(one)
+    for i, value in enumerate(values):
+        cells[i, 0] = _structure(value)
     return cells
 
 

@@ -95,8 +95,8 @@ def _write(writer: "Writer", run: ExportedRun) -> None:
     for loop in run.inner:
         own = [table for table in loop.record.tables if OWNER[table] != "netem"]
         _write_tables(writer, loop, own)
-    for one in run.inner or [run]:
-        _write_errors(writer, one)
+    for loop in run.inner or [run]:
+        _write_errors(writer, loop)
 
 
 def _channel(writer: "Writer", run: ExportedRun, topic: str, schema: dict[str, object]) -> int:
@@ -214,11 +214,11 @@ def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, object]:
 def _type(name: str, field: np.dtype[np.generic]) -> dict[str, object]:
     if field.kind == "V" and field.subdtype is None:
         return {"type": "string"} if name == "change" else {"type": "string", "pattern": _HEX}
-    one = _REAL if field.base.kind == "f" else {"type": "integer"}
+    entry = _REAL if field.base.kind == "f" else {"type": "integer"}
     if not field.shape:
-        return dict(one)
+        return dict(entry)
     size = field.shape[0]
-    return {"type": "array", "items": one, "minItems": size, "maxItems": size}
+    return {"type": "array", "items": entry, "minItems": size, "maxItems": size}
 
 
 def _write_ros(run: ExportedRun, path: Path) -> Path:
@@ -257,21 +257,19 @@ class _Bag:
         loop, name = record.loop, record.scenario.name
         prefix = ros2.namespace(run.name or name, is_only=is_only)
         for part in record.slices(*ros2.TOPICS):
-            found: list[tuple[int, int, str, bytes, int]] = []
+            messages: list[tuple[int, int, str, bytes, int]] = []
             for table in ros2.TOPICS:
                 rows = part[table]
-                for place, topic, entries in ros2.row_entries(
-                    table, rows, loop.state_names, loop.input_names
-                ):
-                    log_ns = max(int(rows["now_ns"][place]) + run.phase_ns, 0)
+                for row, topic, entries in ros2.row_entries(table, rows, loop.state_names, loop.input_names):
+                    log_ns = max(int(rows["now_ns"][row]) + run.phase_ns, 0)
                     stamped = entries._replace(stamp_ns=entries.stamp_ns + run.phase_ns)
-                    number = int(rows["sequence"][place]) & 0xFFFF_FFFF
+                    number = int(rows["sequence"][row]) & 0xFFFF_FFFF
                     message = ros2.joint_state(stamped, name)
-                    found.append((log_ns, stamped.stamp_ns, f"{prefix}/{topic}", message, number))
-            self._add(sorted(found, key=lambda message: message[0]))
+                    messages.append((log_ns, stamped.stamp_ns, f"{prefix}/{topic}", message, number))
+            self._add(sorted(messages, key=lambda message: message[0]))
 
-    def _add(self, found: Iterable[tuple[int, int, str, bytes, int]]) -> None:
-        for log_ns, publish_ns, topic, message, number in found:
+    def _add(self, messages: Iterable[tuple[int, int, str, bytes, int]]) -> None:
+        for log_ns, publish_ns, topic, message, number in messages:
             channel = self._channel(topic, ros2.JOINT_STATE)
             self._writer.add_message(channel, log_ns, message, max(publish_ns, 0), number)
 

@@ -1,7 +1,7 @@
 """The content of a figure as plain data: rows of panels, their axes and their items.
 
 Reports, pages of studies, files and notebooks draw a :class:`FigureDescription` by matplotlib
-(:mod:`cosim.output.figures.figure_drawing`), the lab page in the browser (:mod:`cosim.lab.stage`).
+(:mod:`cosim.output.figures.figure_drawing`), the lab page in the browser (:mod:`cosim.lab.page_parts`).
 Arrays may have any length, including 0. Values that are not finite are drawn as gaps.
 """
 
@@ -321,14 +321,14 @@ def near_ends(ends: tuple[float, float], measured: Reals) -> tuple[float, float]
 
 def histogram(values: Reals, bins: int = 30) -> tuple[Reals, Reals]:
     """Return edges (bins + 1,) of a constant ratio, and the counts of positive values."""
-    seen = finite(values, positive=True)
-    seen = seen[np.isfinite(seen)]
-    if not len(seen):
+    drawn = finite(values, positive=True)
+    drawn = drawn[np.isfinite(drawn)]
+    if not len(drawn):
         return np.ones(1), np.zeros(0)
-    low, high = math.log10(seen.min()), math.log10(seen.max())
+    low, high = math.log10(drawn.min()), math.log10(drawn.max())
     margin = max(0.05 * (high - low), 0.02)
     edges = np.logspace(low - margin, high + margin, bins + 1)
-    return edges, np.histogram(seen, edges)[0].astype(np.float64)
+    return edges, np.histogram(drawn, edges)[0].astype(np.float64)
 
 
 def plain(name: str, longest: int = 16) -> str:

@@ -125,13 +125,13 @@ def _axes(figure: Figure, place: Place, beside: Axes | None = None) -> Axes:
     )
     factor = axes.yaxis.get_offset_text()  # e.g. ×10⁻⁶; above the axes it would overlap the title
     factor.set(x=-0.05 / box.width, horizontalalignment="right")
-    for which, axis in (("x", place.panel.x), ("y", place.panel.y)):
+    for letter, axis in (("x", place.panel.x), ("y", place.panel.y)):
         if axis.logarithmic:
-            _make_logarithmic(axes, which)  # type: ignore[arg-type]
+            _make_logarithmic(axes, letter)  # type: ignore[arg-type]
         if None not in axis.ends:
-            _set_ends(axes, which, axis)  # type: ignore[arg-type]
+            _set_ends(axes, letter, axis)  # type: ignore[arg-type]
         if not axis.grid:
-            axes.grid(visible=False, axis=which)  # type: ignore[arg-type]
+            axes.grid(visible=False, axis=letter)  # type: ignore[arg-type]
     return axes
 
 
@@ -208,7 +208,7 @@ def _curve(axes: Axes, x: Reals, y: Reals, **style: Any) -> Artist:
 
 @_draw.register
 def _(item: Band, axes: Axes, norm: Normalize | None) -> Artist | None:
-    low, high = (finite(one, positive=axes.get_yscale() == "log") for one in (item.low, item.high))
+    low, high = (finite(curve, positive=axes.get_yscale() == "log") for curve in (item.low, item.high))
     if not (np.isfinite(low) & np.isfinite(high)).any():
         return None
     steps = item.steps or None
@@ -222,8 +222,8 @@ def _(item: Marks, axes: Axes, norm: Normalize | None) -> Artist | None:
     x = finite(item.x, positive=axes.get_xscale() == "log")
     y = finite(item.y, positive=axes.get_yscale() == "log")
     y = np.full(len(x), _TOP) if item.at_top else y
-    seen = np.isfinite(x) & np.isfinite(y)
-    x, y, size = x[seen], y[seen], item.size
+    is_finite = np.isfinite(x) & np.isfinite(y)
+    x, y, size = x[is_finite], y[is_finite], item.size
     if not len(x):
         return None
     style: dict[str, Any] = {
@@ -236,7 +236,7 @@ def _(item: Marks, axes: Axes, norm: Normalize | None) -> Artist | None:
     }
     if item.x_error is not None or item.y_error is not None:
         y_error, x_error = (
-            None if error is None else error[..., seen] for error in (item.y_error, item.x_error)
+            None if error is None else error[..., is_finite] for error in (item.y_error, item.x_error)
         )
         axes.errorbar(x, y, y_error, x_error, elinewidth=1.0, markersize=size, **style)
         return Line2D([], [], markersize=size, **style)
@@ -352,9 +352,9 @@ def _for_log_axis(values: Reals) -> Reals:
     return shown
 
 
-def _finish_axis(axes: Axes, which: Literal["x", "y"], described: Axis, has_numbers: bool) -> None:
+def _finish_axis(axes: Axes, letter: Literal["x", "y"], described: Axis, has_numbers: bool) -> None:
     """Set label, numbers and ends of an axis in which everything is drawn."""
-    axis, box = (axes.xaxis, axes.bbox.width) if which == "x" else (axes.yaxis, axes.bbox.height)
+    axis, box = (axes.xaxis, axes.bbox.width) if letter == "x" else (axes.yaxis, axes.bbox.height)
     axis.set_label_text(described.label if has_numbers else "")
     if described.whole:
         few = box / axes.figure.dpi < _NARROW_IN
@@ -370,7 +370,7 @@ def _finish_axis(axes: Axes, which: Literal["x", "y"], described: Axis, has_numb
     elif described.about is not None:
         axes.set_ylim(*near_ends(axes.get_ylim(), described.about))
     if described.ends.count(None) == 1:
-        _set_ends(axes, which, described)
+        _set_ends(axes, letter, described)
 
 
 def _for_font(text: str) -> str:
@@ -381,8 +381,8 @@ def _for_font(text: str) -> str:
     return "$".join(part if i % 2 else part.translate(_ELSEWHERE) for i, part in enumerate(parts))
 
 
-def _set_ends(axes: Axes, which: Literal["x", "y"], described: Axis) -> None:
-    (axes.set_xlim if which == "x" else axes.set_ylim)(*described.ends)
+def _set_ends(axes: Axes, letter: Literal["x", "y"], described: Axis) -> None:
+    (axes.set_xlim if letter == "x" else axes.set_ylim)(*described.ends)
 
 
 class _Numbers(LogFormatter):
@@ -406,10 +406,10 @@ class _Numbers(LogFormatter):
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def _make_logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
+def _make_logarithmic(axes: Axes, letter: Literal["x", "y"]) -> None:
     """Make an axis logarithmic, with numbers that are easy to read."""
-    axes.set(**{f"{which}scale": "log"})
-    axis = axes.xaxis if which == "x" else axes.yaxis
+    axes.set(**{f"{letter}scale": "log"})
+    axis = axes.xaxis if letter == "x" else axes.yaxis
     axis.set_major_formatter(_Numbers())
     axis.set_minor_formatter(_Numbers(labelOnlyBase=False, minor_thresholds=(1.2, 0.5)))
 
@@ -426,10 +426,10 @@ def _fit_to_paper(figure: Figure) -> None:
         line.set_markeredgewidth(line.get_markeredgewidth() * space.line_scale)
     character_in = _EM_PER_CHARACTER_OF_LABEL * mpl.rcParams["axes.labelsize"] / POINTS_PER_IN
     for axes in figure.axes:
-        place, (width_in, height_in) = axes.get_position(), figure.get_size_inches()
+        position, (width_in, height_in) = axes.get_position(), figure.get_size_inches()
         for axis, length_in in (
-            (axes.xaxis, place.width * width_in),
-            (axes.yaxis, place.height * height_in),
+            (axes.xaxis, position.width * width_in),
+            (axes.yaxis, position.height * height_in),
         ):
             most = max(int(length_in / character_in), _SHORTEST_LINE)
             axis.set_label_text(_wrapped(axis.get_label_text(), most))

@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.network_summary import LoopsOverTime, loops_over_time, quantiles
-from cosim.analysis.summary_model import InFlightPart, RunSummary
+from cosim.analysis.summary.network_summary import LoopsOverTime, loops_over_time, quantiles
+from cosim.analysis.summary.summary_model import InFlightPart, RunSummary
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     Axis,

@@ -88,8 +88,8 @@ def run_figures(
             return _thinned(record)
 
     def bounds(quantity: str) -> list[Line]:
-        found = (one for one in envelopes if one[1] == quantity)
-        return bound_lines((label, t_s, values, kind) for label, _, t_s, values, kind in found)
+        curves = (curve for curve in envelopes if curve[1] == quantity)
+        return bound_lines((label, t_s, values, kind) for label, _, t_s, values, kind in curves)
 
     described = {
         "states": lambda: _states(record, aligned()),
@@ -126,16 +126,16 @@ class _Thinned(NamedTuple):
 
 def _thinned(record: RunRecord) -> _Thinned:
     """Align a run; of each part, keep the extremes of all curves at the resolution of a figure."""
-    found = []
+    parts = []
     for part in aligned_parts(record):
         run, true_x = _from_first_update(part.aligned, record), part.true_x
         curves = [run.x, run.x_s, run.x_c, run.e_s_norm, run.threshold, run.e_c_norm]
         curves += [] if true_x is None else [true_x]
         keep = decimate_all(_seconds(run.t_ns), np.column_stack(curves), record.slice_columns)
         thin = AlignedRun._make(values[keep] for values in run)
-        found.append(_Thinned(thin, None if true_x is None else true_x[keep]))
-    whole = AlignedRun._make(map(np.concatenate, zip(*(one.run for one in found), strict=True)))
-    true_states = [one.true_x for one in found if one.true_x is not None]
+        parts.append(_Thinned(thin, None if true_x is None else true_x[keep]))
+    whole = AlignedRun._make(map(np.concatenate, zip(*(part.run for part in parts), strict=True)))
+    true_states = [part.true_x for part in parts if part.true_x is not None]
     return _Thinned(whole, np.concatenate(true_states) if true_states else None)
 
 
@@ -233,8 +233,8 @@ def states_figure(
         for i in range(drawn)
     ]
     columns = drawn if drawn <= 3 else 2 if drawn == 4 else 3 if drawn <= 12 else 4
-    between = [np.diff(one, prepend=np.nan) for one in (sent.sent_s, sent.received_s)]
-    highest = 1.05 * max(np.nanmax(np.append(finite(one), 0.0)) for one in between) or None
+    between = [np.diff(times_s, prepend=np.nan) for times_s in (sent.sent_s, sent.received_s)]
+    highest = 1.05 * max(np.nanmax(np.append(finite(gaps), 0.0)) for gaps in between) or None
     y = Axis(label="interval [s]", ends=(0.0, highest))
     intervals = [
         Panel(
@@ -329,7 +329,7 @@ def _norms(
     """Describe a figure of norms; its axis is limited: resets fall to rounding errors."""
     measured = np.concatenate([line.y for line in lines])
     y = Axis(label="norm", logarithmic=True, about=measured, decades=_DECADES)
-    drawn = [replace(one, opacity=_LIGHT) if _is_far(one, lines) else one for one in bounds]
+    drawn = [replace(bound, opacity=_LIGHT) if _is_far(bound, lines) else bound for bound in bounds]
     panel = Panel(title=title, items=[*lines, *drawn], x=time_axis(lines[0].x), y=y)
     return one_panel(name, panel, height_in)
 
@@ -376,8 +376,8 @@ def fidelity_figure(fidelity: Fidelity) -> FigureDescription:
     """Change of x by each effect, over time: ‖x_(with the effect) − x_(without)‖."""
     t_s, stages = fidelity.t_s, zip(fidelity.stages, fidelity.stage_norms, strict=True)
     lines = [
-        Line(x=t_s, y=y, label=one.name, colour=series_colour(i), dash=DASHES[i], width=1.6)
-        for i, (one, y) in enumerate(stages)
+        Line(x=t_s, y=y, label=part.name, colour=series_colour(i), dash=DASHES[i], width=1.6)
+        for i, (part, y) in enumerate(stages)
     ]
     title = f"{plain(fidelity.scenario, _LONGEST_TITLE)}: effects on x"
     return _norms("fidelity", title, lines, 2.7)
@@ -443,13 +443,13 @@ def _losses(record: RunRecord) -> FigureDescription:
     for rule in network.guarantee.rules[:3]:
         if isinstance(rule, LossesInWindow):
             title = f"Losses in {rule.window} updates"
-            what = f"losses in {rule.window} consecutive updates"
-            found = outcomes.losses_in(rule.window)
-            panels.append(_loss_panel(title, what, "positions", found, rule.limit))
+            label = f"losses in {rule.window} consecutive updates"
+            counts = outcomes.losses_in(rule.window)
+            panels.append(_loss_panel(title, label, "positions", counts, rule.limit))
     if (actuation := network.actuation) is not None:
         lost = packet_outcomes(record, Flow.ACTUATION).loss_bursts()
-        limit, what = actuation.link.longest_burst, "consecutive lost actuations"
-        panels.append(_loss_panel("Of actuations", what, "bursts", lost, limit))
+        limit, label = actuation.link.longest_burst, "consecutive lost actuations"
+        panels.append(_loss_panel("Of actuations", label, "bursts", lost, limit))
         both = " Last panel: the same of actuations."
     narrowest_in, widest_in = _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN
     row = Row(panels=panels, height_in=1.9, narrowest_in=narrowest_in, widest_in=widest_in)
@@ -462,7 +462,7 @@ def _losses(record: RunRecord) -> FigureDescription:
     )
 
 
-def _loss_panel(title: str, what: str, counted: str, values: NDArray[np.int64], limit: int | None) -> Panel:
+def _loss_panel(title: str, label: str, counted: str, values: NDArray[np.int64], limit: int | None) -> Panel:
     """Describe a histogram of whole numbers (k,), and the largest number that is allowed."""
     counts = Counter(values.tolist())
     low, high = min([1, *counts]), max([1 if limit is None else limit, *counts])
@@ -476,6 +476,6 @@ def _loss_panel(title: str, what: str, counted: str, values: NDArray[np.int64], 
     items: list[Item] = [bars]
     if limit is not None:
         items.append(Rule(at=limit + 0.5, colour=palette.CERTIFIED, vertical=True))
-    x = Axis(label=what, ends=(low - 0.6, high + 0.9), whole=True, grid=False)
+    x = Axis(label=label, ends=(low - 0.6, high + 0.9), whole=True, grid=False)
     y = Axis(label=counted, whole=True)
     return Panel(title=title, items=items, x=x, y=y, empty="no loss")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.loop_statistics import latency_us, lateness_parts
+from cosim.analysis.summary.loop_statistics import latency_us, lateness_parts
 from cosim.analysis.value_reduction import QuantileSketch
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
@@ -152,11 +152,11 @@ def clocks_figure(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> Figu
     assert scenario.clocks is not None  # else the record has no tables of clocks
     allowed_us, last_s = scenario.clocks.largest_error_us, scenario.horizon_s
     lines, crosses, texts = list[Item](), list[Item](), list[str]()
-    for i, (process, one) in enumerate(errors.items()):
-        most, colour, order = one.largest_us, palette.PROCESSES[process], 2 + 0.1 * i
+    for i, (process, error) in enumerate(errors.items()):
+        most, colour, order = error.largest_us, palette.PROCESSES[process], 2 + 0.1 * i
         texts.append(f"{process} " + ("never known" if most is None else f"{most:.3g} µs"))
-        keep = one.t_s <= last_s
-        t_s, error_us, lost = one.t_s[keep], one.error_us[keep], one.lost[keep]
+        keep = error.t_s <= last_s
+        t_s, error_us, lost = error.t_s[keep], error.error_us[keep], error.lost[keep]
         # The curves often coincide: the first ones are wider, and stay visible under the last.
         width = 1.3 + 1.2 * (len(errors) - 1 - i)
         curve = Line(x=t_s, y=error_us, label=process, colour=colour, width=width)
@@ -166,7 +166,7 @@ def clocks_figure(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> Figu
         cross = Marks(x=began_s, y=at, colour=colour, marker="x", size=9.0, stroke=2.0)
         crosses.append(replace(cross, order=order))
     limit = Rule(at=allowed_us, colour=THRESHOLD, label="allowed", width=1.2, dash=(4, 3))
-    unknown = all(one.largest_us is None for one in errors.values())
+    unknown = all(error.largest_us is None for error in errors.values())
     ends = (allowed_us / 10, allowed_us * 10) if unknown else (None, None)
     panel = Panel(
         title="Clocks",
@@ -174,7 +174,7 @@ def clocks_figure(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> Figu
         x=time_axis(np.array([0.0, last_s])),
         y=Axis(label="bound of error [wall µs]", logarithmic=True, ends=ends),
     )
-    largest, gone = ", ".join(texts), [name for name, one in errors.items() if one.lost.any()]
+    largest, gone = ", ".join(texts), [name for name, error in errors.items() if error.lost.any()]
     return one_panel("clocks", panel, 1.9).captioned(
         "Bound of the difference between a process's time and the recorder's, for the "
         f"processes on hosts with other clocks. Largest: {largest}. Dashed: the largest bound with "

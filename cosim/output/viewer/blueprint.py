@@ -115,7 +115,7 @@ class ShownLoop:
 
     def static(self) -> dict[str, Static]:
         """Return what does not move, by entity: texts, styles of series, scenery, colour key."""
-        found: dict[str, Static] = {
+        entities: dict[str, Static] = {
             ABOUT: rr.TextDocument(self.about, media_type="text/markdown"),
             **_styles(self),
         }
@@ -125,8 +125,8 @@ class ShownLoop:
         if self.diagram is not None:
             drawings[DIAGRAM] = self.diagram.scenery()
         for parent, shapes in drawings.items():
-            found |= {f"{parent}/{entity}": shape for entity, shape in shapes.items()}
-        return {f"{self.folder}{entity}": shape for entity, shape in found.items()}
+            entities |= {f"{parent}/{entity}": shape for entity, shape in shapes.items()}
+        return {f"{self.folder}{entity}": shape for entity, shape in entities.items()}
 
     def panels(self) -> rrb.Container:
         """Lay out the panels: picture, packets and texts on the left, curves on the right.
@@ -171,8 +171,8 @@ def _styles(shown: ShownLoop) -> dict[str, Static]:
     errors = ["bound (I1)", "‖e_s‖ sensor", "threshold", "‖e_c‖ controller", "certified"]
     colours = [IDENTITY, SENSOR, THRESHOLD, CONTROLLER, CERTIFIED]
     widths = [3.5, 1.5, 2.0, 1.5, 2.0]
-    lateness = {lateness_path(one): line for one, line in _of_processes(shown.processes).items()}
-    clocks = {clock_path(one): line for one, line in _of_processes(shown.processes).items()}
+    lateness = {lateness_path(process): line for process, line in _of_processes(shown.processes).items()}
+    clocks = {clock_path(process): line for process, line in _of_processes(shown.processes).items()}
     return {
         **{state_path(name): triple for name in shown.state_names},
         ERROR: rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4]),
@@ -242,7 +242,7 @@ def move_below(shown: rrb.Container | rrb.View, folder: str) -> None:
         paths = [given] if isinstance(given, str) else [*cast(Sequence[str], given)]
         shown.contents = [p if p.startswith("$") else f"/{folder}{p.lstrip('/')}" for p in paths]
         overrides = shown.visualizer_overrides
-        shown.visualizer_overrides = {f"{folder}{path}": one for path, one in overrides.items()}
+        shown.visualizer_overrides = {f"{folder}{path}": override for path, override in overrides.items()}
         return
     for part in shown.contents:
         if isinstance(part, (rrb.Container, rrb.View)):
@@ -384,11 +384,11 @@ def colour_key_panel(input_names: Sequence[str]) -> rrb.Spatial2DView:
 
 def colour_key(input_names: Sequence[str]) -> Mapping[str, Shape]:
     """Return samples of lines and marks, with their names, by entity."""
-    found: dict[str, Shape] = {}
+    shapes: dict[str, Shape] = {}
     for i, row in enumerate(_key_rows(input_names)):
         for j, (name, colour, sample) in enumerate(row):
             x, y = (j + 0.5) * _WIDE / len(row), -i * _HIGH
             moved = [(x + dx, y + dy) for dx, dy in sample]
-            found[f"{i}/{j}/sample"] = lines([moved], colour, _THICK)
-            found[f"{i}/{j}/name"] = label(name, (x, y - 0.2), colour)
-    return found
+            shapes[f"{i}/{j}/sample"] = lines([moved], colour, _THICK)
+            shapes[f"{i}/{j}/name"] = label(name, (x, y - 0.2), colour)
+    return shapes

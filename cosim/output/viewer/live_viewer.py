@@ -34,8 +34,8 @@ from types import FrameType
 from typing import IO, Self
 from urllib.parse import parse_qs, quote
 
-from cosim.analysis.network_summary import worst_loop
-from cosim.analysis.summary_model import read_summary
+from cosim.analysis.summary.network_summary import worst_loop
+from cosim.analysis.summary.summary_model import read_summary
 from cosim.output.viewer.pictures.picture import TIMELINE
 from cosim.output.viewer.rerun_program import (
     HOST,
@@ -192,14 +192,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer with the page, one of its files, or the recording."""
         recording = self.server.recording
         path, _, query = self.path.partition("?")
-        found = _PATH.fullmatch(path)
+        match = _PATH.fullmatch(path)
         if not (self.path.isascii() and self.path.isprintable()):
             self.send_error(400)
         elif not OWN_HOST.fullmatch(self.headers.get("Host", "")):
             self.send_error(403)  # DNS rebinding: a foreign name that resolves to loopback
-        elif found is None or not recording.admits(found[1], lambda: peer_user(self.connection)):
+        elif match is None or not recording.admits(match[1], lambda: peer_user(self.connection)):
             self.send_error(404)
-        elif (name := found[2]) == RECORDING:
+        elif (name := match[2]) == RECORDING:
             self._send_recording(recording)
         elif name == "" and "url" not in parse_qs(query):
             self._send_to_recording(path, query)
@@ -437,9 +437,9 @@ def opening_time_ns(recording: Path) -> int | None:
     """
     name = loop_of_file(recording.name, RECORDING_FILE)
     summary = read_summary(read_object(recording.parent / SUMMARY_FILE))
-    if summary is None or name not in (None, *(one.name for one in summary.loops)):
+    if summary is None or name not in (None, *(loop.name for loop in summary.loops)):
         return None
-    loops = {one.number: one for one in summary.loops if name in (None, one.name)}
+    loops = {loop.number: loop for loop in summary.loops if name in (None, loop.name)}
     loop = loops[worst_loop([*loops.values()]).number]
     if loop.sup_e_c_at_s is None:
         return None

@@ -80,42 +80,42 @@ class NetworkDiagram:
     def scenery(self) -> Mapping[str, Shape]:
         """Return boxes, arrows, labels, and the packets' styles."""
         colours = [PLANT, SENSOR, NETWORK, CONTROLLER]
-        found: dict[str, Shape] = {}
+        shapes: dict[str, Shape] = {}
         words = ("plant x", "sensor x_s", "network", "controller x_c")
         for text, (name, x), colour in zip(words, _BOXES.items(), colours, strict=True):
-            found[f"box/{name}"] = rr.Boxes2D(
+            shapes[f"box/{name}"] = rr.Boxes2D(
                 centers=[[x, 0.0]], half_sizes=[[_HALF_WIDE, _HALF_HIGH]], radii=0.04, colors=colour
             )
-            found[f"box/{name}/word"] = label(text, (x, 0.28), colour)
+            shapes[f"box/{name}/word"] = label(text, (x, 0.28), colour)
         arrows = [_arrow(a + _HALF_WIDE, b - _HALF_WIDE, 0.0) for a, b in pairwise(_BOXES.values())]
         if self._reverse is Flow.ACKNOWLEDGEMENT:
             arrows += [
                 _arrow(a - _HALF_WIDE, b + _HALF_WIDE, _REVERSE_Y)
                 for a, b in ((_CONTROLLER, _NETWORK), (_NETWORK, _SENSOR))
             ]
-        found["arrows"] = lines([line for arrow in arrows for line in arrow], STILL, 0.03)
+        shapes["arrows"] = lines([line for arrow in arrows for line in arrow], STILL, 0.03)
         home = [(_CONTROLLER, -_HALF_HIGH), (_CONTROLLER, _LOW), (0.0, _LOW), (0.0, -_HALF_HIGH)]
         head = [(-0.14, -_HALF_HIGH - 0.2), (0.0, -_HALF_HIGH), (0.14, -_HALF_HIGH - 0.2)]
         inputs = [home, head]
         if self._reverse is Flow.ACTUATION:  # they cross the network
             inputs.append([(_NETWORK, -_HALF_HIGH), (_NETWORK, _LOW)])
-        found["input"] = lines(inputs, STILL, 0.03)
-        found["input/word"] = label("u = K x_c", (_SENSOR, _LOW + 0.4), STILL)
-        found["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
-        found["forced/word"] = label("forced", (_NETWORK + _APART / 2, 1.55), FORCED)
+        shapes["input"] = lines(inputs, STILL, 0.03)
+        shapes["input/word"] = label("u = K x_c", (_SENSOR, _LOW + 0.4), STILL)
+        shapes["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
+        shapes["forced/word"] = label("forced", (_NETWORK + _APART / 2, 1.55), FORCED)
         for entity, colour in (
             ("broadcast", SENSOR),
             ("delivered", CONTROLLER),
             ("reverse", NETWORK),
         ):
-            found[entity] = rr.Points2D.from_fields(
+            shapes[entity] = rr.Points2D.from_fields(
                 radii=_SIZE if entity != "reverse" else 0.6 * _SIZE,
                 colors=colour,
                 draw_order=5.0,
             )
-        found["forced"] = style(FORCED, 0.1, order=6.0)
-        found["lost"] = style(LOST, 0.1, order=6.0)
-        return found
+        shapes["forced"] = style(FORCED, 0.1, order=6.0)
+        shapes["lost"] = style(LOST, 0.1, order=6.0)
+        return shapes
 
     def add(self, t_ns: Times, release_ns: Times, fate: NDArray[np.int64], *, reverse: bool = False) -> None:
         """Add packets (p,) that follow the previously added ones.
@@ -164,40 +164,40 @@ class NetworkDiagram:
         now_ns = frame * _FRAME_NS
         t_ns, out_ns, reverse = pairs["t_ns"], pairs["out_ns"], pairs["reverse"]
         survives, leaves = effective(pairs["fate"]), now_ns >= out_ns
-        there = np.clip((now_ns - t_ns) / _LEG_NS, 0.0, 1.0)
+        reached = np.clip((now_ns - t_ns) / _LEG_NS, 0.0, 1.0)
         onward = (now_ns - out_ns) / _LEG_NS
         gap = _APART - 2 * _HALF_WIDE
-        x = _NETWORK - _HALF_WIDE - gap * (1.0 - there)
+        x = _NETWORK - _HALF_WIDE - gap * (1.0 - reached)
         # A waiting packet is drawn inside the network; a released one at its other side.
-        x = np.where(there >= 1.0, _NETWORK, x)
+        x = np.where(reached >= 1.0, _NETWORK, x)
         x = np.where(leaves & survives, _NETWORK + _HALF_WIDE + gap * onward, x)
         fall = (now_ns - out_ns) / _FALL_NS
         y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
         forced = pairs["fate"] == Fate.FORCED
         if self._reverse is Flow.ACTUATION:
-            back = np.where(leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _APART * there)
+            back = np.where(leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _APART * reached)
             x, y = np.where(reverse, back, x), np.where(reverse, _LOW + 0.4 * y, y)
         else:
             x = np.where(reverse, 2 * _NETWORK - x, x)
             y = np.where(reverse & (survives | ~leaves), _REVERSE_Y, y)
         places = upright(np.column_stack([x, y]))
-        what = {
+        states = {
             "broadcast": ~leaves & ~reverse,
             "delivered": leaves & survives & ~forced & ~reverse,
             "reverse": (survives | ~leaves) & reverse,
             "forced": leaves & forced & ~reverse,
             "lost": leaves & ~survives,
         }
-        found: dict[str, Moving] = {}
-        for entity, which in what.items():
-            shapes = np.bincount(frame[which] - first, minlength=last - first + 1)
+        moving: dict[str, Moving] = {}
+        for entity, shown in states.items():
+            shapes = np.bincount(frame[shown] - first, minlength=last - first + 1)
             before = np.concatenate([[self._shown.get(entity, 0)], shapes[:-1]])
             self._shown[entity] = int(shapes[-1])
             rows = (shapes > 0) | (before > 0)  # a row without shapes removes the previous ones
             if rows.any():
                 t_ns = (first + np.flatnonzero(rows)) * _FRAME_NS
-                found[entity] = Moving(t_ns, _shapes(entity, places[which], shapes[rows]))
-        return found
+                moving[entity] = Moving(t_ns, _shapes(entity, places[shown], shapes[rows]))
+        return moving
 
 
 _DIAMOND = 1.3 * _SIZE * np.array([[0, -1], [1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]])

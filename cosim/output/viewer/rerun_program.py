@@ -97,8 +97,8 @@ def logged_port(
     """
     deadline_s = time.monotonic() + within_s
     while process.poll() is None and time.monotonic() < deadline_s:
-        if found := address.search(os.pread(output.fileno(), 1 << 16, 0)):
-            return int(found[1])
+        if match := address.search(os.pread(output.fileno(), 1 << 16, 0)):
+            return int(match[1])
         time.sleep(_POLL_S)
     return None
 

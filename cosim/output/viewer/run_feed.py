@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.network_summary import (
+from cosim.analysis.summary.network_summary import (
     INTERVALS,
     add_link_bytes,
     counts_inside,
@@ -68,8 +68,8 @@ class RunFeed:
         self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
         self._together = _AllLoops(scenario, loops, view) if view.is_shared else None
         self._feeds = {
-            number: ViewFeed(loops[number], one, certified=not view.is_shared)
-            for number, one in view.views.items()
+            number: ViewFeed(loops[number], loop_view, certified=not view.is_shared)
+            for number, loop_view in view.views.items()
         }
         self._tables = SHOWN if view.is_shared else (*SHOWN, *CLOCK_TABLES)
         self._waiting: dict[str, list[Rows]] = {}
@@ -238,11 +238,11 @@ class _AllLoops:
         _, from_end = np.unique(models[LOOP][::-1], return_index=True)
         self._newest = models[len(models) - 1 - from_end]
         keys, wanted = _keys(models), _keys(measured)
-        place = np.searchsorted(keys, wanted, "right") - 1
-        age_ns = wanted - keys[place] if len(keys) else wanted
-        known = (place >= 0) & (age_ns >= 0) & (age_ns <= self._periods_ns[measured[LOOP]])
+        row = np.searchsorted(keys, wanted, "right") - 1
+        age_ns = wanted - keys[row] if len(keys) else wanted
+        known = (row >= 0) & (age_ns >= 0) & (age_ns <= self._periods_ns[measured[LOOP]])
         known &= at_ns >= self._first_ns[measured[LOOP]]
-        measured, age_ns, x_c = measured[known], age_ns[known], models["x"][place[known]]
+        measured, age_ns, x_c = measured[known], age_ns[known], models["x"][row[known]]
         for dt_ns in np.unique(age_ns).tolist():
             of = age_ns == dt_ns
             x_c[of] = self._flow(dt_ns, measured[LOOP][of], x_c[of])
@@ -273,11 +273,11 @@ class _AllLoops:
 
     def _reduced(self, rows: Rows, time_name: str, vector_name: str) -> Rows:
         """Return the needed columns of rows."""
-        found = np.empty(len(rows), self._none.dtype)
-        found[LOOP], found["input"] = rows[LOOP], rows["input"]
-        found["t_ns"] = rows[time_name]
-        found["x"] = np.where(self._entries[rows[LOOP]], rows[vector_name], 0.0)
-        return found
+        reduced = np.empty(len(rows), self._none.dtype)
+        reduced[LOOP], reduced["input"] = rows[LOOP], rows["input"]
+        reduced["t_ns"] = rows[time_name]
+        reduced["x"] = np.where(self._entries[rows[LOOP]], rows[vector_name], 0.0)
+        return reduced
 
 
 def _keys(rows: Rows) -> Numbers:

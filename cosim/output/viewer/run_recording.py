@@ -33,7 +33,7 @@ from matplotlib import colormaps
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from cosim.analysis.network_summary import (
+from cosim.analysis.summary.network_summary import (
     QUANTILES,
     LoopOverTime,
     LoopsOverTime,
@@ -42,7 +42,7 @@ from cosim.analysis.network_summary import (
     quantiles,
     worst_loop,
 )
-from cosim.analysis.summary_model import RunSummary
+from cosim.analysis.summary.summary_model import RunSummary
 from cosim.analysis.value_reduction import Reals, is_long
 from cosim.output.figures.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp

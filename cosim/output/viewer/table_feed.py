@@ -220,11 +220,11 @@ class ViewFeed:
         return certificate
 
     def _certified(
-        self, t_s: NDArray[np.float64], what: Literal["controller_error", "state"]
+        self, t_s: NDArray[np.float64], quantity: Literal["controller_error", "state"]
     ) -> NDArray[np.float64]:
         if self._certificate is None:
             return np.full(len(t_s), np.nan)
-        bound = getattr(self._certificate, what)(t_s)
+        bound = getattr(self._certificate, quantity)(t_s)
         return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
     @cached_property

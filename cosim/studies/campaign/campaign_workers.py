@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from cosim.live.process_pool import process_starts, processes
+from cosim.live.processes.process_pool import process_starts, processes
 from noack.core.core_library import SOURCES
 from noack.core.errors import CallerError, PeerError
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.summary_model import ClaimVerdict
+from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.align import align_tables, in_common
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import Rows, RunRecord

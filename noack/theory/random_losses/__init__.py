@@ -18,5 +18,5 @@ losses"). The losses are a Markov chain over the packets
    (``mean_square_growth.py``). The same map with weighted outcomes bounds the growth almost surely
    (``random_growth.py``).
 4. The same map with disturbances and noise has the stationary moments and the mean cost, with or
-   without a limit on the losses: ``loop_moments.py``, from intervals of ``moment_steps.py``.
+   without a limit on the losses (``loop_moments.py``).
 """

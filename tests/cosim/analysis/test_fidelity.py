@@ -14,7 +14,7 @@ import pytest
 
 import cosim.analysis.fidelity
 from cosim.analysis.fidelity import Fidelity, IncomparableError, compute_fidelity, fidelity_for_summary
-from cosim.analysis.summary_model import NoFidelityPart
+from cosim.analysis.summary.summary_model import NoFidelityPart
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import RunRecord

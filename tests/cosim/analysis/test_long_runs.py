@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary.run_summary import summarise
 from cosim.analysis.value_reduction import EXACT, RESOLUTION, QuantileSketch, decimate
 from cosim.record import run_record
 from cosim.record.align import align_tables

@@ -49,20 +49,20 @@ def test_longest_period_is_that_of_the_sampled_loop() -> None:
     assert found.stable_s is not None
     assert found.unstable_s == pytest.approx(found.stable_s + 0.02)
     assert radius(round(found.stable_s * 50)) < 1 < radius(round(found.unstable_s * 50))
-    assert found.found is not None
-    assert found.found.lower == pytest.approx(radius(round(found.unstable_s * 50)), rel=1e-9)
+    assert found.stability is not None
+    assert found.stability.lower == pytest.approx(radius(round(found.unstable_s * 50)), rel=1e-9)
 
 
 def test_verdicts_agree_with_the_bounds() -> None:
     trigger = {"policy": "periodic", "period_s": 0.5}
     found = find_margin(resolve(held_integrator(trigger=trigger)), with_period=False)
     assert [cap.m for cap in found.caps] == list(range(1, len(found.caps) + 1))
-    assert [cap.found.verdict for cap in found.caps[:-1]] == ["stable"] * (len(found.caps) - 1)
-    assert all(cap.found.upper < 1 for cap in found.caps[:-1])
-    growth = [cap.found.lower for cap in found.caps]
+    assert [cap.stability.verdict for cap in found.caps[:-1]] == ["stable"] * (len(found.caps) - 1)
+    assert all(cap.stability.upper < 1 for cap in found.caps[:-1])
+    growth = [cap.stability.lower for cap in found.caps]
     assert growth == sorted(growth)
     assert found.destabilised is not None
-    assert found.destabilised.found.lower > 1
+    assert found.destabilised.stability.lower > 1
     assert f"M ≤ {found.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(found)
 
 
@@ -106,7 +106,7 @@ def test_the_played_settings_are_the_pattern() -> None:
     assert played.network.mansd == found.m - 1
     run = noack.simulate(played)
     received = run.events()["received"].to_pylist()
-    pattern = found.found.pattern
+    pattern = found.stability.pattern
     expected = [pattern[i % len(pattern)] for i in range(len(received))]
     assert received[:-1] == expected[:-1]
 
@@ -115,9 +115,9 @@ def test_guarantees_are_compared() -> None:
     words = ["atmost 6 in 7", "mansd 4 recover 2"]
     found = noack.margin("lane_periodic", most_m=1, period=False, guarantees=words)
     own, weaker, stronger = found.compared.guarantees
-    assert (own.found.verdict, stronger.found.verdict) == ("stable", "stable")
-    assert weaker.found.verdict == "destabilised"
-    assert stronger.found.upper <= own.found.upper <= weaker.found.upper
+    assert (own.stability.verdict, stronger.stability.verdict) == ("stable", "stable")
+    assert weaker.stability.verdict == "destabilised"
+    assert stronger.stability.upper <= own.stability.upper <= weaker.stability.upper
     first, second, third = found.compared.relations
     cap, window = "at most M − 1 = 4 consecutive losses", "at most 6 losses in 7"
     assert first.startswith(f"“{cap}” implies “{window}")

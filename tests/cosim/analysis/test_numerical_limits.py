@@ -8,8 +8,8 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import summarise
-from cosim.analysis.summary_model import ClaimVerdict
+from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_events import GROWTH, Divergence, divergence
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import run_continuous, summary

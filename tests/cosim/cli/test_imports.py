@@ -53,7 +53,7 @@ launcher._Run.watch = show
 main()
 """
 _PROCESSES = """
-from cosim.live import fork_server
+from cosim.live.processes import fork_server
 fork_server._import(fork_server._IMPORTS)
 show()
 """
@@ -66,7 +66,7 @@ def test_a_run_begins_without_large_libraries(program: str, tmp_path: Path) -> N
     assert "numpy" in modules
     assert not modules & _LARGE
     assert [one for one in modules if re.match(r"noack\.theory\.\w+\.", one)] == []
-    assert not modules & {"cosim.live.finalize", "cosim.live.progress"}
+    assert not modules & {"cosim.live.finalize", "cosim.live.monitoring.progress"}
     assert program is _BEFORE_THE_START or "typer" not in modules
 
 

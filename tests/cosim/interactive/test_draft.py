@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.interactive.controls import Field, by_field, chosen, controls_of, dragged, filled, form_of
+from cosim.interactive.controls import chosen, controls_of, dragged
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, known_scenarios, open_draft
+from cosim.interactive.form import Field, by_field, filled, form_of
 from cosim.shipped_files import shipped_names
 from noack.core.errors import CallerError
 from noack.scenario import toml_file

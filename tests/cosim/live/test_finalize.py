@@ -17,9 +17,9 @@ import pytest
 
 import cosim.live.finalize
 from cosim.analysis.replay import replay
-from cosim.live import end_helpers
-from cosim.live.end_helpers import EndHelpers, PreparedEnding
 from cosim.live.finalize import ReplayBeside, finalize, reopen
+from cosim.live.processes import end_helpers
+from cosim.live.processes.end_helpers import EndHelpers, PreparedEnding
 from cosim.live.simulated_run import simulate_run
 from cosim.record.run_directory import (
     ENDING_FILE,

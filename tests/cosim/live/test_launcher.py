@@ -9,9 +9,9 @@ from typing import Any, cast
 
 import pytest
 
-from cosim.live.child_processes import ChildProcesses, Failure
 from cosim.live.launcher import WaitLimit, _Run, launch, require_disk_space, spool_bytes
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
+from cosim.live.processes.child_processes import ChildProcesses, Failure
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.topology import RECORDER, ROLES

@@ -10,8 +10,8 @@ import pytest
 import rerun.chunk
 from typer.testing import Result
 
-from cosim.analysis.network_summary import in_flight
-from cosim.analysis.summary_model import ReplayPart, read_summary
+from cosim.analysis.summary.network_summary import in_flight
+from cosim.analysis.summary.summary_model import ReplayPart, read_summary
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay.replay_result import difference
-from cosim.analysis.summary_model import RunSummary
+from cosim.analysis.summary.summary_model import RunSummary
 from cosim.live import finalize as concluding
 from cosim.output import report_page
 from cosim.output.figures.figure_description import Axis, Line, Panel, one_panel

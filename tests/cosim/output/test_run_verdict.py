@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 import noack
-from cosim.analysis.run_summary import Outcome
-from cosim.analysis.summary_model import Claim
+from cosim.analysis.summary.run_summary import Outcome
+from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import reopen
 from cosim.output.run_tables import short_numbers
 from cosim.output.run_verdict import print_outcome, remarks, state_text, verdict

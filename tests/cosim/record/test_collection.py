@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.loop_statistics import missing_rows
+from cosim.analysis.summary.loop_statistics import missing_rows
 from cosim.record import run_directory
 from cosim.record.collection import collect
 from cosim.record.record_source import with_loop

@@ -7,8 +7,8 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import summarise
-from cosim.analysis.summary_model import ClaimVerdict
+from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.align import align_tables
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord

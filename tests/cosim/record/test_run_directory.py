@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary.run_summary import summarise
 from cosim.api.runs import open_run
 from cosim.record.run_directory import (
     LATEST,

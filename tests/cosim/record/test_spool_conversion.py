@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.record.early_tables import write_early
 from cosim.record.run_directory import REPORTS_FILE, write_environment, write_scenario
 from cosim.record.run_record import RecordedRun, Rows, load_run
-from cosim.record.spool_conversion import Segment, finish_record, merged
+from cosim.record.spool_conversion import Segment, finish_record, merged, write_early
 from cosim.record.table_files import StoredTables, TableFile, write_table
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.errors import MachineError
@@ -159,9 +158,9 @@ def test_tables_written_during_the_run_have_the_same_rows(
         for table, found in rows.items():
             out.append(table, first, found[first:until].tobytes())
 
-    monkeypatch.setattr("cosim.record.early_tables.time.sleep", more)
-    monkeypatch.setattr("cosim.record.early_tables._SLICE_BYTES", 10_000)
-    monkeypatch.setattr("cosim.record.early_tables.BATCH_ROWS", 50)
+    monkeypatch.setattr("cosim.record.spool_conversion.time.sleep", more)
+    monkeypatch.setattr("cosim.record.spool_conversion._SLICE_BYTES", 10_000)
+    monkeypatch.setattr("cosim.record.spool_conversion.BATCH_ROWS", 50)
     early = None
     if kind == "a batch less":
         with pytest.raises(ValueError, match="missing"):

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.fidelity import live_run
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary.run_summary import summarise
 from cosim.record.align import align_tables, true_states
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of

@@ -13,8 +13,8 @@ import pytest
 from scipy.optimize import minimize
 
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import linearisation, summarise
-from cosim.analysis.summary_model import NoLinearisationPart
+from cosim.analysis.summary.run_summary import linearisation, summarise
+from cosim.analysis.summary.summary_model import NoLinearisationPart
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import RunRecord, load_record

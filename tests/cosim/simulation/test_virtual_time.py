@@ -10,8 +10,8 @@ from cosim.analysis.certificates import Certificates
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.fidelity import IncomparableError, live_run
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import summarise
-from cosim.analysis.summary_model import ClaimVerdict
+from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from cosim.analysis.loop_statistics import unintended_losses
 from cosim.analysis.replay import replay
+from cosim.analysis.summary.loop_statistics import unintended_losses
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate

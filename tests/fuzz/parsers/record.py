@@ -14,12 +14,12 @@ import numpy as np
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from cosim.analysis.network_summary import summarise_run
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import Outcome, summarise
-from cosim.analysis.summary_model import ExitPart, LoopSummary
+from cosim.analysis.summary.network_summary import summarise_run
+from cosim.analysis.summary.run_summary import Outcome, summarise
+from cosim.analysis.summary.summary_model import ExitPart, LoopSummary
 from cosim.live.finalize import reopen
-from cosim.live.recorder import Recorder
+from cosim.live.recording.recorder import Recorder
 from cosim.output.run_verdict import print_outcome
 from cosim.record.record_source import with_loop
 from cosim.record.run_directory import (

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.analysis.run_summary import linearisation
-from cosim.analysis.summary_model import LinearisationPart
+from cosim.analysis.summary.run_summary import linearisation
+from cosim.analysis.summary.summary_model import LinearisationPart
 from noack.core.errors import CallerError
 from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.plant_settings import PlantStart

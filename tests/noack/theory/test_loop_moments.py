@@ -16,8 +16,14 @@ from noack.impairments.loss_prediction import loss_process
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.loss_margin import loop_times
-from noack.theory.random_losses.loop_moments import LoopMoments, LoopPeriods, periods_of
-from noack.theory.random_losses.moment_steps import MomentStep, flow, jump
+from noack.theory.random_losses.loop_moments import (
+    LoopMoments,
+    LoopPeriods,
+    MomentStep,
+    flow,
+    jump,
+    periods_of,
+)
 from tests.command_line import invoke
 
 NOISE = {
@@ -81,10 +87,7 @@ def test_second_example_of_jitter_time() -> None:
         return execute(np.vstack([rows, rows]), slice(6, 12))
 
     G = x.T @ (np.array([[0.0, 1.0], [1.0, 0.0]]) @ x + np.array([[0.0], [1.0]]) @ u)
-    weight = np.zeros((13, 13))
-    weight[[0, 1, 12], [0, 1, 12]] = 1.0, 0.1, 0.1
-    noise = np.zeros((13, 13))
-    noise[1, 1] = 1.0
+    weight, noise = np.diag([1.0, 0.1, *np.zeros(10), 0.1]), np.diag(eye[1])
     passed = flow(G, noise, weight[None], 0.05)
     by_first = execute(x, slice(2, 4), 0.1, 2).then(
         observer([[0.5309, 0.079, 0], [-0.8673, 0.8597, 0], [0, 0, 0]],
@@ -144,10 +147,8 @@ def test_the_moments_in_other_units_of_the_states() -> None:
     given = scenario(**NOISE, network={"mansd": 2, "loss": BURSTS}, **{"controller.rate_hz": 16.0})
     outcomes = loss_process(given.network.link).outcomes(join_guarantee(2, ()))
     loop, unit = loop_of(given), 2.0 ** np.array([-25, 20])
-    other = replace(
-        loop, A=unit[:, None] * loop.A / unit, B=unit[:, None] * loop.B, K=loop.K / unit,
-        H=unit[:, None] * loop.H / unit,
-    )  # fmt: skip
+    T = unit[:, None]
+    other = replace(loop, A=T * loop.A / unit, B=T * loop.B, K=loop.K / unit, H=T * loop.H / unit)
     found = []
     for matrices, units in (loop, np.ones(2)), (other, unit):
         noise, form = np.diag((0.1 * units) ** 2), np.diag([*units**-2, 1.0])
@@ -183,9 +184,7 @@ def test_the_mean_over_all_patterns_of_simulated_runs(mode: str, sync: str) -> N
     """With a delay, ticks that drift, and a horizon within a period: three slots."""
     constraint = {"kind": "at_most", "losses": 2, "window": 4}
     timing = {"mode": mode, "controller.rate_hz": 16.0, "horizon_s": 1.4}
-    always = {
-        "mansd": 5, "initial_sync": sync, "impairments": [{"kind": "delay", "delay_s": 0.03}],
-    }  # fmt: skip
+    always = {"mansd": 5, "initial_sync": sync, "impairments": [{"kind": "delay", "delay_s": 0.03}]}
     network = {**always, "loss": BURSTS, "constraints": [constraint]}
     found = find_mean_cost(scenario(**timing, network=network)).with_guarantee
     mean, forced = 0.0, int(sync == "first_packet")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.summary_model import ClaimVerdict
+from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.simulation.virtual_time import simulate
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import PlantStart

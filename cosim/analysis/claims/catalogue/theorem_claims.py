@@ -24,11 +24,7 @@ _CONTINUOUS = "a continuous trigger, a network without delay"
 _CAPPED = "at most M − 1 consecutive losses"
 
 
-@claim(
-    "the controller's error is at most the sensor's error plus the missed jumps",
-    "(I1)",
-    _COMPLETE,
-)
+@claim("the controller's error is at most the sensor's error plus the missed jumps", "(I1)", _COMPLETE)
 def i1_controller_error(run: RunEvidence, samples: Samples) -> Findings:
     """The triangle inequality for (I1)."""
     error, values = (
@@ -69,12 +65,7 @@ def _margin(run: RunEvidence) -> float:
     return max(_LEAST_MARGIN, min(rounding, _LARGEST_MARGIN))
 
 
-@claim(
-    "the paper's bound of the controller's error",
-    "eq:LossEv3",
-    _CONTINUOUS,
-    needs_ideal_loop=True,
-)
+@claim("the paper's bound of the controller's error", "eq:LossEv3", _CONTINUOUS, needs_ideal_loop=True)
 def paper_error_bound(run: RunEvidence, samples: Samples) -> Findings:
     """(I1) with the threshold in place of e_s at the events."""
     coverage = run.record.scenario.coverage
@@ -111,7 +102,7 @@ def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> Findings:
     """Theorem 2's τ."""
     if run.theorem_2 is None:
         return Findings()
-    found = least_inter_event_time(
+    least = least_inter_event_time(
         run,
         samples,
         run.theorem_2.inter_event_s,
@@ -120,7 +111,7 @@ def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> Findings:
         "printed",
     )
     knows_state = run.record.scenario.coverage.knows_state
-    return found if knows_state else Findings(None, found.envelope)
+    return least if knows_state else Findings(None, least.envelope)
 
 
 @claim("the state decays", "Theorem 2, eq:normXt", _IDEAL, needs_ideal_loop=True)

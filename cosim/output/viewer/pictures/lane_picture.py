@@ -81,21 +81,21 @@ class LanePicture(draw.Picture):
     def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
         k = len(frames.t_s)
         zero = np.zeros(k)
-        found: dict[str, draw.Columns] = {}
+        columns: dict[str, draw.Columns] = {}
         for who in draw.WHO:
             x = frames.of(who)
-            found[who] = draw.poses(zero, x[:, self._lateral], self._hand * x[:, self._yaw])
+            columns[who] = draw.poses(zero, x[:, self._lateral], self._hand * x[:, self._yaw])
         along = abs(self._forward_mps) * frames.t_s
         if self._vehicle and frames.z is not None:
             # The first states of every vehicle model; the fourth is the speed.
             along, across, steering, _, yaw = frames.z[:, :5].T
-            found["plant"] = draw.poses(zero, self._hand * across, self._hand * yaw)
+            columns["plant"] = draw.poses(zero, self._hand * across, self._hand * yaw)
             for side, y in (("left", _TRACK_M), ("right", -_TRACK_M)):
-                found[f"plant/steered/{side}"] = draw.poses(
+                columns[f"plant/steered/{side}"] = draw.poses(
                     np.full(k, _AXLE_M), np.full(k, y), self._hand * steering
                 )
-        found["road/passing"] = draw.poses(-np.remainder(along, _POSTS_EVERY_M), zero)
-        return found
+        columns["road/passing"] = draw.poses(-np.remainder(along, _POSTS_EVERY_M), zero)
+        return columns
 
     def _car(self) -> dict[str, draw.Shape]:
         half = _LENGTH_M / 2

@@ -64,43 +64,43 @@ class PendulumPicture(draw.Picture):
 
     def scenery(self) -> Mapping[str, draw.Shape]:
         scale = self._scale
-        found: dict[str, draw.Shape] = {}
+        shapes: dict[str, draw.Shape] = {}
         if self._position is None:
             foot = [(-0.16 * scale, -0.1 * scale), (0.0, 0.0), (0.16 * scale, -0.1 * scale)]
-            found["pivot"] = draw.lines([foot], draw.STILL, 0.04 * scale)
-            found["upright"] = draw.lines([[(0.0, 0.0), (0.0, 1.15 * scale)]], draw.STILL, 0.008 * scale)
+            shapes["pivot"] = draw.lines([foot], draw.STILL, 0.04 * scale)
+            shapes["upright"] = draw.lines([[(0.0, 0.0), (0.0, 1.15 * scale)]], draw.STILL, 0.008 * scale)
         else:
             ground = -(_CART_HIGH / 2 + 0.03) * scale
             ends = (-2 * self._wide, 2 * self._wide)
             step = 10.0 ** np.floor(np.log10(self._wide))
             ticks = (step * np.arange(-10, 11)).tolist()
-            found["rail"] = draw.lines([[(ends[0], ground), (ends[1], ground)]], draw.STILL, 0.03 * scale)
-            found["rail/ticks"] = draw.lines(
+            shapes["rail"] = draw.lines([[(ends[0], ground), (ends[1], ground)]], draw.STILL, 0.03 * scale)
+            shapes["rail/ticks"] = draw.lines(
                 [[(at, ground), (at, ground - 0.08 * scale)] for at in ticks],
                 draw.STILL,
                 0.02 * scale,
             )
-            found["rail/zero"] = draw.lines(
+            shapes["rail/zero"] = draw.lines(
                 [[(0.0, ground), (0.0, ground - 0.2 * scale)]], draw.STILL, 0.03 * scale
             )
         for who in draw.WHO:
             if self._position is not None:
-                found[f"{who}/cart"] = self._cart(who)
+                shapes[f"{who}/cart"] = self._cart(who)
             if self._angle is not None:
-                found[f"{who}/pole"] = self._pole(who)
+                shapes[f"{who}/pole"] = self._pole(who)
         left, _, _, top = self.bounds()
-        return found | draw.legend(left + 0.7 * scale, top - 0.05 * scale, 0.22 * scale)
+        return shapes | draw.legend(left + 0.7 * scale, top - 0.05 * scale, 0.22 * scale)
 
     def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
-        found: dict[str, draw.Columns] = {}
+        columns: dict[str, draw.Columns] = {}
         for who in draw.WHO:
             x = frames.of(who)
             zero: draw.Reals = np.zeros(len(x))
             if self._position is not None:
-                found[who] = draw.poses(x[:, self._position], zero)
+                columns[who] = draw.poses(x[:, self._position], zero)
             if self._angle is not None:
-                found[f"{who}/pole"] = draw.poses(zero, zero, -x[:, self._angle])
-        return found
+                columns[f"{who}/pole"] = draw.poses(zero, zero, -x[:, self._angle])
+        return columns
 
     def _cart(self, who: str) -> draw.Shape:
         x, y = _CART / 2 * self._scale, _CART_HIGH / 2 * self._scale

@@ -42,39 +42,39 @@ class PhasePicture(draw.Picture):
 
     def scenery(self) -> Mapping[str, draw.Shape]:
         square = draw.outline([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-        found: dict[str, draw.Shape] = {
+        shapes: dict[str, draw.Shape] = {
             "axes": draw.lines([*square, [(-1, 0), (1, 0)], [(0, -1), (0, 1)]], draw.STILL, 0.006)
         }
         ends: list[tuple[str, float, tuple[float, float]]] = [(self._names[0], self._reach[0], (1.0, -1.0))]
         if len(self._names) == 2:
             ends.append((self._names[1], self._reach[1], (0.0, 1.17)))
         for i, (name, reach, at) in enumerate(ends):
-            found[f"axes/{i}"] = draw.label(f"{name} = {reach:.3g}", at, draw.STILL)
+            shapes[f"axes/{i}"] = draw.label(f"{name} = {reach:.3g}", at, draw.STILL)
         for who in draw.WHO:
             width = _WIDTHS[who]
             if who == "plant":  # filled by its line width
-                found[f"{who}/point"] = draw.body(who, [[(-1e-3, 0), (1e-3, 0)]], 0.06)
+                shapes[f"{who}/point"] = draw.body(who, [[(-1e-3, 0), (1e-3, 0)]], 0.06)
             else:
                 radius, dash = (_RING, None) if who == "sensor" else (1.6 * _RING, 0.01)
                 ring = draw.outline(draw.circle(radius, 16), dash)
-                found[f"{who}/point"] = draw.body(who, ring, 1.4 * width)
+                shapes[f"{who}/point"] = draw.body(who, ring, 1.4 * width)
             if self.trails:
-                found[f"{who}/trail"] = draw.trail_style(who, width)
-        return found | draw.legend(1.95, 1.0, 0.3)
+                shapes[f"{who}/trail"] = draw.trail_style(who, width)
+        return shapes | draw.legend(1.95, 1.0, 0.3)
 
     def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
-        found: dict[str, draw.Columns] = {}
+        columns: dict[str, draw.Columns] = {}
         for i, who in enumerate(draw.WHO):
             points = self._scaled(frames.of(who), 0.3 - 0.3 * i)
-            found[f"{who}/point"] = draw.poses(points[:, 0], points[:, 1])
+            columns[f"{who}/point"] = draw.poses(points[:, 0], points[:, 1])
             if self.trails:
                 before = np.vstack([self._last.get(who, points[:1]), points[:-1]])
                 # No line to or from an unknown state.
                 whole = np.isfinite(before + points).all(axis=1, keepdims=True)
                 before = np.where(whole, before, points)
-                found[f"{who}/trail"] = draw.strips(np.stack([before, points], axis=1))
+                columns[f"{who}/trail"] = draw.strips(np.stack([before, points], axis=1))
                 self._last[who] = points[-1:]
-        return found
+        return columns
 
     def _scaled(self, states: draw.Reals, row: float) -> draw.Reals:
         if len(self._names) == 1:

@@ -59,9 +59,9 @@ class Frames(NamedTuple):
     z: Reals | None = None
     """(k, N) internal state of a nonlinear plant; NaN if it was not recorded."""
 
-    def at(self, which: NDArray[np.bool_]) -> "Frames":
+    def at(self, subset: NDArray[np.bool_]) -> "Frames":
         """Return a subset."""
-        return Frames(*(None if part is None else part[which] for part in self))  # type: ignore[arg-type]
+        return Frames(*(None if part is None else part[subset] for part in self))  # type: ignore[arg-type]
 
     def of(self, who: str) -> Reals:
         """Return the state (k, n) of one of ``WHO``, in the loop's coordinates."""
@@ -191,8 +191,8 @@ def poses(x: Reals, y: Reals, angle_rad: Reals | None = None) -> Columns:
 
     A shape at NaN, or far outside the visible area, is moved to a place that is never visible.
     """
-    place = np.nan_to_num(np.column_stack([x, -y, np.zeros_like(x)]), nan=_FAR, posinf=_FAR)
-    translation = np.clip(place, -_FAR, _FAR).astype(np.float32)
+    position = np.nan_to_num(np.column_stack([x, -y, np.zeros_like(x)]), nan=_FAR, posinf=_FAR)
+    translation = np.clip(position, -_FAR, _FAR).astype(np.float32)
     if angle_rad is None:
         return rr.Transform3D.columns(translation=translation)
     half = -0.5 * np.nan_to_num(angle_rad, posinf=0.0, neginf=0.0)
@@ -251,7 +251,9 @@ def picture_of(scenario: Scenario) -> Picture:
     for module in pkgutil.iter_modules(import_module(package).__path__):
         import_module(f"{package}.{module.name}")
     kind = scenario.plant.system.kind
-    for drawing in sorted(Picture.__subclasses__(), key=lambda one: (one.draws_any, kind not in one.kinds)):
+    for drawing in sorted(
+        Picture.__subclasses__(), key=lambda each: (each.draws_any, kind not in each.kinds)
+    ):
         if (picture := drawing.of(plant)) is not None:
             return picture
     raise AssertionError("the phase plot draws any plant")

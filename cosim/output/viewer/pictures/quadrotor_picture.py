@@ -36,7 +36,7 @@ class QuadrotorPicture(draw.Picture):
         return -2 * apart, 3.3 * apart, -1.1 * reach, 1.4 * reach
 
     def scenery(self) -> Mapping[str, draw.Shape]:
-        found: dict[str, draw.Shape] = {}
+        shapes: dict[str, draw.Shape] = {}
         thin, edge = 0.008 * self._reach, self._reach
         for view, side in (("above", -1), ("side", 1)):
             middle = side * self._apart
@@ -50,43 +50,43 @@ class QuadrotorPicture(draw.Picture):
                 [(middle - edge, 0.0), (middle + edge, 0.0)],
                 [(middle, -edge), (middle, edge)],
             ]
-            found[f"{view}/frame"] = draw.lines([*draw.outline(corners), *cross], draw.STILL, thin)
+            shapes[f"{view}/frame"] = draw.lines([*draw.outline(corners), *cross], draw.STILL, thin)
             text = {"above": "from above: x, y", "side": "from the side: x, z"}
-            found[f"{view}/title"] = draw.label(text[view], (middle, 1.3 * edge), draw.STILL)
+            shapes[f"{view}/title"] = draw.label(text[view], (middle, 1.3 * edge), draw.STILL)
             for who in draw.WHO:
                 strips = (_above if view == "above" else _side)(dashed=who == "controller")
                 scaled = [np.multiply(strip, self._arm).tolist() for strip in strips]
-                found[f"{view}/{who}"] = draw.body(who, scaled, _WIDTHS[who] * self._arm)
-        return found | draw.legend(2.65 * self._apart, self._reach, 0.3 * self._reach)
+                shapes[f"{view}/{who}"] = draw.body(who, scaled, _WIDTHS[who] * self._arm)
+        return shapes | draw.legend(2.65 * self._apart, self._reach, 0.3 * self._reach)
 
     def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
-        found: dict[str, draw.Columns] = {}
+        columns: dict[str, draw.Columns] = {}
         for who in draw.WHO:
             state = frames.of(who)
             x, y, z, _, pitch, yaw = state[:, :6].T
-            found[f"above/{who}"] = draw.poses(x - self._apart, y, yaw)
+            columns[f"above/{who}"] = draw.poses(x - self._apart, y, yaw)
             # With z up, a positive pitch about +y turns the x axis down.
-            found[f"side/{who}"] = draw.poses(x + self._apart, z, -pitch)
-        return found
+            columns[f"side/{who}"] = draw.poses(x + self._apart, z, -pitch)
+        return columns
 
 
 def _above(*, dashed: bool) -> list[list[list[float]]]:
     """Return four rotors, their arms, and a nose, in units of an arm's length."""
-    found: list[list[list[float]]] = [[[0.0, 0.0], [0.6, 0.0]]]
+    lines: list[list[list[float]]] = [[[0.0, 0.0], [0.6, 0.0]]]
     for x in (-0.7, 0.7):
         for y in (-0.7, 0.7):
-            found += draw.outline(draw.circle(0.4, 12, (x, y)), 0.07 if dashed else None)
+            lines += draw.outline(draw.circle(0.4, 12, (x, y)), 0.07 if dashed else None)
             if not dashed:
-                found.append([[0.0, 0.0], [x, y]])
-    return found
+                lines.append([[0.0, 0.0], [x, y]])
+    return lines
 
 
 def _side(*, dashed: bool) -> list[list[list[float]]]:
     """Return two arms with mast and rotor at each end, in units of an arm's length."""
-    found: list[list[list[float]]] = []
+    lines: list[list[list[float]]] = []
     for side in (-1.0, 1.0):
-        found.append([[side - 0.4, 0.25], [side + 0.4, 0.25]])
-        found.append([[side, 0.0], [side, 0.25]])
+        lines.append([[side - 0.4, 0.25], [side + 0.4, 0.25]])
+        lines.append([[side, 0.0], [side, 0.25]])
     if not dashed:
-        return [[[-1.0, 0.0], [1.0, 0.0]], *found]
-    return [[[at, 0.0], [at + 0.13, 0.0]] for at in np.arange(-1, 1, 0.26).tolist()] + found
+        return [[[-1.0, 0.0], [1.0, 0.0]], *lines]
+    return [[[at, 0.0], [at + 0.13, 0.0]] for at in np.arange(-1, 1, 0.26).tolist()] + lines

@@ -37,30 +37,30 @@ class TanksPicture(draw.Picture):
             for left, low in _PLACES
         ]
         spouts = [[(left + _WIDE / 2, low), (left + _WIDE / 2, low - 0.3)] for left, low in _PLACES]
-        found: dict[str, draw.Shape] = {
+        shapes: dict[str, draw.Shape] = {
             "walls": draw.lines(walls, draw.STILL, 0.06),
             "spouts": draw.lines(spouts, draw.STILL, 0.06),
         }
         for i, (left, low) in enumerate(_PLACES):
             for who, (width, order) in _STYLES.items():
-                found[f"{who}/{i + 1}"] = draw.style(draw.WHO[who], width, order=order)
-            found[f"number/{i + 1}"] = draw.label(
+                shapes[f"{who}/{i + 1}"] = draw.style(draw.WHO[who], width, order=order)
+            shapes[f"number/{i + 1}"] = draw.label(
                 f"tank {i + 1}", (left + _WIDE / 2, low + _HIGH), draw.STILL
             )
-        return found | draw.legend(-2.6, 4.1, 0.45)
+        return shapes | draw.legend(-2.6, 4.1, 0.45)
 
     def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
-        found: dict[str, draw.Columns] = {}
+        columns: dict[str, draw.Columns] = {}
         if frames.z is None:
-            return found
+            return columns
         # x is the deviation of the levels z from the operating point, in cm.
         at_rest = frames.z - frames.x
         for who in draw.WHO:
             levels_cm = frames.of(who) + at_rest
             for i, (left, low) in enumerate(_PLACES):
                 height = low + np.maximum(levels_cm[:, i], 0.0) / _TALLEST_CM * _HIGH
-                found[f"{who}/{i + 1}"] = draw.strips(_level(who, left, low, height))
-        return found
+                columns[f"{who}/{i + 1}"] = draw.strips(_level(who, left, low, height))
+        return columns
 
 
 def _level(who: str, left: float, low: float, height: draw.Reals) -> draw.Reals:

@@ -16,7 +16,7 @@ from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
 from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
 from cosim.analysis.claims.observed_conditions import ObservedConditions, combined
 from cosim.analysis.replay import replay
-from cosim.analysis.summary_model import Claim, ClaimVerdict
+from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate

@@ -20,7 +20,7 @@ from cosim.analysis.claims.observed_conditions import (
     combined,
 )
 from cosim.analysis.claims.run_evidence import certificates_together
-from cosim.analysis.summary_model import ClaimVerdict
+from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.machine_interface import Start

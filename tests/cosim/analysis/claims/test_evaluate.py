@@ -14,7 +14,7 @@ from cosim.analysis.claims import catalogue
 from cosim.analysis.claims.claim_definition import CertifiedClaim, ClaimDefinition
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims, definitions
 from cosim.analysis.claims.run_evidence import trajectory_delta
-from cosim.analysis.summary_model import Claim, ClaimVerdict
+from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.align import AlignedRun, align_tables
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate

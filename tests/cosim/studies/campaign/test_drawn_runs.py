@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary.run_summary import summarise
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS

@@ -11,7 +11,7 @@ from functools import reduce
 
 import numpy as np
 
-from cosim.live.process_pool import process_starts, processes
+from cosim.live.processes.process_pool import process_starts, processes
 from tests.noack.theory.certificate_kinds import Broken, Kind, Tally
 from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, SCHEDULED
 from tests.noack.theory.certificate_kinds.decaying import DECAYING

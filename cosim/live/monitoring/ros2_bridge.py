@@ -17,7 +17,7 @@ import numpy as np
 import zenoh
 from zenoh.handlers import RingChannel
 
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
 from cosim.record.run_directory import SCENARIO_FILE
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.core.process_limits import python_command
@@ -51,11 +51,11 @@ class Ros2Bridge:
         self._types, self._phases_ns = run_tables(scenario), phases_ns(scenario)
         loops = resolved_loops(scenario)
         self._names = [loop.name for loop in loops]
-        self._entries = [(loop_of(one).state_names, loop_of(one).input_names) for one in loops]
-        topics = [topic for found in ros2.TOPICS.values() for topic in found]
+        self._entries = [(loop_of(loop).state_names, loop_of(loop).input_names) for loop in loops]
+        topics = [topic for names in ros2.TOPICS.values() for topic in names]
         self._publishers: list[dict[str, Publisher]] = [
             {topic: node.publisher(f"{prefix}/{topic}") for topic in topics}
-            for prefix in (ros2.namespace(one, is_only=len(loops) == 1) for one in self._names)
+            for prefix in (ros2.namespace(name, is_only=len(loops) == 1) for name in self._names)
         ]
         self.sent = 0
         """Number of published messages."""
@@ -93,7 +93,7 @@ def bridge_run(run: OpenRun, node: Node) -> int:
                 return bridge.sent
             if time.monotonic() - looked_s > _LOOK_S:
                 looked_s = time.monotonic()
-                is_active = any(one.name == run.name for one in run_registry.active_runs())
+                is_active = any(active.name == run.name for active in run_registry.active_runs())
             time.sleep(_POLL_S)
 
 
@@ -132,7 +132,7 @@ def bridge_process(router: str, domain: int, *, listen: bool) -> Iterator[Watche
         CallerError: it cannot join the graph of ROS 2; its process has printed why.
     """
     ros2.require_installed("noack bridge")
-    words = python_command("-m", "cosim.live.bridge.ros2_bridge", router, domain, int(listen))
+    words = python_command("-m", "cosim.live.monitoring.ros2_bridge", router, domain, int(listen))
     pipe = subprocess.PIPE
     with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdin is not None

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 _PROGRAM = """
-from cosim.live.process_pool import process_starts, processes
+from cosim.live.processes.process_pool import process_starts, processes
 
 print("once", flush=True)
 with processes(2) as pool:

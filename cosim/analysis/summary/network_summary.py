@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.run_summary import change_parts
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.run_summary import change_parts
+from cosim.analysis.summary.summary_model import (
     Claim,
     DeadlinesPart,
     ExitPart,
@@ -56,23 +56,23 @@ def summarise_run(
         packets["flow"], np.where(packets["release_ns"] >= 0, packets["size_bytes"], 0), len(loops)
     )
     shares = forwarded_bytes / max(forwarded_bytes.sum(), 1)
-    reached_s = min(one.reached_s for one in loops)
+    reached_s = min(loop.reached_s for loop in loops)
     return RunSummary(
         kind=network.kind,
         startup_s=startup_s,
         scenario=scenario.name,
         mansd=scenario.network.mansd,
-        constraints=[one.text() for one in scenario.network.constraints],
+        constraints=[constraint.text() for constraint in scenario.network.constraints],
         horizon_s=scenario.horizon_s,
         speed=scenario.speed,
         reached_s=reached_s,
         network=_network_part(network, packets, loops, reached_s),
         loops=[
-            one.model_copy(update={"link_share": float(share)})
-            for one, share in zip(loops, shares, strict=True)
+            loop.model_copy(update={"link_share": float(share)})
+            for loop, share in zip(loops, shares, strict=True)
         ],
         changes=change_parts(network),
-        deadlines=_deadlines([one.lateness_us for one in loops]),
+        deadlines=_deadlines([loop.lateness_us for loop in loops]),
         exit=end if end.status != ExitStatus.OK else _end(end, loops),
     )
 
@@ -80,21 +80,21 @@ def summarise_run(
 def _deadlines(lateness_us: Sequence[Mapping[str, LatenessPart]]) -> dict[str, DeadlinesPart]:
     return {
         role: DeadlinesPart(
-            steps=sum(one[role].steps for one in lateness_us),
-            late_steps=sum(one[role].late_steps for one in lateness_us),
-            max_us=max((one[role].max or 0.0 for one in lateness_us if one[role].steps), default=None),
+            steps=sum(late[role].steps for late in lateness_us),
+            late_steps=sum(late[role].late_steps for late in lateness_us),
+            max_us=max((late[role].max or 0.0 for late in lateness_us if late[role].steps), default=None),
         )
         for role in lateness_us[0]
     }
 
 
 def _end(end: ExitPart, loops: Sequence[LoopSummary]) -> ExitPart:
-    failed = [one for one in loops if one.exit.status != ExitStatus.OK]
+    failed = [loop for loop in loops if loop.exit.status != ExitStatus.OK]
     if not failed:
         return end
     if len(loops) == 1:
         return loops[0].exit
-    named = [f"{one.name} {_brief(one)}" for one in failed[:_MOST_NAMED]]
+    named = [f"{loop.name} {_brief(loop)}" for loop in failed[:_MOST_NAMED]]
     more = len(failed) - len(named)
     shown = ", ".join(named) + (f" and {more} more" if more else "")
     reason = f"{len(failed)} of {len(loops)} loops failed ({shown})"
@@ -111,15 +111,15 @@ def _network_part(
     network: RunRecord, packets: Rows, loops: Sequence[LoopSummary], reached_s: float
 ) -> NetworkPart:
     fates, stages = packets["fate"], network.scenario.network.impairments
-    rates = [one for one in stages if isinstance(one, Rate)]
-    slowest = min(rates, key=lambda one: one.rate_bps, default=None)
+    rates = [stage for stage in stages if isinstance(stage, Rate)]
+    slowest = min(rates, key=lambda rate: rate.rate_bps, default=None)
     reached_ns = max(round(reached_s * NS_PER_S), 1)
     return NetworkPart(
         datagrams=len(packets),
         forwarded=int((packets["release_ns"] >= 0).sum()),
         forced_deliveries=int((fates == Fate.FORCED).sum()),
-        drops_by_cause=dict(sum((Counter(one.drops_by_cause) for one in loops), Counter())),
-        longest_loss_burst=max(one.longest_loss_burst for one in loops),
+        drops_by_cause=dict(sum((Counter(loop.drops_by_cause) for loop in loops), Counter())),
+        longest_loss_burst=max(loop.longest_loss_burst for loop in loops),
         rate_bps=None if slowest is None else slowest.rate_bps,
         utilisation=(None if slowest is None else _utilisation(packets, slowest, stages, reached_ns)),
         in_flight=in_flight(packets, network.scenario.timing.horizon_ns, reached_ns),
@@ -128,7 +128,7 @@ def _network_part(
 
 def _utilisation(packets: Rows, bottleneck: Rate, stages: Sequence[Impairment], until_ns: int) -> float:
     """Return the share of a bottleneck's rate that was used until a time."""
-    copied = any(isinstance(one, Duplicate) for one in stages[: stages.index(bottleneck)])
+    copied = any(isinstance(stage, Duplicate) for stage in stages[: stages.index(bottleneck)])
     left = [packets[name] for name in (("release_ns", "copy_ns") if copied else ("release_ns",))]
     times = sum(((at_ns >= 0) & (at_ns <= until_ns)).astype(np.int64) for at_ns in left)
     bits = (bottleneck.line_bits(packets["size_bytes"]) * times).sum()
@@ -167,7 +167,7 @@ def counts_inside(
     # The number of datagrams at t is the number of begins minus the number of ends up to t; its
     # integral from 0 to t is the sum of the times since each begin, minus that since each end.
     integral = _time_since(begin_ns, edges_ns) - _time_since(end_ns, edges_ns)
-    first_ns, last_ns = (edges_ns[place].astype(np.int64) for place in (slice(-1), -1))
+    first_ns, last_ns = (edges_ns[part].astype(np.int64) for part in (slice(-1), -1))
     new_ns = begin_ns[(begin_ns > first_ns[0]) & (begin_ns < last_ns)]
     at_ns = np.unique(np.concatenate([new_ns, first_ns]))
     counts = np.searchsorted(begin_ns, at_ns, "right") - np.searchsorted(end_ns, at_ns, "right")
@@ -231,11 +231,11 @@ def loops_over_time(run: RecordedRun, known: Sequence[LoopOverTime] | None = Non
             loop_over_time(record, phase_ns)
             for record, phase_ns in zip(run.loops, phases_ns(run.scenario), strict=True)
         ]
-    found = empty_over_time(run.scenario)
+    over_time = empty_over_time(run.scenario)
     for number, (errors, states) in enumerate(known):
-        found.errors[number], found.states[number] = errors, states
-    add_link_bytes(found.link_bytes, run.network[NETEM_PACKET], run.scenario.timing.horizon_ns)
-    return found
+        over_time.errors[number], over_time.states[number] = errors, states
+    add_link_bytes(over_time.link_bytes, run.network[NETEM_PACKET], run.scenario.timing.horizon_ns)
+    return over_time
 
 
 @np.errstate(all="ignore")  # a loop may diverge
@@ -245,18 +245,18 @@ def loop_over_time(record: RunRecord, phase_ns: int) -> LoopOverTime:
     errors, states = np.full((2, INTERVALS), np.nan)
     for part in aligned_parts(record):
         aligned = part.aligned
-        place = places(aligned.t_ns + phase_ns, horizon_ns)
+        columns = places(aligned.t_ns + phase_ns, horizon_ns)
         common = aligned.since_delivery(record.scenario)
-        _raise(states, place, row_norms(aligned.x))
-        _raise(errors, place[common], aligned.e_c_norm[common])
+        _raise(states, columns, row_norms(aligned.x))
+        _raise(errors, columns[common], aligned.e_c_norm[common])
     return LoopOverTime(errors, states)
 
 
-def _raise(largest: Reals, place: NDArray[np.int64], values: Reals) -> None:
+def _raise(largest: Reals, columns: NDArray[np.int64], values: Reals) -> None:
     """Take the largest values at places, which ascend, into account."""
-    if len(place):
-        first = np.flatnonzero(np.diff(place, prepend=-1))
-        at = place[first]
+    if len(columns):
+        first = np.flatnonzero(np.diff(columns, prepend=-1))
+        at = columns[first]
         largest[at] = np.fmax(largest[at], np.fmax.reduceat(values, first))
 
 
@@ -273,8 +273,8 @@ def add_link_bytes(link_bytes: Reals, packets: Rows, horizon_ns: int) -> None:
     left = (packets["release_ns"] >= 0) & (packets["release_ns"] <= horizon_ns)
     left &= packets["flow"] < len(link_bytes)  # the others are of the other direction
     packets = packets[left]
-    place = places(packets["release_ns"], horizon_ns)
-    np.add.at(link_bytes, (packets["flow"], place), packets["size_bytes"])
+    columns = places(packets["release_ns"], horizon_ns)
+    np.add.at(link_bytes, (packets["flow"], columns), packets["size_bytes"])
 
 
 def places(t_ns: NDArray[np.int64], horizon_ns: int) -> NDArray[np.int64]:
@@ -285,11 +285,11 @@ def places(t_ns: NDArray[np.int64], horizon_ns: int) -> NDArray[np.int64]:
 def quantiles(values: Reals) -> Reals:
     """Return the ``QUANTILES`` over the loops of values (L, k), (6, k); NaN where all are."""
     known = np.isfinite(values)
-    found, counts = np.full((len(QUANTILES), values.shape[1]), np.nan), known.sum(axis=0)
-    seen = np.flatnonzero(counts)
+    shares, counts = np.full((len(QUANTILES), values.shape[1]), np.nan), known.sum(axis=0)
+    observed = np.flatnonzero(counts)
     ordered = np.sort(np.where(known, values, np.inf), axis=0)
-    found[:, seen] = quantiles_in(ordered, counts[seen], np.array(QUANTILES)[:, None], seen)
-    return found
+    shares[:, observed] = quantiles_in(ordered, counts[observed], np.array(QUANTILES)[:, None], observed)
+    return shares
 
 
 class WorstLoop(NamedTuple):
@@ -311,13 +311,13 @@ def worst_loop(loops: Sequence[LoopSummary]) -> WorstLoop:
             return WorstLoop(loop.number, loop.exit.reason)
     used = [_share_used(loop.claims) for loop in loops]
     if max(used) > 0:
-        place = int(np.argmax(used))
-        text = f"largest share of a certified bound of ‖e_c‖ or ‖x‖: {100 * used[place]:.3g} %"
-        return WorstLoop(loops[place].number, text)
+        number = int(np.argmax(used))
+        text = f"largest share of a certified bound of ‖e_c‖ or ‖x‖: {100 * used[number]:.3g} %"
+        return WorstLoop(loops[number].number, text)
     errors = [-1.0 if loop.sup_e_c_norm is None else loop.sup_e_c_norm for loop in loops]
-    place = int(np.argmax(errors))
-    text = f"largest ‖e_c‖, {shown(errors[place])}; no loop has a certified bound"
-    return WorstLoop(loops[place].number, text)
+    number = int(np.argmax(errors))
+    text = f"largest ‖e_c‖, {shown(errors[number])}; no loop has a certified bound"
+    return WorstLoop(loops[number].number, text)
 
 
 def _share_used(claims: Sequence[Claim]) -> float:

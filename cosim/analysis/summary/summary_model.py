@@ -435,7 +435,7 @@ class RunSummary(SummaryPart):
 
     @model_validator(mode="after")
     def _numbers_ascend(self) -> Self:
-        numbers = [one.number for one in self.loops]
+        numbers = [loop.number for loop in self.loops]
         if numbers != sorted(set(numbers)):
             raise ValueError("the numbers of the loops ascend")
         return self

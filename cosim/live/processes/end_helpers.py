@@ -17,7 +17,7 @@ from pathlib import Path
 from threading import Thread, current_thread
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from cosim.live.process_pool import at_idle_priority, called, process_starts, processes
+from cosim.live.processes.process_pool import at_idle_priority, called, process_starts, processes
 from cosim.record.run_directory import RunEnding
 from noack.core.process_limits import cores
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
@@ -53,9 +53,9 @@ class EndHelpers:
         self._pool: ProcessPoolExecutor | None = None
         self._due: deque[Callable[[], object]] = deque()
         """What is still to be prepared."""
-        self._found: dict[int, Expectations] = {}
+        self._expected: dict[int, Expectations] = {}
         self._ended: Path | None = None
-        """Says that the run has ended to who writes tables; see ``cosim.record.early_tables``."""
+        """Says that the run has ended to who writes tables; see ``cosim.record.spool_conversion``."""
         self._writer: Thread | None = None
         """Waits for them."""
         self.early: Mapping[str, int] = {}
@@ -85,12 +85,12 @@ class EndHelpers:
             pass
 
     def _prepare_loops(self, run_dir: Path, block: range) -> None:
-        found = cast("Sequence[Expectations]", self._idle("expectations_of", run_dir, block))
-        self._found |= zip(block, found, strict=True)
+        expectations = cast("Sequence[Expectations]", self._idle("expectations_of", run_dir, block))
+        self._expected |= zip(block, expectations, strict=True)
 
     def _write_early(self, run_dir: Path) -> None:
         self._ended, self._writer = run_dir / SPOOL / EARLY / EARLY_ENDED, current_thread()
-        written = self.submit(called, "cosim.record.early_tables", "write_early", run_dir).result()
+        written = self.submit(called, "cosim.record.spool_conversion", "write_early", run_dir).result()
         self.early = cast("Mapping[str, int]", written)
 
     def _tell_writer(self) -> bool:
@@ -115,8 +115,8 @@ class EndHelpers:
 
     def expectations(self, loops: range) -> "Sequence[Expectations] | None":
         """Return what to expect of some loops, if all of them are prepared."""
-        found = [self._found[number] for number in loops if number in self._found]
-        return found if len(found) == len(loops) else None
+        expectations = [self._expected[number] for number in loops if number in self._expected]
+        return expectations if len(expectations) == len(loops) else None
 
     def start(self) -> None:
         """Have processes that are free; prepare no more.
@@ -125,10 +125,10 @@ class EndHelpers:
         """
         self._due.clear()
         until_s = time.monotonic() + _GRACE_S
-        told = False
+        notified = False
         while any(thread.is_alive() for thread in self._threads):
-            told = told or self._tell_writer()
-            if time.monotonic() > until_s and not (told and self._is_writing):
+            notified = notified or self._tell_writer()
+            if time.monotonic() > until_s and not (notified and self._is_writing):
                 break
             time.sleep(_POLL_S)
         if any(thread.is_alive() for thread in self._threads):
@@ -160,19 +160,19 @@ class EndHelpers:
     ) -> Iterable[Result]:
         """Call a function for each item, here and in the processes; return its results."""
         with self.shared(work, partial(self.call, function), show) as take:
-            found = take(function)
-        return found.values()
+            results = take(function)
+        return results.values()
 
     @contextmanager
     def shared(
-        self, work: Iterable[Item], there: Callable[[Item], Result], show: Callable[[float], None]
+        self, work: Iterable[Item], elsewhere: Callable[[Item], Result], show: Callable[[float], None]
     ) -> Iterator[Callable[[Callable[[Item], Result]], Mapping[Item, Result]]]:
-        """Let threads do work ``there``, item by item, while this one does it with what is yielded.
+        """Let threads do work ``elsewhere``, item by item; this one does it with what is yielded.
 
         This returns the results, all of which are there at the end of the context. ``show`` is
         called with the completed share.
         """
-        waiting, found = deque(work), dict[Item, Result]()
+        waiting, results = deque(work), dict[Item, Result]()
         count = len(waiting)
 
         def left() -> Iterator[Item]:
@@ -182,18 +182,18 @@ class EndHelpers:
 
         def work_on(function: Callable[[Item], Result]) -> Mapping[Item, Result]:
             for item in left():
-                found[item] = function(item)
-                show(len(found) / count)
-            return found
+                results[item] = function(item)
+                show(len(results) / count)
+            return results
 
         with ThreadPoolExecutor(max(self.count, 1)) as threads:
-            others = [threads.submit(work_on, there) for _ in range(min(self.count, count - 1))]
+            futures = [threads.submit(work_on, elsewhere) for _ in range(min(self.count, count - 1))]
             try:
                 yield work_on
             finally:
                 waiting.clear()  # an interrupted run waits for one item at most
-        for other in others:
-            other.result()
+        for future in futures:
+            future.result()
 
     def close(self) -> None:
         """End the processes."""

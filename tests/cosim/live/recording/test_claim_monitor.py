@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.claims.condition_reader import AssumptionMonitor
-from cosim.live.claim_monitor import MOST_CHECKED, ClaimMonitor, Finding
+from cosim.live.recording.claim_monitor import MOST_CHECKED, ClaimMonitor, Finding
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.clock import NS_PER_S

@@ -136,9 +136,9 @@ class ClaimMonitor:
             self._limits_s += time.thread_time() - began_s
         return f"; there are certificates for up to {limit_s:.4g} s" if limit_s else ""
 
-    def _add(self, loop: int, t_ns: int, level: str, what: str, why: str) -> None:
-        own = f"{what} from {t_ns / NS_PER_S:.3f} s on: {why}"
-        of_run = f"{what} from {self._of_run_s(loop, t_ns):.3f} s on: {why}"
+    def _add(self, loop: int, t_ns: int, level: str, event: str, why: str) -> None:
+        own = f"{event} from {t_ns / NS_PER_S:.3f} s on: {why}"
+        of_run = f"{event} from {self._of_run_s(loop, t_ns):.3f} s on: {why}"
         if len(self._names) > 1:
             of_run = f"{self._names[loop]}: {of_run}"
         self._found.append(Finding(Notice(t_ns, level, own, loop), of_run))
@@ -147,5 +147,5 @@ class ClaimMonitor:
         return (t_ns + self._phases_ns[loop]) / NS_PER_S
 
     def _take_found(self) -> list[Finding]:
-        found, self._found = self._found, []
-        return found
+        findings, self._found = self._found, []
+        return findings

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
 from noack.core.clock import NS_PER_S
 from noack.runtime.control_messages import RunProgress
 from noack.runtime.join_ticket import DEFAULT_SESSION
@@ -140,22 +140,22 @@ class _RunProgress:
 
 @contextmanager
 def _bar(
-    console: Console, total: float, *columns: TextColumn | TimeRemainingColumn, what: str = ""
+    console: Console, total: float, *columns: TextColumn | TimeRemainingColumn, description: str = ""
 ) -> Iterator[Callable[..., None]]:
     """Show a bar while the context lasts, on a terminal only; yields what updates it."""
-    head = (TextColumn("{task.description}"),) if what else ()
+    head = (TextColumn("{task.description}"),) if description else ()
     disabled = not console.is_terminal
     with Progress(
         *head, BarColumn(), *columns, console=console, disable=disabled, transient=True
     ) as progress:
-        task = progress.add_task(what, total=total, rate="")
+        task = progress.add_task(description, total=total, rate="")
         yield lambda **fields: progress.update(task, **fields)
 
 
 @contextmanager
-def work_bar(what: str) -> Iterator[Callable[[float], None]]:
+def work_bar(description: str) -> Iterator[Callable[[float], None]]:
     """Show the completed share of some work."""
-    with _bar(error_console(), 1.0, what=what) as update:
+    with _bar(error_console(), 1.0, description=description) as update:
         yield lambda share: update(completed=share)
 
 
@@ -204,14 +204,14 @@ def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None
     with console.status("searching") as status:
 
         def named(aim: str) -> Callable[[str, int, float], None]:
-            def report(what: str, nodes: int, value: float) -> None:
+            def report(search: str, nodes: int, value: float) -> None:
                 nonlocal line_s
                 now_s = time.monotonic()
                 spent = f"{nodes} segments, worst {abs(value):.6g}, {now_s - began_s:.0f} s"
-                status.update(f"{aim}, {what}: {spent}")
+                status.update(f"{aim}, {search}: {spent}")
                 if not console.is_terminal and now_s - line_s >= _LINE_EVERY_S:
                     line_s = now_s
-                    line = f"noack: {aim}, {what}: {spent}"
+                    line = f"noack: {aim}, {search}: {spent}"
                     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
             return report

@@ -13,8 +13,7 @@ from noack.runtime.control_messages import RunProgress
 if TYPE_CHECKING:
     from cosim.live.remote_access import Listening
 
-_SOURCE = "noack"
-_EVERY_S = 1.0
+_SOURCE, _EVERY_S = "noack", 1.0
 
 
 @dataclass(frozen=True)

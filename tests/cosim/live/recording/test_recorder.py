@@ -14,11 +14,11 @@ import zenoh
 from rich.console import Console
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.loop_statistics import list_violations
-from cosim.analysis.run_summary import summarise
-from cosim.live import recorder
-from cosim.live.progress import progress_line
-from cosim.live.recorder import Recorder
+from cosim.analysis.summary.loop_statistics import list_violations
+from cosim.analysis.summary.run_summary import summarise
+from cosim.live.monitoring.progress import progress_line
+from cosim.live.recording import recorder
+from cosim.live.recording.recorder import Recorder
 from cosim.output.viewer.recording import ViewError
 from cosim.record.record_source import with_loop
 from cosim.record.run_directory import SCENARIO_FILE

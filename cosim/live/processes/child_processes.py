@@ -21,8 +21,8 @@ from typing import IO, Annotated, NamedTuple, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from cosim.live.coordinator import Coordinator
-from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
+from cosim.live.processes.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import open_append
 from noack.core.process_limits import python_command
@@ -37,7 +37,7 @@ SSH_FAILED = 255
 _CONNECT_WITHIN_S = 10
 _OPTIONS = ("-T", "-o", "BatchMode=yes", "-o", f"ConnectTimeout={_CONNECT_WITHIN_S}")
 MODULES = {
-    "recorder": "cosim.live.recorder",
+    "recorder": "cosim.live.recording.recorder",
     "netem": "netem.__main__",
     "plant": "plant_server.__main__",
     "sensor": "sensor_node.__main__",

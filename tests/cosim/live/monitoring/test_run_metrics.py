@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import noack
-from cosim.live.run_metrics import RunMetrics
-from cosim.live.run_watcher import Watcher, joint_watcher
+from cosim.live.monitoring.run_metrics import RunMetrics
+from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
 from tests.command_line import invoke
 from tests.netem.control.test_emulator_metrics import exposed, values_of

@@ -11,7 +11,7 @@ from pathlib import Path
 from prometheus_client import Metric
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 
-from cosim.live.run_watcher import Watcher
+from cosim.live.monitoring.run_watcher import Watcher
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario import Scenario
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import DROPOUTS, AssumptionViolation
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.summary_model import (
     DisturbancePart,
     EstimationPart,
     FlowPart,
@@ -139,7 +139,7 @@ def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
     """Return the number of lost updates by cause, without causes of no losses."""
     fates = outcomes.fate
     counts = Counter(fates.tolist())
-    causes = {one.name.lower(): counts[one] for one in Fate if not one.effective}
+    causes = {fate.name.lower(): counts[fate] for fate in Fate if not fate.effective}
     causes["delivered_out_of_order"] = int((effective(fates) & outcomes.lost).sum())
     return {cause: n for cause, n in causes.items() if n}
 
@@ -194,7 +194,8 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
         legs[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
         legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(_left_until(answers, last_ns), arrived)
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
-    return {leg: max(one.count(complete=complete) - _not_finite(record, leg), 0) for leg, one in legs.items()}
+    counts = {leg: unmatched.count(complete=complete) for leg, unmatched in legs.items()}
+    return {leg: max(count - _not_finite(record, leg), 0) for leg, count in counts.items()}
 
 
 def _not_finite(record: RunRecord, leg: str) -> int:
@@ -236,9 +237,9 @@ def missing_rows(record: RunRecord) -> Counter[str]:
     """
     missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
-        for place, counts in enumerate(record.row_counts(role)):
+        for life, counts in enumerate(record.row_counts(role)):
             if counts.report is None:
-                missing[role] += record.lives(role)[place].missing_inputs
+                missing[role] += record.lives(role)[life].missing_inputs
                 continue
             for table, count in counts.rows.items():
                 missing[table] += counts.report["rows"][table] - count
@@ -250,7 +251,7 @@ def reported_violations(record: RunRecord) -> list[ViolationPart]:
 
     The burst at the end is computed here, because no process can detect it.
     """
-    found = [
+    violations = [
         ViolationPart(
             t_s=notice["t_ns"] * 1e-9,
             process=notice["process"],
@@ -266,10 +267,10 @@ def reported_violations(record: RunRecord) -> list[ViolationPart]:
     mansd = _largest_mansd(record, int(outcomes.event_ns[first - 1]) if first else 0)
     dropped = len(outcomes.lost) - first
     if dropped > mansd:
-        what = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
+        text = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
         at_s = float(outcomes.event_ns[first + mansd]) * 1e-9
-        found.append(ViolationPart(t_s=at_s, process="netem", cause=DROPOUTS, what=what))
-    return found
+        violations.append(ViolationPart(t_s=at_s, process="netem", cause=DROPOUTS, what=text))
+    return violations
 
 
 def _cause(text: str) -> str:
@@ -287,28 +288,28 @@ def list_violations(
 
     A violation of M − 1 that a process reported is not repeated.
     """
-    known = {one.cause for one in reported}
+    known = {violation.cause for violation in reported}
     return [*reported] + [
-        ViolationPart(t_s=one.t_s, process="recorder", cause=one.cause, what=one.text)
-        for one in observed
-        if one.cause not in known
+        ViolationPart(t_s=violation.t_s, process="recorder", cause=violation.cause, what=violation.text)
+        for violation in observed
+        if violation.cause not in known
     ]
 
 
 def _setpoints(record: RunRecord) -> tuple[list[int], Matrix]:
     """Return when the set point changed, (k,), and the set points x_r, (k + 1, n); 0 is a row."""
     changes = changes_of(record)
-    given = (setpoint_of(one) for one in (record.scenario, *(one.scenario for one in changes)))
+    given = (setpoint_of(change) for change in (record.scenario, *(change.scenario for change in changes)))
     nothing = np.zeros(loop_of(record.scenario).n)
     points = [nothing if setpoint is None else setpoint[0] for setpoint in given]
-    return [one.first_ns for one in changes], np.array(points)
+    return [change.first_ns for change in changes], np.array(points)
 
 
 def _largest_mansd(record: RunRecord, since_ns: int) -> int:
     """The largest M − 1 in force at any time from ``since_ns`` on."""
     changes = changes_of(record)
-    caps = [record.scenario.network.mansd, *(one.scenario.network.mansd for one in changes)]
-    ends_ns = [*(one.everywhere_ns for one in changes), NEVER_NS]
+    caps = [record.scenario.network.mansd, *(change.scenario.network.mansd for change in changes)]
+    ends_ns = [*(change.everywhere_ns for change in changes), NEVER_NS]
     return max(cap for cap, end_ns in zip(caps, ends_ns, strict=True) if end_ns > since_ns)
 
 
@@ -346,16 +347,16 @@ class SampleFactsReader:
         if not len(joined.t_ns):
             return
         common = shares_update(self._scenario, joined) if common is None else common
-        found, t_s = self._found, joined.t_ns * 1e-9
-        started = np.logical_or.accumulate(common) | found.any_in_common
+        facts, t_s = self._found, joined.t_ns * 1e-9
+        started = np.logical_or.accumulate(common) | facts.any_in_common
         gaps = np.flatnonzero(started & ~common)
-        gap_s = float(t_s[gaps[0]]) if found.gap_s is None and len(gaps) else found.gap_s
+        gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
         until = t_s < self._until_s
         both = np.concatenate([joined.x_s[until], joined.x_c[common & until]])
-        largest = float(np.abs(both[np.isfinite(both)]).max(initial=found.largest_state))
+        largest = float(np.abs(both[np.isfinite(both)]).max(initial=facts.largest_state))
         changes = joined.t_ns[np.flatnonzero(np.diff(joined.received, prepend=self._newest))]
         ends_ns = changes if self._fresh_ns is None else np.append(self._fresh_ns, changes)
-        longest_ns = int(np.diff(ends_ns).max(initial=found.longest_update_ns))
+        longest_ns = int(np.diff(ends_ns).max(initial=facts.longest_update_ns))
         self._fresh_ns = int(ends_ns[-1]) if len(ends_ns) else None
         self._newest, self._last_ns = int(joined.received[-1]), int(joined.t_ns[-1])
         self._found = SampleFacts(bool(started[-1]), gap_s, largest, longest_ns)
@@ -480,16 +481,16 @@ def signal_statistics(record: RunRecord) -> "SignalStatistics":
 
 def disturbances(record: RunRecord) -> list[DisturbancePart]:
     """The disturbances of u and of ẋ."""
-    found = []
-    for place, column in (("input", "d"), ("state", "w")):
+    parts = []
+    for entry, column in (("input", "d"), ("state", "w")):
         if column not in (record.tables[PLANT_STEP].names or ()):
             continue
         sizes = SizeStatistics()
         for steps in record.source.batches(PLANT_STEP, (column,)):
             sizes.add(row_norms(steps[column]))
-        kinds = [one.kind for one in record.scenario.plant.disturbances if one.at == place]
-        found.append(DisturbancePart(at=place, kinds=kinds, rms=sizes.rms, max=sizes.max))
-    return found
+        kinds = [cause.kind for cause in record.scenario.plant.disturbances if cause.at == entry]
+        parts.append(DisturbancePart(at=entry, kinds=kinds, rms=sizes.rms, max=sizes.max))
+    return parts
 
 
 def watchdog_actions(record: RunRecord) -> WatchdogPart:
@@ -502,17 +503,17 @@ def watchdog_actions(record: RunRecord) -> WatchdogPart:
         steps = part[PLANT_STEP]
         known = np.append(known, part[PLANT_ACTUATION]["sequence"])
         known_ns = np.append(known_ns, part[PLANT_ACTUATION]["t_ns"])
-        found = np.searchsorted(known, steps["actuation"])
-        there = np.append(known, NO_SEQUENCE)[found] == steps["actuation"]
-        newest_ns = np.where(steps["actuation"] != NO_SEQUENCE, np.append(known_ns, 0)[found], 0)
+        index = np.searchsorted(known, steps["actuation"])
+        is_recorded = np.append(known, NO_SEQUENCE)[index] == steps["actuation"]
+        newest_ns = np.where(steps["actuation"] != NO_SEQUENCE, np.append(known_ns, 0)[index], 0)
         # If an actuation is not recorded, its age is unknown.
-        old = there & too_old(steps["t_ns"], newest_ns, timing.actuation_timeout_ns)
+        old = is_recorded & too_old(steps["t_ns"], newest_ns, timing.actuation_timeout_ns)
         begun = np.flatnonzero(old & ~np.append(was_old, old[:-1])[: len(old)])
         if len(begun) and first_s is None:
             first_s = float(steps["t_ns"][begun[0]]) * 1e-9
         trips, steps_old = trips + len(begun), steps_old + int(old.sum())
         if len(steps):  # a later step has the newest of these actuations, or a later one
-            was_old, used = bool(old[-1]), int(found[-1])
+            was_old, used = bool(old[-1]), int(index[-1])
             known, known_ns = known[used:], known_ns[used:]
     return WatchdogPart(
         policy=record.scenario.plant.watchdog.policy,

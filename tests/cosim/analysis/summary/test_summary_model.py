@@ -14,8 +14,8 @@ from pydantic import BaseModel
 from rich.console import Console
 
 import noack
-from cosim.analysis.run_summary import Outcome, summarise
-from cosim.analysis.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
+from cosim.analysis.summary.run_summary import Outcome, summarise
+from cosim.analysis.summary.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.output.report_page import Report, page
 from cosim.output.run_tables import key_numbers
 from cosim.output.run_verdict import print_outcome
@@ -125,7 +125,7 @@ def show(record: RunRecord, summary: RunSummary) -> None:
 
 
 def test_the_docs_list_every_key() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "record.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[4] / "docs" / "record.md").read_text(encoding="utf-8")
     rows = [line.split(" | ")[0] for line in text[text.index("\n## The summary") :].splitlines()]
     keys = [key for row in rows if row.startswith("| `") for key in re.findall(r"`(\w+)`", row)]
     expected = [*RunSummary.model_fields, *NetworkPart.model_fields, *LoopSummary.model_fields]

@@ -53,7 +53,7 @@ _IMPORTS = (
     "sensor_node.__main__",
     "controller_node.__main__",
     "netem.__main__",
-    "cosim.live.recorder",
+    "cosim.live.recording.recorder",
     "numpy.random",
     "zenoh",
 )
@@ -138,7 +138,7 @@ class ForkServer:
             on_error.callback(self._socket.close)
             forked = self._forked(its) if of_itself else None
             self._process = forked or subprocess.Popen(
-                python_command("-m", "cosim.live.fork_server", its.fileno()),
+                python_command("-m", "cosim.live.processes.fork_server", its.fileno()),
                 pass_fds=[its.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # the launcher handles Ctrl-C

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from cosim.live.fork_server import ForkedProcess, ForkServer, fork_server
+from cosim.live.processes.fork_server import ForkedProcess, ForkServer, fork_server
 from noack.core.errors import ExitStatus, MachineError
 from tests.integration.conftest import wait_for
 
@@ -57,7 +57,7 @@ def test_a_process_is_a_child_in_a_session_of_its_own(server: ForkServer, tmp_pa
 _OF_ITSELF = """
 import os, signal, sys
 from contextlib import closing
-from cosim.live.fork_server import ForkServer
+from cosim.live.processes.fork_server import ForkServer
 signal.signal(signal.SIGTERM, lambda *_: print("no"))
 with closing(ForkServer(of_itself=True)) as server, open(sys.argv[1], "a") as log:
     process = server.start("plant_server.__main__", [], log)

@@ -20,7 +20,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.analysis.value_reduction import is_long
 from cosim.lazy_modules import lazy_modules
-from cosim.live.telemetry_store import TelemetryStore
+from cosim.live.recording.telemetry_store import TelemetryStore
 from cosim.record.processes import report_of, write_reports
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from cosim.record.run_events import updates_in
@@ -49,11 +49,11 @@ from noack.scenario.runtime_parameters import is_of_loss_alone
 from noack.scenario.scenario import Scenario, loop_names
 
 with lazy_modules():
-    from cosim.live import claim_monitor
+    from cosim.live.recording import claim_monitor
     from cosim.output.viewer import live_viewer, rerun_program, run_feed, run_recording
 
 if TYPE_CHECKING:
-    from cosim.live.claim_monitor import ClaimMonitor, Finding
+    from cosim.live.recording.claim_monitor import ClaimMonitor, Finding
     from cosim.output.viewer.live_viewer import LiveView
     from cosim.output.viewer.run_feed import RunFeed
     from cosim.output.viewer.run_recording import RunRecording

@@ -13,7 +13,7 @@ from typing import Any, SupportsFloat, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cosim.analysis.loop_statistics import (
+from cosim.analysis.summary.loop_statistics import (
     disturbances,
     drops_by_cause,
     from_controller,
@@ -25,7 +25,7 @@ from cosim.analysis.loop_statistics import (
     unintended_losses,
     watchdog_actions,
 )
-from cosim.analysis.summary_model import (
+from cosim.analysis.summary.summary_model import (
     AssumptionPart,
     ChangePart,
     ExitPart,
@@ -81,7 +81,7 @@ def outcome_of_loop(outcome: Outcome, loop: str | None) -> Outcome:
     """
     if loop is None:
         return outcome
-    names = [one.name for one in outcome.summary.loops]
+    names = [loop.name for loop in outcome.summary.loops]
     if loop not in names:
         raise no_such_loop(loop, names)
     summary = outcome.summary.of_loop(loop)
@@ -119,7 +119,7 @@ def summarise(
         actuations=from_controller(record, Flow.ACTUATION),
         **signals.for_summary(),
         assumption_violations=reported_violations(record),
-        assumptions=[AssumptionPart(**one._asdict()) for one in assumed or assumptions(scenario)],
+        assumptions=[AssumptionPart(**status._asdict()) for status in assumed or assumptions(scenario)],
         restarts=_restarts(record),
         changes=change_parts(record),
         missing_samples=sum(missing.values()),
@@ -202,7 +202,7 @@ def _delays_s(record: RunRecord) -> Vector:
 def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
     """The datagrams that a process rejected, by reason, on all its sockets."""
     both = (channel, channel.get("acknowledgements") or {})
-    return dict(sum((Counter(one.get("rejected") or {}) for one in both), Counter()))
+    return dict(sum((Counter(sockets.get("rejected") or {}) for sockets in both), Counter()))
 
 
 def _why_failed(record: RunRecord, missing: Mapping[str, int], diverged: Divergence | None) -> str | None:
@@ -225,12 +225,12 @@ def _divergence(record: RunRecord) -> Divergence | None:
     scenarios = [record.scenario, *(made.scenario for made in changes_of(record))]
     batches = record.source.batches(PLANT_STEP, ("t_ns", "x"))
     parts = ((steps["t_ns"] * 1e-9, steps["x"]) for steps in batches)
-    found = divergence(parts, record.count(PLANT_STEP), scenarios)
+    diverged = divergence(parts, record.count(PLANT_STEP), scenarios)
     for notice in record.notices:
-        if found is not None and notice["level"] == FAILED:
-            text = f"the plant failed at {found.at_s:g} s: {notice['text']}"
-            return found._replace(text=text)
-    return found
+        if diverged is not None and notice["level"] == FAILED:
+            text = f"the plant failed at {diverged.at_s:g} s: {notice['text']}"
+            return diverged._replace(text=text)
+    return diverged
 
 
 def change_parts(record: RunRecord) -> list[ChangePart]:
@@ -249,11 +249,11 @@ def change_parts(record: RunRecord) -> list[ChangePart]:
 
 def _restarts(record: RunRecord) -> list[RestartPart]:
     """Return the processes that were restarted during the run, in order of time."""
-    found: list[RestartPart] = []
+    restarts: list[RestartPart] = []
     for role in (*LOOP_ROLES, RECORDER):
         notices = [n for n in record.notices if (n["process"], n["level"]) == (role, RESTART)]
         if role == RECORDER:  # the recorder has no rows
-            found += [
+            restarts += [
                 RestartPart(
                     process=role,
                     generation=number,
@@ -275,12 +275,12 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
         last_s = active_s.pop(0)[-1]
         for number in sorted(active_s.keys() | reported.keys()):
             first_s, until_s = active_s.get(number, (None, last_s))
-            what = reported[number]["text"] if number in reported else None
-            found.append(
-                RestartPart(process=role, generation=number, last_s=last_s, first_s=first_s, what=what)
+            notice = reported[number]["text"] if number in reported else None
+            restarts.append(
+                RestartPart(process=role, generation=number, last_s=last_s, first_s=first_s, what=notice)
             )
             last_s = until_s
-    return sorted(found, key=lambda one: one.first_s or one.last_s or math.inf)
+    return sorted(restarts, key=lambda restart: restart.first_s or restart.last_s or math.inf)
 
 
 def _seconds(t_ns: int | None) -> float | None:
@@ -322,8 +322,8 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
             else:
                 is_fixed = plant.system.has_own_step
                 step_ns = resolved.timing.plant_period_ns if is_fixed else STEP_NS
-                found = linearise(system_at, n, m, settling_s=plant.system.settling_s, step_ns=step_ns)
-                A, B = found.A, found.B
+                linearised = linearise(system_at, n, m, settling_s=plant.system.settling_s, step_ns=step_ns)
+                A, B = linearised.A, linearised.B
     except NoackError:  # a user's plant: its code fails, or it does not accept this x(0)
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):
@@ -348,18 +348,18 @@ def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
     return bool((np.abs(off) <= np.maximum(allowed, _EXACT)).all())
 
 
-def linearisation_rows(found: Linearisation) -> tuple[tuple[str, str], ...]:
+def linearisation_rows(linearised: Linearisation) -> tuple[tuple[str, str], ...]:
     """Return a linearisation as text: quantities and their values."""
-    if isinstance(found, NoLinearisationPart):
+    if isinstance(linearised, NoLinearisationPart):
         return (("the plant, linearised", f"none: {NO_STATE}, or it is another program"),)
-    slowest = max(real for real, _ in found.eigenvalues)
+    slowest = max(real for real, _ in linearised.eigenvalues)
     worst, where = max(
         (abs(entry), f"{name}[{i}, {j}]")
-        for name, off in (("A", found.off_A), ("B", found.off_B))
+        for name, off in (("A", linearised.off_A), ("B", linearised.off_B))
         for i, row in enumerate(off, 1)
         for j, entry in enumerate(row, 1)
     )
-    box = {True: ", inside the box", False: ", outside the box", None: ""}[found.in_box]
+    box = {True: ", inside the box", False: ", outside the box", None: ""}[linearised.in_box]
     return (
         ("the plant, linearised: poles of A + BK", f"up to {slowest:.3g} /s"),
         ("  largest difference to the model", f"{where}, by {worst:.3g}{box}"),

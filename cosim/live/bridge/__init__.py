@@ -1,1 +1,0 @@
-"""What shows a live run to programs outside of noack."""

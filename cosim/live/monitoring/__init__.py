@@ -1,0 +1,1 @@
+"""Who follows a live run: terminal, log, metrics, ROS 2."""

@@ -1,0 +1,1 @@
+"""The processes of a live run, and those that help with its end."""
