@@ -116,7 +116,7 @@ def refused_message(record: logging.LogRecord) -> bool:
     return True
 
 
-_END_S = 60.0
+_END_S, _STDERR = 60.0, 2
 _CAN_CHECK = sys.platform == "linux"
 """Whether the user of a connection can be seen."""
 _RECONNECT_S = 60.0
@@ -134,7 +134,7 @@ class _Server(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Give up what would keep it from ending, and end; if that takes too long, say where, and exit."""
-        faulthandler.dump_traceback_later(_END_S, exit=True, file=sys.__stderr__)
+        faulthandler.dump_traceback_later(_END_S, exit=True, file=_STDERR)
         self._on_end()
         await super().shutdown(sockets)
 
