@@ -19,7 +19,7 @@ from noack.core.errors import CallerError
 
 with lazy_modules():
     from cosim.studies.paper import results
-    from noack.scenario import runtime_parameters, scenario, scenario_file, toml_file
+    from noack.scenario import resolution, runtime_parameters, scenario, scenario_file, toml_file
 
 if TYPE_CHECKING:
     from noack.core.linear_systems import Matrix
@@ -181,7 +181,7 @@ class OneLoopOptions(ScenarioOptions):
 
     def load(self, *more: str) -> "Scenario":
         """Load it, with more settings of the whole scenario as for ``--set``."""
-        return scenario.loop_named(super().load(*more), self.loop)
+        return resolution.loop_named(super().load(*more), self.loop)
 
 
 @option_group

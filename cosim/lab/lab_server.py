@@ -9,6 +9,7 @@ another secret, which leads to the page for processes of this user only.
 """
 
 import asyncio
+import faulthandler
 import logging
 import os
 import secrets
@@ -115,6 +116,7 @@ def refused_message(record: logging.LogRecord) -> bool:
     return True
 
 
+_END_S, _STDERR = 60.0, 2
 _CAN_CHECK = sys.platform == "linux"
 """Whether the user of a connection can be seen."""
 _RECONNECT_S = 60.0
@@ -131,7 +133,8 @@ class _Server(uvicorn.Server):
         self._on_start, self._on_end = on_start, on_end
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Give up what would keep it from ending, and end."""
+        """Give up what would keep it from ending, and end; if that takes too long, say where, and exit."""
+        faulthandler.dump_traceback_later(_END_S, exit=True, file=_STDERR)
         self._on_end()
         await super().shutdown(sockets)
 

@@ -163,10 +163,17 @@ class PageCalls:
 
 
 def _end(pool: ProcessPoolExecutor) -> None:
-    """End a worker at once: it may compute for seconds."""
+    """End a worker at once, whatever it does: it may compute for seconds.
+
+    If it dies in the middle of an answer, a thread of the pool waits for the rest. The pool itself
+    keeps the answers' pipe open for writing, so the thread would never see its end, and the pool,
+    the event loop that waits for it, and the interpreter at its exit would wait for ever.
+    """
+    answers = pool._result_queue
     for worker in multiprocessing.active_children():
         worker.kill()
-    pool.shutdown(wait=True)
+    pool.shutdown(wait=False)
+    answers._writer.close()  # type: ignore[attr-defined] # its other end then reads that it ended
 
 
 def _new_pool() -> ProcessPoolExecutor:

@@ -17,6 +17,7 @@ from noack.runtime import private_folder
 from noack.runtime.control_messages import ChangeReply, ChangeRequest, message_json, parse_message
 from noack.runtime.control_plane import RUNS, answer_to, cause_of, open_session, run_name
 from noack.runtime.join_ticket import Ticket
+from noack.scenario.runtime_parameters import require_finite
 from noack.scenario.toml_file import brief
 
 _ANSWER_S = 30.0
@@ -74,6 +75,7 @@ def request_change(run: OpenRun, settings: Mapping[str, object]) -> ChangeReply:
 
     Raise CallerError, with one line per mistake, for wrong settings, PeerError without an answer.
     """
+    require_finite(settings)
     request = message_json(ChangeRequest.model_validate({"settings": dict(settings)}))
     try:
         with open_session(RUNS, run.name, listen=False) as plane:

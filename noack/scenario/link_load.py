@@ -20,6 +20,7 @@ transmission: so L bounds this delay, too. A live run adds the lateness of its p
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from itertools import cycle
 from typing import NamedTuple
 
 from noack.core.clock import NS_PER_S
@@ -32,8 +33,8 @@ from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
-from noack.scenario.resolution import policy_of, resolve
 from noack.scenario.response_times import Sender, response_ns
+from noack.scenario.run_sections import ProvenDelay
 from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
 from noack.scenario.scenario_checks import with_settings
 from noack.scenario.sections import DirectionSection
@@ -84,15 +85,26 @@ class DelayBound(NamedTuple):
 
     impairments_s: dict[str, float]
     """The largest delay in each impairment that delays, by its key; infinite: no bound is known."""
-    largest_s: float
-    """The largest delay in all of them."""
-    certified_s: float
-    """The delay that the certificates cover."""
+    loops_s: list[float]
+    """The largest delay of each loop's updates in all of them."""
+    certified: tuple[float, ...]
+    """The delay that the certificates of each loop cover."""
+
+    @property
+    def largest_s(self) -> float:
+        """The largest delay of an update."""
+        return max(self.loops_s)
+
+    @property
+    def certified_s(self) -> float:
+        """The largest delay that a loop's certificates cover."""
+        return max(self.certified)
 
     @property
     def is_certified(self) -> bool:
         """Whether the certificates cover every delay; times are whole nanoseconds."""
-        return round(self.certified_s * NS_PER_S) >= self.largest_s * NS_PER_S - 0.5
+        pairs = zip(self.certified, self.loops_s, strict=True)
+        return all(round(own_s * NS_PER_S) >= largest_s * NS_PER_S - 0.5 for own_s, largest_s in pairs)
 
 
 def link_loads(scenario: Scenario) -> list[LinkLoad]:
@@ -115,12 +127,27 @@ def update_delay(scenario: Scenario) -> DelayBound:
     Raises:
         CallerError: as :func:`link_loads`.
     """
-    delays, largest_s = _largest_delays(_stages(scenario)[0])
+    delays, loops_s = _largest_delays(_stages(scenario)[0])
     own_s = {f"network.impairments.{place}": max(one) for place, one in enumerate(delays) if any(one)}
-    certified_s = scenario.certificate.network_delay_s
-    if certified_s is None:
-        certified_s = scenario.network.link.longest_delay_s
-    return DelayBound(own_s, largest_s, certified_s)
+    given_s, else_s = scenario.certificate.network_delay_s, scenario.network.link.longest_delay_s
+    if given_s is not None:
+        return DelayBound(own_s, loops_s, (given_s,) * len(loops_s))
+    return DelayBound(own_s, loops_s, tuple(one if math.isfinite(one) else else_s for one in loops_s))
+
+
+def proven_delays(scenario: Scenario) -> list[ProvenDelay | None]:
+    """Return the bound of the delay of each loop's updates that its certificates can use.
+
+    There is none where a delay is given, or where the impairments alone have a bound.
+
+    Raises:
+        CallerError: as :func:`link_loads`.
+    """
+    count = sum(section.count for section in loop_sections(scenario))
+    if scenario.certificate.network_delay_s is not None or scenario.network.link.delay_is_bounded:
+        return [None] * count
+    _, loops_s = _largest_delays(_stages(scenario)[0])
+    return [ProvenDelay(delay_s, count) for delay_s in loops_s]
 
 
 def _stages(scenario: Scenario) -> tuple[list[_Stage], list[_Stage]]:
@@ -133,10 +160,10 @@ def _stages(scenario: Scenario) -> tuple[list[_Stage], list[_Stage]]:
         begin = f"from changes.{number - 1} on, " if number else ""
         if number:
             loops = [with_settings(loop, scenario.changes[number - 1].set) for loop in loops]
-        network, resolved = loops[0].network, [resolve(loop) for loop in loops]
-        updates.append(_Stage(begin, network, [*map(_demand, resolved, counts)]))
+        network = loops[0].network
+        updates.append(_Stage(begin, network, [*map(_demand, loops, counts)]))
         if network.actuation is not None:
-            demands = [*map(_actuations, resolved, counts)]
+            demands = [*map(_actuations, loops, counts)]
             actuations.append(_Stage(begin, network.actuation, demands))
     return updates, actuations
 
@@ -173,9 +200,9 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
 
 
 def _by_loops(delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
-    """Yield each bound of a delay, with the loops that have it, such as ``loops 1, 3 to 5``."""
+    """Yield each bound of a delay, with the loops that have it, such as ``loops 0, 2 to 4``."""
     for delay_s in dict.fromkeys(delays_s):
-        loops = {loop for loop, own_s in enumerate(delays_s, 1) if own_s == delay_s}
+        loops = {loop for loop, own_s in enumerate(delays_s) if own_s == delay_s}
         begins = sorted(loops - {loop + 1 for loop in loops})
         ends = sorted(loops - {loop - 1 for loop in loops})
         spans = (str(a) if a == b else f"{a} to {b}" for a, b in zip(begins, ends, strict=True))
@@ -202,7 +229,7 @@ def _slot_loads(
             bits = 8 * loop.payload_bytes
             must_pass = bits * _share(window)
             yield LinkLoad(
-                begin=f"{begin}loop {number + 1}, ",
+                begin=f"{begin}loop {number}, ",
                 key=key,
                 flow=flow,
                 window=window,
@@ -229,28 +256,31 @@ def _share(window: LossWindow) -> float:
     return (window.packets - window.losses) / window.packets
 
 
-def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], float]:
-    """Return the bounds of the delay in each impairment, and the bound in all of them, in seconds.
+def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], list[float]]:
+    """Return the bounds of the delay in each impairment, and of each loop in all, in seconds.
 
     A schedule, and a rate that chooses what it sends, have a bound for each loop; another
     impairment has one for all; infinite: there is none.
     """
-    least_s = largest_s = 0.0
+    least_s, largest_s = 0.0, [0.0] * sum(demand.loops for demand in stages[0].loops)
     found, copied = list[list[float]](), False
     for one in stages[0].direction.impairments:  # they cannot change
-        spread_s = largest_s - least_s
-        if isinstance(one, Schedule):
-            found.append(_slot_delays_s(one, stages, spread_s, copied=copied))
-            largest_s += max(found[-1])
-        elif isinstance(one, Rate) and one.scheduler is not None:
-            found.append(_chosen_delays_s(one, one.scheduler, stages))
-            largest_s += max(found[-1])
-        elif isinstance(one, Rate):
-            found.append([_queue_delay_s(one, stages, spread_s, copied=copied)])
-            largest_s += max(found[-1])
+        spread_s = max(largest_s) - least_s
+        if isinstance(one, Schedule | Rate):
+            if isinstance(one, Schedule):
+                found.append(_slot_delays_s(one, stages, spread_s, copied=copied))
+            elif one.scheduler is not None:
+                found.append(_chosen_delays_s(one, one.scheduler, stages))
+            else:
+                found.append([_queue_delay_s(one, stages, spread_s, copied=copied)])
+            largest_s = [
+                before_s + own_s for before_s, own_s in zip(largest_s, cycle(found[-1]), strict=False)
+            ]
         else:
             found.append([one.longest_s if one.is_bounded else math.inf])
-            least_s, largest_s = one.delay_range_s(least_s, largest_s)
+            ranges_s = {before_s: one.delay_range_s(least_s, before_s) for before_s in set(largest_s)}
+            largest_s = [ranges_s[before_s][1] for before_s in largest_s]
+            least_s = min(ranges_s.values())[0]
         copied = copied or one.copies
     return found, largest_s
 
@@ -345,14 +375,12 @@ def require_slots(scenario: Scenario) -> None:
     loops = sum(section.count for section in loop_sections(scenario))
     for path, section in scenario.network.directions.items():
         for place, one in enumerate(section.impairments):
-            missing = set(range(1, loops + 1)) - set(one.order) if isinstance(one, Schedule) else ()
-            if isinstance(one, Schedule) and (missing or max(one.order) > loops):
-                wrong = (
-                    f"loop {min(missing)} has no slot" if missing else f"a slot is for loop {max(one.order)}"
-                )
+            flows = len(one.slots) if isinstance(one, Schedule) else loops
+            if flows != loops:
+                wrong = f"loop {flows} has no slot" if flows < loops else f"a slot is for loop {flows - 1}"
                 raise CallerError(
                     f"{path}.impairments.{place}.order: {wrong}; the run has the loops "
-                    f"1 to {loops}, and each needs a slot (0: an idle slot)"
+                    f"0 to {loops - 1}, and each needs a slot (-1: an idle slot)"
                 )
 
 
@@ -399,7 +427,8 @@ def _demand(loop: Scenario, count: int) -> Demand:
 
 def _inter_event_times_ns(loop: Scenario) -> tuple[float, float]:
     """Return the least and the largest time between two events that the trigger permits."""
-    rule, measured_ns = policy_of(loop), loop.timing.measurement_period_ns
+    rule = loop.trigger.trigger_policy(loop.model.trigger_matrices)
+    measured_ns = loop.timing.measurement_period_ns
     if isinstance(rule, CodedPolicy):  # it may transmit at every measurement, or never
         return measured_ns, math.inf
     least_ns = max(measured_ns, rule.idle_ns)

@@ -16,19 +16,11 @@ from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observer_settings import EstimationModel, unobservable_mode
 from noack.protocol.record_tables import CLOCK_TABLES, LOOP, OWNER, RecordShape, entry_names, largest, tables
-from noack.scenario.scenario import (
-    Scenario,
-    few_of,
-    loop_names,
-    loop_scenario,
-    loop_sections,
-    loops_by_entry,
-    loops_of,
-)
+from noack.scenario.link_load import proven_delays
+from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, loops_by_entry
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.sections import AnyObserver, ModelSection
 from noack.settings.section import rows_of
-from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule
 
 _SURELY_FINITE = 600.0
@@ -75,13 +67,12 @@ def resolve(scenario: Scenario) -> Scenario:
             that the plant needs is not installed; or the scenario has more than one loop, see
             :func:`resolved_loops`.
     """
-    loops = loops_of(scenario)
-    if len(loops) > 1:
+    if (count := len(names := loop_names(scenario))) > 1:
         raise CallerError(
-            f"{scenario.name}: it has {len(loops)} loops, and this is for one: give its file, or --loop NAME "
-            f"where there is this option; they are {few_of(loop_names(scenario))}"
+            f"{scenario.name}: it has {count} loops, and this is for one: give its file, or --loop NAME "
+            f"where there is this option; they are {few_of(names)}"
         )
-    return _resolved(loops)[0]
+    return resolved_loops(scenario)[0]
 
 
 def resolve_run(scenario: Scenario) -> Scenario:
@@ -111,7 +102,34 @@ def resolved_loops(scenario: Scenario) -> tuple[Scenario, ...]:
     Raises:
         CallerError: as :func:`resolve`.
     """
-    return tuple(loop for loops in loops_by_entry(scenario) for loop in _resolved(loops))
+    return tuple(loop for loops in _loops_with_delays(scenario) for loop in _resolved(loops))
+
+
+def loop_named(scenario: Scenario, name: str | None) -> Scenario:
+    """Return the scenario of the loop of a name; without a name, the scenario.
+
+    It is one of a loop alone, except that its certificates allow for the delay in the run.
+
+    Raises:
+        CallerError: there is no such loop.
+    """
+    if name is None:
+        return scenario
+    if name not in (names := loop_names(scenario)):
+        raise CallerError(f"--loop {name}: the loops of the scenario are {few_of(names)}")
+    return [loop for loops in _loops_with_delays(scenario) for loop in loops][names.index(name)]
+
+
+def _loops_with_delays(scenario: Scenario) -> list[list[Scenario]]:
+    """Return the loops of each entry, each with the bound of its updates' delay in this run."""
+    entries, known = loops_by_entry(scenario), scenario.certificate.proven_delay
+    if known is not None and known.loops > 1:  # a loop of several, by loop_named
+        return entries
+    delays = proven_delays(scenario)
+    if known is None and not any(delays):
+        return entries
+    sections = iter([scenario.certificate.with_proven_delay(delay) for delay in delays])
+    return [[loop.model_copy(update={"certificate": next(sections)}) for loop in loops] for loops in entries]
 
 
 def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
@@ -262,9 +280,7 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
 
 def policy_of(resolved: Scenario) -> Policy:
     """Return a resolved scenario's trigger policy; raise CallerError if its model excludes it."""
-    model = resolved.model
-    matrices = ModelMatrices(np.array(model.A), np.array(model.B), np.array(model.gain))
-    return resolved.trigger.trigger_policy(matrices)
+    return resolved.trigger.trigger_policy(resolved.model.trigger_matrices)
 
 
 def rule_of(resolved: Scenario) -> TriggerRule:

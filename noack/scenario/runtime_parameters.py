@@ -5,10 +5,12 @@ like a scenario file. So a change can only set values that a run could also star
 """
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from types import NoneType
 from typing import get_args
 
+from noack.core.errors import CallerError
 from noack.scenario.toml_file import nearest_key
 from noack.settings.section import ReadTable, Table
 from noack.trigger.policy_settings import PolicySettings
@@ -60,8 +62,15 @@ def require_runtime_parameters(settings: ReadTable, trigger: PolicySettings) -> 
             hint = near and f"did you mean {near}?"
             all_known = f"these can: {_list(known)} (for short: {', '.join(short)})"
             raise ValueError(f"{key}: cannot be changed during a run; {hint or all_known}")
-        if _has_none(value):
+        if _has(value, lambda one: one is None):
             raise ValueError(f"{key}: needs a value")
+
+
+def require_finite(settings: ReadTable) -> None:
+    """Raise CallerError if a value has a number that is not finite, which no message can carry."""
+    for key, value in settings.items():
+        if _has(value, lambda one: isinstance(one, float) and not math.isfinite(one)):
+            raise CallerError(f"{key} = {_value(value)}: should be a finite number")
 
 
 def put_settings(content: Table, settings: ReadTable) -> None:
@@ -103,7 +112,7 @@ def _value(value: object) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return f"{value:g}" if abs(value) < 1e300 else "…"  # an integer may be too large for it
+        return "…" if isinstance(value, int) and abs(value) > 10**300 else f"{value:g}"  # no float
     return json.dumps(value)
 
 
@@ -112,10 +121,9 @@ def _is_number(annotation: object) -> bool:
     return all(kind in (int, float) for kind in kinds)
 
 
-def _has_none(value: object) -> bool:
-    if isinstance(value, Mapping):
-        return any(map(_has_none, value.values()))
-    return any(map(_has_none, value)) if isinstance(value, list | tuple) else value is None
+def _has(value: object, found: Callable[[object], bool]) -> bool:
+    inner = [*value.values()] if isinstance(value, Mapping) else value
+    return any(_has(one, found) for one in inner) if isinstance(inner, list | tuple) else found(value)
 
 
 def _list(keys: tuple[str, ...]) -> str:

@@ -14,10 +14,10 @@ from functools import cache
 from typing import Any, Self
 
 import numpy as np
-from pydantic import ValidationError, create_model, model_validator
+from pydantic import GetJsonSchemaHandler, ValidationError, create_model, model_validator
+from pydantic_core import CoreSchema
 
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
 from noack.core.random_streams import named_stream_keys, stream
 from noack.scenario.run_sections import MOST_LOOPS, LoopSection, SeedsSection
 from noack.scenario.scenario_checks import check_changes, check_sections
@@ -37,9 +37,20 @@ class Scenario(ScenarioTables):
         check_loops(self)
         return self
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler, /) -> Table:
+        """Return the JSON Schema; a scenario whose loops all have a file needs no tables of a loop."""
+        schema = super().__get_pydantic_json_schema__(core_schema, handler)
+        whole = handler.resolve_ref_schema(schema)
+        whole["required"] = [key for key in whole["required"] if key not in LOOP_NEEDS]
+        whole["anyOf"] = [{"required": ["loops"]}, {"required": [*LOOP_NEEDS]}]
+        return schema
+
 
 PARTS = ("mode", "model", "plant", "trigger", "observer", "controller")
 """Keys of a scenario that each loop has for itself."""
+LOOP_NEEDS = ("model", "plant", "trigger")
+"""Those without which there is no loop."""
 _KINDS: Mapping[str, tuple[str, ...]] = {
     "model": ("name", "A", "file"),
     "plant": (),
@@ -70,19 +81,6 @@ def loops_of(scenario: Scenario) -> tuple[Scenario, ...]:
     number. So a run with one entry of [[loops]] computes what the run without it does.
     """
     return tuple(loop for loops in loops_by_entry(scenario) for loop in loops)
-
-
-def loop_named(scenario: Scenario, name: str | None) -> Scenario:
-    """Return the scenario of the loop of a name, as if it were alone; without a name, the scenario.
-
-    Raises:
-        CallerError: there is no such loop.
-    """
-    if name is None:
-        return scenario
-    if name not in (names := loop_names(scenario)):
-        raise CallerError(f"--loop {name}: the loops of the scenario are {few_of(names)}")
-    return loops_of(scenario)[names.index(name)]
 
 
 def few_of(names: Sequence[str]) -> str:

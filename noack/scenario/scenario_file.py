@@ -20,7 +20,7 @@ from noack.core.file_access import shipped_folder
 from noack.scenario import toml_file
 from noack.scenario.matrix_files import with_matrices
 from noack.scenario.runtime_parameters import SHORT, full_key
-from noack.scenario.scenario import PARTS, Scenario, parts_model, with_loop_tables
+from noack.scenario.scenario import LOOP_NEEDS, PARTS, Scenario, parts_model, with_loop_tables
 from noack.scenario.scenario_checks import check_kept_loss
 from noack.scenario.sections import DirectionSection
 from noack.scenario.toml_file import keys as known_keys
@@ -109,8 +109,9 @@ def _read(section: DirectionSection, folder: Path, place: str) -> Table:
 def with_named_scenarios(content: ReadTable, folder: Path, source: str) -> ReadTable:
     """Return a scenario's content with the tables of the files that its loops name.
 
-    Names are relative to ``folder``, or those of shipped scenarios. Raise CallerError, with one
-    line per mistake, if a file is no scenario of one loop.
+    Names are relative to ``folder``, or those of shipped scenarios. If every loop has a file, and
+    the top level nothing of what a loop needs, it gets the tables of the first one, which no loop
+    uses. Raise CallerError, with one line per mistake, if a file is no scenario of one loop.
     """
     if not isinstance(loops := content.get("loops"), list):
         return content
@@ -121,6 +122,9 @@ def with_named_scenarios(content: ReadTable, folder: Path, source: str) -> ReadT
             named = printable(f'{source}: loops.{place}.scenario = "{name}"')
             tables = {"scenario": _loop_tables(_path(name, folder, named), named)}
         read.append(entry | tables if tables else entry)
+    files = [entry["scenario"] for entry in read if isinstance(entry, dict) and "scenario" in entry]
+    if len(files) == len(read) and content.keys().isdisjoint(LOOP_NEEDS):
+        content = {**next(filter(None, files), {}), **content}
     return {**content, "loops": read}
 
 

@@ -40,7 +40,7 @@ from noack.settings.section import (
     shape,
     union_of,
 )
-from noack.trigger.policy_settings import PolicySettings
+from noack.trigger.policy_settings import ModelMatrices, PolicySettings
 
 # Settings classes by kind: a module in the folder adds its kind.
 CONTROLLERS = kinds_in("noack.controllers", ControllerSettings)
@@ -166,6 +166,12 @@ class ModelSection(ScenarioSection):
         if self.name is not None:
             return self.named.A, self.named.B
         return np.array(self.A), np.array(self.B)
+
+    @property
+    def trigger_matrices(self) -> ModelMatrices:
+        """Â, B̂ and K, on which a trigger's policy can depend."""
+        K = self.named.K if self.gain is None else np.array(self.gain)
+        return ModelMatrices(*self.matrices, K)
 
 
 def require_read(file: str | None, names: object | None) -> None:

@@ -39,7 +39,7 @@ WORDS = f"""
     opportunities at 0,0,1,2,2,2,5 queue 50 bytes 4000 from random
     opportunities at 1 queue 1 overhead -10 from 500us; opportunities at 0,20 queue 5
     opportunities 'a trace.up'
-    schedule 1 slot 2ms; schedule 2,1,0,1,1 slot 1ms queue 1; schedule 0,2 slot 300us queue 3
+    schedule 0 slot 2ms; schedule 1,0,-1,0,0 slot 1ms queue 1; schedule -1,0 slot 300us queue 3
     {
     "; ".join(
         f"replay records 0s+3ms,1ms+lost,1ms+9ms,4ms+2ms,5ms+lost,5.000001ms+0s{options}"

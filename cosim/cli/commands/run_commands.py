@@ -241,6 +241,8 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, object]:
         word = left.pop(0)
         name, equals, text = word.partition("=")
         if not equals:
+            if Path(word).is_dir():
+                raise CallerError(f"{word}: a folder, not a key; a run is given by --run {word}")
             if not left:
                 raise CallerError(f"{word}: needs a value, e.g. `noack set loss.p 0.9`")
             text = left.pop(0)

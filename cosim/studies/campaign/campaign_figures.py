@@ -36,7 +36,7 @@ _HEIGHT_IN = 3.4
 _MAP_HEIGHT_IN, _MAPS_IN_A_ROW, _NARROWEST_MAP_IN = 2.2, 3, 2.2
 _QUANTILES = 400
 _FAR = 10.0
-"""A metric with values further apart than this factor gets a logarithmic axis."""
+"""A metric with values at least this factor apart gets a logarithmic axis."""
 _LONGEST_LABEL = 28
 
 
@@ -96,8 +96,8 @@ def curve_figure(
 ) -> FigureDescription:
     """Describe the means of a metric over an axis, with their intervals.
 
-    The axis has k values ``x`` (None if they are not numbers) with k labels; each series has k
-    estimates, or None where there is no estimate.
+    The axis has k values ``x`` (None if they are not numbers) with k labels, and is logarithmic if
+    they grow by factors; each series has k estimates, or None where there is no estimate.
     """
     at = np.arange(len(labels), dtype=np.float64) if x is None else x
     order = np.argsort(at)
@@ -111,7 +111,8 @@ def curve_figure(
         ]
     ticks = dict(zip(at.tolist(), map(plain, labels), strict=True)) if x is None else None
     means = [e.mean for estimates in series.values() for e in estimates if e]
-    panel = Panel(items=items, x=Axis(label=_name(axis), ticks=ticks), y=_axis(metric, means))
+    x_axis = Axis(label=_name(axis), ticks=ticks, logarithmic=x is not None and _is_geometric(x))
+    panel = Panel(items=items, x=x_axis, y=_axis(metric, means))
     return one_panel("curve", panel, _HEIGHT_IN)
 
 
@@ -203,7 +204,7 @@ def _curve(
     labels = [axis.labels[i] for i in places]
     series = {name: [one.get(x) for x in labels] for name, one in known.items() if any(one.values())}
     numbers = None if axis.numbers is None else np.array(axis.numbers)[places]
-    return curve_figure(numbers, labels, series, axis.called, wanted.metric), (
+    return curve_figure(numbers, labels, series, axis.heading, wanted.metric), (
         f"{_title(wanted.metric)} over {axis.called}: means and 95 % confidence intervals"
     )
 
@@ -220,7 +221,7 @@ def _heat_map(
             if wanted.metric in one.estimates:
                 row, column = (axis.labels.index(one.point.labels[axis.name]) for axis in (y, x))
                 maps[label][row, column] = one.estimates[wanted.metric].mean
-    figure = heat_map_figure(maps, (x.called, x.labels), (y.called, y.labels), wanted.metric)
+    figure = heat_map_figure(maps, (x.heading, x.labels), (y.heading, y.labels), wanted.metric)
     return figure, f"{_title(wanted.metric)} over {x.called} and {y.called}: means"
 
 
@@ -286,5 +287,11 @@ def _axis(metric: Metric, values: Sequence[float] | Vector) -> Axis:
     return Axis(label=METRICS[metric].label, logarithmic=is_log)
 
 
+def _is_geometric(values: Vector) -> bool:
+    """Whether values are far apart, and their middle is nearer to the geometric mean of the ends."""
+    middle, ends = float(np.median(values)), (values.min(), values.max())
+    return _far(values) and middle - math.sqrt(ends[0] * ends[1]) < sum(ends) / 2 - middle
+
+
 def _far(values: Vector) -> bool:
-    return bool(len(values) and values.min() > 0 and values.max() > _FAR * values.min())
+    return bool(len(values) and values.min() > 0 and values.max() >= _FAR * values.min())

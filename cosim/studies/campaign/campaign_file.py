@@ -75,6 +75,13 @@ def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
             raise ValueError(f"{place}: {new} replaces {old}, which is given before it")
 
 
+_UNITS = {
+    "_per_s": "1/s", "_s": "s", "_ms": "ms", "_us": "µs", "_ns": "ns", "_hz": "Hz", "_bps": "bit/s",
+    "_bytes": "bytes",
+}  # fmt: skip
+"""Units by the ends of keys, the longer ends first."""
+
+
 class Axis(ScenarioSection):
     """An axis of the grid: a key of the scenario with its values, or variants of several keys."""
 
@@ -108,6 +115,13 @@ class Axis(ScenarioSection):
     def called(self) -> str:
         """The axis's title, or its name if it has no title."""
         return self.title or self.name.replace("_", " ")
+
+    @property
+    def heading(self) -> str:
+        """What it is called, with the unit of its key in brackets: the end of the key's name."""
+        ends = (unit for end, unit in _UNITS.items() if (self.key or "").endswith(end))
+        unit = next(ends, "") if "[" not in self.title else ""
+        return f"{self.called} [{unit}]" if unit else self.called
 
     @property
     def labels(self) -> list[str]:

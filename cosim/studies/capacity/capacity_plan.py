@@ -314,7 +314,7 @@ class CapacityPlan:
         for place, one in enumerate(self.scenario.network.impairments):
             key = f"network.impairments.{place}"
             if isinstance(one, Schedule):
-                settings[f"{key}.order"] = [*range(1, loops + 1)]
+                settings[f"{key}.order"] = [*range(loops)]
                 settings[f"{key}.slot_s"] = max(one.slot_s / factor, 1e-6)
             if isinstance(one, Rate) and factor > 1:
                 settings[f"{key}.rate_bps"] = min(one.rate_bps * factor, 10**12)

@@ -103,13 +103,20 @@ class LinearModel:
         both = np.hstack([self.A, self.B])
         return "\n".join([_matrix("Â, B̂", both, states, states + inputs), *self._sentences()])
 
-    def _sentences(self) -> Iterator[str]:
+    @property
+    def origin(self) -> str:
+        """Where A and B are from."""
+        if self.plant.matrices is not None:
+            return "the matrices of the scenario's plant, as drawn, not from those of its [model]"
         way = {
-            "derivative": "differences of its derivative",
-            "motion": f"the matrix logarithm of its motion over {self.plant.step_ns * 1e-9:g} s",
+            "derivative": "differences of the plant's derivative",
+            "motion": f"the matrix logarithm of the plant's motion over {self.plant.step_ns * 1e-9:g} s",
             "exact": "the plant's own matrices",
         }[self.source]
-        yield f"computed from {way}, at x = {_shown(self.at)}, u = {_shown(self.input)}"
+        return f"{way}, at x = {_shown(self.at)}, u = {_shown(self.input)}"
+
+    def _sentences(self) -> Iterator[str]:
+        yield f"computed from {self.origin}"
         if not self.rests:
             move, *_ = np.linalg.lstsq(np.hstack([self.A, self.B]), -self.drift, rcond=None)
             x, u = np.split(np.concatenate([self.at, self.input]) + move, [len(self.A)])
@@ -168,6 +175,7 @@ class LoopGain:
             [
                 _matrix("K", self.K, plant.input_names, plant.state_names),
                 f"u = K x; {self.method}",
+                f"Â and B̂ are computed from {self.model.origin}",
                 f"eigenvalues of Â + B̂K: {eigenvalue_text(self.eigenvalues)} /s",
                 f"trigger.alpha_per_s must be below {self.decay_per_s:.4g}; half of it is usual",
             ]

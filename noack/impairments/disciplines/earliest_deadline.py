@@ -25,7 +25,7 @@ class EarliestDeadline(Scheduler):
         Clause(
             "earliest_deadline",
             "rate 1mbit queue 20 earliest_deadline 10ms,50ms",
-            Part("deadlines_s", list_of(OWN_TIME_S, "times, e.g. 10ms,50ms"), "T,T,..."),
+            Part("deadlines_s", list_of(OWN_TIME_S, "times in s, ms, us or ns, e.g. 10ms,50ms"), "T,T,..."),
             implied={"kind": "earliest_deadline"},
         ),
     )

@@ -85,7 +85,7 @@ class _DistributionPart(Part):
         return f"distribution {shlex.quote(f'./{name}' if name in SHAPES else name)}"
 
 
-_SAMPLES = list_of(OWN_TIME_S, "delays with their units, e.g. 1ms,2ms,10ms")
+_SAMPLES = list_of(OWN_TIME_S, "delays in s, ms, us or ns, e.g. 1ms,2ms,10ms")
 _DelayS = Annotated[FiniteFloat, Field(ge=0, le=MOST_DELAY_S)]
 _Samples = Annotated[
     tuple[Annotated[FiniteFloat, Field(ge=-MOST_DELAY_S, le=MOST_DELAY_S)], ...],

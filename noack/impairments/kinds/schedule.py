@@ -10,9 +10,9 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.core.clock import NS_PER_S
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.feature import MOST_FLOWS, Impairment, Stage, StageTables, add_numbers, numbers_text
-from noack.impairments.words import COUNT, OWN_TIME_S, list_of, time_text
+from noack.impairments.words import COUNT, OWN_TIME_S, SIGNED_COUNT, list_of, time_text
 
-_EXAMPLE = "schedule 1,2,1,3 slot 5ms"
+_EXAMPLE = "schedule 0,1,0,2 slot 5ms"
 
 
 class Schedule(Impairment):
@@ -20,10 +20,10 @@ class Schedule(Impairment):
 
     kind: Literal["schedule"] = "schedule"
     order: Annotated[
-        tuple[Annotated[int, Field(ge=0, le=MOST_FLOWS)], ...],
+        tuple[Annotated[int, Field(ge=-1, lt=MOST_FLOWS)], ...],
         Field(min_length=1, max_length=MOST_FLOWS),
     ]
-    """The flow of each slot, counted from 1; 0: an idle slot. In a run: the number of the loop."""
+    """The flow of each slot, counted from 0; −1: an idle slot. In a run: the number of the loop."""
     slot_s: Annotated[FiniteFloat, Field(ge=1e-6, le=3600)]
     """Length of a slot in seconds; the first slot begins at time 0."""
     queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
@@ -33,7 +33,7 @@ class Schedule(Impairment):
         Clause(
             "schedule",
             _EXAMPLE,
-            Part("order", list_of(COUNT, "numbers of flows from 1, e.g. 1,2,1,3"), "N,N,..."),
+            Part("order", list_of(SIGNED_COUNT, "numbers of flows from 0, e.g. 0,1,0,2"), "N,N,..."),
             Part("slot_s", OWN_TIME_S, "T", "slot", _EXAMPLE),
             Part("queue", COUNT, "N", "queue", f"{_EXAMPLE} queue 1"),
         ),
@@ -43,17 +43,20 @@ class Schedule(Impairment):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if not any(self.order):
-            raise ValueError("order: no slot is for a flow; flows are counted from 1")
+        missing = set(range(max(self.order) + 1 or 1)) - {*self.order}
+        if missing:
+            raise ValueError(
+                f"order: flow {min(missing)} has no slot; flows are counted from 0 (-1: an idle slot)"
+            )
         return self
 
     @property
     def slots(self) -> list[list[int]]:
-        """The numbers of the slots in a round, of each flow; without a slot: none."""
-        found: list[list[int]] = [[] for _ in range(max(self.order))]
+        """The numbers of the slots in a round, of each flow that has some."""
+        found: list[list[int]] = [[] for _ in range(max(self.order) + 1)]
         for place, flow in enumerate(self.order):
-            if flow:
-                found[flow - 1].append(place)
+            if flow >= 0:
+                found[flow].append(place)
         return found
 
     @property
@@ -71,7 +74,7 @@ class Schedule(Impairment):
     @property
     def longest_s(self) -> float:
         """Longest time until a full queue has left; packets that must pass may take longer."""
-        return max(self.wait_ns(one, self.queue) for one in self.slots if one) / NS_PER_S
+        return max(self.wait_ns(one, self.queue) for one in self.slots) / NS_PER_S
 
     @property
     def is_bounded(self) -> bool:

@@ -17,7 +17,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.theory.bounds.disturbances import normal_bounds
 from noack.theory.bounds.terms import Constants, NetworkConditions
-from noack.theory.certificates.conditions import certified_delay_s
+from noack.theory.certificates.conditions import network_delay_texts
 
 _NOT_COVERED = "not covered by the theorems and the certificates"
 _NOT_BY_THEOREMS = "not covered by the theorems"
@@ -218,21 +218,9 @@ def _continuous_time(resolved: Scenario) -> Assumption:
         AssumptionStatus.IDEALISED,
         "never true of a sampled loop; the certificates allow for the difference. Here: sampled "
         f"every {period_ms:g} ms, input held for {control_ms:g} ms"
-        + _network_delay(resolved)
+        + "".join(f"; {delay}" for delay in network_delay_texts(resolved)[:1])
         + _actuation_gap(resolved),
     )
-
-
-def _network_delay(resolved: Scenario) -> str:
-    link = resolved.network.link
-    if not link.longest_delay_s:
-        return ""
-    longest_ms, certified_ms = 1e3 * link.longest_delay_s, 1e3 * certified_delay_s(resolved)
-    allowed = f"; the certificates allow for {certified_ms:g} ms"
-    if not link.delay_is_bounded:
-        return f"; no setting bounds the network's delay{allowed}"
-    text = f"; the network delays updates by up to {longest_ms:g} ms"
-    return text if certified_ms == longest_ms else text + allowed
 
 
 def _actuation_gap(resolved: Scenario) -> str:
@@ -318,14 +306,19 @@ def _conditions(conditions: NetworkConditions, resolved: Scenario, kept: float |
         why,
     )
     sampling = f"every {1e3 * conditions.sampling_s:g} ms" if conditions.sampling_s else "continuously"
+    delay = "".join(network_delay_texts(resolved)) if conditions.delay_s else ""
+    network = f"; {delay}" if delay else ""
     schedule = (
-        f"the trigger is tested {sampling}",
-        f"an update reaches the plant within {1e3 * conditions.delay_s:g} ms of its event",
-        f"the applied input is at most {1e3 * conditions.hold_s:g} ms old",
-        f"the first input arrives within {1e3 * conditions.start_s:g} ms",
+        (f"the trigger is tested {sampling}", ""),
+        (f"an update reaches the plant within {1e3 * conditions.delay_s:g} ms of its event", network),
+        (f"the applied input is at most {1e3 * conditions.hold_s:g} ms old", ""),
+        (f"the first input arrives within {1e3 * conditions.start_s:g} ms", ""),
     )
-    checked = AssumptionStatus.ASSUMED, "checked in each run"
-    return [losses, *(Assumption(what, "certificate", *checked) for what in schedule)]
+    status = AssumptionStatus.ASSUMED
+    return [
+        losses,
+        *(Assumption(what, "certificate", status, f"checked in each run{why}") for what, why in schedule),
+    ]
 
 
 def below(alpha_per_s: float, decay_per_s: float) -> bool:

@@ -72,9 +72,41 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
 
 
 def certified_delay_s(resolved: Scenario) -> float:
-    """The network delay that the certificates allow for: as given, or the longest one."""
-    given_s = resolved.certificate.network_delay_s
-    return resolved.network.link.longest_delay_s if given_s is None else given_s
+    """The network delay that the certificates allow for.
+
+    As given; else the proven bound of the loop in its run, if one is known; else the longest delay
+    of the impairments, in which a rate counts as a full queue, and an unbounded jitter four times.
+    """
+    certificate = resolved.certificate
+    proven = certificate.proven_delay
+    if certificate.network_delay_s is not None:
+        return certificate.network_delay_s
+    if proven is not None and math.isfinite(proven.delay_s):
+        return proven.delay_s
+    return resolved.network.link.longest_delay_s
+
+
+def network_delay_texts(resolved: Scenario) -> list[str]:
+    """Return in words which network delay the certificates allow for, and what a proof of it needs.
+
+    A proof needs settings, which the certificates know, and what is said here.
+    """
+    certificate, link, proven = resolved.certificate, resolved.network.link, resolved.certificate.proven_delay
+    certified_ms, longest_ms = (1e3 * one for one in (certified_delay_s(resolved), link.longest_delay_s))
+    delays = f"the network delays updates by up to {longest_ms:g} ms" if link.delay_is_bounded else ""
+    if certificate.network_delay_s is not None and certified_ms != longest_ms:
+        given = f"certificate.network_delay_s allows for a delay of {certified_ms:g} ms"
+        return [f"{delays}; {given}" if delays and longest_ms else given]
+    if link.delay_is_bounded:
+        return [delays] if longest_ms else []
+    if proven is None or math.isinf(proven.delay_s):
+        return [f"no bound of the network's delay is known; the certificates allow for {certified_ms:g} ms"]
+    whose = "its loop" if proven.loops == 1 else f"each of the {proven.loops} loops"
+    return [
+        f"the network delays updates by up to {certified_ms:g} ms in virtual time",
+        f", if {whose} keeps the least time between transmissions that its trigger and rate give, no "
+        "sensor is restarted, and settings change only as in [[changes]]",
+    ]
 
 
 def network_delay_ns(resolved: Scenario, late_periods: int) -> int:

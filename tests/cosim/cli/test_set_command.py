@@ -96,6 +96,8 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
         assert run_registry.find(run_dir=Path(ticket.run_dir)).run_dir == ticket.run_dir
         with pytest.raises(CallerError, match="no run is active in session 'none'; active: "):
             run_registry.find(session="none")
+        with pytest.raises(CallerError, match="probability = nan: should be a finite number"):
+            run_registry.request_change(run_registry.find(session="lab"), parsed(["loss.p", "nan"]))
     assert list(path.parent.iterdir()) == []
 
 

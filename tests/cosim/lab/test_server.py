@@ -1,11 +1,13 @@
 """The page's server without a browser: what it computes, whom it answers, its live runs."""
 
 import asyncio
+import faulthandler
 import gc
 import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -25,6 +27,45 @@ from cosim.lab.lab_server import AddressGuard, LabOptions
 from cosim.lab.lab_services import LabServices, PageCalls, Session
 from cosim.lab.live_run import LiveRun
 from tests.integration import conftest as live
+
+UNANSWERED = {
+    "computes": "while True: pass",
+    "stopped": "os.kill(os.getpid(), signal.SIGSTOP)",
+    # The pool's thread has begun to read an answer of a million bytes, of which this is all.
+    "half an answer": """
+    answers = sys._getframe(1).f_locals["result_queue"]._writer
+    os.write(answers.fileno(), struct.pack("!i", 1_000_000) + b"x")
+    time.sleep(3600)
+""",
+}
+
+
+@pytest.mark.parametrize("what", UNANSWERED)
+def test_the_services_end_whatever_the_worker_does(what: str, tmp_path: Path) -> None:
+    """In a program of its own: the interpreter's exit must not wait either."""
+    program = tmp_path / "program.py"
+    program.write_text(f"""
+import asyncio, os, signal, struct, sys, time
+from pathlib import Path
+from cosim.lab.lab_services import LabServices
+
+def unanswered(begun):
+    Path(begun).touch()
+    {UNANSWERED[what]}
+
+async def main(services):
+    call = asyncio.create_task(services.compute(unanswered, "begun"))
+    while not Path("begun").exists():
+        await asyncio.sleep(0.01)
+    await asyncio.sleep(0.1)  # so that the pool's thread reads what there is
+    call.cancel()
+
+if __name__ == "__main__":
+    with LabServices("lane_following", Path(), Path()) as services:
+        asyncio.run(main(services))
+        services._replace_worker()
+""")
+    subprocess.run([sys.executable, program], cwd=tmp_path, timeout=live.PATIENCE_S, check=True)
 
 
 class Inline:
@@ -252,6 +293,7 @@ def test_the_browser_is_started_with_the_address_for_command_lines(
     monkeypatch.setattr(lab_server.webbrowser, "open", open_page)
     options = LabOptions("lane_following", "", tmp_path, tmp_path / "runs", 0, open_browser=True)
     lab_server.serve(options, announced.append)
+    faulthandler.cancel_dump_traceback_later()
     (page,), (line) = announced, opened[0]
     assert urlsplit(page).netloc == urlsplit(line).netloc
     assert urlsplit(page).path != urlsplit(line).path

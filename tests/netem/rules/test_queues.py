@@ -395,7 +395,8 @@ def test_a_packet_leaves_in_its_flows_next_free_slot(
     order: list[int], slot_ns: int, steps: Any, places: int, mansd: int | None
 ) -> None:
     """Against slots one by one; at most mansd successive packets of a flow are lost."""
-    schedule = Schedule(order=tuple(order), slot_s=slot_ns / 1e9, queue=places)
+    order = [sorted({0, *order}).index(flow) for flow in order]  # every flow up to the last has slots
+    schedule = Schedule(order=tuple(flow - 1 for flow in order), slot_s=slot_ns / 1e9, queue=places)
     link = Link(LinkSettings(impairments=(schedule,), mansd=mansd, limit=1000), 0, "a")
     model, losses, found, now_ns = Slots(tuple(order), slot_ns, places), [0] * 6, [], 0
     names: dict[int, int] = {}
@@ -411,13 +412,13 @@ def test_a_packet_leaves_in_its_flows_next_free_slot(
 
 
 def test_copies_take_slots_and_a_changed_schedule_goes_on_after_those_that_are_taken() -> None:
-    link = Link(settings_of("duplicate 100% schedule 1,2 slot 1ms queue 4"), 0, "a")
+    link = Link(settings_of("duplicate 100% schedule 0,1 slot 1ms queue 4"), 0, "a")
     decisions = []
     for now_ns in (0, 0, 0):
         decision = link.decide(0, 100, now_ns)
         decisions.append((decision.fate, decision.release_ns // MS, decision.copy_ns // MS))
     assert decisions == [(0, 0, 2), (0, 4, 6), (0, 8, -1)]
-    link.change(settings_of("duplicate 0% schedule 2,1 slot 3ms queue 9"))
+    link.change(settings_of("duplicate 0% schedule 1,0 slot 3ms queue 9"))
     assert link.decide(0, 100, 1).release_ns == 9 * MS
 
 

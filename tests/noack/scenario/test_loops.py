@@ -111,6 +111,11 @@ def test_a_loop_is_that_of_its_file_on_the_network_of_the_run(
     assert (second.horizon_s, second.speed) == (scenario.horizon_s, scenario.speed)
     assert (second.ports, second.seeds.loss) == (scenario.ports, scenario.seeds.loss)
     assert second.seeds.plant != 9  # drawn from the seeds of the run
+    shared = {key: value for key, value in content.items() if key not in PARTS}
+    entries = [{"name": name, "scenario": "parts/other.toml"} for name in "ab"]
+    assert loops_of(load(write(tmp_path, "files.toml", shared | {"loops": entries})))[1] == second
+    with pytest.raises(CallerError, match="model: missing"):
+        load(write(tmp_path, "files.toml", shared | {"loops": [*entries, {"name": "c"}]}))
 
 
 def test_keys_of_the_entry_change_the_file(content: dict[str, Any], tmp_path: Path) -> None:

@@ -25,8 +25,10 @@ from noack.impairments.loss_prediction import read_files
 from noack.protocol.record_tables import Fate
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.link_load import link_loads, load_warnings, require_capacity, update_delay
+from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
+from noack.theory.certificates.conditions import certified_delay_s
 from tests.approved import compare_lines, lines_of_error
 from tests.netem.feature_examples import IMPAIRED, keeps_loss, names_file
 from tests.oracles.link import Datagram, Link
@@ -187,15 +189,15 @@ def test_recorded_opportunities_are_a_bottleneck(content: dict[str, Any]) -> Non
 @pytest.mark.parametrize(
     ("order", "says"),
     [
-        ([1, 3, 1], "order: loop 2 has no slot; the run has the loops 1 to 3"),
-        ([1, 2, 3, 4], "order: a slot is for loop 4; the run has the loops 1 to 3"),
-        ([1, 1, 1, 2, 3], "loop 2, the datagrams that must pass, 1 of any 3 of each loop, need"),
+        ([0, 1, 0], "order: loop 2 has no slot; the run has the loops 0 to 2"),
+        ([1, 2, 3, 0], "order: a slot is for loop 3; the run has the loops 0 to 2"),
+        ([0, 0, 0, 1, 2], "loop 1, the datagrams that must pass, 1 of any 3 of each loop, need"),
     ],
 )
 def test_a_schedule_has_enough_slots_for_each_loop(
     content: dict[str, Any], order: list[int], says: str
 ) -> None:
-    """Loop 2 needs a slot in 3 × 50 ms; of five of these, it has one."""
+    """Loop 1 needs a slot in 3 × 50 ms; of five of these, it has one."""
     loops = {"name": "a", "count": 3, "trigger": PERIODIC}
 
     def given(slot_s: float) -> Scenario:
@@ -238,8 +240,8 @@ TIGHT: list[tuple[list[dict[str, Any]], int, float, float]] = [
     ([{"kind": "rate", "rate_bps": 0.7 * RATE_BPS, "queue": 2}, CORRUPT], 19,
      3 * 0.05 / 0.65, 0.157),
     # The same in slots, which are taken by datagrams that are lost later; two copies.
-    ([{"kind": "schedule", "order": [1, 0], "slot_s": 0.05, "queue": 1}, CORRUPT], 1, 0.2, 0.12),
-    ([{"kind": "duplicate", "probability": 1.0}, {"kind": "schedule", "order": [1],
+    ([{"kind": "schedule", "order": [0, -1], "slot_s": 0.05, "queue": 1}, CORRUPT], 1, 0.2, 0.12),
+    ([{"kind": "duplicate", "probability": 1.0}, {"kind": "schedule", "order": [0],
       "slot_s": 0.025}], 1, 0.05, 0.04),
 ]  # fmt: skip
 
@@ -270,7 +272,7 @@ QUEUES = [
 ]  # fmt: skip
 SCHEDULES = [
     Schedule(order=order, slot_s=round_s / len(order), queue=queue)
-    for order in ((1, 2, 3, 4, 5, 6, 7), (*(1, 2, 1) * 2, *range(1, 8)), (7, *range(1, 7), *(1, 7)))
+    for order in (tuple(range(7)), (*(0, 1, 0) * 2, *range(7)), (6, *range(6), *(0, 6)))
     for round_s in (0.04, 0.05, 0.11, 0.2) for queue in (1, 4)
 ]  # fmt: skip
 
@@ -299,9 +301,13 @@ def test_the_largest_delay_is_bounded_and_a_warning_tells_that_it_is_not_covered
     scenario = scenario_of(content, 1000, 1, {"name": "a", "count": loops})
     network = scenario.network.model_copy(update={"impairments": tuple(stages)})
     scenario = scenario.model_copy(update={"network": network})
-    bound_s = update_delay(scenario).largest_s
+    bound = update_delay(scenario)
+    bound_s = bound.largest_s
     longest_s = longest_delay_s(scenario, loops, seed, together)
     assert longest_s <= bound_s + 1e-9 * (len(stages) + 1)
+    longest = scenario.network.link.longest_delay_s
+    for loop, own_s in zip(resolved_loops(scenario), bound.loops_s, strict=True):
+        assert certified_delay_s(loop) == pytest.approx(own_s if math.isfinite(own_s) else longest)
     covered_s = covered * (bound_s if math.isfinite(bound_s) else longest_s)
     certificate = scenario.certificate.model_copy(update={"network_delay_s": covered_s})
     scenario = scenario.model_copy(update={"certificate": certificate})

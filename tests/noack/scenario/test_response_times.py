@@ -1,6 +1,7 @@
 """The bounds of a link that chooses what it sends, against a published example and arrivals."""
 
 import math
+import pickle
 from itertools import product
 from typing import Any
 
@@ -17,7 +18,10 @@ from noack.impairments.feature import Scheduler
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario.link_load import link_loads
+from noack.scenario.resolution import loop_named, resolve, resolved_loops
 from noack.scenario.response_times import Sender, response_ns
+from noack.scenario.scenario import Scenario, loop_names
+from noack.theory.certificates.conditions import allowed_conditions, certified_delay_s, network_delay_texts
 from tests.netem.stepped_channel import send
 from tests.shipped import shipped
 
@@ -111,12 +115,41 @@ def test_no_arrivals_exceed_the_bound(loops: Any, kind: type[Scheduler], data: s
 
 
 def test_the_loops_of_each_bound_are_named() -> None:
-    """Updates take 2.5 ms each, 10 ms apart; loops 1 to 3 need three quarters of the rate."""
+    """Updates take 2.5 ms each, 10 ms apart; loops 0 to 2 need three quarters of the rate."""
     levels = "network.impairments.0.discipline.levels=[1,2,1,3]"
     (found,) = link_loads(shipped("priority_channel", levels, "loops=[{name='p',count=5}]"))
-    bounds = (("loops 1, 3", 0.0075), ("loop 2", 0.01), ("loops 4 to 5", math.inf))
+    bounds = (("loops 0, 2", 0.0075), ("loop 1", 0.01), ("loops 3 to 4", math.inf))
     assert found.loop_bounds_s == bounds
     assert found.delay_bound_s is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "delays_s", "says"),
+    [
+        ([], [0.005, 0.0075, 0.0075], "up to {} ms in virtual time, if each of the 3 loops keeps"),
+        (["loops=[{name='p'}]"], [0.0025], "up to {} ms in virtual time, if its loop keeps"),
+        # Five loops need more than the rate: the last three have a full queue of long packets.
+        (["loops=[{name='p',count=5}]"], [0.005, 0.0075, *[4 * 12_000 / 294_400] * 3], "no bound"),
+        (["certificate.network_delay_s=0.02"], [0.02] * 3, "network_delay_s allows for a delay of {} ms"),
+        (["network.impairments=[{kind='delay',delay_s=0.003}]"], [0.003] * 3, "delays updates by up to"),
+    ],
+)  # fmt: skip
+def test_certificates_allow_for_the_proven_delay_of_the_loop_in_its_run(
+    settings: list[str], delays_s: list[float], says: str
+) -> None:
+    run = shipped("priority_channel", *settings)
+    loops = resolved_loops(run)
+    assert [certified_delay_s(loop) for loop in loops] == pytest.approx(delays_s)
+    assert says.format(f"{1e3 * delays_s[-1]:g}") in "".join(network_delay_texts(loops[-1]))
+    for loop, name in zip(loops, loop_names(run), strict=True):
+        assert certified_delay_s(resolve(loop_named(run, name))) == certified_delay_s(loop)
+        assert allowed_conditions(loop).delay_s == allowed_conditions(copy_of(loop)).delay_s
+
+
+def copy_of(loop: Scenario) -> Scenario:
+    """Return the loop as another process receives it."""
+    copied: Scenario = pickle.loads(pickle.dumps(loop))
+    return copied
 
 
 @pytest.mark.parametrize("kind", [Priority, EarliestDeadline])

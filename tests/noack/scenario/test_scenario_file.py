@@ -147,8 +147,8 @@ def test_shipped_scenarios_are_unchanged_by_writing_and_reading(path: Path, tmp_
     copy = tmp_path / "copy.toml"
     for scenario in (load(path), *resolved):
         copy.write_text(dumps(scenario), encoding="utf-8")
-        assert load(copy) == scenario
-    assert resolve(load(copy)) == resolved[-1]
+        assert load(copy).model_dump() == scenario.model_dump()
+    assert resolve(load(copy)).model_dump() == resolved[-1].model_dump()
 
 
 # --- the file before it is parsed -----------------------------------------------------------------

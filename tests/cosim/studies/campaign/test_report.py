@@ -22,7 +22,7 @@ from cosim.studies.campaign.campaign_figures import (
     pareto_figure,
     undominated,
 )
-from cosim.studies.campaign.campaign_file import load
+from cosim.studies.campaign.campaign_file import Axis, load
 from cosim.studies.campaign.campaign_grid import Point, base_of
 from cosim.studies.campaign.campaign_report import write_report, written
 from cosim.studies.campaign.campaign_summary import JudgedClaim, judge_claims, summarise
@@ -190,6 +190,25 @@ def test_figures_and_texts_accept_infinite_single_and_many_values() -> None:
     drawn.append(distribution_figure(values, "cost"))
     for figure in drawn:
         assert inline(figure).startswith("<svg")
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "label", "logarithmic"),
+    [
+        ("network.impairments.0.rate_bps", (10_000, 30_000, 100_000), "rate [bit/s]", True),
+        ("plant.rate_hz", (10, 20, 50, 100, 200, 500, 1000), "rate [Hz]", True),
+        ("trigger.alpha_per_s", (0.1, 0.2, 0.3), "rate [1/s]", False),  # not far apart
+        ("network.mansd", (1, 2, 5, 10, 15, 20), "rate", False),  # evenly
+        ("network.impairments.0.delay_s", (0, 0.01, 1.0), "rate [s]", False),  # with 0
+    ],
+)
+def test_an_axis_has_the_unit_of_its_key_and_is_logarithmic_if_its_values_grow_by_factors(
+    key: str, values: tuple[float, ...], label: str, logarithmic: bool
+) -> None:
+    axis = Axis(name="rate", key=key, values=values)
+    series = {"a": [estimate(np.ones(3)) for _ in values]}
+    drawn = curve_figure(np.array(values, np.float64), axis.labels, series, axis.heading, "cost")
+    assert (drawn.rows[0].panels[0].x.label, drawn.rows[0].panels[0].x.logarithmic) == (label, logarithmic)
 
 
 MORE = {"says": "ZOH sends more.", "axis": "policy",

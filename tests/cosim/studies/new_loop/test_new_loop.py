@@ -179,6 +179,7 @@ def test_the_double_integrators_gain_is_the_textbooks_and_none_is_needed_before(
     settings = {"model": model, "plant.uncertainty_B": [[0.0], [0.0]]}
     found = noack.gain("double_integrator", q=[1.0, 0.0], settings=settings)
     np.testing.assert_allclose(found.K, [[-1.0, -np.sqrt(2.0)]], atol=1e-9)
+    assert "the scenario's plant, as drawn, not from those of its [model]" in repr(found)
 
 
 def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(folder: Path) -> None:
