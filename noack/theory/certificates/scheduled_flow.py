@@ -331,7 +331,7 @@ class _OpenLoopErrors:
         spacing_s: float,
     ) -> None:
         error, each = plant.error, [growth for row in growths for growth in row]
-        self._ends, self._lost = np.cumsum([0, *map(len, growths)]), conditions.dropouts
+        self._ends, self.lost = np.cumsum([0, *map(len, growths)]), conditions.dropouts
         generator = error.scaled_H - plant.B @ error.K
         driven = np.hstack([plant.columns.input_error, plant.columns.mismatch])
         groups, still = (0, plant.columns.input_error.shape[1]), np.ones(1)
@@ -377,7 +377,7 @@ class _OpenLoopErrors:
             return np.asarray(np.min(rows, axis=0))
 
         lost = [0.0]
-        for _ in range(self._lost):
+        for _ in range(self.lost):
             lost.append(max(float(followed(self._step, lost[-1])[0]), lost[-1]))
         return np.array([followed(self._whole, one) for one in lost]).T
 
@@ -463,7 +463,7 @@ class _Inserted(ErrorInequalities):
         return {
             name: (
                 np.append(free.highest, free.tail_highest) + begun[name],
-                np.append(forced.integral_until(free.edges_s[1:]), forced.integral()),
+                forced.integral_until(np.append(free.edges_s[1:], forced.edges_s[-1] + 1.0)),
             )
             for (name, free), forced in zip(plant.free.items(), plant.forced.values(), strict=True)
         }
