@@ -108,6 +108,15 @@ class KernelBounds:
         """∫k over all times, (…)."""
         return np.asarray(self.area.sum(axis=-1) + self.tail_area)
 
+    def integral_until(self, age_s: Stack) -> Stack:
+        """∫₀^a k for each a, (j,), of one kernel."""
+        sums = np.append(0.0, np.cumsum(self.area))
+        cell = np.searchsorted(self.edges_s, age_s, side="right") - 1
+        inside = np.minimum(cell, len(self.area) - 1)
+        within = self.highest[inside] * (age_s - self.edges_s[inside])
+        part = sums[inside] + np.minimum(within, self.area[inside])
+        return np.asarray(np.where(cell < len(self.area), part, self.integral()))
+
     def sup_on_grid(self) -> Stack:
         """Sup of k over the grid only, (…)."""
         return np.asarray(self.highest.max(axis=-1, initial=0.0))

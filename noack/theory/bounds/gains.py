@@ -402,11 +402,15 @@ class PlantGains:
         Raises:
             NotDecayingError: α is not below the decay rate of e^{(A+BK)τ}.
         """
-        start = response(self.closed_loop, self.start).through_each(self.stacked)
         return {
-            output: Coefficients(start[output].sup() + self.disturbed(C), self.forced[output].integral())
+            output: Coefficients(self.free[output].sup() + self.disturbed(C), self.forced[output].integral())
             for output, C in self.outputs.items()
         }
+
+    @cached_property
+    def free(self) -> Mapping[str, KernelBounds]:
+        """‖C e^{(A+BK+αI)τ} x(0)‖ for every output."""
+        return response(self.closed_loop, self.start).through_each(self.stacked)
 
     def disturbed(self, C: Matrix) -> float:
         """Return the part of sup‖C x‖ from the disturbances: min(∫k, duration · sup k) of each."""

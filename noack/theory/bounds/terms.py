@@ -112,6 +112,8 @@ class TriggerBound(NamedTuple):
     earlier than this after the last one, unless ‖e_s‖_W has exceeded ``reached``."""
     is_mean: bool = False
     """Whether it also bounds the mean of ‖e_s‖_W over that time, or that since the event."""
+    root: str = ""
+    """A C of the shares for which (β² + sup‖C x‖²)^½ may take the place of β + share_C sup‖C x‖."""
     apart_s: float = 0.0
     """Events are at least this far apart, whatever happens to e_s."""
     due_s: float = math.inf

@@ -213,7 +213,8 @@ class TriggerBounds:
             # Of the trapezoids of tests that may be missing, the oldest may count most.
             is_mean = self.area > 0 and h_s == conditions.spacing_s
             for ago_s, beta, least in self._levels(conditions, level, reached):
-                bound = TriggerBound(beta, least, shares, untested_s, ago_s=ago_s, is_mean=is_mean)
+                root = next(iter(shares)) if self.comparison.has_root else ""
+                bound = TriggerBound(beta, least, shares, untested_s, ago_s=ago_s, is_mean=is_mean, root=root)
                 # What enters is followed if there is one growth; two growths are smaller.
                 bounds += [bound._replace(is_one_growth=True), bound] if untested_s else [bound]
         if math.isfinite(due_s):
@@ -349,7 +350,7 @@ class ErrorGrowth:
         self.ages_s = np.array([longest_s]) if ages_s is None else ages_s
         self.mean_s, self.highest = float(self.ages_s.mean()), np.zeros(())
         self.longest_s, self.stretch = longest_s, plant.error.stretch(longest_s)
-        self.fixed, self.shares = after.beta, after.shares
+        self.fixed, self.shares, self.root = after.beta, after.shares, after.root
         # The trigger tests x_s − x̂, and may compare it with x̂.
         self.estimation = 1 + sum(
             share * spectral_norm(outputs[C] @ plant.error.inverse_weight)
@@ -360,6 +361,11 @@ class ErrorGrowth:
         if longest_s > 0:
             growth = plant.growth(longest_s, COARSE_CELLS)
             self.driven, self.highest = growth.means(self.ages_s), growth.input_error.sup_on_grid()
+
+    def after_test(self, states: Mapping[str, float]) -> float:
+        """Return b, given bounds of sup‖C x‖; not linear in them."""
+        shares = sum(share * states[C] for C, share in self.shares.items() if self.root != C)
+        return math.hypot(self.fixed, states.get(self.root, 0.0)) + shares
 
 
 def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[ErrorGrowth]:

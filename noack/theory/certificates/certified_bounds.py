@@ -254,7 +254,7 @@ class KnownStatePart:
     def deviation(self, input_errors: Vector, age_s: Vector, missing: Counts, delay_s: float) -> Vector:
         """Return the scaled bound of the deviation from the prediction, (k,)."""
         known, forced = _entries(input_errors, missing), self._forced
-        whole = integral_until(forced, age_s)
+        whole = forced.integral_until(age_s)
         # In the time d after the event, updates before it may be in flight.
         latest = np.minimum(age_s, delay_s) * forced.sups(np.maximum(age_s - delay_s, 0.0))
         deviation = known * whole + (input_errors[-1] - known) * np.minimum(latest, whole)
@@ -343,16 +343,6 @@ def _together(parts: Sequence[tuple[Vector, float]]) -> list[Vector]:
 
 def _entries(table: Vector, missing: Counts) -> Vector:
     return np.asarray(table[np.clip(missing, 0, len(table) - 1)])
-
-
-def integral_until(kernel: KernelBounds, age_s: Vector) -> Vector:
-    """Return bounds of ∫₀^a k for each a, (j,)."""
-    sums = np.append(0.0, np.cumsum(kernel.area))
-    cell = np.searchsorted(kernel.edges_s, age_s, side="right") - 1
-    inside = np.minimum(cell, len(kernel.area) - 1)
-    within = kernel.highest[inside] * (age_s - kernel.edges_s[inside])
-    part = sums[inside] + np.minimum(within, kernel.area[inside])
-    return np.asarray(np.where(cell < len(kernel.area), part, kernel.integral()))
 
 
 def known_state_bounds(resolved: Scenario, certificate: ScenarioCertificate) -> KnownStateBounds | None:

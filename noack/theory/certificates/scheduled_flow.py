@@ -28,8 +28,9 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.bounds.contraction import spectral_norm
-from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.contraction import Stack, spectral_norm
+from noack.theory.bounds.enclosure import response_until
+from noack.theory.bounds.gains import Growth, Output, PlantGains
 from noack.theory.bounds.terms import MEASURED, Constants, NetworkConditions, Part
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth
 from noack.theory.certificates.delivery_flow import (
@@ -314,6 +315,73 @@ class _ErrorsByNumber:
         return np.asarray(np.min(rows, axis=0))
 
 
+class _OpenLoopErrors:
+    """The gains of e_c, followed from the last test before each lost event in open loop.
+
+    The input is computed from x_c, so e_c follows G − BK = H + αI − BK while no update acts. At
+    the last test before an event it is e_s, at most b, and what is left of the lost errors. Axes
+    are those of :class:`_ErrorsByNumber`.
+    """
+
+    def __init__(
+        self,
+        plant: PlantGains,
+        growths: Sequence[Sequence[ErrorGrowth]],
+        conditions: NetworkConditions,
+        spacing_s: float,
+    ) -> None:
+        error, each = plant.error, [growth for row in growths for growth in row]
+        self._ends, self.lost = np.cumsum([0, *map(len, growths)]), conditions.dropouts
+        generator = error.scaled_H - plant.B @ error.K
+        driven = np.hstack([plant.columns.input_error, plant.columns.mismatch])
+        groups, still = (0, plant.columns.input_error.shape[1]), np.ones(1)
+
+        def gains(later_s: float, apart_s: float) -> Stack:
+            """Return those of b, of a lost error, and of q and R_E x, then without means, (6, o, g)."""
+            found = []
+            for growth in each:
+                ages_s = growth.ages_s + later_s
+                until_s = float(ages_s.max())
+                alone = response_until(generator, error.inverse_weight, until_s, COARSE_CELLS)
+                pairs = response_until(generator, driven, until_s, COARSE_CELLS, groups=groups)
+                kept, entered = alone.through_each(error.stacked), pairs.through_groups(error.stacked)
+                rows = []
+                for C in error.outputs:
+                    by_input, mismatched = entered[C]
+                    one = Growth(mismatched, by_input, np.zeros(COARSE_CELLS))
+                    means = one.means(ages_s if until_s else still)
+                    rows.append((kept[C].sup_on_grid(), *means[:2], *one.totals[:2]))
+                found.append(rows)
+            stay, *entered_by = np.array(found).transpose(2, 1, 0)
+            left_s = np.array([max(apart_s - growth.longest_s, 0.0) for growth in each])
+            left = {C: error.kernels[C].sups(left_s) for C in error.outputs}
+            turned = np.array([*left.values()]) + entered_by[2] * left[Output.GAIN]
+            return np.array([stay, np.minimum(stay * left[Output.WEIGHTED], turned), *entered_by])
+
+        self._step, self._whole = gains(0.0, spacing_s)[:, :1], gains(conditions.delay_s, 0.0)
+        until_s = max(conditions.delay_s, conditions.start_s)
+        self._late = plant.growth(until_s, COARSE_CELLS).totals[:2] if until_s else (0.0, 0.0)
+
+    def bound(self, b: Vector, held: float, input_error: float, mismatch: float) -> Matrix:
+        """Bound sup‖C e_c‖ after at most 0, 1, … lost events, (o, j).
+
+        ``input_error`` bounds π before the first input, too.
+        """
+        late = float(self._late[0] * input_error + self._late[1] * mismatch)
+
+        def followed(gains: Stack, lost: float) -> Vector:
+            stay, after, by_input, mismatched, *totals = gains
+            tested = stay * b + after * lost + by_input * held + mismatched * mismatch
+            values = np.maximum(tested, stay * late + totals[0] * held + totals[1] * mismatch)
+            rows = [values[:, i:j].max(axis=1) for i, j in zip(self._ends, self._ends[1:], strict=False)]
+            return np.asarray(np.min(rows, axis=0))
+
+        lost = [0.0]
+        for _ in range(self.lost):
+            lost.append(max(float(followed(self._step, lost[-1])[0]), lost[-1]))
+        return np.array([followed(self._whole, one) for one in lost]).T
+
+
 @dataclass
 class _KnownBounds:
     """Bounds of one loop that hold, each of which may be replaced by a smaller one."""
@@ -358,10 +426,9 @@ class _Inserted(ErrorInequalities):
             v[[0, 3, 4]].tolist(),
             [*self._error.outputs].index(Output.GAIN),
         )
-        for name, (free, gain) in self._states.items():
-            states[name] = min(states[name], float(free + gain * input_error))
-        growths = [growth for row in self._growths for growth in row]
-        b = np.array([g.fixed + sum(share * states[C] for C, share in g.shares.items()) for g in growths])
+        for name, (free, forced) in self._timed_states.items():
+            states[name] = min(states[name], float((free + forced * input_error).max()))
+        b = np.array([growth.after_test(states) for row in self._growths for growth in row])
         for method, by_number in self._by_number(spacing_s).items():
             inputs, before = np.full(by_number.count + 1, input_error), np.inf
             if len(known.inputs.get(method, ())) == len(inputs):
@@ -375,12 +442,31 @@ class _Inserted(ErrorInequalities):
             if method is BoundMethod.MISSING:
                 known.earlier = min(known.earlier, float(missing[place, -1]) + held)
                 known.received = min(known.received, float(whole[place, 0]) + held)
+        followed = self._followed(spacing_s).bound(b, held, max(input_error, self.start_error), mismatch)
+        for output, size in zip(self._error.outputs, followed[:, -1].tolist(), strict=True):
+            errors[output] = min(errors[output], size)
+        for inputs in known.inputs.values():
+            numbers = np.minimum(np.arange(len(inputs)), followed.shape[1] - 1)
+            np.minimum(inputs, followed[place, numbers] + held, out=inputs)
+        known.received = min(known.received, float(followed[place, 0]) + held)
         rows = iter(b.tolist())
         sizes = [max(self._grown(one, next(rows), *v[3:5]) for one in row) for row in self._growths]
         known.sensor = min(known.sensor, *sizes)
         age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
         found_v = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
         known.signals = np.minimum(v, np.array(found_v, dtype=np.float64))
+
+    @cached_property
+    def _timed_states(self) -> Mapping[str, tuple[Vector, Vector]]:
+        """Bounds of ‖C x‖ from the start, and of what a p of 1 has added, up to some times, (k,)."""
+        plant, (_, begun) = self._plant, self._plant.start_up(self._conditions.start_s)
+        return {
+            name: (
+                np.append(free.highest, free.tail_highest) + begun[name],
+                forced.integral_until(np.append(free.edges_s[1:], forced.edges_s[-1] + 1.0)),
+            )
+            for (name, free), forced in zip(plant.free.items(), plant.forced.values(), strict=True)
+        }
 
     def _grown(self, growth: ErrorGrowth, b: float, input_error: float, mismatch: float) -> float:
         """Return how large e_s may become under one bound."""
@@ -406,6 +492,10 @@ class _Inserted(ErrorInequalities):
             )
             for method in self.methods
         }
+
+    @cached_method
+    def _followed(self, spacing_s: float) -> _OpenLoopErrors:
+        return _OpenLoopErrors(self._plant, self._growths, self._conditions, spacing_s)
 
     def _missing_events(self, spacing_s: float) -> int:
         """Return how many events may be missing: lost, or in flight."""

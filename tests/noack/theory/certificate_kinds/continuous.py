@@ -13,13 +13,14 @@ from unittest.mock import patch
 
 import numpy as np
 
-from noack.theory.bounds.enclosure import NotDecayingError
+from noack.core.linear_systems import Matrix
+from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
 from noack.theory.certificates import scheduled_flow
 from noack.theory.certificates.delivery_flow import UNDISTURBED, DeliveryFlow, Reach
 from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
-from noack.theory.certificates.scheduled_flow import _ScheduledFlow
+from noack.theory.certificates.scheduled_flow import _OpenLoopErrors, _ScheduledFlow
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import bounds_of, certified_by, dominated_by_errors, search
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time
@@ -61,6 +62,21 @@ def no_mismatch(*, at_nodes: bool) -> AbstractContextManager[Any]:
 def no_age_of_inputs() -> AbstractContextManager[Any]:
     """Inputs that are held and late do not change the flow."""
     return patch.object(_ScheduledFlow, "_disturbed", lambda *_: UNDISTURBED)
+
+
+def no_lost_errors() -> AbstractContextManager[Any]:
+    """In open loop a lost update has left nothing."""
+    exact = _OpenLoopErrors.bound
+
+    def bound(errors: _OpenLoopErrors, *known: Any) -> Matrix:
+        return np.repeat(exact(errors, *known)[:, :1], errors.lost + 1, axis=1)
+
+    return patch.object(_OpenLoopErrors, "bound", bound)
+
+
+def no_time_to_drive() -> AbstractContextManager[Any]:
+    """Up to every time inputs have driven x for a moment only."""
+    return patch.object(KernelBounds, "integral_until", lambda kernel, ages_s: 0 * ages_s)
 
 
 _ROUNDED = 1e-12
@@ -156,6 +172,8 @@ SCHEDULED = Kind(
         name: Broken(partial(_broken, _certified, mistake), draw)
         for name, mistake, draw in (
             ("the ellipsoid holds x(0) only", only_the_start, partial(_sampled, far=False)),
+            ("no lost errors in open loop", no_lost_errors, partial(_sampled, far=True)),
+            ("inputs drive x for no time", no_time_to_drive, partial(_sampled, far=False)),
             ("no mismatch in the flow", partial(no_mismatch, at_nodes=True),
              partial(random_system, **_LONG, **DRIFTING, delay_steps=4, hold_steps=0)),
             ("no age of inputs in the flow", no_age_of_inputs,
