@@ -95,6 +95,12 @@ def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def no_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finalise runs without a recording for the viewer: half of a short run's end."""
+    monkeypatch.setattr("cosim.live.finalize._write_recording", lambda *_: None)
+
+
+@pytest.fixture
 def usual_signals() -> Iterator[None]:
     """Let signals do what they usually do, also in a process that was started to ignore them."""
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
