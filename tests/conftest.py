@@ -5,6 +5,7 @@ new examples per test.
 """
 
 import copy
+import gc
 import os
 import signal
 import sys
@@ -59,6 +60,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         providers._get_local_constants = providers.Constants
 
 
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector what is loaded by now: half a million objects that stay."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def no_signal_is_ignored_by_children() -> Iterator[None]:
     """Stop child processes from inheriting ignored signals.
@@ -92,6 +99,12 @@ def runs_of_other_workers_are_unknown(
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Finalise runs without a report, whose figures take longer than everything else."""
     monkeypatch.setattr("cosim.live.finalize._write_report", lambda *_: None)
+
+
+@pytest.fixture
+def no_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finalise runs without a recording for the viewer: half of a short run's end."""
+    monkeypatch.setattr("cosim.live.finalize._write_recording", lambda *_: None)
 
 
 @pytest.fixture

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.command_line import invoke
+
 ROOT = Path(__file__).parents[1]
 PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md", "docs/netem.md",
@@ -43,14 +45,9 @@ def fill(folder: Path) -> Path:
             (folder / named[1]).write_text(code)
         elif code.startswith("import control"):  # this snippet writes the matrices file
             subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
-    result = subprocess.run(
-        [
-            sys.executable, "-m", "cosim.cli", "simulate", "lane_following", "--json",
-            "--set", "horizon_s=2", "--no-report",
-        ],
-        cwd=folder, capture_output=True, text=True, check=False, timeout=250,
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
+    simulate = ("simulate", "lane_following", "--set", "horizon_s=2", "--no-report")
+    result = invoke(*simulate, "--runs", folder / "runs")
+    assert result.exit_code == 0, result.stderr
     for name in ("model", "hold"):  # two runs for `compare`, as commands run in any order
         (folder / "runs" / name).mkdir()
         (folder / "runs" / name / "latest").symlink_to((folder / "runs/latest").resolve())

@@ -40,6 +40,7 @@ SHORTER = {
     "simulate": ("--no-report", "--set", "horizon_s=1"),
     "demo": ("--no-report",),
     "run": ("--no-report",),
+    "campaign": ("--workers", "1"),
     "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
     "design": ("--draws", "80"),
     "capacity": ("--draws", "1", "--loops", "11", "--set", "horizon_s=1"),
@@ -54,6 +55,7 @@ def shorter(words: list[str]) -> list[str]:
     return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
 
 
+@pytest.mark.usefixtures("no_recording")
 @pytest.mark.parametrize("command", sorted(set(commands())))
 def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *words = shlex.split(command.partition(" > ")[0])
@@ -199,7 +201,8 @@ def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> N
         noack(run), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         try:
-            wait_for(lambda: (folder / "runs/latest/spool").exists() or process.poll() is not None)
+            rows = folder / "runs/latest/spool/plant_step.recorder"
+            wait_for(lambda: rows.exists() or process.poll() is not None)
             while process.poll() is None:  # the run may not have begun
                 done = subprocess.run(
                     [*noack(change), "--run", "runs/latest"],

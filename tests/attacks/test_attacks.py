@@ -10,7 +10,7 @@ from tests.attacks.attacked import CHECKS, Attacked, attack, may_forge_addresses
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, PEER, STRANGER, Target
 from tests.wire_decoder import Decoder
 
-PER_PORT = 3_000
+PER_PORT = 1_500
 RATE_HZ = 4000.0
 
 

@@ -52,7 +52,7 @@ def test_a_wait_for_a_missing_process_can_be_interrupted(
     assert live.private_files(tmp_path) == []
 
 
-@pytest.mark.usefixtures("no_report")
+@pytest.mark.usefixtures("no_report", "no_recording")
 def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> None:
     """The loop reaches its horizon, and each process stores all of its rows itself."""
     horizon_s = 24.0  # a machine that stalls for seconds does not reach it before the kill

@@ -47,7 +47,7 @@ def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     assert running.left_behind() == []
 
 
-@pytest.mark.usefixtures("no_report")
+@pytest.mark.usefixtures("no_report", "no_recording")
 def test_a_killed_launcher_leaves_no_process_behind(start: Start) -> None:
     running = start(*LONG)
     running.wait_recording()
@@ -58,7 +58,7 @@ def test_a_killed_launcher_leaves_no_process_behind(start: Start) -> None:
     assert len(load_record(run_dir)["plant_step"]) > 10
 
 
-@pytest.mark.usefixtures("no_report")
+@pytest.mark.usefixtures("no_report", "no_recording")
 def test_a_process_that_is_not_ready_in_time_is_named(start: Start) -> None:
     """It is frozen before the start barrier, so that it has no liveliness token.
 

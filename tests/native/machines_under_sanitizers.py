@@ -127,7 +127,7 @@ def test_random_machines(
         drive(machines_of(role, loops, scale, rows=rows), given_inputs)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(roles, sizes(64), st.integers(0, 2**16), st.sampled_from([1.0, 1e308]), inputs)
 def test_large_machines(role: str, of: Sizes, seed: int, scale: float, given_inputs: list[Any]) -> None:
     with np.errstate(all="ignore"):
@@ -166,7 +166,7 @@ sizes_and_policies = st.one_of(
 )
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(st.integers(0, 2**32), sizes_and_policies, st.integers(1, 3))
 def test_random_batches(seed: int, size_and_policy: tuple[int, str], m: int) -> None:
     (n, policy), rng = size_and_policy, np.random.default_rng(seed)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from netem import link_state
@@ -194,7 +194,6 @@ def plain(value: Any) -> bytes | int:
     return bytes(value) if isinstance(value, bytes | np.void) else int(value)
 
 
-@settings(max_examples=40)
 @given(any_link, any_link, st.none() | any_link, arrivals, st.sampled_from([0, 2**40]))
 def test_it_does_what_the_plain_network_does(
     first: LinkSettings,

@@ -58,7 +58,7 @@ def test_ctrl_c_during_any_command_gives_one_line(line: str, monkeypatch: pytest
 SHORT = ("double_integrator", "--no-report", "--set", "horizon_s=0.1")
 
 
-@pytest.mark.usefixtures("usual_signals", "no_report")
+@pytest.mark.usefixtures("usual_signals", "no_report", "no_recording")
 @pytest.mark.parametrize(
     ("number", "status", "why"),
     [

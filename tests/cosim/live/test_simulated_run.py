@@ -110,6 +110,7 @@ def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
     assert (refused.exit_code, "has other loops than" in refused.stderr) == (2, True)
 
 
+@pytest.mark.usefixtures("no_recording")
 def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:
     settings = ("horizon_s=1", "certificate.late_periods=20", 'loops=[{ name = "p", count = 3 }]')
     late = simulated(tmp_path, *settings, options=["--no-report"])
@@ -128,7 +129,7 @@ def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: s
     assert path.read_bytes().startswith(b"RRF")
 
 
-@pytest.mark.usefixtures("no_report")
+@pytest.mark.usefixtures("no_report", "no_recording")
 def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     own = "A = [[0.0, 1.0], [50.0, 0.0]], B = [[0.0], [1.0]]"
     wild = f'{{ name = "wild", phase = 0.75, plant = {{ draw = "given", {own} }} }}'

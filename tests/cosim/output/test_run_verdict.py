@@ -13,11 +13,13 @@ from rich.console import Console
 import noack
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
-from cosim.live.finalize import reopen
+from cosim.live.finalize import finalize, reopen
+from cosim.live.simulated_run import simulate_run
 from cosim.output.run_tables import short_numbers
 from cosim.output.run_verdict import print_outcome, remarks, state_text, verdict
 from tests.approved import compare_lines
 from tests.cosim.summaries import with_values
+from tests.shipped import shipped
 
 RED, RED_STYLE = "\x1b[1;31m", "bold red"
 LOST = {"t_s": 2.5, "process": "controller", "cause": "dropouts", "what": "MANSD violated: 6 lost"}
@@ -34,8 +36,8 @@ def claim(verdict: str, **more: Any) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def outcome(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     """The paper's example, completed without problems."""
-    run = noack.simulate("lane_following", runs=tmp_path_factory.mktemp("runs"))
-    return reopen(run.directory)
+    ending = simulate_run(shipped("lane_following"), tmp_path_factory.mktemp("runs"))
+    return finalize(ending, report=False, view=False)
 
 
 def printed(outcome: Outcome, *, verbose: bool = False, **changed: Any) -> str:
@@ -155,6 +157,7 @@ def test_the_longest_burst_is_shown_with_the_limit_of_all_rules(outcome: Outcome
     assert "longest loss burst (at most 3 allowed)" in dict(short_numbers(limited))
 
 
+@pytest.mark.usefixtures("no_report", "no_recording")
 def test_an_assumption_that_a_scenario_violates_is_a_warning() -> None:
     trigger = {"policy": "absolute", "delta": 0.02}
     run = noack.simulate(noack.load("double_integrator", {"trigger": trigger}))

@@ -59,7 +59,7 @@ def test_a_scripted_network() -> None:
 
 
 def test_loops_of_different_sizes_on_one_network() -> None:
-    given = shipped("unstable_pendulum", "horizon_s=2.0").model_dump(mode="json", exclude_none=True)
+    given = shipped("unstable_pendulum", "horizon_s=1.0").model_dump(mode="json", exclude_none=True)
     rate = {"kind": "rate", "rate_bps": 50_000, "queue": 6}
     network = given["network"] | {
         "impairments": [rate, IMPAIRMENTS[1]], "actuation": {"impairments": IMPAIRMENTS},

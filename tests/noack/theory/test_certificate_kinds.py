@@ -10,8 +10,8 @@ from tests.noack.theory.certificate_kinds.comparison import KINDS, examine
 from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, constants_of
 from tests.noack.theory.certificate_kinds.decaying import dominated_by_errors
 
-FEW, MOST = 6, 60
-LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 25, "continuous time": 15}
+FEW, MOST = 3, 60
+LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 6, "continuous time": 5}
 BROKEN = [(name, next(iter(kind.broken))) for name, kind in KINDS.items() if kind.broken]
 """One of each kind; `python -m tests.noack.theory.certificate_kinds` tries all."""
 

@@ -28,7 +28,7 @@ from fmpy.fmi3 import FMU3Slave  # noqa: E402
 from fmpy.validation import validate_fmu  # noqa: E402
 
 BURSTS: dict[str, Any] = {
-    "horizon_s": 4.0,
+    "horizon_s": 3.0,
     "network.mansd": 3,
     "network.loss": {"model": "gilbert_elliott", "good_to_bad": 0.4, "bad_to_good": 0.3},
     "network.impairments": [

@@ -102,13 +102,11 @@ def test_check_and_certify_accept_the_written_scenario(
     assert certificate["constants"]["state"] == pytest.approx(best["bounds"]["state"])
 
 
-def test_a_chosen_norm_and_gain_are_certified_as_written(
-    one: Path, tmp_path: Path, run_design: Design
-) -> None:
+def test_a_chosen_norm_is_certified_as_written(one: Path, tmp_path: Path, run_design: Design) -> None:
     out = tmp_path / "chosen.toml"
     result = run_design(
-        one, "--settling", "4", "--quantile", "0.7", "--draws", "40", "--gain", "lqr",
-        "--weights", "chosen", "--bound", "error=0.3", "--bound", "state=2",
+        one, "--settling", "4", "--quantile", "0.7", "--draws", "40", "--weights", "chosen",
+        "--bound", "error=0.3", "--bound", "state=2",
         "--out", str(out), "--json",
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr

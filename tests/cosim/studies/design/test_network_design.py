@@ -223,7 +223,7 @@ def test_the_written_scenario_is_checked_and_decided_as_claimed(tmp_path: Path) 
 @pytest.fixture(scope="module")
 def events() -> FoundEvents:
     """The pendulum's own trigger and gain, and better ones, with a certified bound of ‖x‖."""
-    wish = Wish(most=40, bounds={"state": 1.6}, effort=300)
+    wish = Wish(most=40, bounds={"state": 1.6}, effort=120)
     return searched_events(shipped("unstable_pendulum"), wish, seed=5)
 
 
@@ -270,7 +270,7 @@ def test_runs_with_the_claimed_m_keep_the_certified_bound(events: FoundEvents) -
 
 def test_fewer_transmissions_of_events_for_the_same_network() -> None:
     given = shipped("double_integrator")
-    found = searched_events(given, Wish("transmissions", effort=300), seed=1)
+    found = searched_events(given, Wish("transmissions", effort=120), seed=1)
     assert found.shown.scenario.network == given.network
     assert found.best.measured.transmissions < 0.9 * found.given.measured.transmissions
     assert found.search.certificate(found.best.loop, given.network.mansd + 1) is not None
