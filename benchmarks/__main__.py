@@ -82,15 +82,15 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
     parser.add_argument("--docs", type=Path, metavar="FILE", help="write the goals into this page")
     names = f"of {', '.join(benchmarks)}; {GOALS}: {', '.join(OF_GOALS)}"
     parser.add_argument("names", nargs="*", metavar="NAME", help=names)
-    for one in benchmarks.values():
-        for option, settings in one.options.items():
+    for benchmark in benchmarks.values():
+        for option, settings in benchmark.options.items():
             parser.add_argument(option, **settings)
     options = parser.parse_args(arguments)
     if options.list:
-        print("\n".join(f"{one.name:<20}{one.title}" for one in benchmarks.values()))
+        print("\n".join(f"{benchmark.name:<20}{benchmark.title}" for benchmark in benchmarks.values()))
         return 0
     asked = options.names or [*benchmarks]
-    chosen = [name for one in asked for name in (OF_GOALS if one == GOALS else (one,))]
+    chosen = [name for entry in asked for name in (OF_GOALS if entry == GOALS else (entry,))]
     if unknown := [name for name in chosen if name not in benchmarks]:
         parser.error(f"no benchmark {unknown[0]!r}; benchmarks: {', '.join(benchmarks)}")
     console = Console()
@@ -98,8 +98,8 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
         console.width = 130
     rows, failures = list[tuple[str, Row]](), 0
     for benchmark in (benchmark for name, benchmark in benchmarks.items() if name in chosen):
-        found, failed = _measured(benchmark, options, console)
-        rows += [(benchmark.name, row) for row in found]
+        rows_of_one, failed = _measured(benchmark, options, console)
+        rows += [(benchmark.name, row) for row in rows_of_one]
         failures += failed
     if options.json is not None:
         content = [row.as_json() | {"benchmark": name} for name, row in rows]

@@ -82,8 +82,8 @@ def check_row(words: str, limits: Limits, count: int) -> Row:
     say(f"{count:,} decisions, {words}")
     flows = Decider(f"{words} limit 1000000").outcomes(count)
     note = f"{count:,} decisions, {np.mean(flows):.2%} lost"
-    found = sum(violations(lost, limits) for lost in flows)
-    return Row(f"{words}: violations", found, "", goal=Goal("==", 0), note=note)
+    count = sum(violations(lost, limits) for lost in flows)
+    return Row(f"{words}: violations", count, "", goal=Goal("==", 0), note=note)
 
 
 def expected_row(words: str, count: int) -> Row:
@@ -137,7 +137,7 @@ def guarantee(options: argparse.Namespace) -> Iterator[Row]:
         for words in COMBINATIONS:
             cap = f"mansd {settings_of(words).longest_burst}"
             if words != cap:
-                ours, plain = (Decider(f"{before} {one} limit 1000000").cost() for one in (words, cap))
+                ours, plain = (Decider(f"{before} {text} limit 1000000").cost() for text in (words, cap))
                 yield compared(
                     f"{before} {words}: decision",
                     "ns",
@@ -174,7 +174,7 @@ def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]
     absolute = {"policy": "absolute", "delta": delta} | W
     deadline = {"policy": "deadline", "interval_s": _DEADLINE_S}
     dynamic = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.1, "decay_per_s": 1.0}
-    found: list[dict[str, Any]] = [
+    rules: list[dict[str, Any]] = [
         {"policy": "decaying"} | paper | W,
         absolute,
         {"policy": "relative", "sigma": _SIGMA} | W,
@@ -196,7 +196,9 @@ def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]
         deadline | {"rule": {"policy": "lyapunov", "rate_per_s": 0.2} | W},
         deadline | {"rule": dynamic | W},
     ]
-    return {one["policy"] + (f"({one['rule']['policy']})" if "rule" in one else ""): one for one in found}
+    return {
+        rule["policy"] + (f"({rule['rule']['policy']})" if "rule" in rule else ""): rule for rule in rules
+    }
 
 
 def loop_named(name: str, horizon_s: float, norm: str) -> Scenario:

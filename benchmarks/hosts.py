@@ -186,15 +186,15 @@ def run_client(options: Exchange) -> None:
                 true_ns = time.monotonic_ns()
                 added_ns = clocks.added_ns(true_ns)
                 truth_ns = options.ahead_ns - added_ns
-                found = offset.interval(true_ns + added_ns)
-                estimate_ns = bare.midpoint_ns if bare else found and found.midpoint_ns
-                if found is not None:
+                bounds = offset.interval(true_ns + added_ns)
+                estimate_ns = bare.midpoint_ns if bare else bounds and bounds.midpoint_ns
+                if bounds is not None:
                     checks += 1
-                    outside += not found.lower_ns <= truth_ns <= found.upper_ns
+                    outside += not bounds.lower_ns <= truth_ns <= bounds.upper_ns
                 if estimate_ns is not None and true_ns > steady_ns:
                     estimates_ns.append(abs(estimate_ns - truth_ns))
-                    if found is not None:
-                        errors_ns.append(found.error_ns)
+                    if bounds is not None:
+                        errors_ns.append(bounds.error_ns)
     figures = {
         "checks": checks,
         "outside": outside,
@@ -270,8 +270,8 @@ def measured(hosts: TwoHosts, ahead_s: int, drift_ppb: int, case: Case, *, bare:
         reference.communicate()
     if client.returncode:
         raise MeasurementError(f"the client failed: {client.stderr.strip().splitlines()[-1:]}")
-    found: Figures = json.loads(client.stdout)
-    return found
+    figures: Figures = json.loads(client.stdout)
+    return figures
 
 
 @benchmark("clock_offset_bound", "Bound of the offset between two clocks")
@@ -281,24 +281,24 @@ def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
     The programs request the real-time settings of a run. The alternative is a plain NTP exchange in
     Python: the newest midpoint, without a bound, authentication or kernel timestamps.
     """
-    rounds, others = Rounds(), [(case, Rounds()) for case in CASES]
+    rounds, alternatives = Rounds(), [(case, Rounds()) for case in CASES]
     with two_hosts() as hosts:
         for ahead_s, drift_ppb in CLOCKS:
             say(f"client {ahead_s:+} s, {drift_ppb / 1000:+.0f} ppm")
             rounds.add(BARE, measured(hosts, ahead_s, drift_ppb, MAIN, bare=True))
             rounds.add(OURS, measured(hosts, ahead_s, drift_ppb, MAIN))
-        for case, found in others:
+        for case, own in alternatives:
             say(case.name)
-            found.add(OURS, measured(hosts, *CLOCKS[0], case))
-    cases = [(MAIN, rounds), *others]
-    checks, outside = (sum(sum(one.of(OURS, name)) for _, one in cases) for name in ("checks", "outside"))
+            own.add(OURS, measured(hosts, *CLOCKS[0], case))
+    cases = [(MAIN, rounds), *alternatives]
+    checks, outside = (sum(sum(own.of(OURS, name)) for _, own in cases) for name in ("checks", "outside"))
     yield Row("checks of the bound against the true offset", checks, "", goal=Goal(">=", 1e5))
     yield Row("true offset outside the bound", outside, "", goal=Goal("==", 0))
-    for case, found in cases:
-        note = f"largest: {max(found.of(OURS, 'error_max_us')):.0f} µs"
+    for case, own in cases:
+        note = f"largest: {max(own.of(OURS, 'error_max_us')):.0f} µs"
         for q in ("p50", "p99"):
             name = f"error bound, {q}, {case.name}"
-            yield found.row(name, "µs", f"error_{q}_us", OURS, goal=case.goal, note=note)
+            yield own.row(name, "µs", f"error_{q}_us", OURS, goal=case.goal, note=note)
     for quantity, name in (
         ("estimate_p50_us", "error of the estimate, p50"),
         ("estimate_p99_us", "error of the estimate, p99"),
@@ -311,7 +311,7 @@ ROUNDS = 3
 ACROSS, ON_LOOPBACK = "noack across a veth link", "noack on loopback"
 _PATIENCE_S = 120.0
 _CHANGES = ("horizon_s=10", "trigger.beta=1e-9", 'network.loss={model="lossless"}')
-_SETTINGS = (*FREE_PORTS, *(word for one in _CHANGES for word in ("--set", one)), "--no-report")
+_SETTINGS = (*FREE_PORTS, *(word for change in _CHANGES for word in ("--set", change)), "--no-report")
 
 
 def run_by_hand(hosts: TwoHosts | None) -> Figures:

@@ -150,8 +150,8 @@ def summary_of(side: str, folder: Path) -> dict[str, Any]:
         for button in ("live", "run live"):
             page.press_button(button)
         page.wait(f"{TEXT}.includes('completed {HORIZON_S:g} s')")
-    found: dict[str, Any] = json.loads((folder / "runs/latest/summary.json").read_bytes())
-    return found
+    summary: dict[str, Any] = json.loads((folder / "runs/latest/summary.json").read_bytes())
+    return summary
 
 
 @contextmanager
@@ -181,9 +181,9 @@ def stroke(options: argparse.Namespace) -> Iterator[Row]:
             _opened(Path(folder), "--set", "horizon_s=20", card=()) as page,
             _busy(processes),
         ):
-            place = page.js(_BOX)
-            median_ms = median(_strokes_ms(page, _NOTE_STROKES, *place))
-            alone_ms = median(_strokes_ms(page, _DRAW_ALONE, *place))
+            box = page.js(_BOX)
+            median_ms = median(_strokes_ms(page, _NOTE_STROKES, *box))
+            alone_ms = median(_strokes_ms(page, _DRAW_ALONE, *box))
         yield Row(f"moved slider to painted curve, {name}", median_ms, "ms", goal=Goal("<=", goal_ms))
         yield Row(f"moved mouse to a curve of the browser alone, {name}", alone_ms, "ms")
 

@@ -66,10 +66,10 @@ def updates(case: Case, refused: set[str]) -> Figures:
     """Run the loop live; return the latencies of its updates, µs, and their count."""
     horizon = ("--set", f"horizon_s={case.round_s}")
     (loop,) = noack("run", "lane_following", *horizon, *_LOSSLESS, *case.arguments).summary["loops"]
-    found = loop["latency_us"]
+    latency = loop["latency_us"]
     for granted in loop["realtime"].values():
-        refused |= {one for one, answer in granted.items() if answer.startswith("not permitted")}
-    return {"p50": found["p50"], "p99": found["p99"], "count": found["updates"]}
+        refused |= {setting for setting, answer in granted.items() if answer.startswith("not permitted")}
+    return {"p50": latency["p50"], "p99": latency["p99"], "count": latency["updates"]}
 
 
 @benchmark("latency", "One-way latency")
@@ -113,17 +113,17 @@ def cyclictest(seconds: int = ROUND_S, priority: int = PRIORITY, core: int | Non
     if (program := shutil.which("cyclictest")) is None:
         raise MeasurementError("cyclictest is not installed (Debian: apt-get install rt-tests)")
     with tempfile.TemporaryDirectory() as folder:
-        found = Path(folder) / "cyclictest.json"
+        output = Path(folder) / "cyclictest.json"
         command = [
             program, "-m", "-q", "-p", str(priority), "-i", str(PERIOD_US),
-            "-D", str(seconds), "-h", str(_HISTOGRAM_US), f"--json={found}",
+            "-D", str(seconds), "-h", str(_HISTOGRAM_US), f"--json={output}",
             *(() if core is None else ("-a", str(core))),
         ]  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0 or not found.is_file():
-            said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[0]
-            raise MeasurementError(f"cyclictest failed, said {said!r}")
-        thread = json.loads(found.read_text())["thread"]["0"]
+        if done.returncode != 0 or not output.is_file():
+            messages = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[0]
+            raise MeasurementError(f"cyclictest failed, said {messages!r}")
+        thread = json.loads(output.read_text())["thread"]["0"]
     low_us, counts = np.array([*map(int, thread["histogram"])]), [*thread["histogram"].values()]
     p50_us, p99_us = np.quantile(np.repeat(low_us + 0.5, counts), (0.5, 0.99)).tolist()
     return {"p50": p50_us, "p99": p99_us, "max": float(thread["max"])}
@@ -132,10 +132,10 @@ def cyclictest(seconds: int = ROUND_S, priority: int = PRIORITY, core: int | Non
 def wake_ups() -> Figures:
     """Return the lateness of a round of a run's loop with real-time settings, µs."""
     numbers = map(str, (1000 * PERIOD_US, ROUND_S, PRIORITY, 0))
-    found = json.loads(execute([sys.executable, "-m", "cosim.doctor.probe", "wake", *numbers]).stdout)
-    if (answer := found["granted"]["sched_fifo"]) != "applied":
+    lateness = json.loads(execute([sys.executable, "-m", "cosim.doctor.probe", "wake", *numbers]).stdout)
+    if (answer := lateness["granted"]["sched_fifo"]) != "applied":
         raise MeasurementError(f"SCHED_FIFO {answer}")
-    p50, p99, most = (np.quantile(found["realtime"], (0.5, 0.99, 1)) / 1e3).tolist()
+    p50, p99, most = (np.quantile(lateness["realtime"], (0.5, 0.99, 1)) / 1e3).tolist()
     return {"p50": p50, "p99": p99, "max": most}
 
 

@@ -57,7 +57,7 @@ def random_loop(seed: int) -> RandomLoop:
     rng = np.random.default_rng([seed, 43])
     if rng.random() < 1 / 6:
         both = zip(_matrices(rng, 2), _matrices(rng, 2), strict=True)
-        A, B, K = (block_diag(one, other) for one, other in both)
+        A, B, K = (block_diag(nominal, other) for nominal, other in both)
     else:
         A, B, K = _matrices(rng, 4)
     mode, step_s = ("model", "zoh")[seed % 2], 0.02
@@ -73,12 +73,12 @@ def random_loop(seed: int) -> RandomLoop:
     }
     content["network"]["impairments"] = [{"kind": "delay", "delay_s": delay_s}] * (delay_s > 0)
     margin = LossMargin(resolve(validate(content, f"loop {seed}")))
-    which = seed // 2 % len(GUARANTEES)
+    number = seed // 2 % len(GUARANTEES)
     burst = int(rng.integers(1, 8))
     rules: list[LossRule] = [LongestBurst(burst)]
-    if which % 2:
+    if number % 2:
         rules.append(LossesInWindow(int(rng.integers(1, burst + 2)), burst + int(rng.integers(2, 6))))
-    if which >= 2:
+    if number >= 2:
         rules.append(DeliveriesBetweenBursts(int(rng.integers(2, 4))))
     guarantee = LossGuarantee(tuple(rules))
     distance = 10 ** rng.uniform(-3, -1)
@@ -91,7 +91,7 @@ def random_loop(seed: int) -> RandomLoop:
         return matrix @ exactly(np.eye(len(matrix.middle[0])) * scale ** (losses + 1))
 
     margin.maps = scaled  # type: ignore[assignment]
-    return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[which]}", wanted, scale)
+    return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[number]}", wanted, scale)
 
 
 def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:
@@ -107,7 +107,7 @@ class Examined(NamedTuple):
     """What was found about a loop."""
 
     loop: RandomLoop
-    found: Stability
+    stability: Stability
     took_s: float
 
 
@@ -125,16 +125,16 @@ def margins(options: argparse.Namespace) -> Iterator[Row]:
     for seed in range(options.margin_first, options.margin_first + options.margin_loops):
         loop = random_loop(seed)
         begun_s = time.process_time()
-        found = loop.margin.stability(loop.guarantee)
+        stability = loop.margin.stability(loop.guarantee)
         took_s = time.process_time() - begun_s
-        examined.append(Examined(loop, found, took_s))
-        bounds = f"{found.lower:.6f} to {found.upper:.6f}"
-        text = f"growth {loop.growth:.6f}: {found.verdict}, {bounds}, {took_s:.2f} s"
+        examined.append(Examined(loop, stability, took_s))
+        bounds = f"{stability.lower:.6f} to {stability.upper:.6f}"
+        text = f"growth {loop.growth:.6f}: {stability.verdict}, {bounds}, {took_s:.2f} s"
         say(f"{seed}: {loop.kind}, {text}, {loop.guarantee.meaning}")
-    for kind in [*sorted({one.loop.kind for one in examined}), "all"]:
-        some = [one for one in examined if kind in (one.loop.kind, "all")]
-        times_s = [one.took_s for one in some]
-        undecided = [one for one in some if one.found.verdict == "undecided"]
+    for kind in [*sorted({case.loop.kind for case in examined}), "all"]:
+        some = [case for case in examined if kind in (case.loop.kind, "all")]
+        times_s = [case.took_s for case in some]
+        undecided = [case for case in some if case.stability.verdict == "undecided"]
         note = f"{len(some)} loops, worst {max(times_s):.1f} s"
         yield Row(f"{kind}: undecided", len(undecided), "", goal=Goal("==", 0), note=note)
         yield Row(f"{kind}: CPU time, median", median(times_s), "s", goal=Goal("<=", MEDIAN_S))

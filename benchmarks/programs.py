@@ -141,9 +141,9 @@ def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:
     there was no progress line.
     """
     bounds_s = [
-        line.at_s - (float(found[1]) - _ROUNDING_S) - begun_s
+        line.at_s - (float(match[1]) - _ROUNDING_S) - begun_s
         for line in lines
-        if (found := PROGRESS.match(line.text)) is not None
+        if (match := PROGRESS.match(line.text)) is not None
     ]
     return min(bounds_s, default=None)
 
@@ -187,11 +187,11 @@ class Processes:
         if len(self._known) <= len(ROLES):
             with contextlib.suppress(psutil.Error):
                 self._known = processes_of(self._known[LAUNCHER]) | self._known
-        found = {}
+        samples = {}
         for role, process in self._known.items():
             with contextlib.suppress(psutil.Error):
-                found[role] = Sample.of(process)
-        return found
+                samples[role] = Sample.of(process)
+        return samples
 
     def are_alive(self, roles: Sequence[str]) -> bool:
         """Whether a process of these roles, once seen by :meth:`sample`, has not ended."""
@@ -230,7 +230,7 @@ def is_of(role: str, process: psutil.Process) -> bool:
 
 def udp_port(process: psutil.Process) -> int:
     """Return the port of a process in the loop."""
-    (port,) = {one.laddr.port for one in process.net_connections("udp4") if not one.raddr}
+    (port,) = {udp.laddr.port for udp in process.net_connections("udp4") if not udp.raddr}
     return int(port)
 
 

@@ -146,20 +146,20 @@ class Ends:
             slack: the burst may end although this number of last datagrams have not arrived.
             addresses: send from these in turn; see :func:`sources`.
         """
-        found = _FFI.new("struct burst *")
+        result = _FFI.new("struct burst *")
         senders = (_FFI.NULL, 0)
         if addresses is not None:
             senders = (_FFI.from_buffer("uint32_t[]", addresses), len(addresses))
         self._call("burst", self.sink.fileno(), relay, self._first(count), count, DATAGRAM_BYTES,
-                   *senders, slack, _PATIENCE_NS, found)  # fmt: skip
-        return Burst(found.wall_ns * 1e-9, found.last + 1, found.received)
+                   *senders, slack, _PATIENCE_NS, result)  # fmt: skip
+        return Burst(result.wall_ns * 1e-9, result.last + 1, result.received)
 
     def direct(self, count: int) -> tuple[Burst, float]:
         """Send directly to the sink; also return the CPU time in seconds."""
-        found, cpu_ns = _FFI.new("struct burst *"), _FFI.new("int64_t *")
+        result, cpu_ns = _FFI.new("struct burst *"), _FFI.new("int64_t *")
         self._call("direct", self.sink.fileno(), self._first(count), count, DATAGRAM_BYTES,
-                   _PATIENCE_NS, found, cpu_ns)  # fmt: skip
-        return Burst(found.wall_ns * 1e-9, found.last + 1, found.received), cpu_ns[0] * 1e-9
+                   _PATIENCE_NS, result, cpu_ns)  # fmt: skip
+        return Burst(result.wall_ns * 1e-9, result.last + 1, result.received), cpu_ns[0] * 1e-9
 
     def ping(self, count: int) -> Nanoseconds:
         """Return the one-way delays of datagrams sent one by one, ns; -1 for a missing one."""
@@ -267,8 +267,8 @@ class Relay:
     def scheduled_s(self) -> tuple[float, float]:
         """CPU time of all its threads so far, and time in which other threads had their core."""
         tasks = Path(f"/proc/{self.pid}/task").glob("*/schedstat")
-        found = [[int(word) for word in task.read_text().split()[:2]] for task in tasks]
-        return sum(one for one, _ in found) * 1e-9, sum(one for _, one in found) * 1e-9
+        times_ns = [[int(word) for word in task.read_text().split()[:2]] for task in tasks]
+        return sum(run_ns for run_ns, _ in times_ns) * 1e-9, sum(run_ns for _, run_ns in times_ns) * 1e-9
 
     def burst(self, addresses: Addresses | None = None) -> Figures:
         """Send it one burst, from these addresses in turn if there are any.
@@ -281,9 +281,9 @@ class Relay:
             if not self._burst:
                 raise MeasurementError(f"{self.name} forwards nothing")
         before_s, _ = self.scheduled_s()
-        found = self.ends.burst(self.pid, self._burst, self._slack, addresses)
+        result = self.ends.burst(self.pid, self._burst, self._slack, addresses)
         cpu_s = self.scheduled_s()[0] - before_s
-        return figures_of(self.name, found, cpu_s, self._burst, self._slack)
+        return figures_of(self.name, result, cpu_s, self._burst, self._slack)
 
     def totals(self) -> Totals:
         """End our relay as Ctrl-C does; return its totals."""
@@ -328,10 +328,10 @@ def _listening_on(kind: Kind, process: subprocess.Popen[str], chosen: int) -> in
                 time.sleep(0.01)
         else:
             stream, port = kind.says
-            said: IO[str] = getattr(process, stream)
-            for line in said:
-                if (found := port.search(line)) is not None:
-                    return int(found[1])
+            output: IO[str] = getattr(process, stream)
+            for line in output:
+                if (match := port.search(line)) is not None:
+                    return int(match[1])
     finally:
         deadline.cancel()
     _, stderr = process.communicate()

@@ -79,7 +79,7 @@ def drained(options: argparse.Namespace) -> Iterator[Row]:
         ours = our_relay(PLAIN, WORDS), our_relay(SEGMENTS, WORDS, "--segment")
         kinds = socat(), *(c_relay(tools, *modes) for modes in C_MODES), *ours
         with started(kinds, tools) as (rounds, relays):
-            rounds.in_turn(ROUNDS, {one.name: one.burst for one in relays} | {DIRECT: directly})
+            rounds.in_turn(ROUNDS, {relay.name: relay.burst for relay in relays} | {DIRECT: directly})
     for side, peer, goal in RATES:
         yield rounds.row(f"{side}: drained", "datagrams/s", "per_s", side, peer, goal, paired=True)
     for side, peer in COSTS:
@@ -99,13 +99,13 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
     does what our relay with the reverse direction does: it also waits for answers at all sockets
     and returns them. (To wait for a socket by epoll costs when sending, too.)
     """
-    one, many = sources(1), sources(FLOWS)
+    single, many = sources(1), sources(FLOWS)
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
         ours = our_relay(PLAIN, WORDS), our_relay(REVERSE, WORDS, reverse=True)
         with started((c_relay(tools), c_relay(tools, "paths"), *ours), tools) as (rounds, relays):
             for relay in relays:
                 relay.burst(many)  # makes the states of the flows; not counted
-            loads = (_single, one), (_many, many)
+            loads = (_single, single), (_many, many)
             sides = {name(relay.name): partial(relay.burst, to) for relay in relays for name, to in loads}
             rounds.in_turn(FLOW_ROUNDS, sides)
             for name, reason in list(rounds.missing.items()):
@@ -181,9 +181,9 @@ def _added(tools: Built) -> Rounds:
 
     def base() -> Figures:
         nonlocal base_us
-        found = quantiles_of(DIRECT, direct.ping(PINGS))
-        base_us = found["p50"]
-        return found
+        delays = quantiles_of(DIRECT, direct.ping(PINGS))
+        base_us = delays["p50"]
+        return delays
 
     with (
         scheduled(BEFORE_OTHERS),
@@ -350,7 +350,7 @@ def _shell_figures(run: _Run) -> Figures:
 @benchmark("shell", "A shell: throughput of TCP, and time to the outside and back")
 def shell(_options: argparse.Namespace) -> Iterator[Row]:
     """Measure a shell without impairments, in turn with the alternatives; needs root for these."""
-    if missing := [one for one in ("iperf3", "ping", "ip") if shutil.which(one) is None]:
+    if missing := [program for program in ("iperf3", "ping", "ip") if shutil.which(program) is None]:
         raise MeasurementError(f"there is no {', '.join(missing)}")
     rounds = Rounds()
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder, ExitStack() as stack:
@@ -359,7 +359,7 @@ def shell(_options: argparse.Namespace) -> Iterator[Row]:
         stack.callback(process.kill)
         runs: dict[str, _Run] = {_BARE_FORWARDER: partial(_bare, compiled("tun.c", Path(folder)))}
         runs |= {name: partial(_in_shell, words) for name, words in _SHELLS.items()}
-        rounds.in_turn(_SHELL_ROUNDS, {name: partial(_shell_figures, one) for name, one in runs.items()})
+        rounds.in_turn(_SHELL_ROUNDS, {name: partial(_shell_figures, run) for name, run in runs.items()})
     for peer in [name for name in runs if name != _SHELL]:
         goal = Goal(">=", 0.9) if peer == _BARE_FORWARDER else None
         yield rounds.row("TCP", "Mbit/s", "mbit", _SHELL, peer, goal, paired=True)

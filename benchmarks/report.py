@@ -77,10 +77,10 @@ class Row:
     @property
     def holds(self) -> bool | None:
         """Whether the goal was reached; None if there is none or it cannot be judged."""
-        found = self.value if self.peer is None else self.ratio
-        if self.goal is None or found is None or self.unjudged is not None:
+        judged = self.value if self.peer is None else self.ratio
+        if self.goal is None or judged is None or self.unjudged is not None:
             return None
-        return bool(_COMPARISONS[self.goal.comparison](found, self.goal.limit))
+        return bool(_COMPARISONS[self.goal.comparison](judged, self.goal.limit))
 
     @property
     def notes(self) -> str:
@@ -204,10 +204,10 @@ class Rounds:
         else:
             self._figures.setdefault(side, []).append(figures)
 
-    def in_turn(self, count: int, sides: Mapping[str, Callable[[], Figures | str]], what: str = "") -> None:
+    def in_turn(self, count: int, sides: Mapping[str, Callable[[], Figures | str]], head: str = "") -> None:
         """Measure the sides in turn, in some rounds; one that fails is missing from then on."""
         for number in range(count):
-            say(f"{what}round {number + 1} of {count}")
+            say(f"{head}round {number + 1} of {count}")
             for side in [side for side in sides if side not in self.missing]:
                 try:
                     self.add(side, sides[side]())
@@ -232,7 +232,7 @@ class Rounds:
         value, alternative = self.of(ours, quantity), self.of(peer or "", quantity)
         ratios = []
         if paired and not reasons:
-            ratios = [one / other for one, other in zip(value, alternative, strict=True)]
+            ratios = [own / other for own, other in zip(value, alternative, strict=True)]
         return Row(
             name,
             median(value) if value else None,
@@ -267,9 +267,9 @@ def compared(
     say(name)
     if not isinstance(peer, tuple) or isinstance(peer, Peer):
         return Row(name, median(ours() for _ in range(rounds)), unit, peer, goal, note, unjudged)
-    found = [(ours(), peer[1]()) for _ in range(rounds)]
-    value, other = (median(side) for side in zip(*found, strict=True))
-    ratio = median(a / b for a, b in found)
+    pairs = [(ours(), peer[1]()) for _ in range(rounds)]
+    value, other = (median(side) for side in zip(*pairs, strict=True))
+    ratio = median(a / b for a, b in pairs)
     return Row(name, value, unit, Peer(peer[0], other), goal, note, unjudged, ratio)
 
 

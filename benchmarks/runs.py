@@ -136,8 +136,8 @@ def run(load: Load, folder: Path) -> Measured:
         output.seek(0)
         summary = json.loads(output.read() or "{}")
     if process.returncode != 0:
-        found = summary.get("exit", {}).get("reason", summary.get("error"))
-        raise MeasurementError(f"{load.loops} loops at {load.rate_hz:g} Hz: {found}")
+        reason = summary.get("exit", {}).get("reason", summary.get("error"))
+        raise MeasurementError(f"{load.loops} loops at {load.rate_hz:g} Hz: {reason}")
     return Measured(summary, *followed)
 
 
@@ -151,10 +151,10 @@ def _follow(
     while process.poll() is None:
         if time.monotonic() >= sampled_s + _POLL_S and started.exists():
             sampled_s = time.monotonic()
-            for role, one in processes.sample().items():
-                memory[role].append(one.uss_kib / _KIBI)
+            for role, sample in processes.sample().items():
+                memory[role].append(sample.uss_kib / _KIBI)
                 if role in LOOP_ROLES:
-                    cpu_s[role].append(one.cpu_s)
+                    cpu_s[role].append(sample.cpu_s)
         if processes.are_alive(LOOP_ROLES):
             ended_s = time.monotonic()
         time.sleep(_LOOK_S)
@@ -162,43 +162,43 @@ def _follow(
     return memory, used_s, time.monotonic() - ended_s
 
 
-def figures(load: Load, found: Measured) -> list[Row]:
+def figures(load: Load, measured: Measured) -> list[Row]:
     """Return the figures of a run."""
-    network, loops = found.summary["network"], found.summary["loops"]
-    step_us = load.step_us(found)
-    equal = [one["replay"]["bit_exact"] for one in (network, *loops)].count(True)
-    loop_memory = {role: mib for role, mib in found.memory_mib.items() if role in LOOP_ROLES}
+    network, loops = measured.summary["network"], measured.summary["loops"]
+    step_us = load.step_us(measured)
+    equal = [loop["replay"]["bit_exact"] for loop in (network, *loops)].count(True)
+    loop_memory = {role: mib for role, mib in measured.memory_mib.items() if role in LOOP_ROLES}
     growth = max(mib[-1] - mib[len(mib) // 2] for mib in loop_memory.values())
     rows = [
-        Row("missing samples", sum(one["missing_samples"] for one in loops), "", goal=_NOTHING),
-        Row("unintended losses", sum(one["unintended_losses"] for one in loops), "", goal=_NOTHING),
-        Row("longest loss burst", max(one["longest_loss_burst"] for one in loops), "",
+        Row("missing samples", sum(loop["missing_samples"] for loop in loops), "", goal=_NOTHING),
+        Row("unintended losses", sum(loop["unintended_losses"] for loop in loops), "", goal=_NOTHING),
+        Row("longest loss burst", max(loop["longest_loss_burst"] for loop in loops), "",
             goal=Goal("<=", CAP)),
         Row("updates", network["datagrams"] / load.horizon_s, "/s"),
         *(
             Row(f"{role} lateness p99, worst loop",
-                max(one["lateness_us"][role]["p99"] for one in loops) * 1e-3, "ms",
+                max(loop["lateness_us"][role]["p99"] for loop in loops) * 1e-3, "ms",
                 goal=_LATE_MS[load.rate_hz])
             for role in WITH_DEADLINES
         ),
         Row("loops and network not replayed bit for bit", 1 + len(loops) - equal, "",
             goal=_NOTHING),
         Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US.get(load.rate_hz),
-            note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in found.cpu_s.items())),
+            note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in measured.cpu_s.items())),
         Row("growth of memory in the second half, worst process", growth, "MiB",
             goal=Goal("<", _FLAT_MIB),
             note=", ".join(
                 f"{role} {mib[len(mib) // 2]:.0f}–{mib[-1]:.0f}"
-                for role, mib in found.memory_mib.items()
+                for role, mib in measured.memory_mib.items()
             )),
-        Row("end of the run", found.end_s, "s", Peer("the run", load.horizon_s), _END_SHARE),
+        Row("end of the run", measured.end_s, "s", Peer("the run", load.horizon_s), _END_SHARE),
     ]  # fmt: skip
     return [replace(row, name=f"{load}: {row.name}") for row in rows]
 
 
-def memory(load: Load, found: Measured) -> Iterator[Row]:
+def memory(load: Load, measured: Measured) -> Iterator[Row]:
     """Yield the private memory of the processes of one loop: the median over its run."""
-    used = {role: median(found.memory_mib[role]) for role in LOOP_ROLES}
+    used = {role: median(measured.memory_mib[role]) for role in LOOP_ROLES}
     name, total = f"{load}: private memory of {', '.join(used)}", sum(used.values())
     note = ", ".join(f"{role} {mib:.0f}" for role, mib in used.items())
     peer = Peer("as many Pythons that import numpy and zenoh", libraries_mib(len(used)))
@@ -266,10 +266,10 @@ def started() -> Figures:
         ``first_s``, wall seconds from the start of ``noack run`` to the first control step, and
         ``launch_s``, the launch time from the run's summary.
     """
-    found = noack("run", "lane_following", "--set", "horizon_s=1")
-    if found.first_step_s is None:
+    started_run = noack("run", "lane_following", "--set", "horizon_s=1")
+    if started_run.first_step_s is None:
         raise MeasurementError("the run showed no progress line")
-    return {"first_s": found.first_step_s, "launch_s": found.summary["startup_s"]}
+    return {"first_s": started_run.first_step_s, "launch_s": started_run.summary["startup_s"]}
 
 
 def cpu_s(command: Sequence[str]) -> float:
@@ -337,7 +337,7 @@ def installed_bytes(names: Iterable[str]) -> int:
             files = distribution(name).files or ()
         except PackageNotFoundError:  # only on other systems or versions of Python
             continue
-        total += sum(path.stat().st_size for one in files if (path := Path(one.locate())).is_file())
+        total += sum(path.stat().st_size for file in files if (path := Path(file.locate())).is_file())
     return total
 
 

@@ -84,7 +84,7 @@ def integrated(
     def flow(_: float, z: Vector) -> Vector:
         return np.asarray(field @ z)
 
-    t_s, z, found = 0.0, np.concatenate([x, x, x]), [0.0]
+    t_s, z, events_s = 0.0, np.concatenate([x, x, x]), [0.0]
     while True:
         span = t_s, setting.horizon_s
         solution = solve_ivp(flow, span, z, method=method, events=excess, rtol=1e-8, atol=1e-10)
@@ -92,18 +92,18 @@ def integrated(
         assert solution.y_events is not None
         (at_s,), (states,) = solution.t_events, solution.y_events
         if not len(at_s):
-            return found
+            return events_s
         t_s, z = float(at_s[0]), states[0].copy()
         z[n : 2 * n] = z[:n]
-        if delivered[len(found)]:
+        if delivered[len(events_s)]:
             z[2 * n :] = z[:n]
-        found.append(t_s)
+        events_s.append(t_s)
 
 
-def apart_s(found: Vector, expected: list[float]) -> float:
+def apart_s(events_s: Vector, expected: list[float]) -> float:
     """Return the largest difference of event times; infinite if their numbers differ."""
-    same = len(found) == len(expected)
-    return float(np.abs(np.subtract(found, expected)).max()) if same else np.inf
+    same = len(events_s) == len(expected)
+    return float(np.abs(np.subtract(events_s, expected)).max()) if same else np.inf
 
 
 _LOOPS, _LOOPS_HZ, _LOOPS_S = 50, 50.0, 10.0
@@ -199,7 +199,7 @@ def batch_rows(mode: str) -> list[Row]:
     batch = Population._make(np.concatenate([part] * ENGINE[mode]) for part in population)
     few = range(INTEGRATED[mode])
     engine = per_cpu_s(len(batch.A), lambda: run_batch(setting, batch))
-    name, found = f"lane_following, {setting.horizon_s:g} s, {mode}", list[Row]()
+    name, results = f"lane_following, {setting.horizon_s:g} s, {mode}", list[Row]()
     methods: dict[Method, Goal | None] = {"RK45": Goal(">=", 1000), "DOP853": None}
     for method, goal in methods.items():
 
@@ -212,10 +212,10 @@ def batch_rows(mode: str) -> list[Row]:
         peer = f"solve_ivp, {method}, rtol 1e-8", per_cpu_s(len(few), integrate)
         note = f"event times differ by {error_s:.1g} s from those of {method}"
         doubt = None if error_s <= _AGREEMENT_S else "the two do not agree"
-        found.append(compared(name, "runs/s", engine, peer, goal, note=note, unjudged=doubt))
-    value = median(row.value for row in found if row.value is not None)
+        results.append(compared(name, "runs/s", engine, peer, goal, note=note, unjudged=doubt))
+    value = median(row.value for row in results if row.value is not None)
     note = f"{rows['transmissions'].mean():.0f} events a run"
-    return [Row(name, value, "runs/s", goal=Goal(">=", _FASTEST[mode]), note=note), *found]
+    return [Row(name, value, "runs/s", goal=Goal(">=", _FASTEST[mode]), note=note), *results]
 
 
 @benchmark("batch", "Exact runs of a batch, one core")
@@ -279,20 +279,20 @@ def steps_us(scenario: Scenario) -> Iterator[float]:
 def timed_steps(scenario: Scenario) -> list[tuple[float, ...]]:
     """Make steps of a scenario and of a linear plant in turn; return the µs of both."""
     sides = steps_us(scenario), steps_us(resolve(load(find_scenario(_LINEAR))))
-    found = list[tuple[float, ...]]()
+    timed = list[tuple[float, ...]]()
     with realtime(True, PRIORITY):
         due_ns = time.monotonic_ns()
         for pair in zip(*sides, strict=False):
-            found.append(pair)
+            timed.append(pair)
             due_ns += _PACE_NS
             time.sleep(max(due_ns - time.monotonic_ns(), 0) / NS_PER_S)
-    return found[1:]  # the first step has length 0
+    return timed[1:]  # the first step has length 0
 
 
-def plant_rows(name: str, scenario: Scenario, found: Sequence[tuple[float, ...]]) -> Iterator[Row]:
+def plant_rows(name: str, scenario: Scenario, timed: Sequence[tuple[float, ...]]) -> Iterator[Row]:
     """Yield the rows of a case: median, p99, and p99 as a share of the period in wall time."""
     period_us = scenario.timing.plant_period_ns / scenario.speed / 1e3
-    p50, p99 = np.quantile(np.array(found), (0.5, 0.99), axis=0).tolist()
+    p50, p99 = np.quantile(np.array(timed), (0.5, 0.99), axis=0).tolist()
     yield Row(f"{name}: p50", p50[0], "µs/step", Peer("linear plant", p50[1]))
     yield Row(f"{name}: p99", p99[0], "µs/step", Peer("linear plant", p99[1]))
     yield Row(f"{name}: p99, of {period_us / 1e3:g} ms", 100 * p99[0] / period_us, "%", goal=Goal("<", 20.0))
@@ -339,7 +339,7 @@ def whole_campaign(draws: int) -> tuple[float, float]:
             while process.poll() is None:
                 with contextlib.suppress(psutil.Error):
                     every = first, *first.children(recursive=True)
-                    peak_mib = max(peak_mib, sum(one.memory_full_info().pss for one in every) / 2**20)
+                    peak_mib = max(peak_mib, sum(process.memory_full_info().pss for process in every) / 2**20)
                 time.sleep(_LOOK_EVERY_S)
         messages.seek(0)
         if process.returncode != 0:

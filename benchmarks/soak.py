@@ -318,7 +318,7 @@ class _Soak:
             looks = [(at_s - began_s, sample) for at_s, sample in self._looks.get(role, ())]
             looks = [look for look in looks if 0 <= look[0] <= length_s]
             if looks:
-                watched[role] = Watched([at_s for at_s, _ in looks], [one for _, one in looks], length_s)
+                watched[role] = Watched([at_s for at_s, _ in looks], [look for _, look in looks], length_s)
                 self._faults += watched[role].faults(role)
             else:
                 self._faults.append(f"{role}: was never seen")
@@ -351,8 +351,8 @@ class _Soak:
         began_s, tenths, reached_s, disk_bytes = math.inf, 0, 0.0, 0
         while self._run.poll() is None and (now_s := time.monotonic()) < began_s + self._length_s:
             for line in self._log:
-                if (found := PROGRESS.match(line)) is not None:
-                    reached_s, moved_s = float(found[1]), now_s
+                if (match := PROGRESS.match(line)) is not None:
+                    reached_s, moved_s = float(match[1]), now_s
                     began_s = min(began_s, now_s - reached_s / self._scenario.speed)
             if reached_s and now_s >= look_s:
                 for role, sample in self._processes.sample().items():
@@ -431,7 +431,7 @@ def ended_badly(summary: Mapping[str, Any], status: int, delivered_out_of_order:
     stale = {"controller": {"stale": delivered_out_of_order}} if delivered_out_of_order else {}
     right = {"missing_samples": 0, "unintended_losses": 0, "rejected_datagrams": stale}
     yield from (f"{key}: {loop[key]}" for key, value in right.items() if loop[key] != value)
-    if bursts := [one for one in loop["assumption_violations"] if one["cause"] == "dropouts"]:
+    if bursts := [part for part in loop["assumption_violations"] if part["cause"] == "dropouts"]:
         yield f"assumption_violations: {bursts}"
     replay = loop["replay"] or {}
     if not (replay.get("bit_exact") and replay.get("complete")):
@@ -477,7 +477,7 @@ def print_result(console: Console, result: Result) -> None:
         rows.append(
             (
                 role,
-                *(f"{one / 1024:.1f} MiB" for one in kib),
+                *(f"{size_kib / 1024:.1f} MiB" for size_kib in kib),
                 f"{memory.growth_kib:+.0f} KiB",
                 f"{memory.slope_kib_per_h:+.0f} KiB",
                 *(str(most) if least == most else f"{least}–{most}" for least, most in ends),

@@ -224,7 +224,7 @@ class CampaignResult:
         """
         rows = [
             {**found.point.labels, "metric": str(metric), **one._asdict()}
-            for found in self._finished.summary.found
+            for found in self._finished.summary.results
             for metric, one in found.estimates.items()
         ]
         return _table(rows)
@@ -259,7 +259,7 @@ class CampaignResult:
             NoackError: there is no such grid point.
         """
         wanted = {name: campaign_file.label_of(value) for name, value in axes.items()}  # type: ignore[arg-type]
-        points = [one.point for one in self._finished.summary.found]
+        points = [one.point for one in self._finished.summary.results]
         for point in points:
             if dict(point.labels) == wanted:
                 metrics, _ = campaign_summary.runs_at(point, self._finished.store)

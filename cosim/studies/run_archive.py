@@ -128,16 +128,16 @@ def unpack(path: Path, folder: Path) -> Manifest:
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, ValueError) as error:
         raise CallerError(f"{path}: not an archive of a run: {one_line(error)}") from None
     except OSError as error:
-        place = f"{path}: " if error.filename in (None, str(path)) else f"{folder}: "
-        kind = CallerError if place.startswith(f"{path}:") else MachineError
-        raise kind(f"{place}{why(error)}") from None
+        prefix = f"{path}: " if error.filename in (None, str(path)) else f"{folder}: "
+        kind = CallerError if prefix.startswith(f"{path}:") else MachineError
+        raise kind(f"{prefix}{why(error)}") from None
     return manifest
 
 
 def outside_files(scenario: Scenario, folder: Path) -> str | None:
     """Return a file that a scenario names outside a folder; None if there is none."""
-    for one in (scenario, *loops_of(scenario)):
-        for _, table in file_tables(one):
+    for part in (scenario, *loops_of(scenario)):
+        for _, table in file_tables(part):
             if not Path(table.file or "").resolve().is_relative_to(folder.resolve()):
                 return table.file
     return None
@@ -175,7 +175,7 @@ def _checked_entries(path: Path, archive: zipfile.ZipFile, most_bytes: int) -> d
     infos = archive.infolist()
     if len(infos) > _MOST_ENTRIES:
         raise CallerError(f"{path}: has {len(infos):,} entries, more than an archive may have")
-    found: dict[str, zipfile.ZipInfo] = {}
+    entries: dict[str, zipfile.ZipInfo] = {}
     for info in infos:
         name, shown = info.filename, printable(info.filename)
         parts = name.split("/")
@@ -185,16 +185,16 @@ def _checked_entries(path: Path, archive: zipfile.ZipFile, most_bytes: int) -> d
             (len(parts) == 1 and parts[0] in _FILES) or (len(parts) == 2 and parts[0] in _FOLDERS)
         ):
             raise CallerError(f"{path}: {shown}: an archive has no such file")
-        if name in found:
+        if name in entries:
             raise CallerError(f"{path}: {shown}: is there twice")
         if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
             raise CallerError(f"{path}: {shown}: is compressed; noack's archives are not")
-        found[name] = info
+        entries[name] = info
     if sum(info.file_size for info in infos) > most_bytes:
         raise CallerError(f"{path}: its entries overlap")
-    if MANIFEST not in found:
+    if MANIFEST not in entries:
         raise CallerError(f"{path}: not an archive of a run: has no {MANIFEST}")
-    return found
+    return entries
 
 
 def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
@@ -204,11 +204,11 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
         return Manifest.model_validate_json(archive.read(MANIFEST))
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "content"
-        raise CallerError(f"{path}: {MANIFEST}: {printable(place)}: {first['msg']}") from None
+        key = ".".join(map(str, first["loc"])) or "content"
+        raise CallerError(f"{path}: {MANIFEST}: {printable(key)}: {first['msg']}") from None
 
 
-def _copy_out(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, entry: Entry, what: str) -> None:
+def _copy_out(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, entry: Entry, name: str) -> None:
     """Write an entry, and check its size and its SHA-256."""
     digest, size = hashlib.sha256(), 0
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -218,7 +218,7 @@ def _copy_out(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, ent
             size += len(chunk)
             file.write(chunk)
     if (size, digest.hexdigest()) != (entry.bytes, entry.sha256):
-        raise CallerError(f"{printable(what)}: is damaged: its SHA-256 is not that of {MANIFEST}")
+        raise CallerError(f"{printable(name)}: is damaged: its SHA-256 is not that of {MANIFEST}")
 
 
 _MOST_STEPS = 1_000_000
@@ -250,8 +250,8 @@ class Repetition(NamedTuple):
 
     def to_json(self) -> dict[str, object]:
         """Return the result for programs."""
-        found = self._asdict() | {"numbers": [list(row) for row in self.numbers]}
-        return {"bit_exact": self.bit_exact, **found}
+        document = self._asdict() | {"numbers": [list(row) for row in self.numbers]}
+        return {"bit_exact": self.bit_exact, **document}
 
 
 def repeat_archive(
@@ -290,13 +290,13 @@ def repeat_archive(
         repeated = load_run(ending.run_dir)
         compare = _replayed if manifest.kind == "live" else _repeated
         pairs = zip(_named(recorded), _named(repeated), strict=True)
-        found = [compare(name, one, other) for (name, one), (_, other) in pairs]
+        compared = [compare(name, record, other) for (name, record), (_, other) in pairs]
         return Repetition(
             scenario=manifest.scenario,
             kind=manifest.kind,
-            compared=sum(one.compared for one in found),
-            differences=[text for one in found for text in one.differences],
-            gaps=[text for one in found for text in one.gaps],
+            compared=sum(result.compared for result in compared),
+            differences=[text for result in compared for text in result.differences],
+            gaps=[text for result in compared for text in result.gaps],
             changes=all_changes_since(archived),
             numbers=_numbers(archived, ending.run_dir),
         )
@@ -330,12 +330,12 @@ def _scenario(path: Path, archived: Path, *, run_code: bool) -> Scenario:
     scenario = load(archived / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     if (outside := outside_files(scenario, archived)) is not None:
         raise CallerError(f"{path}: its scenario names {outside}, which is not in the archive")
-    for one in (scenario, *loops_of(scenario)):
-        for place, table in file_tables(one):
+    for part in (scenario, *loops_of(scenario)):
+        for key, table in file_tables(part):
             if not run_code:
                 name = Path(table.file or "").name
                 raise CallerError(
-                    f"{path}: contains code ({place}: {name}), which would be run with your "
+                    f"{path}: contains code ({key}: {name}), which would be run with your "
                     "permissions; --run-code runs it"
                 )
     return scenario
@@ -352,10 +352,10 @@ def _named(run: RecordedRun) -> Iterator[tuple[str, RunRecord]]:
 
 
 def _replayed(name: str, archived: RunRecord, _: RunRecord) -> _Compared:
-    found = replay(archived)
-    first = found.first_difference
-    gaps = [f"{name}{gap}" for gap in found.gaps]
-    return _Compared(found.inputs, [] if first is None else [f"{name}{first}"], gaps)
+    replayed = replay(archived)
+    first = replayed.first_difference
+    gaps = [f"{name}{gap}" for gap in replayed.gaps]
+    return _Compared(replayed.inputs, [] if first is None else [f"{name}{first}"], gaps)
 
 
 def _repeated(name: str, archived: RunRecord, repeated: RunRecord) -> _Compared:
@@ -364,19 +364,19 @@ def _repeated(name: str, archived: RunRecord, repeated: RunRecord) -> _Compared:
     return _Compared(count, [] if first is None else [f"{name}{first}"], [])
 
 
-def first_difference(one: RunRecord, other: RunRecord) -> ReplayDifference | None:
+def first_difference(archived: RunRecord, repeated: RunRecord) -> ReplayDifference | None:
     """Return the first difference between the tables of two records, bit for bit."""
-    before = dict.fromkeys(one.tables, 0)
+    before = dict.fromkeys(archived.tables, 0)
     nothing: Slice = {}
-    for recorded, again in zip_longest(one.slices(), other.slices(), fillvalue=nothing):
-        found = [
+    for recorded, again in zip_longest(archived.slices(), repeated.slices(), fillvalue=nothing):
+        differences = [
             different
-            for table in one.tables
+            for table in archived.tables
             if (different := _in_table(table, before[table], recorded, again)) is not None
         ]
-        if found:
-            return min(found, key=lambda each: each.now_ns)
-        for table in one.tables:
+        if differences:
+            return min(differences, key=lambda each: each.now_ns)
+        for table in archived.tables:
             before[table] += len(recorded[table])
     return None
 
@@ -389,15 +389,15 @@ def _in_table(table: str, before: int, recorded: Slice, again: Slice) -> ReplayD
         if row.tobytes() != other.tobytes():
             return rows_differ(table, before + i, row, other)
     common, longer = min(len(rows), len(others)), max(rows, others, key=len)
-    what = "the row is missing in the " + ("repetition" if len(rows) > common else "archive")
-    return difference(table, before + common, int(longer[common]["now_ns"]), what)
+    description = "the row is missing in the " + ("repetition" if len(rows) > common else "archive")
+    return difference(table, before + common, int(longer[common]["now_ns"]), description)
 
 
 def _numbers(archived: Path, repeated: Path) -> list[tuple[str, ...]]:
     """Return the key numbers that differ, as text."""
-    summaries = [reopen(one, view=False).summary for one in (archived, repeated)]
+    summaries = [reopen(run_dir, view=False).summary for run_dir in (archived, repeated)]
     if len(summaries[0].loops) > 1:
-        first, second = (dict(network_rows(one)) for one in summaries)
+        first, second = (dict(network_rows(summary)) for summary in summaries)
         rows = [(name, value, second.get(name, "-")) for name, value in first.items()]
         return [row for row in rows if row[1] != row[2]]
     return [
@@ -407,7 +407,7 @@ def _numbers(archived: Path, repeated: Path) -> list[tuple[str, ...]]:
     ]
 
 
-def print_repetition(console: Console, found: Repetition) -> None:
+def print_repetition(console: Console, result: Repetition) -> None:
     """Print what was compared, and what differs: bits, numbers, versions and machine.
 
     Texts of the archive are printed without control characters.
@@ -416,20 +416,20 @@ def print_repetition(console: Console, found: Repetition) -> None:
     def say(text: str, style: str = "") -> None:
         console.print(Text(printable(text), style), soft_wrap=True)
 
-    what = "inputs replayed" if found.kind == "live" else "rows repeated"
-    verdict = ("bit-exact", "green") if found.bit_exact else ("not reproduced", "bold red")
-    if not found.compared:
+    unit = "inputs replayed" if result.kind == "live" else "rows repeated"
+    verdict = ("bit-exact", "green") if result.bit_exact else ("not reproduced", "bold red")
+    if not result.compared:
         verdict = "nothing to compare", "bold red"
-    say(f"{found.scenario}, {found.kind}: {verdict[0]}, {found.compared:,} {what}", verdict[1])
-    for text in found.differences:
+    say(f"{result.scenario}, {result.kind}: {verdict[0]}, {result.compared:,} {unit}", verdict[1])
+    for text in result.differences:
         say(f"first difference: {text}")
-    for text in found.gaps:
+    for text in result.gaps:
         say(f"record incomplete: {text}", "yellow")
-    if found.numbers:
-        late = ": the simulation has no lateness" if found.kind == "live" else ""
-        rows = [[*map(printable, row)] for row in found.numbers]
+    if result.numbers:
+        late = ": the simulation has no lateness" if result.kind == "live" else ""
+        rows = [[*map(printable, row)] for row in result.numbers]
         heads = ("quantity", "archived", "repeated")
         table = ResultTable("numbers", f"numbers that differ{late}", heads, rows)
         console.print(terminal_table(table))
-    for change in found.changes:
+    for change in result.changes:
         say(f"differs from the archived run's machine: {change}")

@@ -101,20 +101,20 @@ class RunComparison:
     @cached_property
     def numbers(self) -> list[KeyNumber]:
         """The key numbers that at least one of the runs has."""
-        found = {name: tuple(value(run.loop) for run in self.runs) for name, value in _NUMBERS.items()}
+        values = {name: tuple(value(run.loop) for run in self.runs) for name, value in _NUMBERS.items()}
         apart = [_distance(self.runs[0].record, run.record) for run in self.runs]
-        found["distance in x to A, RMS"], found["distance in x to A, maximum"] = zip(*apart, strict=True)
-        return [KeyNumber(*one) for one in found.items() if any(v is not None for v in one[1])]
+        values["distance in x to A, RMS"], values["distance in x to A, maximum"] = zip(*apart, strict=True)
+        return [KeyNumber(*entry) for entry in values.items() if any(v is not None for v in entry[1])]
 
     @cached_property
     def settings(self) -> dict[str, tuple[str, ...]]:
         """The settings that differ, by key, with the value in every run."""
         flat = [dict(_flat(run.record.scenario.model_dump(mode="json"))) for run in self.runs]
         keys = dict.fromkeys(key for settings in flat for key in settings)
-        found = {key: tuple(settings.get(key, "-") for settings in flat) for key in keys}
+        by_key = {key: tuple(settings.get(key, "-") for settings in flat) for key in keys}
         return {
             key: tuple(shortened(value, _LONGEST_VALUE) for value in values)
-            for key, values in found.items()
+            for key, values in by_key.items()
             if len(set(values)) > 1 and not key.startswith(_NAMES_ONLY)
         }
 
@@ -147,7 +147,7 @@ class RunComparison:
         if width is not None:
             raise CallerError(f"{path}: a page has its own width; --width is that of a figure")
         template = templates(Path(__file__).parent).get_template("overlay.html.jinja")
-        write_whole(path, template.render(found=self, figure=overlay_figure(self.runs)))
+        write_whole(path, template.render(comparison=self, figure=overlay_figure(self.runs)))
 
     def to_json(self) -> dict[str, object]:
         """Return the comparison without the figure, for programs."""

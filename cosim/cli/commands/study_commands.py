@@ -512,7 +512,7 @@ def capacity(
     points = []
     for policy, count in chosen:
         with cli.status(f"live: {policy}, {count} loops"):
-            found = done.summary.found
+            found = done.summary.results
             points.append(capacity_result.live_point((policy, count), found, folder / "live"))
     capacities = capacity_result.capacities(plan, done.summary, done.store)
     result = capacity_page.CapacityResult(plan, done.summary, capacities, points)

@@ -44,16 +44,16 @@ def figures(summary: CampaignSummary, store: Store) -> Iterator[FigureDescriptio
     """Describe the figures that the campaign asks for."""
     for i, wanted in enumerate(summary.campaign.figures):
         places = set(summary.campaign.selected(wanted.where))
-        found = [one for one in summary.found if one.point.place in places]
+        results = [result for result in summary.results if result.point.place in places]
         match wanted:
             case campaign_file.Pareto():
-                figure, caption = _pareto(summary, found, wanted)
+                figure, caption = _pareto(summary, results, wanted)
             case campaign_file.Curve():
-                figure, caption = _curve(summary, found, wanted)
+                figure, caption = _curve(summary, results, wanted)
             case campaign_file.HeatMap():
-                figure, caption = _heat_map(summary, found, wanted)
+                figure, caption = _heat_map(summary, results, wanted)
             case campaign_file.Distribution():
-                figure, caption = _distribution(summary, found, wanted, store)
+                figure, caption = _distribution(summary, results, wanted, store)
         where = [f"{axis} = {campaign_file.label_of(v)}" for axis, v in wanted.where.items()]
         name = f"{wanted.kind.replace('_', '-')}-{i + 1}"
         yield replace(figure, name=name, caption=f"{', '.join([caption, *where])}.")
@@ -166,10 +166,10 @@ def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> FigureD
     items = []
     for i, (name, values) in enumerate(series.items()):
         at = np.quantile(values, share, method="inverted_cdf")
-        seen = np.isfinite(at)
+        is_known = np.isfinite(at)
         colour, _, dash = _look(i)
         items.append(
-            Line(x=at[seen], y=share[seen], label=_name(name), colour=colour, dash=dash, steps="post")
+            Line(x=at[is_known], y=share[is_known], label=_name(name), colour=colour, dash=dash, steps="post")
         )
     x = _axis(metric, np.concatenate(list(series.values())))
     panel = Panel(items=items, x=x, y=Axis(label="share of runs", ends=(0, 1.02)))
@@ -177,14 +177,14 @@ def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> FigureD
 
 
 def _pareto(
-    summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.Pareto
+    summary: CampaignSummary, results: Sequence[GridPointResult], wanted: campaign_file.Pareto
 ) -> tuple[FigureDescription, str]:
     series: dict[str, tuple[list[Estimate], list[Estimate]]] = {}
-    for one in found:
-        if wanted.x in one.estimates and wanted.y in one.estimates:
-            xs, ys = series.setdefault(one.point.labels[wanted.series], ([], []))
-            xs.append(one.estimates[wanted.x])
-            ys.append(one.estimates[wanted.y])
+    for result in results:
+        if wanted.x in result.estimates and wanted.y in result.estimates:
+            xs, ys = series.setdefault(result.point.labels[wanted.series], ([], []))
+            xs.append(result.estimates[wanted.x])
+            ys.append(result.estimates[wanted.y])
     called = summary.campaign.by_name[wanted.series].called
     return pareto_figure(series, wanted.x, wanted.y), (
         f"{_title(wanted.y)} against {METRICS[wanted.x].title}, means with 95 % confidence "
@@ -193,16 +193,16 @@ def _pareto(
 
 
 def _curve(
-    summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.Curve
+    summary: CampaignSummary, results: Sequence[GridPointResult], wanted: campaign_file.Curve
 ) -> tuple[FigureDescription, str]:
     axis = summary.campaign.by_name[wanted.x]
     known = {
-        name: {one.point.labels[axis.name]: one.estimates.get(wanted.metric) for one in group}
-        for name, group in _series(summary, found, (wanted.x, *wanted.where)).items()
+        name: {result.point.labels[axis.name]: result.estimates.get(wanted.metric) for result in group}
+        for name, group in _series(summary, results, (wanted.x, *wanted.where)).items()
     }
-    places = [i for i, x in enumerate(axis.labels) if any(one.get(x) for one in known.values())]
+    places = [i for i, x in enumerate(axis.labels) if any(curve.get(x) for curve in known.values())]
     labels = [axis.labels[i] for i in places]
-    series = {name: [one.get(x) for x in labels] for name, one in known.items() if any(one.values())}
+    series = {name: [curve.get(x) for x in labels] for name, curve in known.items() if any(curve.values())}
     numbers = None if axis.numbers is None else np.array(axis.numbers)[places]
     return curve_figure(numbers, labels, series, axis.heading, wanted.metric), (
         f"{_title(wanted.metric)} over {axis.called}: means and 95 % confidence intervals"
@@ -210,32 +210,32 @@ def _curve(
 
 
 def _heat_map(
-    summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.HeatMap
+    summary: CampaignSummary, results: Sequence[GridPointResult], wanted: campaign_file.HeatMap
 ) -> tuple[FigureDescription, str]:
     x, y = (summary.campaign.by_name[name] for name in (wanted.x, wanted.y))
     maps = {}
     spanned = (wanted.x, wanted.y, *wanted.where)
-    for label, group in _series(summary, found, spanned).items():
+    for label, group in _series(summary, results, spanned).items():
         maps[label] = np.full((len(y.labels), len(x.labels)), np.nan)
-        for one in group:
-            if wanted.metric in one.estimates:
-                row, column = (axis.labels.index(one.point.labels[axis.name]) for axis in (y, x))
-                maps[label][row, column] = one.estimates[wanted.metric].mean
+        for result in group:
+            if wanted.metric in result.estimates:
+                row, column = (axis.labels.index(result.point.labels[axis.name]) for axis in (y, x))
+                maps[label][row, column] = result.estimates[wanted.metric].mean
     figure = heat_map_figure(maps, (x.heading, x.labels), (y.heading, y.labels), wanted.metric)
     return figure, f"{_title(wanted.metric)} over {x.called} and {y.called}: means"
 
 
 def _distribution(
     summary: CampaignSummary,
-    found: Sequence[GridPointResult],
+    results: Sequence[GridPointResult],
     wanted: campaign_file.Distribution,
     store: Store,
 ) -> tuple[FigureDescription, str]:
     series = {
-        label: runs_at(one.point, store)[0][wanted.metric]
-        for label, group in _series(summary, found, tuple(wanted.where)).items()
-        for one in group
-        if wanted.metric in one.estimates
+        label: runs_at(result.point, store)[0][wanted.metric]
+        for label, group in _series(summary, results, tuple(wanted.where)).items()
+        for result in group
+        if wanted.metric in result.estimates
     }
     return distribution_figure(series, wanted.metric), (
         f"{_title(wanted.metric)}: the share of runs in which it is at most so much"
@@ -243,19 +243,19 @@ def _distribution(
 
 
 def _series(
-    summary: CampaignSummary, found: Sequence[GridPointResult], spanned: tuple[str, ...]
+    summary: CampaignSummary, results: Sequence[GridPointResult], spanned: tuple[str, ...]
 ) -> dict[str, list[GridPointResult]]:
     """Group grid points by the values of the axes that the figure does not show as coordinates."""
     rest = [axis for axis in summary.campaign.axes if axis.name not in spanned]
     groups: dict[str, list[GridPointResult]] = {}
-    for one in found:
+    for result in results:
         label = ", ".join(
-            one.point.labels[axis.name]
+            result.point.labels[axis.name]
             if axis.numbers is None
-            else f"{axis.called} = {one.point.labels[axis.name]}"
+            else f"{axis.called} = {result.point.labels[axis.name]}"
             for axis in rest
         )
-        groups.setdefault(label, []).append(one)
+        groups.setdefault(label, []).append(result)
     return groups
 
 

@@ -291,14 +291,14 @@ class Claim(ScenarioSection):
     @cached_property
     def conditions(self) -> list[tuple[Term, Term]]:
         """The smaller and the larger side of each condition."""
-        found = []
+        conditions = []
         for text in self.holds:
             sides = re.split("([<>])", text)
             if len(sides) != 3:
                 raise ValueError(f"holds: {text}: write a condition as A < B or A > B")
             left, right = Term.parse(sides[0]), Term.parse(sides[2])
-            found.append((left, right) if sides[1] == "<" else (right, left))
-        return found
+            conditions.append((left, right) if sides[1] == "<" else (right, left))
+        return conditions
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -353,7 +353,7 @@ class Campaign(ScenarioSection):
         """The metrics of the tables, the figures and the claims."""
         of_figures = {getattr(figure, key, None) for figure in self.figures for key in ("metric", "x", "y")}
         of_claims = {term.metric for claim in self.claims for pair in claim.conditions for term in pair}
-        return {*self.metrics.shown, *(one for one in METRICS if one in of_figures | of_claims)}
+        return {*self.metrics.shown, *(metric for metric in METRICS if metric in of_figures | of_claims)}
 
     @model_validator(mode="after")
     def _check(self) -> Self:

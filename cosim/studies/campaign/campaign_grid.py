@@ -92,8 +92,8 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
     """
     scenario_path, base = base_of(campaign, path)
     points = []
-    for number, place in enumerate(campaign.selected({})):
-        content, chosen = copy.deepcopy(base), list(zip(campaign.axes, place, strict=True))
+    for number, indices in enumerate(campaign.selected({})):
+        content, chosen = copy.deepcopy(base), list(zip(campaign.axes, indices, strict=True))
         labels = {axis.name: axis.labels[i] for axis, i in chosen}
         values = {axis.name: (axis.numbers or axis.labels)[i] for axis, i in chosen}
         source = f"{path}: at {', '.join(f'{name} = {label}' for name, label in labels.items())}"
@@ -112,7 +112,7 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
             work, certified = _work(campaign, scenario)
         except (CallerError, ValueError) as error:
             raise CallerError(f"{source}: {error}") from None
-        points.append(Point(number, place, labels, values, scenario, certified, work))
+        points.append(Point(number, indices, labels, values, scenario, certified, work))
     if len({type(point.work) for point in points}) > 1:
         raise CallerError(f"{path}: axes: either all grid points have loops, or none has")
     _require_effects(campaign, points, path)
@@ -135,23 +135,23 @@ def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
 
 def _scaled(entries: object, value: int, source: str) -> list[Table]:
     """Return the entries of [[loops]] with so many loops in all, in the same proportions."""
-    if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise CallerError(f"{source}: loops: should be a list of tables")
     if len(entries) == 1:
         return [entries[0] | {"count": value}]
-    counts = [one.get("count", 1) for one in entries]
-    if not all(isinstance(one, int) and one > 0 for one in counts):
+    counts = [entry.get("count", 1) for entry in entries]
+    if not all(isinstance(count, int) and count > 0 for count in counts):
         return entries  # the scenario's validation says what is wrong
     least = sum(counts) // math.gcd(*counts)
     if value < 1 or value % least:
         given = zip(entries, counts, strict=True)
-        names = ", ".join(f"{count} {one.get('name')}" for one, count in given)
+        names = ", ".join(f"{count} {entry.get('name')}" for entry, count in given)
         raise CallerError(
             f"{source}: loops = {value}: should be a multiple of {least}, to keep the proportions "
             f"of [[loops]]: {names}"
         )
     total = sum(counts)
-    return [one | {"count": count * value // total} for one, count in zip(entries, counts, strict=True)]
+    return [entry | {"count": count * value // total} for entry, count in zip(entries, counts, strict=True)]
 
 
 def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
@@ -162,10 +162,10 @@ def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) ->
     """
     runs = {point.place: blake2b(pickle.dumps(point.work)).digest() for point in points}
     for i, axis in enumerate(campaign.axes):
-        found: dict[bytes, str] = {}
+        contents: dict[bytes, str] = {}
         for value, label in enumerate(axis.labels):
-            same = b"".join(content for place, content in runs.items() if place[i] == value)
-            if (other := found.setdefault(same, label)) != label:
+            same = b"".join(content for indices, content in runs.items() if indices[i] == value)
+            if (other := contents.setdefault(same, label)) != label:
                 raise CallerError(
                     f"{path}: axes.{i}: {axis.name} = {other} and {axis.name} = {label} are the "
                     f"same runs: {', '.join(axis.keys)} has no effect on them"
@@ -209,7 +209,7 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
             'time = "sampled" takes both'
         )
     kept = timeless(resolved.network.link).impairments
-    taking_time = [one.kind for one in resolved.network.link.impairments if one not in kept]
+    taking_time = [stage.kind for stage in resolved.network.link.impairments if stage not in kept]
     if taking_time:
         raise CallerError(
             f"network.impairments: {', '.join(taking_time)}: in continuous time the "

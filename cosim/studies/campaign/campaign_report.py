@@ -66,31 +66,31 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
         *(METRICS[name].heading for name in shown),
     ]
     means = [
-        (*found.point.labels.values(), *(written(found.estimates.get(name)) for name in shown))
-        for found in summary.found
+        (*result.point.labels.values(), *(written(result.estimates.get(name)) for name in shown))
+        for result in summary.results
     ]
-    what = f"{campaign.name}: {summary.draws:,} draws; mean ± half-width"
-    yield ResultTable("campaign", what, headings, means)
+    title = f"{campaign.name}: {summary.draws:,} draws; mean ± half-width"
+    yield ResultTable("campaign", title, headings, means)
     if campaign.compare is not None:
         differences = []
         for compared in summary.compared:
             cells = []
-            for found in map(compared.differences.get, shown):
-                cells.append(written(found.estimate if found and found.estimate.finite else None))
-                if found and shares:
-                    cells[-1] += f", smaller in {100 * found.smaller:.3g} %"
+            for paired in map(compared.differences.get, shown):
+                cells.append(written(paired.estimate if paired and paired.estimate.finite else None))
+                if paired and shares:
+                    cells[-1] += f", smaller in {100 * paired.smaller:.3g} %"
             differences.append((*compared.point.labels.values(), *cells))
-        what = f"{campaign.name}: paired difference to {_reference(summary)}"
-        yield ResultTable("differences", what, headings, differences)
+        title = f"{campaign.name}: paired difference to {_reference(summary)}"
+        yield ResultTable("differences", title, headings, differences)
     if summary.claims:
         yield claims_table(summary)
 
 
 def claims_table(summary: CampaignSummary) -> ResultTable:
     """Return the claims with their verdicts."""
-    what = f"{summary.campaign.name}: claims, over {summary.draws:,} draws"
-    rows = [(one.says, one.source, one.reason, one.verdict) for one in summary.claims]
-    return ResultTable("claims", what, ("claim", "where", "draws", "verdict"), rows)
+    title = f"{summary.campaign.name}: claims, over {summary.draws:,} draws"
+    rows = [(claim.says, claim.source, claim.reason, claim.verdict) for claim in summary.claims]
+    return ResultTable("claims", title, ("claim", "where", "draws", "verdict"), rows)
 
 
 def page(summary: CampaignSummary, store: Store, base: Mapping[str, object]) -> str:
@@ -108,7 +108,7 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, object]) -> 
         .render(
             title=campaign.name,
             description=campaign.description,
-            subtitle=f"{len(summary.found):,} grid points, {summary.draws:,} draws at each, "
+            subtitle=f"{len(summary.results):,} grid points, {summary.draws:,} draws at each, "
             f"seed {campaign.seed}",
             verdict=_verdict(summary),
             tone="bad" if summary.breaches else "doubt" if remarks else "good",
@@ -187,8 +187,8 @@ def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
 
 
 def _verdict(summary: CampaignSummary) -> str:
-    runs = len(summary.found) * summary.draws
-    certified = sum(found.point.certified_error is not None for found in summary.found)
+    runs = len(summary.results) * summary.draws
+    certified = sum(result.point.certified_error is not None for result in summary.results)
     if summary.breaches:
         return f"{summary.breaches:,} of {runs:,} runs exceed a certified bound."
     if not certified:
@@ -196,7 +196,7 @@ def _verdict(summary: CampaignSummary) -> str:
             f"{runs:,} runs; no grid point has a certified bound "
             "(a hold, a floor and other policies have none)."
         )
-    where = "all" if certified == len(summary.found) else f"{certified} of {len(summary.found)}"
+    where = "all" if certified == len(summary.results) else f"{certified} of {len(summary.results)}"
     return f"{runs:,} runs; {where} grid points have a certified bound; none was exceeded."
 
 
@@ -221,18 +221,18 @@ def written(estimate: Estimate | None) -> str:
 
 def _unfinished(summary: CampaignSummary) -> Iterator[str]:
     """Return a note for each grid point at which a run did not reach the horizon."""
-    for found in summary.found:
-        others = {how: count for how, count in found.ended.items() if how != "finished"}
-        if others:
-            counts = ", ".join(f"{n:,} {how.replace('_', ' ')}" for how, n in others.items())
-            yield f"{_at(found.point.labels)} not all runs reached the horizon: {counts}"
+    for result in summary.results:
+        unfinished = {how: count for how, count in result.ended.items() if how != "finished"}
+        if unfinished:
+            counts = ", ".join(f"{n:,} {how.replace('_', ' ')}" for how, n in unfinished.items())
+            yield f"{_at(result.point.labels)} not all runs reached the horizon: {counts}"
 
 
 def _bursts(summary: CampaignSummary) -> Iterator[str]:
     """Return, for each grid point without an enforced guarantee, how often it was exceeded."""
-    for found in summary.found:
-        if found.bursts is not None:
-            yield f"{_at(found.point.labels)} {found.bursts.text}"
+    for result in summary.results:
+        if result.bursts is not None:
+            yield f"{_at(result.point.labels)} {result.bursts.text}"
 
 
 def _at(labels: Mapping[str, str]) -> str:

@@ -158,14 +158,14 @@ class CampaignSummary(NamedTuple):
 
     campaign: Campaign
     draws: int
-    found: Sequence[GridPointResult]
+    results: Sequence[GridPointResult]
     compared: Sequence[ComparedResult]
     claims: Sequence[JudgedClaim] = ()
 
     @property
     def breaches(self) -> int:
         """Number of runs in which a certified bound is exceeded."""
-        return sum(found.breaches for found in self.found)
+        return sum(result.breaches for result in self.results)
 
     def document(self) -> dict[str, object]:
         """The content of ``summary.json``."""
@@ -176,13 +176,13 @@ class CampaignSummary(NamedTuple):
             "breaches": self.breaches,
             "points": [
                 {
-                    "axes": dict(found.point.labels),
-                    "ended": dict(found.ended),
-                    "certified_error": found.point.certified_error,
-                    "bursts": None if found.bursts is None else found.bursts._asdict(),
-                    "metrics": {name: e._asdict() for name, e in found.estimates.items()},
+                    "axes": dict(result.point.labels),
+                    "ended": dict(result.ended),
+                    "certified_error": result.point.certified_error,
+                    "bursts": None if result.bursts is None else result.bursts._asdict(),
+                    "metrics": {name: e._asdict() for name, e in result.estimates.items()},
                 }
-                for found in self.found
+                for result in self.results
             ],
             "differences": [
                 {
@@ -203,13 +203,13 @@ class CampaignSummary(NamedTuple):
 
 def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
     """Estimate all metrics and judge the claims; the runs of a few grid points are in memory."""
-    found = [_found(point, store) for point in store.points]
+    results = [_result(point, store) for point in store.points]
 
     def values(point: Point) -> Mapping[Metric, Vector]:
         return runs_at(point, store)[0]
 
     claims = list(judge_claims(campaign, store.points, values))
-    return CampaignSummary(campaign, store.draws, found, list(_compared(campaign, store)), claims)
+    return CampaignSummary(campaign, store.draws, results, list(_compared(campaign, store)), claims)
 
 
 def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], NDArray[np.generic]]:
@@ -218,7 +218,7 @@ def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], NDArray[n
     return measured(columns, point.certified_error), columns["status"]
 
 
-def _found(point: Point, store: Store) -> GridPointResult:
+def _result(point: Point, store: Store) -> GridPointResult:
     metrics, status = runs_at(point, store)
     used = metrics.get("certificate_used", np.zeros(0))
     return GridPointResult(
@@ -236,8 +236,8 @@ def _compared(campaign: Campaign, store: Store) -> Iterator[ComparedResult]:
     axis, wanted = campaign.compare.axis, label_of(campaign.compare.reference)
     groups: dict[tuple[str, ...], list[Point]] = {}
     for point in store.points:
-        others = tuple(label for name, label in point.labels.items() if name != axis)
-        groups.setdefault(others, []).append(point)
+        labels = tuple(label for name, label in point.labels.items() if name != axis)
+        groups.setdefault(labels, []).append(point)
     for group in groups.values():
         reference = next(point for point in group if point.labels[axis] == wanted)
         own, _ = runs_at(reference, store)

@@ -53,11 +53,11 @@ def arithmetic() -> Mapping[str, str]:
     }
 
 
-def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str | None:
+def difference(stored: Mapping[str, str], here: Mapping[str, str]) -> str | None:
     """Return the first difference as text; None if there is none."""
     for name in here:
-        if there.get(name) != here[name]:
-            return f"{name} is {there.get(name, 'unknown')} there, {here[name]} here"
+        if stored.get(name) != here[name]:
+            return f"{name} is {stored.get(name, 'unknown')} there, {here[name]} here"
     return None
 
 

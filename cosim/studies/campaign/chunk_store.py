@@ -113,11 +113,11 @@ class Store:
     def _is_there(self, chunk: Chunk) -> bool:
         """Whether the chunk's file is valid; it may have more rows, if draws was larger before."""
         try:
-            found = pq.read_metadata(self._path(chunk))
+            table = pq.read_metadata(self._path(chunk))
         except (OSError, pa.ArrowException):
             return False
         return bool(
-            found.num_rows >= len(chunk.draws) and found.schema.to_arrow_schema().names == self._schema.names
+            table.num_rows >= len(chunk.draws) and table.schema.to_arrow_schema().names == self._schema.names
         )
 
     def _path(self, chunk: Chunk) -> Path:
@@ -172,21 +172,21 @@ def _claim(folder: Path, manifest: Mapping[str, object]) -> Mapping[str, str]:
     """Write or check the folder's manifest; return the code and libraries of its runs."""
     path = folder / MANIFEST
     try:
-        there = json.loads(path.read_text(encoding="utf-8"))
+        stored = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         if (folder / RUNS).exists():
             raise CallerError(f"{folder}: holds runs, but no {MANIFEST}; give another --out") from None
         write_whole(path, json.dumps(manifest, indent=1))
-        there = dict(manifest)
+        stored = dict(manifest)
     except ValueError:
-        there = None
-    if not isinstance(there, dict) or not isinstance(there.get("arithmetic"), dict):
+        stored = None
+    if not isinstance(stored, dict) or not isinstance(stored.get("arithmetic"), dict):
         raise CallerError(f"{path}: not a manifest of a campaign; give another --out")
-    made_by: dict[str, str] = there.pop("arithmetic")
-    found = _difference(there, {k: v for k, v in manifest.items() if k != "arithmetic"})
-    if found is not None:
+    made_by: dict[str, str] = stored.pop("arithmetic")
+    difference = _difference(stored, {k: v for k, v in manifest.items() if k != "arithmetic"})
+    if difference is not None:
         raise CallerError(
-            f"{folder}: holds another campaign ({found}); give another --out, or remove the folder"
+            f"{folder}: holds another campaign ({difference}); give another --out, or remove the folder"
         )
     return made_by
 
@@ -203,21 +203,21 @@ def _identity(campaign: Campaign) -> dict[str, object]:
     return content
 
 
-def _difference(there: object, here: object, key: str = "") -> str | None:
+def _difference(stored: object, here: object, key: str = "") -> str | None:
     """Return the first difference as text; None if there is none."""
-    if isinstance(there, dict) and isinstance(here, dict):
-        names: list[object] = sorted(there.keys() | here.keys())
-        pairs = [(there.get(name), here.get(name)) for name in names]
-    elif isinstance(there, list) and isinstance(here, list):
-        if len(there) != len(here):
-            return f"{key} has {len(there)} entries there, {len(here)} here"
-        names, pairs = list(range(len(here))), list(zip(there, here, strict=True))
+    if isinstance(stored, dict) and isinstance(here, dict):
+        names: list[object] = sorted(stored.keys() | here.keys())
+        pairs = [(stored.get(name), here.get(name)) for name in names]
+    elif isinstance(stored, list) and isinstance(here, list):
+        if len(stored) != len(here):
+            return f"{key} has {len(stored)} entries there, {len(here)} here"
+        names, pairs = list(range(len(here))), list(zip(stored, here, strict=True))
     else:
-        texts = [shortened(json.dumps(one, ensure_ascii=False), 60) for one in (there, here)]
-        return None if there == here else f"{key} is {texts[0]} there, {texts[1]} here"
+        texts = [shortened(json.dumps(value, ensure_ascii=False), 60) for value in (stored, here)]
+        return None if stored == here else f"{key} is {texts[0]} there, {texts[1]} here"
     places = (f"{key}.{name}".removeprefix(".") for name in names)
-    found = (_difference(*pair, place) for pair, place in zip(pairs, places, strict=True))
-    return next(filter(None, found), None)
+    differences = (_difference(*pair, inner_key) for pair, inner_key in zip(pairs, places, strict=True))
+    return next(filter(None, differences), None)
 
 
 Progress = Callable[[int, int], None]
@@ -249,9 +249,9 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
     report = progress or (lambda done, total: None)
     report(done, total)
 
-    def message(what: object) -> str:
+    def message(ending: object) -> str:
         return (
-            f"{what}; {done:,} of {total:,} runs are in {store.folder}; "
+            f"{ending}; {done:,} of {total:,} runs are in {store.folder}; "
             "the same command continues the campaign"
         )
 

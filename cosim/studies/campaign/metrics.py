@@ -95,19 +95,19 @@ def measured(columns: Mapping[str, NDArray[np.generic]], certified: float | None
     A time is infinite if its event does not happen. All metrics of a failed run are infinite.
     Without a certified Δβ, the result has no ``certificate_used``.
     """
-    found: dict[Metric, Vector] = {}
+    values_of: dict[Metric, Vector] = {}
     failed = columns["status"] != OK
     for name in METRICS:
         if name in columns:
             values = np.asarray(columns[name], dtype=np.float64)
             if name == "loops_claims_held" and np.isnan(values).all():  # they were not judged
                 continue
-            found[name] = np.where(np.isnan(values) | failed, np.inf, values)
+            values_of[name] = np.where(np.isnan(values) | failed, np.inf, values)
     arrived = columns["deliveries"] / np.maximum(columns["transmissions"], 1)
-    found["lost_share"] = np.where(failed, np.inf, 1.0 - arrived)
+    values_of["lost_share"] = np.where(failed, np.inf, 1.0 - arrived)
     if certified is not None:
-        found["certificate_used"] = found["sup_e_c_scaled"] / certified
-    return found
+        values_of["certificate_used"] = values_of["sup_e_c_scaled"] / certified
+    return values_of
 
 
 def certified_error(resolved: Scenario) -> float | None:

@@ -77,7 +77,7 @@ def box_of(scenario: Scenario) -> Box:
 def drawn_scenario(scenario: Scenario, seed: int, draw: int) -> Scenario:
     """Return one run of a campaign as a resolved scenario."""
     draws = range(draw, draw + 1)
-    A, B, x0, loss_seeds = (one[0].tolist() for one in box_of(scenario).population(seed, draws))
+    A, B, x0, loss_seeds = (quantity[0].tolist() for quantity in box_of(scenario).population(seed, draws))
     update: dict[str, object] = {"initial_state": tuple(x0), "initial_state_halfwidth": None}
     if scenario.coverage.is_linear:
         update |= {"draw": "given", "A": tuple(map(tuple, A)), "B": tuple(map(tuple, B))}

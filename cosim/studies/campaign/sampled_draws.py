@@ -222,7 +222,7 @@ class SharedNetworkWork(SampledWork):
                 self._measure(record, own)
             if self.judges:
                 held = [
-                    all(one.verdict == ClaimVerdict.HELD for one in RunClaims(record).judge())
+                    all(claim.verdict == ClaimVerdict.HELD for claim in RunClaims(record).judge())
                     for record in records
                 ]
         for name, of_all in _OF_ALL.items():
@@ -234,9 +234,9 @@ class SharedNetworkWork(SampledWork):
             row[cost_of(name)] = np.nan
         if self.entries:
             sections = self.scenario.loops or ()
-            ends = np.cumsum([one.count for one in sections])[:-1]
-            for one, costs in zip(sections, np.split(loops["cost"], ends), strict=True):
-                row[cost_of(one.name)] = np.mean(costs)
+            ends = np.cumsum([section.count for section in sections])[:-1]
+            for section, costs in zip(sections, np.split(loops["cost"], ends), strict=True):
+                row[cost_of(section.name)] = np.mean(costs)
         row["loops_failed"] = np.mean(loops["status"] != OK)
         row["loops_claims_held"] = np.mean(held) if self.judges else np.nan
         self._measure_network(records, row)
@@ -245,9 +245,9 @@ class SharedNetworkWork(SampledWork):
         scenario = records[0].scenario
         counted = [_updates(record, self.count_from_s) for record in records]
         burst = scenario.network.longest_burst
-        row["loops_guarantee_used"] = np.mean([used_up(one["fate"], burst) for one in counted])
+        row["loops_guarantee_used"] = np.mean([used_up(packets["fate"], burst) for packets in counted])
         delays_ns = np.concatenate(
-            [(one["release_ns"] - one["now_ns"])[effective(one["fate"])] for one in counted]
+            [(packets["release_ns"] - packets["now_ns"])[effective(packets["fate"])] for packets in counted]
         )
         due_s = scenario.certificate.network_delay_s
         due_ns = scenario.timing.measurement_period_ns if due_s is None else due_s * NS_PER_S

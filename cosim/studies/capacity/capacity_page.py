@@ -76,10 +76,10 @@ class CapacityResult(NamedTuple):
             "draws": plan.draws,
             "disturbance": plan.amplitude,
             "seed": plan.seed,
-            "capacities": [one.document(plan) for one in self.capacities],
+            "capacities": [capacity.document(plan) for capacity in self.capacities],
             "comparisons": list(comparisons(self)),
             "points": self.summary.document()["points"],
-            "live": [one.document() for one in self.live],
+            "live": [point.document() for point in self.live],
         }
 
 
@@ -119,7 +119,7 @@ def page(result: CapacityResult) -> str:
             rows=list(rows(result)),
             headings=HEADINGS,
             figures=list(figures(result)),
-            live=[live_row(one) for one in result.live],
+            live=[live_row(point) for point in result.live],
         )
     )
 
@@ -130,27 +130,27 @@ HEADINGS = ("policy", "disturbance", "loops carried", "limited by", *LIMITS)
 def rows(result: CapacityResult) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of capacities."""
     last = result.plan.counts[-1]
-    for one in result.capacities:
-        limits = [_shown(one.limits[limit], last) for limit in LIMITS]
-        yield (one.policy, one.disturbance, _shown(one.any_limit, last), one.limited_by or "–", *limits)
+    for case in result.capacities:
+        limits = [_shown(case.limits[limit], last) for limit in LIMITS]
+        yield (case.policy, case.disturbance, _shown(case.any_limit, last), case.limited_by or "–", *limits)
 
 
 def by_rate(plan: CapacityPlan) -> str:
     """Say how many periodic loops the rate carries, or the slots."""
-    what = "the slots carry" if plan.rate_bps is None else "the rate carries"
+    carrier = "the slots carry" if plan.rate_bps is None else "the rate carries"
     if plan.is_one_kind:
         (kind,) = plan.kinds
-        return f"{what} {plan.periodic_loops:.1f} loops, periodic every {kind.period_s:g} s"
+        return f"{carrier} {plan.periodic_loops:.1f} loops, periodic every {kind.period_s:g} s"
     periods = ", ".join(f"{kind.name} every {kind.period_s:g} s" for kind in plan.kinds)
     factor = plan.factor(plan.periodic_loops)
-    return f"{what} {factor:.2f} × the given mixture, {plan.periodic_loops:.1f} loops, periodic: {periods}"
+    return f"{carrier} {factor:.2f} × the given mixture, {plan.periodic_loops:.1f} loops, periodic: {periods}"
 
 
 def mixtures(result: CapacityResult) -> Iterator[str]:
     """Yield the median capacities as multiples of the mixture that the scenario has."""
     plan = result.plan
-    for one in () if plan.is_one_kind else result.capacities:
-        median, least = one.any_limit.median, ""
+    for capacity in () if plan.is_one_kind else result.capacities:
+        median, least = capacity.any_limit.median, ""
         if math.isinf(median):
             median, least = plan.counts[-1], "at least "
         text = f"{least}{plan.factor(median):g} × the given mixture"
@@ -158,18 +158,18 @@ def mixtures(result: CapacityResult) -> Iterator[str]:
             text += f" ({_listed(plan.composition(median))})"
         else:
             text += f"; {_listed(plan.composition(plan.counts[0]))} already reach a limit"
-        yield f"{one.policy}, disturbance {one.disturbance}: {text}"
+        yield f"{capacity.policy}, disturbance {capacity.disturbance}: {text}"
 
 
 def delay_bounds_s(result: CapacityResult) -> dict[str, list[float]]:
     """Return the bound of an update's delay for each number of loops, by policy; infinite: none."""
-    found = {
-        (one.point.labels[POLICY], one.point.labels[LOOPS]): one.point.scenario
-        for one in result.summary.found
+    scenarios = {
+        (entry.point.labels[POLICY], entry.point.labels[LOOPS]): entry.point.scenario
+        for entry in result.summary.results
     }
     counts = [*map(str, result.plan.counts)]
     return {
-        policy: [update_delay(found[policy, count]).largest_s for count in counts]
+        policy: [update_delay(scenarios[policy, count]).largest_s for count in counts]
         for policy in result.plan.policies
     }
 
@@ -201,10 +201,10 @@ def _listed(composition: Mapping[str, int]) -> str:
 
 def comparisons(result: CapacityResult) -> Iterator[str]:
     """Yield for each event-triggered policy whether it carries more loops than the periodic one."""
-    found = {(one.policy, one.disturbance): one.any_limit for one in result.capacities}
+    limits = {(capacity.policy, capacity.disturbance): capacity.any_limit for capacity in result.capacities}
     last = result.plan.counts[-1]
-    for (policy, disturbance), own in found.items():
-        other = found[PERIODIC, disturbance]
+    for (policy, disturbance), own in limits.items():
+        other = limits[PERIODIC, disturbance]
         if policy == PERIODIC:
             continue
         how = "undecided, the intervals overlap"
@@ -221,7 +221,7 @@ def comparisons(result: CapacityResult) -> Iterator[str]:
 
 def figures(result: CapacityResult) -> Iterator[FigureDescription]:
     """Describe the metric of each limit over the number of loops."""
-    for disturbance in dict.fromkeys(one.disturbance for one in result.capacities):
+    for disturbance in dict.fromkeys(capacity.disturbance for capacity in result.capacities):
         for limit, metric in LIMITS.items():
             yield replace(
                 _figure(result, limit, disturbance),
@@ -234,13 +234,13 @@ def figures(result: CapacityResult) -> Iterator[FigureDescription]:
 
 def _figure(result: CapacityResult, limit: Limit, disturbance: str) -> FigureDescription:
     counts, metric = result.plan.counts, LIMITS[limit]
-    found = {
-        (one.point.labels[POLICY], one.point.labels[LOOPS]): one.estimates[metric]
-        for one in result.summary.found
-        if one.point.labels.get(DISTURBANCE, OWN) == disturbance
+    results = {
+        (entry.point.labels[POLICY], entry.point.labels[LOOPS]): entry.estimates[metric]
+        for entry in result.summary.results
+        if entry.point.labels.get(DISTURBANCE, OWN) == disturbance
     }
     policies = list(result.plan.policies)
-    series = {name: [found[name, str(count)] for count in counts] for name in policies}
+    series = {name: [results[name, str(count)] for count in counts] for name in policies}
     figure = curve_figure(
         np.array(counts, dtype=np.float64), [*map(str, counts)], series, "number of loops", metric
     )
@@ -252,14 +252,14 @@ def _figure(result: CapacityResult, limit: Limit, disturbance: str) -> FigureDes
     if _is_live(result, disturbance):
         items += [
             Marks(
-                x=np.array([float(one.loops)]),
-                y=np.array([one.values[metric]]),
+                x=np.array([float(point.loops)]),
+                y=np.array([point.values[metric]]),
                 marker="x",
                 size=9,
                 stroke=2.2,
-                colour=series_colour(policies.index(one.policy)),
+                colour=series_colour(policies.index(point.policy)),
             )
-            for one in result.live
+            for point in result.live
         ]
     y = panel.y if limit == "cost" else replace(panel.y, ends=(-0.02, 1.02))
     return replace(figure, rows=[replace(figure.rows[0], panels=[replace(panel, items=items, y=y)])])
@@ -269,23 +269,23 @@ def _is_live(result: CapacityResult, disturbance: str) -> bool:
     return bool(result.live) and disturbance == OWN
 
 
-def live_row(one: LivePoint) -> tuple[str, ...]:
+def live_row(point: LivePoint) -> tuple[str, ...]:
     """Return the row of a live run: each metric with the interval of the simulation."""
     cells = [
-        f"{number(one.values[metric])} [{number(low)}, {number(high)}]"
-        for metric, (low, high) in one.simulated.items()
+        f"{number(point.values[metric])} [{number(low)}, {number(high)}]"
+        for metric, (low, high) in point.simulated.items()
     ]
-    verdict = "agrees" if not one.outside else f"differs: {', '.join(one.outside)}"
-    if one.status:
-        verdict = f"failed: {one.reason}"
-    return (one.policy, str(one.loops), *cells, str(one.unintended_losses), verdict)
+    verdict = "agrees" if not point.outside else f"differs: {', '.join(point.outside)}"
+    if point.status:
+        verdict = f"failed: {point.reason}"
+    return (point.policy, str(point.loops), *cells, str(point.unintended_losses), verdict)
 
 
-def _shown(one: Capacity, last: int) -> str:
+def _shown(capacity: Capacity, last: int) -> str:
     def text(count: float) -> str:
         return f"≥ {last}" if math.isinf(count) else f"{count:g}"
 
-    return f"{text(one.median)} [{text(one.low)}, {text(one.high)}]"
+    return f"{text(capacity.median)} [{text(capacity.low)}, {text(capacity.high)}]"
 
 
 def print_result(console: Console, result: CapacityResult) -> None:
@@ -302,7 +302,7 @@ def print_result(console: Console, result: CapacityResult) -> None:
         *comparisons(result),
         *waiting(result),
         *caveats(plan),
-        *(f"live: {one.policy}, {one.loops} loops: {live_row(one)[-1]}" for one in result.live),
+        *(f"live: {point.policy}, {point.loops} loops: {live_row(point)[-1]}" for point in result.live),
     ]
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -69,10 +69,10 @@ class Kind(NamedTuple):
     def disturbed(self, pulse: Entry, amplitude: float) -> list[Entry]:
         """Return its disturbances, and with an amplitude a pulse on all its inputs."""
         own = self.scenario.plant.disturbances
-        found = [one.model_dump(mode="json", exclude_none=True) for one in own]
+        disturbances = [disturbance.model_dump(mode="json", exclude_none=True) for disturbance in own]
         if amplitude:
-            found.append({**pulse, "amplitude": [amplitude] * self.scenario.model.dimensions[1]})
-        return found
+            disturbances.append({**pulse, "amplitude": [amplitude] * self.scenario.model.dimensions[1]})
+        return disturbances
 
 
 def kinds_of(scenario: Scenario, period_s: float | None) -> tuple[Kind, ...]:
@@ -85,7 +85,7 @@ def kinds_of(scenario: Scenario, period_s: float | None) -> tuple[Kind, ...]:
     Raises:
         CallerError: a period is not possible, or all kinds are periodic.
     """
-    found = []
+    kinds = []
     for section in scenario.loops or (LoopSection(name="loop"),):
         loop = loop_scenario(scenario, section)
         if isinstance(loop.trigger, PeriodicSettings):
@@ -93,13 +93,13 @@ def kinds_of(scenario: Scenario, period_s: float | None) -> tuple[Kind, ...]:
         else:
             own_s = sampling_period_s(loop) if period_s is None else period_s
         entry = section.model_dump(mode="json", exclude_none=True, exclude={"seeds"})
-        found.append(Kind(section.name, section.count, loop, entry, require_multiple(own_s, loop)))
-    if all(kind.is_periodic for kind in found):
+        kinds.append(Kind(section.name, section.count, loop, entry, require_multiple(own_s, loop)))
+    if all(kind.is_periodic for kind in kinds):
         raise CallerError(
             'trigger.policy = "periodic": the event-triggered loops need an event-triggered '
             "policy, e.g. --set 'trigger={ policy = \"absolute\", delta = 0.05 }'"
         )
-    return tuple(found)
+    return tuple(kinds)
 
 
 def smallest_mixture(kinds: Sequence[Kind]) -> int:
@@ -207,16 +207,16 @@ class CapacityPlan:
     @property
     def rate_bps(self) -> int | None:
         """Rate of the bottleneck; None: it is a schedule."""
-        one = bottleneck(self.scenario)
-        return one.rate_bps if isinstance(one, Rate) else None
+        limit = bottleneck(self.scenario)
+        return limit.rate_bps if isinstance(limit, Rate) else None
 
     @property
     def link(self) -> str:
         """The bottleneck, in words."""
-        one = bottleneck(self.scenario)
-        if isinstance(one, Rate):
-            return f"{one.rate_bps / 1000:g} kbit/s"
-        return f"slots of {time_text(one.slot_s)}"
+        limit = bottleneck(self.scenario)
+        if isinstance(limit, Rate):
+            return f"{limit.rate_bps / 1000:g} kbit/s"
+        return f"slots of {time_text(limit.slot_s)}"
 
     @property
     def periodic_loops(self) -> float:
@@ -260,7 +260,7 @@ class CapacityPlan:
     def campaign(self) -> Campaign:
         """Return the campaign of all runs."""
         axes = [
-            Axis(name=POLICY, variants={name: dict(one) for name, one in self.policies.items()}),
+            Axis(name=POLICY, variants={name: dict(settings) for name, settings in self.policies.items()}),
             self._numbers(),
         ]
         if self.amplitude:
@@ -268,8 +268,8 @@ class CapacityPlan:
             pulse: Entry = {"kind": "step", "from_s": begin_s, "until_s": begin_s + _PULSE_S}
             variants = {
                 name: {
-                    f"loops.{place}.plant.disturbances": kind.disturbed(pulse, amplitude)
-                    for place, kind in enumerate(self.kinds)
+                    f"loops.{number}.plant.disturbances": kind.disturbed(pulse, amplitude)
+                    for number, kind in enumerate(self.kinds)
                 }
                 for name, amplitude in ((OWN, 0.0), (COMMON, self.amplitude))
             }
@@ -311,14 +311,14 @@ class CapacityPlan:
     def _network(self, loops: int, factor: int) -> Entry:
         """Return the settings of loops on bottlenecks so many times as fast, with longer queues."""
         settings: Entry = {"loops": loops}
-        for place, one in enumerate(self.scenario.network.impairments):
+        for place, impairment in enumerate(self.scenario.network.impairments):
             key = f"network.impairments.{place}"
-            if isinstance(one, Schedule):
+            if isinstance(impairment, Schedule):
                 settings[f"{key}.order"] = [*range(loops)]
-                settings[f"{key}.slot_s"] = max(one.slot_s / factor, 1e-6)
-            if isinstance(one, Rate) and factor > 1:
-                settings[f"{key}.rate_bps"] = min(one.rate_bps * factor, 10**12)
-                settings[f"{key}.queue"] = min(one.queue * factor, 10**6)
+                settings[f"{key}.slot_s"] = max(impairment.slot_s / factor, 1e-6)
+            if isinstance(impairment, Rate) and factor > 1:
+                settings[f"{key}.rate_bps"] = min(impairment.rate_bps * factor, 10**12)
+                settings[f"{key}.queue"] = min(impairment.queue * factor, 10**6)
         return settings
 
 
@@ -334,14 +334,14 @@ def bottleneck(scenario: Scenario) -> Rate | Schedule:
         CallerError: it has none.
     """
     stages = scenario.network.impairments
-    rates = [one for one in stages if isinstance(one, Rate)]
-    schedules = [one for one in stages if isinstance(one, Schedule)]
+    rates = [stage for stage in stages if isinstance(stage, Rate)]
+    schedules = [stage for stage in stages if isinstance(stage, Schedule)]
     if not rates and not schedules:
         raise CallerError(
             "network.impairments: no bottleneck that the loops could share; "
             "give --rate-bps, or an impairment of kind rate or schedule"
         )
-    return min(rates, key=lambda one: one.rate_bps) if rates else schedules[0]
+    return min(rates, key=lambda rate: rate.rate_bps) if rates else schedules[0]
 
 
 def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
@@ -364,9 +364,9 @@ def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
 def with_rate(scenario: Scenario, rate_bps: int) -> Scenario:
     """Return the scenario with this rate of its slowest bottleneck; without one, add it."""
     stages = list(scenario.network.impairments)
-    if any(isinstance(one, Rate) for one in stages):
-        place = stages.index(bottleneck(scenario))
-        stages[place] = stages[place].model_copy(update={"rate_bps": rate_bps})
+    if any(isinstance(stage, Rate) for stage in stages):
+        number = stages.index(bottleneck(scenario))
+        stages[number] = stages[number].model_copy(update={"rate_bps": rate_bps})
     else:
         stages.append(Rate(rate_bps=rate_bps, queue=_QUEUE))
     network = scenario.network.model_copy(update={"impairments": tuple(stages)})
@@ -382,7 +382,7 @@ def default_counts(periodic: float, least: int, depth: Depth) -> tuple[int, ...]
         depth: how thorough the study is.
     """
     multiples = {max(round(share * periodic / least), 1) for share in depth.shares}
-    return require_counts([least * one for one in multiples], least)
+    return require_counts([least * multiple for multiple in multiples], least)
 
 
 def require_counts(counts: Sequence[int], least: int) -> tuple[int, ...]:
@@ -391,12 +391,12 @@ def require_counts(counts: Sequence[int], least: int) -> tuple[int, ...]:
     Raises:
         CallerError: a number is not a positive multiple of that of the smallest mixture.
     """
-    for one in counts:
-        if one < 1:
-            raise CallerError(f"--loops {one}: numbers of loops are at least 1")
-        if one % least:
+    for count in counts:
+        if count < 1:
+            raise CallerError(f"--loops {count}: numbers of loops are at least 1")
+        if count % least:
             raise CallerError(
-                f"--loops {one}: should be a multiple of {least}, to keep the proportions of "
+                f"--loops {count}: should be a multiple of {least}, to keep the proportions of "
                 "[[loops]]; or study one kind, e.g. --set 'loops=[{ name = \"p\" }]'"
             )
     return tuple(sorted({*counts, *([1] if least == 1 else [])}))

@@ -104,10 +104,10 @@ class PolicyCapacity(NamedTuple):
 def capacities(plan: CapacityPlan, summary: CampaignSummary, store: Store) -> list[PolicyCapacity]:
     """Return the capacity of the link for each policy and disturbance."""
     groups: dict[tuple[str, str], dict[str, Mapping[str, Vector]]] = {}
-    for found in summary.found:
-        labels = found.point.labels
-        runs = {str(name): values for name, values in runs_at(found.point, store)[0].items()}
-        for name, costs in store.columns(found.point.number, plan.cost_columns).items():
+    for result in summary.results:
+        labels = result.point.labels
+        runs = {str(name): values for name, values in runs_at(result.point, store)[0].items()}
+        for name, costs in store.columns(result.point.number, plan.cost_columns).items():
             runs[name] = np.where(np.isnan(costs), np.inf, costs)
         groups.setdefault((labels[POLICY], labels.get(DISTURBANCE, OWN)), {})[labels[LOOPS]] = runs
     return [capacity_of(plan, policy, how, runs) for (policy, how), runs in groups.items()]
@@ -142,7 +142,7 @@ def capacity_of(
             ]
         )
     draws = {limit: carried(plan.counts, flags) for limit, flags in reached.items()}
-    limits = {limit: Capacity.estimate(found) for limit, found in draws.items()}
+    limits = {limit: Capacity.estimate(counts) for limit, counts in draws.items()}
     worst = np.min(np.stack([*draws.values()]), axis=0)
     return PolicyCapacity(policy, disturbance, limits, Capacity.estimate(worst))
 
@@ -196,7 +196,7 @@ def chosen_points(text: str | None, plan: CapacityPlan) -> list[tuple[str, int]]
     return [points[part] for part in texts]
 
 
-def live_point(chosen: tuple[str, int], found: Sequence[GridPointResult], folder: Path) -> LivePoint:
+def live_point(chosen: tuple[str, int], results: Sequence[GridPointResult], folder: Path) -> LivePoint:
     """Run a grid point live, without the common disturbance and with the seeds of draw 0.
 
     Raises:
@@ -204,7 +204,7 @@ def live_point(chosen: tuple[str, int], found: Sequence[GridPointResult], folder
     """
     policy, count = chosen
     wanted = {POLICY: policy, LOOPS: str(count), DISTURBANCE: OWN}
-    simulated = next(one for one in found if {DISTURBANCE: OWN, **one.point.labels} == wanted)
+    simulated = next(result for result in results if {DISTURBANCE: OWN, **result.point.labels} == wanted)
     point, work = simulated.point, simulated.point.work
     assert isinstance(work, SharedNetworkWork)
     changes = {"seeds": seeds_of(work.seed, 0), "name": f"{policy}-{count}"}

@@ -48,18 +48,18 @@ _DESIGNED = "_designed"
 _LOOP_HEADINGS = ("", "given", "designed")
 
 
-def write_page(found: DesignResult, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
+def write_page(result: DesignResult, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
     """Write page and figure; return the files.
 
     Raises:
         MachineError: they cannot be written.
     """
-    return [write_whole(path, page(found)), *save_figures([trade_off(found)], path, figure_files)]
+    return [write_whole(path, page(result)), *save_figures([trade_off(result)], path, figure_files)]
 
 
-def page(found: DesignResult) -> str:
+def page(result: DesignResult) -> str:
     """Return the page as HTML; all text except the figure is escaped."""
-    limits, bounds = found.limits, found.bounds or {}
+    limits, bounds = result.limits, result.bounds or {}
     lines = [
         f"{100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
         f"within {limits.settling_s:g} s",
@@ -69,26 +69,26 @@ def page(found: DesignResult) -> str:
         templates(Path(__file__).parent)
         .get_template("design.html.jinja")
         .render(
-            title=found.name,
-            subtitle=f"{len(found.trials):,} candidates, {found.fresh.draws:,} draws, seed {found.seed}",
-            verdict=found.verdict(),
-            tone="good" if found.confirmed else "doubt" if found.feasible else "bad",
+            title=result.name,
+            subtitle=f"{len(result.trials):,} candidates, {result.fresh.draws:,} draws, seed {result.seed}",
+            verdict=result.verdict(),
+            tone="good" if result.confirmed else "doubt" if result.feasible else "bad",
             limits=lines,
             certified=[certified(name, value) for name, value in bounds.items()],
-            conditions=found.conditions,
-            figure=trade_off(found),
+            conditions=result.conditions,
+            figure=trade_off(result),
             headings=HEADINGS,
-            rows=rows(found),
-            scenario_toml=dumps(found.scenario),
+            rows=rows(result),
+            scenario_toml=dumps(result.scenario),
         )
     )
 
 
-def trade_off(found: DesignResult) -> FigureDescription:
+def trade_off(result: DesignResult) -> FigureDescription:
     """Describe all tried candidates, the trade-off curve, the limit and the chosen candidate."""
     items: list[Item] = []
-    for i, family in enumerate(found.space.families):
-        own = [t.measured for t in found.trials if t.candidate.family == i]
+    for i, family in enumerate(result.space.families):
+        own = [t.measured for t in result.trials if t.candidate.family == i]
         own = [m for m in own if np.isfinite(m.settling_s)]
         items.append(
             Marks(
@@ -102,30 +102,30 @@ def trade_off(found: DesignResult) -> FigureDescription:
                 reduced=False,
             )
         )
-    front, best = [trial.measured for trial in found.front], found.fresh
+    front, best = [trial.measured for trial in result.front], result.fresh
     high_s = best.settling_high_s if np.isfinite(best.settling_high_s) else best.settling_s
     items += [
         Line(x=np.array([m.transmissions for m in front]),
              y=np.array([m.settling_s for m in front]), label="trade-off", steps="post",
              colour=palette.NETWORK, width=1.4),
-        Rule(at=found.limits.settling_s, colour=palette.CERTIFIED, label="limit"),
+        Rule(at=result.limits.settling_s, colour=palette.CERTIFIED, label="limit"),
         Marks(x=np.array([best.transmissions]), y=np.array([best.settling_s]), marker="*",
               size=12, colour=palette.LOST,
-              label="the choice" if found.feasible else "the closest",
+              label="the choice" if result.feasible else "the closest",
               x_error=np.array([best.halfwidth]),
               y_error=np.array([[best.settling_s - best.settling_low_s],
                                 [high_s - best.settling_s]])),
     ]  # fmt: skip
-    settles = any(np.isfinite(trial.measured.settling_s) for trial in found.trials)
+    settles = any(np.isfinite(trial.measured.settling_s) for trial in result.trials)
     panel = Panel(
         items=items,
         x=Axis(label="transmissions (mean)", logarithmic=settles),
-        y=Axis(label=f"settling time, {100 * found.limits.quantile:g} % quantile [s]"),
+        y=Axis(label=f"settling time, {100 * result.limits.quantile:g} % quantile [s]"),
     )
     return one_panel("trade-off", panel, _HEIGHT_IN).captioned(_CAPTION)
 
 
-def rows(found: DesignResult) -> list[tuple[str, ...]]:
+def rows(result: DesignResult) -> list[tuple[str, ...]]:
     """Return the rows of the trade-off curve."""
     return [
         (
@@ -133,31 +133,31 @@ def rows(found: DesignResult) -> list[tuple[str, ...]]:
             trial.measured.settling,
             f"{trial.candidate.alpha_per_s:.4g}",
             f"{trial.candidate.beta:.4g}",
-            found.space.families[trial.candidate.family].weight,
-            found.space.families[trial.candidate.family].gain,
+            result.space.families[trial.candidate.family].weight,
+            result.space.families[trial.candidate.family].gain,
         )
-        for trial in found.front
+        for trial in result.front
     ]
 
 
-def print_found(console: Console, found: DesignResult) -> None:
+def print_found(console: Console, result: DesignResult) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
-    title = f"{found.name}: trade-off of transmissions and settling time"
-    every = rows(found)
+    title = f"{result.name}: trade-off of transmissions and settling time"
+    every = rows(result)
     shown = every[:: -(-len(every) // _MOST_ROWS) or 1]
     if every:
         words = range(len(HEADINGS) - 2, len(HEADINGS))
         console.print(terminal_table(ResultTable("design", title, HEADINGS, shown), left=words))
     lines = []
-    if found.feasible:
+    if result.feasible:
         lines = [
-            found.verdict(),
-            f"chosen among {len(found.trials):,} candidates on {found.best.measured.draws:,} "
-            f"draws; the numbers are from {found.fresh.draws:,} other draws",
+            result.verdict(),
+            f"chosen among {len(result.trials):,} candidates on {result.best.measured.draws:,} "
+            f"draws; the numbers are from {result.fresh.draws:,} other draws",
         ]
-    if found.bounds:
-        bounds = [certified(name, value) for name, value in found.bounds.items()]
-        lines.append(f"certified {found.conditions}: {', '.join(bounds)}")
+    if result.bounds:
+        bounds = [certified(name, value) for name, value in result.bounds.items()]
+        lines.append(f"certified {result.conditions}: {', '.join(bounds)}")
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
@@ -189,17 +189,17 @@ class DesignOutcome:
     @property
     def lines(self) -> str:
         """What to change in the scenario, as TOML."""
-        one = self.scenario.model_dump(mode="json", exclude_none=True)
+        document = self.scenario.model_dump(mode="json", exclude_none=True)
         keys = {
             "model": ("gain",),
             "network": ("mansd", "constraints"),
             "trigger": ("policy", "period_s", "alpha_per_s", "beta"),
         }
         tables = {
-            table: {key: one[table][key] for key in some if one[table].get(key, []) != []}
+            table: {key: document[table][key] for key in some if document[table].get(key, []) != []}
             for table, some in keys.items()
         }
-        return toml_text({"mode": one["mode"], **tables})
+        return toml_text({"mode": document["mode"], **tables})
 
     @property
     def rows(self) -> list[tuple[str, str, str]]:
@@ -235,24 +235,24 @@ def figure_of(name: str, panel: Panel, caption: str) -> FigureDescription:
     return one_panel(name, panel, _HEIGHT_IN).captioned(caption)
 
 
-def write_outcome(found: DesignOutcome, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
+def write_outcome(outcome: DesignOutcome, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
     """Write page and figure; return the files.
 
     Raises:
         MachineError: they cannot be written.
     """
     page = templates(Path(__file__).parent).get_template("network.html.jinja")
-    html = page.render(found=found, headings=_LOOP_HEADINGS, scenario_toml=found.written())
-    return [write_whole(path, html), *save_figures([found.figure], path, figure_files)]
+    html = page.render(outcome=outcome, headings=_LOOP_HEADINGS, scenario_toml=outcome.written())
+    return [write_whole(path, html), *save_figures([outcome.figure], path, figure_files)]
 
 
-def print_design(console: Console, found: DesignOutcome) -> None:
+def print_design(console: Console, outcome: DesignOutcome) -> None:
     """Print the comparison, the verdict, and the lines for the scenario."""
-    title = f"{found.name}: loops under the worst losses"
-    table = ResultTable("design", title, _LOOP_HEADINGS, found.rows)
+    title = f"{outcome.name}: loops under the worst losses"
+    table = ResultTable("design", title, _LOOP_HEADINGS, outcome.rows)
     console.print(terminal_table(table, left=range(3)))
-    lines = [found.verdict, *found.notes]
-    if found.is_certified:
-        lines.append(f"for the scenario:\n{found.lines.rstrip()}")
+    lines = [outcome.verdict, *outcome.notes]
+    if outcome.is_certified:
+        lines.append(f"for the scenario:\n{outcome.lines.rstrip()}")
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

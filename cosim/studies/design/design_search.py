@@ -160,16 +160,16 @@ def _bounds_of(scenario: Scenario, limits: DesignLimits) -> Bounds:
     return bounds_of(certificate_of(scenario, limits), scenario)
 
 
-def bounds_of(found: ScenarioCertificate, scenario: Scenario) -> Bounds:
+def bounds_of(certificate: ScenarioCertificate, scenario: Scenario) -> Bounds:
     """Return certified sup‖x‖ and sup‖e_c‖ over all times; ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W."""
-    if found.constants is None:
+    if certificate.constants is None:
         return {"state": math.inf, "error": math.inf}
-    t_s = np.array([0.0, found.floor_from_s if math.isfinite(found.floor_from_s) else 0.0])
+    t_s = np.array([0.0, certificate.floor_from_s if math.isfinite(certificate.floor_from_s) else 0.0])
     weight = loop_of(resolve(scenario)).weight
     shrinks = 1.0 if weight is None else float(np.linalg.norm(np.linalg.inv(weight), 2))
     return {
-        "state": float(found.state(t_s).max()),
-        "error": shrinks * float(found.controller_error(t_s).max()),
+        "state": float(certificate.state(t_s).max()),
+        "error": shrinks * float(certificate.controller_error(t_s).max()),
     }
 
 

@@ -117,8 +117,8 @@ def space_of(families: Mapping[tuple[str, str], Scenario]) -> DesignSpace:
     Raises:
         CallerError: ‖x(0)‖ = 0, the floor is above all β, or a nominal loop does not decay.
     """
-    found = tuple(Family(gain, weight, one) for (gain, weight), one in families.items())
-    first = found[0].scenario
+    normed = tuple(Family(gain, weight, scenario) for (gain, weight), scenario in families.items())
+    first = normed[0].scenario
     initial_norm = math.hypot(*first.plant.initial_state)
     if initial_norm == 0:
         raise CallerError("plant.initial_state: is 0, but a loop settles to a share of ‖x(0)‖; give another")
@@ -128,8 +128,8 @@ def space_of(families: Mapping[tuple[str, str], Scenario]) -> DesignSpace:
             f"trigger.floor = {floor:g}: must be less than the largest β that is tried, "
             f"{LEVELS[-1]:g} ‖x(0)‖ = {highest:g}"
         )
-    rates = tuple(decay_rate(one.scenario) for one in found)
-    return DesignSpace(found, rates, initial_norm, floor)
+    rates = tuple(decay_rate(family.scenario) for family in normed)
+    return DesignSpace(normed, rates, initial_norm, floor)
 
 
 NORMS = ("identity", "given", "chosen")
@@ -155,15 +155,15 @@ def families_of(
     if not norms:
         raise CallerError(f"--weights: name one at least of {', '.join(NORMS)}")
     gains = {"given": scenario} if lqr is None else dict(_regulated(scenario, *lqr))
-    found = {}
-    for i, (gain, one) in enumerate(gains.items()):
+    scenarios = {}
+    for i, (gain, regulated) in enumerate(gains.items()):
 
         def report(share: float, done: int = i) -> None:
             progress((done + share) / len(gains))
 
         for norm in norms:
-            found[gain, norm] = _normed(one, norm, report)
-    return found
+            scenarios[gain, norm] = _normed(regulated, norm, report)
+    return scenarios
 
 
 def _regulated(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str, Scenario]]:
@@ -171,12 +171,12 @@ def _regulated(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str, Scen
     for name, matrix, size in (("--Q", Q, loop.n), ("--R", R, loop.m)):
         if matrix.shape != (size, size):
             raise CallerError(f"{name}: expected {size} x {size}, or {size} numbers for its diagonal")
-    found = []
+    scenarios = []
     for cost in COSTS_OF_INPUT:
         K = lqr_gain(loop.A_model, loop.B_model, Q, cost * R)
         model = scenario.model.model_copy(update={"gain": tuple(map(tuple, K.tolist()))})
-        found.append((f"lqr R × {cost:g}", scenario.model_copy(update={"model": model})))
-    return found
+        scenarios.append((f"lqr R × {cost:g}", scenario.model_copy(update={"model": model})))
+    return scenarios
 
 
 def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:

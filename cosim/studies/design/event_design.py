@@ -94,22 +94,22 @@ class EventSearch:
         self._draws = box.population(seed, range(draws))
         self._fresh = box.population(seed, range(draws, 2 * draws))
         self.of_box = False
-        found = self.certificate(self.given, 1, of_box=True)
-        self.of_box = found is not None and found.constants is not None
+        certificate = self.certificate(self.given, 1, of_box=True)
+        self.of_box = certificate is not None and certificate.constants is not None
         base = self.measured(self.given, self._draws)
         self.limits = Measured(wish.cost * base.cost, wish.transmissions * base.transmissions)
 
     def scenario_of(self, loop: EventLoop, m: int | None = None) -> Scenario:
         """Return the scenario of a loop; with M, or with its own."""
-        one = self.scenario
-        trigger = one.decaying.model_copy(update={"alpha_per_s": loop.alpha_per_s, "beta": loop.beta})
+        scenario = self.scenario
+        trigger = scenario.decaying.model_copy(update={"alpha_per_s": loop.alpha_per_s, "beta": loop.beta})
         update: dict[str, object] = {
-            "model": one.model.model_copy(update={"gain": loop.K}),
+            "model": scenario.model.model_copy(update={"gain": loop.K}),
             "trigger": trigger,
         }
         if m is not None:
-            update["network"] = one.network.model_copy(update={"mansd": m - 1})
-        return one.model_copy(update=update)
+            update["network"] = scenario.network.model_copy(update={"mansd": m - 1})
+        return scenario.model_copy(update=update)
 
     def certificate(
         self, loop: EventLoop, m: int, *, of_box: bool | None = None
@@ -124,10 +124,10 @@ class EventSearch:
 
     def state_bound(self, loop: EventLoop, m: int) -> float:
         """Return certified sup‖x‖; infinite without a certificate, or beyond the given limits."""
-        found = self.certificate(loop, m)
-        if found is None:
+        certificate = self.certificate(loop, m)
+        if certificate is None:
             return math.inf
-        bounds = bounds_of(found, self.scenario)
+        bounds = bounds_of(certificate, self.scenario)
         within = all(bounds[name] <= limit for name, limit in self.wish.bounds.items())
         return bounds["state"] if within else math.inf
 
@@ -165,14 +165,14 @@ class EventSearch:
         if not rate_per_s < 0 or not 0 < loop.alpha_per_s < -rate_per_s:
             return _FORBIDDEN + min(abs(rate_per_s), _FORBIDDEN)
         self.tried += 1
-        found, least = self.measured(loop, self._draws), self.scenario.network.mansd + 1
-        over = max(0.0, math.log(found.cost / self.limits.cost))
+        measured, least = self.measured(loop, self._draws), self.scenario.network.mansd + 1
+        over = max(0.0, math.log(measured.cost / self.limits.cost))
         if self.wish.goal == "transmissions":
             bound = 0.0 if math.isfinite(self.state_bound(loop, least)) else 1.0
             if over or bound:
                 return min(1.0 + over + bound, _FORBIDDEN)
-            return -math.log(1e6 / found.transmissions)
-        over += max(0.0, math.log(found.transmissions / self.limits.transmissions))
+            return -math.log(1e6 / measured.transmissions)
+        over += max(0.0, math.log(measured.transmissions / self.limits.transmissions))
         if over:
             return min(1.0 + over, _FORBIDDEN)
         m = self.largest_m(loop)
@@ -195,10 +195,10 @@ class EventSearch:
             progress(0.3 * (number + 1) / len(starts))
         order = sorted(range(len(starts)), key=lambda number: values[number])[:_STARTS]
         best, value = starts[order[0]], values[order[0]]
-        for number, place in enumerate(order):
-            found, reached = self._improve(starts[place], self.wish.effort // (10 * _STARTS))
+        for number, index in enumerate(order):
+            improved, reached = self._improve(starts[index], self.wish.effort // (10 * _STARTS))
             if reached < value:
-                best, value = found, reached
+                best, value = improved, reached
             progress(0.3 + 0.6 * (number + 1) / len(order))
         if value >= min(values[0], 0.0):  # no better than the given loop, or beyond a limit
             best = self.given
@@ -239,7 +239,7 @@ class EventSearch:
 def _rounded(entries: Vector, like: EventLoop, alpha_per_s: float, beta: float) -> EventLoop:
     """Return a loop with six digits: what is judged is what is printed."""
     width = len(like.K[0])
-    *numbers, alpha_per_s, beta = (float(f"{one:.6g}") for one in (*entries, alpha_per_s, beta))
+    *numbers, alpha_per_s, beta = (float(f"{entry:.6g}") for entry in (*entries, alpha_per_s, beta))
     K = tuple(tuple(numbers[i : i + width]) for i in range(0, len(numbers), width))
     return EventLoop(K, alpha_per_s, beta)
 
@@ -249,12 +249,12 @@ def event_outcome(search: EventSearch, given: Certified, best: Certified) -> Des
     limits = search.limits
     is_network = search.wish.goal == "network"
 
-    def entry(one: Certified) -> dict[str, object]:
-        return {"certified": one.m or None, **one.loop._asdict(), **one.measured._asdict()}
+    def entry(certified: Certified) -> dict[str, object]:
+        return {"certified": certified.m or None, **certified.loop._asdict(), **certified.measured._asdict()}
 
     plants = "for the whole box" if search.of_box else "for the scenario's own plant"
     sent = f"{given.measured.transmissions:.4g} to {best.measured.transmissions:.4g}"
-    before, after = (_reach(search, one) for one in (given, best))
+    before, after = (_reach(search, certified) for certified in (given, best))
     verdict = f"certified {plants}: {before} before, {after} after; transmissions {sent}"
     if best.loop == given.loop:
         verdict = f"{after} for the given loop; no better one was found"
@@ -289,26 +289,26 @@ def event_outcome(search: EventSearch, given: Certified, best: Certified) -> Des
     )
 
 
-def _reach(search: EventSearch, one: Certified) -> str:
-    top = ", the most examined" if one.m == search.most else ""
-    return f"M = {one.m}{top}" if one.m else "nothing certified"
+def _reach(search: EventSearch, certified: Certified) -> str:
+    top = ", the most examined" if certified.m == search.most else ""
+    return f"M = {certified.m}{top}" if certified.m else "nothing certified"
 
 
-def _cells(search: EventSearch, one: Certified) -> dict[str, str]:
+def _cells(search: EventSearch, certified: Certified) -> dict[str, str]:
     def bound(m: int) -> str:
-        value = search.state_bound(one.loop, m) if m else math.inf
+        value = search.state_bound(certified.loop, m) if m else math.inf
         return f"{value:.4g}" if value < math.inf else NONE
 
     own = search.scenario.network.mansd + 1
     return {
-        "certified for": _reach(search, one),
-        "sup‖x‖ there at most": bound(one.m),
+        "certified for": _reach(search, certified),
+        "sup‖x‖ there at most": bound(certified.m),
         f"sup‖x‖ with M = {own} at most": bound(own),
-        "cost, mean": f"{one.measured.cost:.4g}",
-        "transmissions, mean": f"{one.measured.transmissions:.4g}",
-        "α [1/s]": f"{one.loop.alpha_per_s:.4g}",
-        "β": f"{one.loop.beta:.4g}",
-        "K": gain_text(one.loop.K),
+        "cost, mean": f"{certified.measured.cost:.4g}",
+        "transmissions, mean": f"{certified.measured.transmissions:.4g}",
+        "α [1/s]": f"{certified.loop.alpha_per_s:.4g}",
+        "β": f"{certified.loop.beta:.4g}",
+        "K": gain_text(certified.loop.K),
     }
 
 
@@ -316,8 +316,8 @@ def _figure(search: EventSearch, given: Certified, best: Certified) -> FigureDes
     """Describe the certified bounds of ‖x‖ over M, which end where the certificate does."""
     numbers = np.unique(np.geomspace(1, max(given.m, best.m, 2), 30).round().astype(int))
     items = []
-    for one, label, colour in ((given, "given", NETWORK), (best, "designed", LOST)):
-        bounds = np.array([search.state_bound(one.loop, int(m)) for m in numbers])
+    for certified, label, colour in ((given, "given", NETWORK), (best, "designed", LOST)):
+        bounds = np.array([search.state_bound(certified.loop, int(m)) for m in numbers])
         items.append(Line(x=numbers.astype(float), y=bounds, colour=colour, label=label, marker="o"))
     x, y = Axis(label="M", logarithmic=True), Axis(label="certified sup‖x‖", logarithmic=True)
     caption = "Certified bound of the state over M. A curve ends where its certificate does."

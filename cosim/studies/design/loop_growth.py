@@ -88,11 +88,11 @@ class QuickLoop:
         steps = range((from_ns // times.step_ns + 1) * times.step_ns, until_ns + 1, times.step_ns)
         both += [(t_ns, 0, self._latch) for t_ns in steps]
         none = np.zeros_like(self._generator)
-        found, now_ns = _Map(np.eye(len(none)), none), from_ns
-        for t_ns, _, matrix in sorted(both, key=lambda one: one[:2]):
-            found = _Map(matrix, none).after(self._flow(t_ns - now_ns).after(found))
+        passed, now_ns = _Map(np.eye(len(none)), none), from_ns
+        for t_ns, _, matrix in sorted(both, key=lambda occurrence: occurrence[:2]):
+            passed = _Map(matrix, none).after(self._flow(t_ns - now_ns).after(passed))
             now_ns = t_ns
-        return self._flow(until_ns - now_ns).after(found)
+        return self._flow(until_ns - now_ns).after(passed)
 
     def _period(self, slot: int) -> tuple[_Map, _Map]:
         """Return the maps of a period whose update is lost, and of one whose update is not."""
@@ -118,13 +118,13 @@ class QuickLoop:
 
     def maps(self, bursts: Sequence[Burst]) -> Matrix:
         """Return the maps of bursts between two deliveries, (k, d, d)."""
-        (rows, start), slots, found = self._z, len(self._periods), []
+        (rows, start), slots, maps = self._z, len(self._periods), []
         for burst in bursts:
             M = self._periods[burst.slot][1].M @ start
             for number in range(1, burst.losses + 1):
                 M = self._periods[(burst.slot + number) % slots][0].M @ M
-            found.append(rows @ M)
-        return np.array(found)
+            maps.append(rows @ M)
+        return np.array(maps)
 
 
 def _radius(matrix: Matrix) -> float:
@@ -145,9 +145,9 @@ class PatternGraph:
 
     def __init__(self, bursts: Sequence[Burst]) -> None:
         self.bursts = bursts
-        self._sources = np.array([one.source for one in bursts])
-        self._targets = np.array([one.target for one in bursts])
-        self._durations = np.array([float(one.steps) for one in bursts])
+        self._sources = np.array([burst.source for burst in bursts])
+        self._targets = np.array([burst.target for burst in bursts])
+        self._durations = np.array([float(burst.steps) for burst in bursts])
         nodes = range(int(self._sources.max()) + 1)
         self._leaving = [np.flatnonzero(self._sources == node) for node in nodes]
         self._rounds = min(_ROUNDS + len(nodes), _MOST_ROUNDS)
@@ -188,7 +188,7 @@ class PatternGraph:
             rank = durations * (norms - max(best.logarithm, -50.0))
             kept = np.argsort(-rank, kind="stable")[:_BEAM]
             steps = [self._leaving[self._targets[paths[index, -1]]] for index in kept]
-            before, step = np.repeat(kept, [len(one) for one in steps]), np.concatenate(steps)
+            before, step = np.repeat(kept, [len(edges) for edges in steps]), np.concatenate(steps)
             paths = np.concatenate([paths[before], step[:, None]], axis=1)
             products = maps[step] @ products[before]
             durations = durations[before] + self._durations[step]

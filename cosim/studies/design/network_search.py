@@ -108,7 +108,7 @@ class Reached(NamedTuple):
     candidate: Candidate
     rung: int
     """Its number in the ladder; −1: none."""
-    found: Stability | None
+    stability: Stability | None
     """The certificate there; None: there is none."""
     beyond: Stability | None
     """What is known about the next rung; None: there is none, or its cost is above the limit."""
@@ -134,8 +134,8 @@ def time_triggered(scenario: Scenario, period_s: float | None) -> Scenario:
     return scenario.model_copy(update={"trigger": trigger})
 
 
-def _capped(others: LossGuarantee, limit: int) -> LossGuarantee:
-    return LossGuarantee((LongestBurst(limit), *others.rules))
+def _capped(further: LossGuarantee, limit: int) -> LossGuarantee:
+    return LossGuarantee((LongestBurst(limit), *further.rules))
 
 
 def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
@@ -146,21 +146,21 @@ def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
     if wish.window is not None:
         if not 2 <= wish.window <= 64:
             raise CallerError(f"--window: from 2 to 64 updates, not {wish.window}")
-        found = []
+        rungs = []
         for m in range(wish.window):
             rules = (AtMost(losses=m, window=wish.window),) if m else ()
-            guarantee = LossGuarantee((LongestBurst(m), *(one.rule for one in rules)))
+            guarantee = LossGuarantee((LongestBurst(m), *(rule.rule for rule in rules)))
             settings: dict[str, object] = {"mansd": m, "constraints": rules}
             name = f"m = {m} of {wish.window}"
-            found.append(Rung(name, m, guarantee, period_ns, settings))
-        return found
-    others = LossGuarantee(
+            rungs.append(Rung(name, m, guarantee, period_ns, settings))
+        return rungs
+    further = LossGuarantee(
         tuple(rule for rule in network.guarantee.rules if not isinstance(rule, LongestBurst))
     )
     most = wish.most or _MOST_M
-    most = min(most, (others.longest_burst or most) + 1)
+    most = min(most, (further.longest_burst or most) + 1)
     return [
-        Rung(f"M = {m}", m, _capped(others, m - 1), period_ns, {"mansd": m - 1}) for m in range(1, most + 1)
+        Rung(f"M = {m}", m, _capped(further, m - 1), period_ns, {"mansd": m - 1}) for m in range(1, most + 1)
     ]
 
 
@@ -263,14 +263,14 @@ class NetworkSearch:
 
     def scenario_of(self, candidate: Candidate, rung: int) -> Scenario:
         """Return the scenario of a loop on a rung, not resolved."""
-        at, one = self.ladder[max(rung, 0)], self.scenario
-        trigger = one.trigger.model_copy(update={"period_s": at.period_ns / NS_PER_S})
-        return one.model_copy(
+        at, scenario = self.ladder[max(rung, 0)], self.scenario
+        trigger = scenario.trigger.model_copy(update={"period_s": at.period_ns / NS_PER_S})
+        return scenario.model_copy(
             update={
-                "model": one.model.model_copy(update={"gain": candidate.K}),
+                "model": scenario.model.model_copy(update={"gain": candidate.K}),
                 "mode": candidate.mode,
                 "trigger": trigger,
-                "network": one.network.model_copy(update=at.network),
+                "network": scenario.network.model_copy(update=at.network),
             }
         )
 
@@ -278,14 +278,14 @@ class NetworkSearch:
         """Return the certified bounds of a loop on a rung."""
         self.judged += 1
         margin = LossMargin(resolve(self.scenario_of(candidate, rung)))
-        found = margin.first_bounds()
-        return margin.is_stable() if found.verdict == "undecided" else found
+        stability = margin.first_bounds()
+        return margin.is_stable() if stability.verdict == "undecided" else stability
 
     def reach(self, candidate: Candidate, most: int, least: int = -1) -> tuple[int, Stability | None]:
         """Return the highest certified rung from ``most`` down to above ``least``."""
         for rung in range(most, least, -1):
-            if (found := self.judge(candidate, rung)).verdict == "stable":
-                return rung, found
+            if (stability := self.judge(candidate, rung)).verdict == "stable":
+                return rung, stability
         return least, None
 
     def first(self) -> Reached:
@@ -293,7 +293,7 @@ class NetworkSearch:
         start = 0
         if self.wish.goal == "transmissions":
             period_ns = self._times.period_ns
-            start = max(i for i, one in enumerate(self.ladder) if one.period_ns <= period_ns)
+            start = max(i for i, rung in enumerate(self.ladder) if rung.period_ns <= period_ns)
         top, _ = self.climb(self.given, start)
         if top < start:
             top = next((i for i in range(start, -1, -1) if self.climb(self.given, i)[0] >= i), -1)
@@ -305,16 +305,16 @@ class NetworkSearch:
         A designed loop stays on a rung beyond which its cost would exceed the limit.
         """
         rung = most
-        found = None
-        while rung >= 0 and (found := self.judge(candidate, rung)).verdict != "stable":
-            rung, found = rung - 1, None
+        stability = None
+        while rung >= 0 and (stability := self.judge(candidate, rung)).verdict != "stable":
+            rung, stability = rung - 1, None
         beyond, limit = None, math.inf if candidate == self.given else self.limit
         while rung + 1 < len(self.ladder) and self.cost(candidate, rung + 1) <= limit:
             beyond = self.judge(candidate, rung + 1)
             if beyond.verdict != "stable":
                 break
-            rung, found, beyond = rung + 1, beyond, None
-        return Reached(candidate, rung, found, beyond, self.cost(candidate, rung))
+            rung, stability, beyond = rung + 1, beyond, None
+        return Reached(candidate, rung, stability, beyond, self.cost(candidate, rung))
 
     def regulators(self) -> list[Candidate]:
         """Return LQR gains of the model with all hold strategies."""
@@ -330,16 +330,16 @@ class NetworkSearch:
         starts = [Candidate(mode, given.candidate.K) for mode in self.wish.modes]
         starts += self.regulators()
         ranked = sorted(
-            ((*self.climb(one, max(rung, 0)), one) for one in starts),
+            ((*self.climb(start, max(rung, 0)), start) for start in starts),
             key=lambda entry: (-entry[0], entry[1]),
         )
         for top, _, candidate in ranked[:_STARTS]:
             if top > rung:
-                reached, found = self.reach(candidate, top, rung)
-                if found is not None:
+                reached, stability = self.reach(candidate, top, rung)
+                if stability is not None:
                     best, rung = candidate, reached
         progress(0.3)
-        pool = [best, *dict.fromkeys(one for _, _, one in ranked[:_STARTS])]
+        pool = [best, *dict.fromkeys(candidate for _, _, candidate in ranked[:_STARTS])]
         share = max(self.wish.effort // len(pool), 1)
         for number, start in enumerate(pool):
             candidate = start
@@ -352,8 +352,8 @@ class NetworkSearch:
                     break
                 candidate = improved
                 top, _ = self.climb(candidate, rung + 1)
-                reached, found = self.reach(candidate, max(top, rung + 1), rung)
-                if found is None:
+                reached, stability = self.reach(candidate, max(top, rung + 1), rung)
+                if stability is None:
                     break
                 best, rung = candidate, reached
             progress(0.3 + 0.6 * (number + 1) / len(pool))
@@ -414,32 +414,32 @@ def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> De
     """Return what is shown of a search."""
     ladder, wish = search.ladder, search.wish
 
-    def reach(one: Reached) -> str:
-        if one.rung < 0:
+    def reach(reached: Reached) -> str:
+        if reached.rung < 0:
             return "nothing proven"
-        return ladder[one.rung].name + (", the most examined" * (one.rung == len(ladder) - 1))
+        return ladder[reached.rung].name + (", the most examined" * (reached.rung == len(ladder) - 1))
 
-    def sent(one: Reached) -> float:
-        period_ns = ladder[max(one.rung, 0)].period_ns
+    def sent(reached: Reached) -> float:
+        period_ns = ladder[max(reached.rung, 0)].period_ns
         return search.scenario.timing.measurement_period_ns / period_ns
 
-    def cells(one: Reached) -> dict[str, str]:
-        found = one.found
+    def cells(reached: Reached) -> dict[str, str]:
+        proven = reached.stability
         return {
-            "proven stable for": reach(one),
-            "growth per period there": f"{found.lower:.5f} to {found.upper:.5f}" if found else NONE,
-            "the next one": _beyond(ladder, one),
-            "cost without losses": f"{one.cost:.4g}",
-            "share of measurements sent": f"{100 * sent(one):.3g} %",
-            "between updates": _HOLDS[one.candidate.mode],
-            "K": gain_text(one.candidate.K),
+            "proven stable for": reach(reached),
+            "growth per period there": f"{proven.lower:.5f} to {proven.upper:.5f}" if proven else NONE,
+            "the next one": _beyond(ladder, reached),
+            "cost without losses": f"{reached.cost:.4g}",
+            "share of measurements sent": f"{100 * sent(reached):.3g} %",
+            "between updates": _HOLDS[reached.candidate.mode],
+            "K": gain_text(reached.candidate.K),
         }
 
-    def entry(one: Reached) -> dict[str, object]:
-        certified = None if one.rung < 0 else ladder[one.rung].number
-        known = {"certified": certified, "cost": one.cost, "transmitted": sent(one)}
-        bounds = {"stability": _document(one.found), "beyond": _document(one.beyond)}
-        return {**known, **one.candidate._asdict(), **bounds}
+    def entry(reached: Reached) -> dict[str, object]:
+        certified = None if reached.rung < 0 else ladder[reached.rung].number
+        known = {"certified": certified, "cost": reached.cost, "transmitted": sent(reached)}
+        bounds = {"stability": _document(reached.stability), "beyond": _document(reached.beyond)}
+        return {**known, **reached.candidate._asdict(), **bounds}
 
     verdict = f"stable for every loss pattern: {reach(given)} before, {reach(best)} after"
     if best.candidate == given.candidate:
@@ -471,18 +471,18 @@ def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> De
     )
 
 
-def _beyond(ladder: Sequence[Rung], one: Reached) -> str:
-    if one.rung + 1 == len(ladder):
+def _beyond(ladder: Sequence[Rung], reached: Reached) -> str:
+    if reached.rung + 1 == len(ladder):
         return "not examined"
-    if one.beyond is None:
-        return f"{ladder[one.rung + 1].name}: costs too much"
-    destabilised = one.beyond.verdict == "destabilised"
-    what = f"{one.beyond.text} destabilises" if destabilised else "undecided"
-    return f"{ladder[one.rung + 1].name}: {what}"
+    if reached.beyond is None:
+        return f"{ladder[reached.rung + 1].name}: costs too much"
+    destabilised = reached.beyond.verdict == "destabilised"
+    result = f"{reached.beyond.text} destabilises" if destabilised else "undecided"
+    return f"{ladder[reached.rung + 1].name}: {result}"
 
 
-def _document(found: Stability | None) -> dict[str, object] | None:
-    return found and stability_document(found)
+def _document(stability: Stability | None) -> dict[str, object] | None:
+    return stability and stability_document(stability)
 
 
 def _figure(search: NetworkSearch, given: Reached, best: Reached) -> FigureDescription:
@@ -490,13 +490,13 @@ def _figure(search: NetworkSearch, given: Reached, best: Reached) -> FigureDescr
     ladder, wish = search.ladder, search.wish
     top = min(max(best.rung, given.rung) + 4, len(ladder))
     rungs = np.unique(np.linspace(0, top - 1, min(top, _MOST_POINTS)).astype(int))
-    numbers = np.array([one.number for one in ladder])
+    numbers = np.array([rung.number for rung in ladder])
     items: list[Item] = [Rule(at=1.0, colour=palette.CERTIFIED, label="stable below")]
-    for one, label, colour in ((given, "given", palette.NETWORK), (best, "designed", palette.LOST)):
-        growth = np.exp(np.minimum([search.growth(one.candidate, int(i)) for i in rungs], 1.1))
+    for reached, label, colour in ((given, "given", palette.NETWORK), (best, "designed", palette.LOST)):
+        growth = np.exp(np.minimum([search.growth(reached.candidate, int(i)) for i in rungs], 1.1))
         items.append(Line(x=numbers[rungs], y=growth, colour=colour, label=label, marker="o"))
-        if one.found is not None:
-            x, y = numbers[[one.rung]], np.array([one.found.upper])
+        if reached.stability is not None:
+            x, y = numbers[[reached.rung]], np.array([reached.stability.upper])
             about = f"{label}: proven"
             items.append(Marks(x=x, y=y, colour=colour, marker="*", size=12, label=about))
     along = "M" if wish.window is None else f"losses in {wish.window} updates"

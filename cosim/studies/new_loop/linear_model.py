@@ -108,12 +108,12 @@ class LinearModel:
         """Where A and B are from."""
         if self.plant.matrices is not None:
             return "the matrices of the scenario's plant, as drawn, not from those of its [model]"
-        way = {
+        source = {
             "derivative": "differences of the plant's derivative",
             "motion": f"the matrix logarithm of the plant's motion over {self.plant.step_ns * 1e-9:g} s",
             "exact": "the plant's own matrices",
         }[self.source]
-        return f"{way}, at x = {_shown(self.at)}, u = {_shown(self.input)}"
+        return f"{source}, at x = {_shown(self.at)}, u = {_shown(self.input)}"
 
     def _sentences(self) -> Iterator[str]:
         yield f"computed from {self.origin}"
@@ -220,24 +220,24 @@ def linearise(
     if not (np.isfinite(within) and within > 0):
         raise CallerError(f"within: {within:g}; give a positive number")
     sizes = (None if at is None else len(at), None if input is None else len(input))
-    found = plant_reference(plant, settings or {}, sizes)
-    x, u = vector("at", at, found.n, "states"), vector("input", input, found.m, "inputs")
-    place = {"at": x, "held": u, "step_ns": found.step_ns, "settling_s": found.system.settling_s}
+    reference = plant_reference(plant, settings or {}, sizes)
+    x, u = vector("at", at, reference.n, "states"), vector("input", input, reference.m, "inputs")
+    point = {"at": x, "held": u, "step_ns": reference.step_ns, "settling_s": reference.system.settling_s}
     with np.errstate(all="ignore"):
-        exact = found.matrices or found.system.linearisation()
+        exact = reference.matrices or reference.system.linearisation()
         if exact is None:
-            motion = linear_motion(found.at, found.n, found.m, **place)  # type: ignore[arg-type]
+            motion = linear_motion(reference.at, reference.n, reference.m, **point)  # type: ignore[arg-type]
         else:
             motion = LinearMotion(*exact, exact[0] @ x + exact[1] @ u, "motion")
     if motion.void is not None:
         raise CallerError(f"{plant}: no linear model: {motion.void}")
-    widths = () if found.matrices else (within, within / 10)
+    widths = () if reference.matrices else (within, within / 10)
     errors = tuple(
-        (width, largest_errors(found.at, motion, np.full(found.n + found.m, width), **place))  # type: ignore[arg-type]
+        (width, largest_errors(reference.at, motion, np.full(reference.n + reference.m, width), **point))  # type: ignore[arg-type]
         for width in widths
     )
     source = motion.source if exact is None else "exact"
-    return LinearModel(found, motion.A, motion.B, x, u, motion.drift, source, errors)
+    return LinearModel(reference, motion.A, motion.B, x, u, motion.drift, source, errors)
 
 
 def gain(
@@ -266,7 +266,7 @@ def gain(
         worst = eigenvalue_text(rest[:1])
         raise CallerError(f"{label}: no gain stabilises it: the eigenvalue {worst} /s is not controllable")
     if poles is None:
-        Q, R = (_diagonal(*one) for one in (("q", q, model.A), ("r", r, model.B.T)))
+        Q, R = (_diagonal(*weight) for weight in (("q", q, model.A), ("r", r, model.B.T)))
         K = _regulator(model, Q, R)
         method = f"linear-quadratic regulator, Q = {_diagonal_text(Q)}, R = {_diagonal_text(R)}"
     elif q is not None or r is not None:
@@ -345,8 +345,8 @@ def controllable_states(A: Matrix, B: Matrix) -> Matrix:
 
 def eigenvalues(matrix: Matrix) -> Complex:
     """Return the eigenvalues, the largest real part first."""
-    found = np.linalg.eigvals(matrix).astype(np.complex128)
-    return found[np.lexsort((found.imag, -found.real))]
+    values = np.linalg.eigvals(matrix).astype(np.complex128)
+    return values[np.lexsort((values.imag, -values.real))]
 
 
 def eigenvalue_text(values: Complex) -> str:
@@ -360,17 +360,17 @@ def eigenvalue_text(values: Complex) -> str:
     return ", ".join(shown)
 
 
-def vector(key: str, given: object, size: int, what: str) -> Vector:
+def vector(key: str, given: object, size: int, meaning: str) -> Vector:
     """Return a given vector, (size,); None is 0. Raise CallerError if it is not one."""
     try:
-        found = np.zeros(size) if given is None else np.array(given, dtype=np.float64)
+        values = np.zeros(size) if given is None else np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise CallerError(f"{key}: {given!r} is no list of numbers") from None
-    if found.shape != (size,):
-        raise CallerError(f"{key}: {found.size} numbers; the plant has {size} {what}")
-    if not np.isfinite(found).all():
-        raise CallerError(f"{key}: {found.tolist()} has entries that are not finite")
-    return found
+    if values.shape != (size,):
+        raise CallerError(f"{key}: {values.size} numbers; the plant has {size} {meaning}")
+    if not np.isfinite(values).all():
+        raise CallerError(f"{key}: {values.tolist()} has entries that are not finite")
+    return values
 
 
 def read_document(path: Path) -> dict[str, UserCode]:

@@ -86,11 +86,11 @@ class NewScenario:
 
     def to_json(self) -> Table:
         """Return the document of ``noack new --json``."""
-        found = self.certificate and self.certificate.to_json()
+        certificate = self.certificate and self.certificate.to_json()
         return self.gain.to_json() | {
             "toml": self.text,
             "notes": self.notes,
-            "certificate": found,
+            "certificate": certificate,
         }
 
     def __repr__(self) -> str:
@@ -129,13 +129,13 @@ def new(
     Raises:
         NoackError: the plant does not rest at x = 0, u = 0, or a value is wrong.
     """
-    found = model_or_gain(plant, settings or {}) if isinstance(plant, str) else plant
-    fixed = {key: one for key, one in (settings or {}).items() if not key.startswith("plant.system")}
+    plant_model = model_or_gain(plant, settings or {}) if isinstance(plant, str) else plant
+    fixed = {key: value for key, value in (settings or {}).items() if not key.startswith("plant.system")}
     given = fixed.pop("plant.initial_state", initial_state)
-    model = found.model if isinstance(found, LoopGain) else found
+    model = plant_model.model if isinstance(plant_model, LoopGain) else plant_model
     _require_rest(model)
     build = _Builder(model, Path(path), fixed)
-    best = build.search(list(_trials(found, _initial_state(model, given))), report)
+    best = build.search(list(_trials(plant_model, _initial_state(model, given))), report)
     report("simulating")
     for _ in range(_FEWEST):
         if (returns := build.returns(best)) or given is not None:
@@ -156,7 +156,7 @@ def _require_rest(model: LinearModel) -> None:
             "plant subtract this point, and linearise it at 0"
         )
     if not model.rests:
-        drift = ", ".join(f"{one:.4g}" for one in model.drift)
+        drift = ", ".join(f"{entry:.4g}" for entry in model.drift)
         raise CallerError(
             f"{label}: a scenario needs an equilibrium; at the point ẋ is ({drift}). "
             "`noack linearise` shows where the linear model rests"
@@ -173,20 +173,20 @@ def _initial_state(model: LinearModel, given: object) -> Vector:
     return np.where(is_rate, 0.0, _START) if not all(is_rate) else np.full(n, _START)
 
 
-def _trials(found: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
+def _trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
     """Yield what is tried, the preferred settings first."""
-    gains = [found] if isinstance(found, LoopGain) else [gain(found, r=weight) for weight in _INPUT_WEIGHTS]
-    for one in gains:
-        fastest = max((size for size in np.abs(one.eigenvalues) if size < _FASTEST_PER_S), default=1)
+    gains = [model] if isinstance(model, LoopGain) else [gain(model, r=weight) for weight in _INPUT_WEIGHTS]
+    for loop_gain in gains:
+        fastest = max((size for size in np.abs(loop_gain.eigenvalues) if size < _FASTEST_PER_S), default=1)
         wanted = _STEPS_PER_TIME_CONSTANT * fastest
         base = next((rate for rate in _RATES_HZ if rate >= wanted), _RATES_HZ[-1])
-        base = one.model.plant.rates.get("rate_hz", base)
-        is_fixed = one.model.plant.system.has_own_step
+        base = loop_gain.model.plant.rates.get("rate_hz", base)
+        is_fixed = loop_gain.model.plant.system.has_own_step
         for rate in (base,) if is_fixed else (base, 2 * base):
             for mansd in range(MANSD, 0, -1):
                 for share in (ALPHA_SHARE, ALPHA_SHARE / 2):
-                    alpha = rounded(min(share * one.decay_per_s, _FASTEST_ALPHA_PER_S))
-                    yield _Trial(one, rate, mansd, alpha, x0)
+                    alpha = rounded(min(share * loop_gain.decay_per_s, _FASTEST_ALPHA_PER_S))
+                    yield _Trial(loop_gain, rate, mansd, alpha, x0)
 
 
 class _Builder:
@@ -252,7 +252,7 @@ class _Builder:
             for key, value in (("operating_state", model.at), ("operating_input", model.input)):
                 if value.any():
                     table[key] = (value + np.array(getattr(system, key) or 0.0)).tolist()
-        return {key: one for key, one in table.items() if one not in ({}, [])}
+        return {key: value for key, value in table.items() if value not in ({}, [])}
 
     def scenario(self, trial: _Trial) -> Scenario:
         """Return the loaded scenario."""
@@ -263,29 +263,29 @@ class _Builder:
         resolved = with_linear_plant(resolve(self.scenario(trial)))
         resolved.coverage.require_certifiable()
         conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
-        found = own_plant(resolved).certificate(conditions)
-        if found.constants is not None:
-            return found, found.constants.loop_gain
-        return found, own_plant(resolved).loop_gain(conditions)
+        certificate = own_plant(resolved).certificate(conditions)
+        if certificate.constants is not None:
+            return certificate, certificate.constants.loop_gain
+        return certificate, own_plant(resolved).loop_gain(conditions)
 
     def search(self, trials: Sequence[_Trial], report: Callable[[str], None]) -> _Trial:
         """Return the trial that is used."""
         certified: list[tuple[float, _Trial]] = []
         closest, known = (math.inf, trials[0]), set[str]()
-        for place, trial in enumerate(trials):
-            report(f"certifying: {place + 1} of {len(trials)}")
+        for number, trial in enumerate(trials):
+            report(f"certifying: {number + 1} of {len(trials)}")
             if (content := str(self.content(trial))) in known:  # the given settings exclude it
                 continue
             known.add(content)
-            found, loop_gain = self.certified(trial)
-            if found.constants is None:
-                closest = min(closest, (loop_gain, trial), key=lambda one: one[0])
+            certificate, loop_gain = self.certified(trial)
+            if certificate.constants is None:
+                closest = min(closest, (loop_gain, trial), key=lambda entry: entry[0])
                 continue
-            certified.append((found.constants.state / (norm(trial.x0) or 1.0), trial))
+            certified.append((certificate.constants.state / (norm(trial.x0) or 1.0), trial))
             if certified[-1][0] <= _LOOSE:
                 return trial
         if certified:
-            return min(certified, key=lambda one: one[0])[1]
+            return min(certified, key=lambda entry: entry[0])[1]
         report("choosing a norm")
         weighted = self._weighted(closest[1]) if math.isfinite(closest[0]) else None
         return trials[0] if weighted is None else weighted
@@ -327,7 +327,7 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
             "linear plant, and is checked against its certificate. Largest relative error of the "
             f"linear model, sampled: {errors}."
         )
-    start = ", ".join(f"{one:.3g}" for one in trial.x0)
+    start = ", ".join(f"{entry:.3g}" for entry in trial.x0)
     end = "returns to 0" if returns else "does not return to 0"
     yield f"Simulated from x(0) = ({start}), the loop {end}."
 

@@ -147,8 +147,8 @@ def _rate(key: str, value: object) -> float:
 def _classes(path: Path) -> str:
     with suppress(OSError, SyntaxError, ValueError):
         statements = ast.parse(path.read_bytes()).body
-        if found := [one.name for one in statements if isinstance(one, ast.ClassDef)]:
-            return "write " + " or ".join(f"{path}:{name}" for name in found)
+        if names := [statement.name for statement in statements if isinstance(statement, ast.ClassDef)]:
+            return "write " + " or ".join(f"{path}:{name}" for name in names)
     return f"write {path}:Class"
 
 

@@ -94,16 +94,16 @@ def evidence(scenario: Scenario, draws: int, representative: int) -> Numbers:
 
 def _eigenvalues() -> Numbers:
     """Return the numbers of the example as printed, and with the other sign of U."""
-    found: Numbers = {}
+    values: Numbers = {}
     for name, speed in (("printed", -12.0), ("flipped", 12.0)):
         model = lane_following(speed=speed)
         eigenvalues = np.linalg.eigvals(model.A + model.B @ model.K)
-        found[name] = sorted([value.real, value.imag] for value in eigenvalues.tolist())
+        values[name] = sorted([value.real, value.imag] for value in eigenvalues.tolist())
     A = lane_following().A
-    found["open"] = sorted(open_loop_eigenvalues(A).real.tolist())
-    found["rank"] = int(np.linalg.matrix_rank(A))
-    found["rank_squared"] = int(np.linalg.matrix_rank(A @ A))
-    return found
+    values["open"] = sorted(open_loop_eigenvalues(A).real.tolist())
+    values["rank"] = int(np.linalg.matrix_rank(A))
+    values["rank_squared"] = int(np.linalg.matrix_rank(A @ A))
+    return values
 
 
 def _plants(scenario: Scenario, draws: int) -> Numbers:
@@ -122,16 +122,16 @@ def _plants(scenario: Scenario, draws: int) -> Numbers:
 
 def _growth(scenario: Scenario, draws: int) -> Numbers:
     """Return the number of stretches between deliveries, and in how many of them ‖x‖ grows."""
-    found: Numbers = {"draws": draws}
+    growth: Numbers = {"draws": draws}
     for mode in MODES:
         runs = [run_continuous(resolved_draw(scenario, draw, mode)) for draw in range(draws)]
         norms = [np.linalg.norm([state.x for state in run.before], axis=1) for run in runs]
         rises = [np.diff(n[run.delivered]) > 0 for n, run in zip(norms, runs, strict=True)]
-        found[mode] = {
+        growth[mode] = {
             "stretches": sum(map(len, rises)),
-            "growing": sum(int(one.sum()) for one in rises),
+            "growing": sum(int(rise.sum()) for rise in rises),
         }
-    return found
+    return growth
 
 
 def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
@@ -181,16 +181,16 @@ def _theorem_2(resolved: Scenario, constants: Constants) -> list[dict[str, float
     ``negative`` is 1 if F̄ < 0, so that eq:tau falls with t_i. Without the theorem there is no row.
     """
     trigger = resolved.decaying
-    found = theorem_2(loop_of(resolved), trigger.beta, trigger.alpha_per_s, constants.delta)
-    if found is None:
+    theorem = theorem_2(loop_of(resolved), trigger.beta, trigger.alpha_per_s, constants.delta)
+    if theorem is None:
         return []
-    start = found.a_tilde * (found.state_start - found.state_forced)  # F̄
-    gap = found.alpha_bar_per_s - trigger.alpha_per_s
-    forced = (gap / found.c + found.a_tilde) * found.state_forced  # F
-    rate = found.a_hat + found.alpha_bar_per_s
-    F = start / rate + forced / (found.a_hat + trigger.alpha_per_s)
+    start = theorem.a_tilde * (theorem.state_start - theorem.state_forced)  # F̄
+    gap = theorem.alpha_bar_per_s - trigger.alpha_per_s
+    forced = (gap / theorem.c + theorem.a_tilde) * theorem.state_forced  # F
+    rate = theorem.a_hat + theorem.alpha_bar_per_s
+    F = start / rate + forced / (theorem.a_hat + trigger.alpha_per_s)
     first_s = math.log1p(trigger.beta / F) / rate if F > 0 else math.inf
-    return [{"inter_event_s": found.inter_event_s, "first_s": first_s, "negative": int(start < 0)}]
+    return [{"inter_event_s": theorem.inter_event_s, "first_s": first_s, "negative": int(start < 0)}]
 
 
 def _loss(M: int) -> Numbers:
@@ -327,15 +327,15 @@ def _overshoot(scenario: Scenario, representative: int) -> dict[str, list[float]
     """Return sup ‖x‖ / ‖x(0)‖ for a sequence of decreasing x(0)."""
     scales = (1.0, 1e-2, 1e-4)
     scenario = scenario.model_copy(update={"horizon_s": 100.0})
-    found: dict[str, list[float]] = {"scales": list(scales), "model": [], "zoh": []}
+    overshoots: dict[str, list[float]] = {"scales": list(scales), "model": [], "zoh": []}
     for mode, scale in itertools.product(MODES, scales):
         resolved = resolved_draw(scenario, representative, mode)
         start = tuple(scale * value for value in resolved.plant.initial_state)
         plant = resolved.plant.model_copy(update={"initial_state": start})
         run = run_continuous(resolved.model_copy(update={"plant": plant}))
         norms = np.linalg.norm(run.at(np.linspace(0, run.reached_s, 2001)).x, axis=1)
-        found[mode].append(float(norms.max() / norms[0]))
-    return found
+        overshoots[mode].append(float(norms.max() / norms[0]))
+    return overshoots
 
 
 def _theorem_1(scenario: Scenario, representative: int) -> Numbers:

@@ -77,33 +77,33 @@ def write_page(done: FinishedCampaign, folder: Path) -> tuple[Document, list[Pat
     Raises:
         MachineError: they cannot be written.
     """
-    found, inner = numbers(done), make_folder(folder)
-    draw, scenario = found["representative"], _base(done)
-    described = {one.name: one for one in figures(done.summary, done.store)}
+    document, inner = numbers(done), make_folder(folder)
+    draw, scenario = document["representative"], _base(done)
+    described = {figure.name: figure for figure in figures(done.summary, done.store)}
     described |= {
         policy.lower(): draw_figure(scenario, draw, mode)
         for policy, mode in zip(POLICIES, MODES, strict=True)
     }
     written = [
-        write_whole(folder / "paper.md", render(found)),
-        write_whole(inner / "paper.json", json.dumps(found, indent=1, ensure_ascii=False) + "\n"),
+        write_whole(folder / "paper.md", render(document)),
+        write_whole(inner / "paper.json", json.dumps(document, indent=1, ensure_ascii=False) + "\n"),
         write_whole(inner / "paper-draw.toml", dumps(resolved_draw(scenario, draw, "model"))),
     ]
     for name, figure in described.items():
         written.append(inner / f"paper-{name}.svg")
         save_figure(figure, written[-1])
-    return found, written
+    return document, written
 
 
 def numbers(done: FinishedCampaign) -> Document:
     """Return the content of ``paper.json``: rounded, null for infinity."""
     draws, draw = done.summary.draws, _representative(done)
-    found = {
+    document = {
         "representative": draw,
         "evidence": evidence(_base(done), draws, draw),
         "summary": done.summary.document(),
     }
-    rounded: Document = _rounded(found)
+    rounded: Document = _rounded(document)
     return rounded
 
 
@@ -117,7 +117,7 @@ def _representative(done: FinishedCampaign) -> int:
     Distance is the sum of squares of (value − median) / (upper − lower quartile).
     """
     distance = np.zeros(done.summary.draws)
-    for point in (one for one in done.store.points if one.labels["variation"] == BASE):
+    for point in (drawn for drawn in done.store.points if drawn.labels["variation"] == BASE):
         metrics, _ = runs_at(point, done.store)
         for name in _REPRESENTED:
             low, middle, high = quartiles(metrics[name])
@@ -156,11 +156,11 @@ def draw_figure(scenario: Scenario, draw: int, mode: str) -> FigureDescription:
     return states_figure(resolved.mode, f"draw {draw}", states, sent)
 
 
-def render(found: Document) -> str:
+def render(document: Document) -> str:
     """Return the page in Markdown, from the content of ``paper.json``."""
-    summary = found["summary"]
-    point = {tuple(one["axes"].values()): one["metrics"] for one in summary["points"]}
-    apart = {one["axes"]["variation"]: one["metrics"] for one in summary["differences"]}
+    summary = document["summary"]
+    point = {tuple(point["axes"].values()): point["metrics"] for point in summary["points"]}
+    apart = {difference["axes"]["variation"]: difference["metrics"] for difference in summary["differences"]}
     templates = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         undefined=StrictUndefined,
@@ -172,7 +172,7 @@ def render(found: Document) -> str:
     return _wrapped(
         templates.get_template("paper.md.jinja").render(
             draws=summary["draws"],
-            representative=found["representative"],
+            representative=document["representative"],
             confirmed_from=CONFIRMED_FROM,
             partly_from=PARTLY_FROM,
             claims=summary["claims"],
@@ -181,7 +181,7 @@ def render(found: Document) -> str:
             apart=apart[BASE],
             compared=list(_compared(point, apart[BASE])),
             varied=list(_varied(point, apart)),
-            **found["evidence"],
+            **document["evidence"],
         )
     )
 

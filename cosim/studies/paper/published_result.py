@@ -94,13 +94,13 @@ class Reproduction(NamedTuple):
         return {"name": self.name, **known, "rows": rows, "notes": list(self.result.notes)}
 
 
-def print_rows(console: "Console", found: Reproduction) -> None:
+def print_rows(console: "Console", reproduction: Reproduction) -> None:
     """Print published against computed, and what is to be known about it."""
-    console.print(terminal_table(found.table, left=range(3), styles=_STYLES, dense=True))
-    for remark in found.remarks():
+    console.print(terminal_table(reproduction.table, left=range(3), styles=_STYLES, dense=True))
+    for remark in reproduction.remarks():
         console.print(remark, markup=False, highlight=False)
-    verdict = f"{sum(row.agrees for row in found.rows)} of {len(found.rows)} reproduced"
-    console.print(verdict, style="bold" if found.as_expected else "bold red", highlight=False)
+    verdict = f"{sum(row.agrees for row in reproduction.rows)} of {len(reproduction.rows)} reproduced"
+    console.print(verdict, style="bold" if reproduction.as_expected else "bold red", highlight=False)
 
 
 def number(quantity: str, where: str, published: float, computed: float, how: str, *, digits: int) -> Row:

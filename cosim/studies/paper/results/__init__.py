@@ -24,8 +24,8 @@ def named(name: str) -> "PublishedResult":
     if name not in NAMES:
         near = did_you_mean(name, NAMES) or f"there are {', '.join(NAMES)}"
         raise CallerError(f"{name}: no published result of this name; {near}")
-    found: PublishedResult = import_module(f"{__name__}.{name}").RESULT
-    return found
+    result: PublishedResult = import_module(f"{__name__}.{name}").RESULT
+    return result
 
 
 def reproduce(name: str) -> "Reproduction":

@@ -50,8 +50,8 @@ def _rows() -> list[Row]:
     loop = shipped_loop("reactor_petc")
     states = np.vstack([directions(2000, 4), *(_latest(loop, k)[1] for k in range(1, 5))])
     periods = _periods(loop, states)
-    found = set(periods.tolist())
-    complete = found == _REGIONS and _latest(loop, 5)[0] > 0
+    proven = set(periods.tolist())
+    complete = proven == _REGIONS and _latest(loop, 5)[0] > 0
     following = set(_periods(loop, states[periods == 1] @ _held(loop, 1).T).tolist())
     forms = stored("batch_reactor")["region_2"].values()
     stays, leaves = (np.einsum("ki,ij,kj->k", states, form, states) for form in forms)
@@ -59,7 +59,7 @@ def _rows() -> list[Row]:
     counts, same = (f"{inside.sum()}", f"{two.sum()}"), bool((inside == two).all())
     few, after_one = following <= _AFTER_ONE, (_listed(_AFTER_ONE), _listed(following))
     return [
-        Row("intervals, periods", _WHERE, "=", _listed(_REGIONS), _listed(found), _HOW, complete),
+        Row("intervals, periods", _WHERE, "=", _listed(_REGIONS), _listed(proven), _HOW, complete),
         Row("intervals after one of 1 period", _WHERE, "among", *after_one, _HOW, few),
         Row("states whose interval is 2 periods", _WHERE, "=", *counts, _HOW, same),
     ]

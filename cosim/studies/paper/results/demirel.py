@@ -54,7 +54,7 @@ class Loop(NamedTuple):
         noise = plant @ self.W @ plant.T + sensor @ self.V @ sensor.T
         copy = np.eye(3 * n)
         copy[2 * n :] = copy[n : 2 * n]
-        steps = [(copy @ free, copy @ noise @ copy.T) if one else (free, noise) for one in sent]
+        steps = [(copy @ free, copy @ noise @ copy.T) if is_sent else (free, noise) for is_sent in sent]
         period, added = np.eye(3 * n), np.zeros((3 * n, 3 * n))
         for step, drive in steps:
             period, added = step @ period, step @ added @ step.T + drive
@@ -74,24 +74,24 @@ def loops(seed: int = 20, n: int = 2, count: int = 3) -> list[Loop]:
         drawn = random.rand(size, size)
         return np.asarray((drawn + drawn.T) / 2 + size * np.eye(size))
 
-    found: list[Loop] = []
-    while len(found) < count:
+    loops: list[Loop] = []
+    while len(loops) < count:
         A = random.rand(n, n)
         while np.linalg.eigvals(A).real.max() < 1:
             A = random.rand(n, n)
         B, C = random.rand(n, 1), random.rand(1, n)
-        found.append(Loop(A, B, C, positive(n), positive(1), positive(n), positive(1)))
-    return found
+        loops.append(Loop(A, B, C, positive(n), positive(1), positive(n), positive(1)))
+    return loops
 
 
 def _rows() -> list[Row]:
-    drawn, found = list(zip("123", loops(), strict=True)), []
+    drawn, rows = list(zip("123", loops(), strict=True)), []
     for schedule, published in stored("demirel")["losses"].items():
         turns = schedule.split(",")
         total = sum(loop.loss([turn == own for turn in turns]) for own, loop in drawn)
         row = number(f"loss of {', '.join(turns)}", _WHERE, float(published), total, _HOW, digits=4)
-        found.append(row._replace(deviation=_DEVIATION if len(turns) == 7 else ""))
-    return found
+        rows.append(row._replace(deviation=_DEVIATION if len(turns) == 7 else ""))
+    return rows
 
 
 RESULT = PublishedResult(

@@ -19,23 +19,23 @@ _HOW = "by noack margin's enclosures: a cycle from below, invariant polytopes fr
 
 def edges() -> list[Edge]:
     """Return the system: either gain may fail, not twice in succession; both only after success."""
-    found = []
+    edges = []
     for text in map(str, _EDGES):
         source, target, mode = map(int, text)
         matrix = np.array(_A) + np.array(_B) * (np.array(_K) * _WORKS[mode])
-        found.append(Edge(source, target, exactly(matrix)))
-    return found
+        edges.append(Edge(source, target, exactly(matrix)))
+    return edges
 
 
 def _rows() -> list[Row]:
-    found = joint_spectral_radius(edges(), accuracy=1e-11)
-    modes = [_EDGES[number] % 10 for number in found.cycle]
+    radius = joint_spectral_radius(edges(), accuracy=1e-11)
+    modes = [_EDGES[number] % 10 for number in radius.cycle]
     rotated = [tuple(modes[i:] + modes[:i]) for i in range(len(modes))]
     shown = _CYCLE if _CYCLE in rotated else rotated[0]
     published, computed = (",".join(map(str, cycle)) for cycle in (_CYCLE, shown))
     return [
-        number("growth, lower bound", _WHERE, _RADIUS, found.lower, _HOW, digits=12),
-        number("growth, upper bound", _WHERE, _RADIUS, found.upper, _HOW, digits=10),
+        number("growth, lower bound", _WHERE, _RADIUS, radius.lower, _HOW, digits=12),
+        number("growth, upper bound", _WHERE, _RADIUS, radius.upper, _HOW, digits=10),
         Row("its modes", _WHERE, "=", published, computed, _HOW, _CYCLE in rotated),
     ]
 

@@ -123,22 +123,22 @@ INEQUALITIES = {
 
 
 def _rows() -> list[Row]:
-    found, solved = [], stored("selivanov_fridman")
+    rows, solved = [], stored("selivanov_fridman")
     for statement, (inequalities, h, epsilon, waits) in INEQUALITIES.items():
         parts = inequalities(solved[statement], h, epsilon, waits=waits)
         margin = min(map(smallest_eigenvalue, parts))
-        what = f"{statement}, h = {h}, ε = {epsilon}"
-        found.append(Row(what, _WHERE, ">", "0", f"{margin:.1e}", _LMI, margin > _MARGIN))
+        quantity = f"{statement}, h = {h}, ε = {epsilon}"
+        rows.append(Row(quantity, _WHERE, ">", "0", f"{margin:.1e}", _LMI, margin > _MARGIN))
     loops = (("switching", "Theorem 1", _switching()), ("periodic", "Remark 1", _periodic()))
     means = []
     for name, statement, loop in loops:
         grown, mean = _run(loop, solved[statement]["P"], directions(100, 2))
         means.append(mean)
-        what, where = f"growth of V, {name}", f"follows from {statement}"
-        found.append(Row(what, where, "≤", "1", f"{grown:.3f}", _RUN, grown <= 1))
+        quantity, where = f"growth of V, {name}", f"follows from {statement}"
+        rows.append(Row(quantity, where, "≤", "1", f"{grown:.3f}", _RUN, grown <= 1))
     share = means[0] / means[1]
-    what, how = "transmissions, switching / periodic", _SENT.format(*means)
-    return [*found, Row(what, "abstract", "<", "1", f"{share:.3f}", how, share < 1)]
+    quantity, how = "transmissions, switching / periodic", _SENT.format(*means)
+    return [*rows, Row(quantity, "abstract", "<", "1", f"{share:.3f}", how, share < 1)]
 
 
 def _switching() -> ContinuousLoop:
@@ -165,7 +165,7 @@ def _run(loop: ContinuousLoop, P: Matrix, x0: Matrix) -> tuple[float, float]:
     happened = ~np.isnan(log.event_s)
     x, t_s = log.states[:, :, 0][happened], log.event_s[happened]
     starts = np.repeat(x0, happened.sum(axis=1), axis=0)
-    energies, at_start = (np.einsum("ki,ij,kj->k", one, P, one) for one in (x, starts))
+    energies, at_start = (np.einsum("ki,ij,kj->k", states, P, states) for states in (x, starts))
     grown = energies * np.exp(2 * DELTA * t_s) / at_start
     return float(grown.max()), 1 + len(t_s) / len(x0)
 

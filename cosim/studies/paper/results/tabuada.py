@@ -17,12 +17,12 @@ def bound_s(loop: ContinuousLoop, sigma: float) -> float:
     """Return τ: φ(τ) = σ, φ̇ = a + (a+b)φ + bφ², φ(0) = 0, a = ‖A+BK‖, b = ‖BK‖."""
     BK = loop.loop.B @ loop.loop.K
     a, b = np.linalg.norm(loop.loop.A + BK, 2), np.linalg.norm(BK, 2)
-    found, _ = quad(lambda phi: 1 / (a + (a + b) * phi + b * phi**2), 0.0, sigma)
-    return float(found)
+    bound, _ = quad(lambda phi: 1 / (a + (a + b) * phi + b * phi**2), 0.0, sigma)
+    return float(bound)
 
 
 def _rows() -> list[Row]:
-    found = []
+    rows = []
     for sigma in _SIGMAS:
         trigger = f'trigger={{policy="relative", sigma={sigma}}}'
         loop = shipped_loop("tabuada_dynamic", [trigger])
@@ -31,8 +31,8 @@ def _rows() -> list[Row]:
         least_s = bound_s(loop, sigma)
         agrees = least_s <= shortest_s <= _CLOSE * least_s
         texts = f"{1e3 * least_s:.3f} ms", f"{1e3 * shortest_s:.3f} ms"
-        found.append(Row(f"shortest interval, σ = {sigma:g}", _WHERE, "≥", *texts, _HOW, agrees))
-    return found
+        rows.append(Row(f"shortest interval, σ = {sigma:g}", _WHERE, "≥", *texts, _HOW, agrees))
+    return rows
 
 
 RESULT = PublishedResult(

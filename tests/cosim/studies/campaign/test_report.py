@@ -95,10 +95,10 @@ def test_metrics_without_a_value_and_of_failed_runs_are_infinite(failure: int) -
 def test_a_summary_covers_all_draws_and_pairs_them(full: Store, campaign: Few) -> None:
     summary = summarise(campaign[0], full)
     rows = [point.work.run(range(7)) for point in campaign[1]]
-    for found, row in zip(summary.found, rows, strict=True):
+    for found, row in zip(summary.results, rows, strict=True):
         assert found.estimates["cost"].mean == pytest.approx(row["cost"].mean(), rel=1e-12)
         assert found.ended == {"finished": 7}
-    assert ["certificate_used" in found.estimates for found in summary.found] == [
+    assert ["certificate_used" in found.estimates for found in summary.results] == [
         True, True, False, False
     ]  # fmt: skip
     assert summary.breaches == 0

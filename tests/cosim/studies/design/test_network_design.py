@@ -100,13 +100,13 @@ def growths(scenario: Scenario, guarantee: LossGuarantee, length: int) -> dict[s
 
 def test_no_pattern_grows_faster_than_certified(pole: Found) -> None:
     best, search = pole.best, pole.search
-    assert best.found is not None
+    assert best.stability is not None
     assert best.rung > pole.given.rung
     guarantee = pole.shown.scenario.network.guarantee
     found = growths(pole.shown.scenario, guarantee, 10)
     assert len(found) > 500
-    assert max(found.values()) <= best.found.upper < 1
-    assert max(found.values()) >= best.found.lower * (1 - 1e-3)  # its pattern is longer
+    assert max(found.values()) <= best.stability.upper < 1
+    assert max(found.values()) >= best.stability.lower * (1 - 1e-3)  # its pattern is longer
     # The given gain, with the same claim, is found out.
     broken = search.scenario_of(pole.given.candidate, best.rung)
     assert max(growths(broken, guarantee, 10).values()) > 1
@@ -127,7 +127,7 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
         run = simulate(resolved, lambda data, now_ns: 0 if pattern[next(numbers) % len(pattern)] else None)
         return float(np.linalg.norm(run["plant_step"]["x"][-1]))
 
-    kept = pole.best.found
+    kept = pole.best.stability
     assert kept is not None
     assert final(kept.pattern) < 1e-3
     assert final((True, False, False, True, False)) < 1e-3
@@ -152,7 +152,7 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
     assert best.rung >= given.rung
     assert best.cost <= found.search.limit or best == given
     if best.rung >= 0:
-        assert best.found is not None
+        assert best.stability is not None
         assert LossMargin(resolve(found.shown.scenario)).is_stable().upper < 1
         slower = growths(found.shown.scenario, found.shown.scenario.network.guarantee, 6)
         assert max(slower.values()) < 1
