@@ -3,7 +3,7 @@
 import re
 import shlex
 import subprocess
-import sys
+from contextlib import chdir
 from pathlib import Path
 
 from tests.command_line import invoke
@@ -44,10 +44,10 @@ def fill(folder: Path) -> Path:
         if (named := re.match(r"# (\w+\.(?:py|toml))\n", code)) is not None:
             (folder / named[1]).write_text(code)
         elif code.startswith("import control"):  # this snippet writes the matrices file
-            subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
-    simulate = ("simulate", "lane_following", "--set", "horizon_s=2", "--no-report")
-    result = invoke(*simulate, "--runs", folder / "runs")
-    assert result.exit_code == 0, result.stderr
+            with chdir(folder):
+                exec(compile(code, "snippet", "exec"), {"__name__": "__main__"})
+    run = invoke("simulate", "lane_following", "--set=horizon_s=2", "--no-report", "--runs", folder / "runs")
+    assert run.exit_code == 0, run.stderr
     for name in ("model", "hold"):  # two runs for `compare`, as commands run in any order
         (folder / "runs" / name).mkdir()
         (folder / "runs" / name / "latest").symlink_to((folder / "runs/latest").resolve())

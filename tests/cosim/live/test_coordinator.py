@@ -194,7 +194,6 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
 # --- other hosts ----------------------------------------------------------------------------------
 
 ROBOT = '[controller]\nssh = "robot"\n'
-UNREACHABLE = "not an address at which other hosts can reach this one"
 
 
 def test_a_run_listens_at_addresses_that_others_can_reach() -> None:

@@ -1,24 +1,22 @@
 """``noack certify``: its text and JSON output, and the figures quoted in the documentation."""
 
-import json
 import re
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 from scipy.linalg import expm
 
-from cosim.analysis.certificates import Certificates, certificates_of, in_chosen_norm, with_weight
+from cosim.analysis.certificates import Certificates, certificates_of, with_weight
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.output.certificate_report import print_certificates
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.impairments.loss_guarantee import LossHistory
 from noack.scenario.resolution import loop_of
-from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import most_events
@@ -237,23 +235,14 @@ def test_a_loop_without_any_certificate_has_the_reasons(words: list[str], reason
     assert "largest certified value" not in result.stdout
 
 
-def test_a_norm_with_certificates_is_found_and_can_be_pasted(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_norm_with_certificates_is_found_and_can_be_pasted(monkeypatch: pytest.MonkeyPatch) -> None:
     """At 62.5 Hz the lane has no certificate in the paper's norm."""
-    slow = ("plant.rate_hz=62.5", "controller.rate_hz=62.5")
-    found: list[Certificates] = []
-
-    def kept(loaded: Scenario, given: Certificates, _: object) -> Certificates | None:
-        chosen = in_chosen_norm(loaded, given)
-        found.extend(one for one in (given, chosen) if one is not None)
-        return chosen
-
-    monkeypatch.setattr("cosim.analysis.certificates.in_chosen_norm", kept)
-    words = ["certify", "lane_following", *(f"--set={one}" for one in slow), "--json"]
-    document = json.loads(invoke(*words).stdout)
-    print_certificates(Console(file=(out := StringIO()), width=100), *found)
-    shown = out.getvalue()
+    slow, shows = ("plant.rate_hz=62.5", "controller.rate_hz=62.5"), list[Any]()
+    monkeypatch.setattr("cosim.cli.command.show", lambda *given: shows.append(given))
+    invoke("certify", "lane_following", *(f"--set={one}" for one in slow))
+    ((_, to_json, print_text, *found),) = shows
+    print_text(Console(file=(out := StringIO()), width=100), *found)
+    shown, document = out.getvalue(), to_json()
     pasted = shown[shown.index("\nweight = [") :].splitlines()[1:]
     rows = "".join(line.strip() for line in pasted)
     weighted = certificates_of(shipped("lane_following", *slow, f"trigger.{rows}"))

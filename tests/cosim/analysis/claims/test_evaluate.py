@@ -31,6 +31,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import MS, Make, event_s, without
 from tests.cosim.record.changed_records import changed
+from tests.cosim.record.test_recorded_changes import CONTENT as CHANGING
 from tests.oracles.random_scenarios import POLICIES, random_scenario
 from tests.shipped import resolved
 
@@ -241,17 +242,9 @@ def test_a_claim_is_not_held_where_the_record_has_no_rows(run: RunRecord) -> Non
 # --- parts of runs: before and after changes of parameters, and up to a common stop ---------------
 
 
-CONTENT: dict[str, Any] = {
-    "name": "changing",
+CONTENT: dict[str, Any] = CHANGING | {
     "horizon_s": 6.0,
-    "model": {"name": "double_integrator"},
-    "plant": {
-        "initial_state": [1.0, 0.0],
-        "rate_hz": 100.0,
-        "draw": "uniform",
-        "uncertainty_A": [[0.0, 0.0], [0.0, 0.1]],
-    },
-    "controller": {"rate_hz": 100.0},
+    "plant": CHANGING["plant"] | {"uncertainty_A": [[0.0, 0.0], [0.0, 0.1]]},
     "trigger": {"beta": 0.05, "alpha_per_s": 0.2},
     "network": {"mansd": 1, "loss": {"model": "bernoulli", "probability": 0.3}},
 }

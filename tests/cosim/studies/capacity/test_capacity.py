@@ -27,8 +27,6 @@ PERIOD_S = 0.1
 BITS = 8 * (28 + 64)
 """Bits of an update of two states on the link: UDP and IPv4, and the datagram of docs/wire.md."""
 SHORT = ("--set", "horizon_s=1.0", "--set", "plant.rate_hz=50", "--set", "controller.rate_hz=50")
-
-
 LOOP = "loops=[{ name = 'loop' }]"
 
 
