@@ -9,8 +9,7 @@ bound. Each bound that becomes smaller is inserted into all others.
 
 The inequalities have one bound of e_s in each row, so that they stay linear. Inserted bounds need not:
 for each error and output the smallest of all bounds of e_s counts, and where e_s may have grown in
-two ways, from a test or from an event, the larger one of them. What entered before the i-th missing
-event is bounded by π_i, the bound of ‖p‖ while at most i events are missing.
+two ways, from a test or from an event, the larger one of them. Besides, e_c is followed in open loop.
 
 **The next event.** After an event e_s begins at 0. If updates act at once and no input is held, it
 is C_r z(t_k) after r, C_r = (0, I) e^{Fr} − e^{(H+αI)r} (0, I), as long as no update is received.
@@ -21,8 +20,9 @@ time.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -42,7 +42,7 @@ from noack.theory.certificates.delivery_flow import (
     error_after,
     errors_after_losses,
 )
-from noack.theory.certificates.inequalities import MOST_STAGES, BoundMethod, ErrorInequalities, LoopConstants
+from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
 
 _ROUNDS, _SETTLED = 20, 0.99
@@ -226,93 +226,66 @@ def _next_event_s(at_events: Reach, level: float, known_s: float, bend: float) -
     return found_s
 
 
-class _ErrorsByNumber:
+Growths = Sequence[Sequence[ErrorGrowth]]
+"""How e_s may grow under each bound of it. All bounds hold, and of each one growth applies."""
+
+
+def _smallest(values: Matrix, growths: Growths) -> Matrix:
+    """Return the smallest over all bounds of e_s of the largest over its growths, (o, g, …) → (o, …)."""
+    ends = np.cumsum([0, *map(len, growths)])
+    rows = [values[:, a:b].max(axis=1) for a, b in pairwise(ends)]
+    return np.asarray(np.min(rows, axis=0))
+
+
+class _SumOfErrors:
     """The gains of the errors of one loop, of events ``spacing_s`` apart, of which ``count`` are missing.
 
-    The present e_s is followed for ``later_s``, as if nothing reset it. ``growths``: how e_s may grow
-    under each bound of it. Axes are named o, output; g, growth; m, newer missing events; i, older ones.
+    The present e_s is followed for ``later_s``, as if nothing reset it. Axes are named o, output; g,
+    growth; i, the present error and those of the missing events, from the newest one on.
     """
 
     def __init__(
         self,
         plant: PlantGains,
-        growths: Sequence[Sequence[ErrorGrowth]],
-        delay_s: float,
+        growths: Growths,
         begin_s: float,
         spacing_s: float,
         count: int,
         later_s: float,
     ) -> None:
         error, each = plant.error, [growth for row in growths for growth in row]
-        self.count = count
-        self._ends = np.cumsum([0, *map(len, growths)])
-        self._is_staged = 0 < count <= MOST_STAGES
-        numbers = np.arange(count + 1, dtype=np.float64)
-        ages_s = spacing_s * numbers[:-1]
-        self._gains = np.array([error.kernels[C].sups(ages_s) for C in error.outputs])
-        """(o, m)"""
+        self._growths, ages_s = growths, spacing_s * np.arange(count, dtype=np.float64)
+        missing = np.array([error.kernels[C].sups(ages_s) for C in error.outputs])[:, None]
         kernels = [plant.driven[C] for C in error.outputs]
-        by_input, mismatched = (np.array([pair[k].sups(ages_s) for pair in kernels]) for k in (0, 1))
+        sups = [np.array([pair[k].sups(ages_s) for pair in kernels])[:, None] for k in (0, 1)]
         grown = np.array([growth.driven[:2] for growth in each])
-        means_s, longest_s = np.array([(growth.mean_s, growth.longest_s) for growth in each]).T
-        self._entered, self._mismatched = (
-            np.minimum(self._gains[:, None] * grown[:, k, None], means_s[:, None] * sups[:, None])
-            for k, sups in enumerate((by_input, mismatched))
-        )
-        """(o, g, m): of what enters before a missing event."""
-        in_flight_s = np.maximum(delay_s - spacing_s * numbers, 0.0)
-        late_s = np.minimum(in_flight_s[:-1], longest_s[:, None])
-        late = late_s[:, None] * by_input[:, None, :, None]
-        self._late = np.minimum(self._entered[..., None], late if self._is_staged else np.inf)
-        """(o, g, m, i): the part that may have entered while an update was in flight."""
-        now, highest = [error.now_until(later_s + g.longest_s) for g in each], [k.sup() for k, _ in kernels]
-        self._now = np.array([[gains[C] for gains in now] for C in error.outputs])
-        """(o, g)"""
-        driven = np.zeros((len(kernels), len(each), 2))
+        means_s = np.array([growth.mean_s for growth in each])[:, None]
+        now = [error.now_until(later_s + growth.longest_s) for growth in each]
+        present = np.array([[gains[C] for gains in now] for C in error.outputs])
+        driven = np.zeros((2, len(kernels), len(each)))
         for place, growth in enumerate(each):
             if (until_s := later_s + growth.longest_s) > 0:
                 followed = plant.growths(until_s, COARSE_CELLS)
                 means = [followed[C].means(growth.ages_s + later_s)[:2] for C in error.outputs]
-                driven[:, place] = means
-        self._now_entered, self._now_mismatched = driven[..., 0], driven[..., 1]
-        late = np.array(highest)[:, None, None] * in_flight_s
-        self._now_late = np.minimum(self._now_entered[..., None], late if self._is_staged else np.inf)
-        """(o, g, j)"""
-        self._begun = np.fmin(
-            begin_s * np.array(highest)[:, None],
-            np.cumsum([self._now_entered.max(axis=1), *self._entered.max(axis=1).T], axis=0).T,
+                driven[:, :, place] = np.array(means).T
+        self._entered, self._mismatched = (
+            np.dstack([driven[k], np.minimum(missing * grown[:, k, None], means_s * sups[k])]) for k in (0, 1)
         )
-        """(o, j): of what enters before the first input, beyond the bounds of later times."""
+        self._gains = np.dstack([present, np.broadcast_to(missing, (*present.shape, count))])
+        """(o, g, i), like those of what has entered."""
+        highest = np.array([kernel.sup() for kernel, _ in kernels])
+        self._begun = np.fmin(begin_s * highest[:, None], self._entered.max(axis=1).cumsum(axis=1))
+        """(o, i): of what enters before the first input, beyond the bounds of later times."""
 
     def bound(
-        self, b: Vector, inputs: Vector, input_error: float, mismatch: float, start_error: float
+        self, b: Vector, input_error: float, mismatch: float, start_error: float
     ) -> tuple[Matrix, Matrix]:
-        """Bound sup‖C e_c‖ while at most 0, 1, … events are missing, and its part from these, (o, j).
+        """Bound each error's part of ‖C e_c‖, and what the first i of them had entered at first, (o, i).
 
-        Given are bounds of ‖e_s‖_W after a test for each growth, of π_i, π and sup‖R_E x‖.
+        Given are bounds of ‖e_s‖_W after a test for each growth, of π and sup‖R_E x‖.
         """
-        stages = inputs if self._is_staged else np.array([input_error])
-        i = stages[: max(len(stages) - 1, 1)]
-        errors = self._gains[:, None] * b[:, None] + self._mismatched * mismatch
-        errors = errors[..., None] + (self._entered[..., None] - self._late) * i + self._late * input_error
-        errors = self._best(errors)
-        now = self._now * b + self._now_mismatched * mismatch
-        now = now[..., None] + (self._now_entered[..., None] - self._now_late) * stages
-        present = self._best(now + self._now_late * input_error)
-        count, last = errors.shape[1], errors.shape[2] - 1
-        older = np.arange(count)
-        missing = [
-            errors[:, older[:number], np.minimum(number - 1 - older[:number], last)].sum(axis=1)
-            for number in range(count + 1)
-        ]
-        alone = np.array(missing).T + self._begun * max(start_error - float(stages[0]), 0.0)
-        whole = np.broadcast_to(present, alone.shape) + alone
-        return np.maximum.accumulate(whole, axis=1), np.maximum.accumulate(alone, axis=1)
-
-    def _best(self, values: Matrix) -> Matrix:
-        """Return the smallest over all bounds of e_s of the largest over its growths, (o, …)."""
-        rows = [values[:, a:b].max(axis=1) for a, b in zip(self._ends, self._ends[1:], strict=False)]
-        return np.asarray(np.min(rows, axis=0))
+        errors = self._gains * b[:, None] + self._entered * input_error + self._mismatched * mismatch
+        return _smallest(errors, self._growths), self._begun * max(start_error - input_error, 0.0)
 
 
 class _OpenLoopErrors:
@@ -320,18 +293,18 @@ class _OpenLoopErrors:
 
     The input is computed from x_c, so e_c follows G − BK = H + αI − BK while no update acts. At
     the last test before an event it is e_s, at most b, and what is left of the lost errors. Axes
-    are those of :class:`_ErrorsByNumber`.
+    are those of :class:`_SumOfErrors`.
     """
 
     def __init__(
         self,
         plant: PlantGains,
-        growths: Sequence[Sequence[ErrorGrowth]],
+        growths: Growths,
         conditions: NetworkConditions,
         spacing_s: float,
     ) -> None:
         error, each = plant.error, [growth for row in growths for growth in row]
-        self._ends, self.lost = np.cumsum([0, *map(len, growths)]), conditions.dropouts
+        self._growths, self._lost = growths, conditions.dropouts
         generator = error.scaled_H - plant.B @ error.K
         driven = np.hstack([plant.columns.input_error, plant.columns.mismatch])
         groups, still = (0, plant.columns.input_error.shape[1]), np.ones(1)
@@ -363,7 +336,7 @@ class _OpenLoopErrors:
         self._late = plant.growth(until_s, COARSE_CELLS).totals[:2] if until_s else (0.0, 0.0)
 
     def bound(self, b: Vector, held: float, input_error: float, mismatch: float) -> Matrix:
-        """Bound sup‖C e_c‖ after at most 0, 1, … lost events, (o, j).
+        """Bound sup‖C e_c‖ without a lost event, and after as many as there may be, (o, 2).
 
         ``input_error`` bounds π before the first input, too.
         """
@@ -373,13 +346,12 @@ class _OpenLoopErrors:
             stay, after, by_input, mismatched, *totals = gains
             tested = stay * b + after * lost + by_input * held + mismatched * mismatch
             values = np.maximum(tested, stay * late + totals[0] * held + totals[1] * mismatch)
-            rows = [values[:, i:j].max(axis=1) for i, j in zip(self._ends, self._ends[1:], strict=False)]
-            return np.asarray(np.min(rows, axis=0))
+            return _smallest(values, self._growths)
 
         lost = [0.0]
-        for _ in range(self.lost):
+        for _ in range(self._lost):
             lost.append(max(float(followed(self._step, lost[-1])[0]), lost[-1]))
-        return np.array([followed(self._whole, one) for one in lost]).T
+        return np.array([followed(self._whole, one) for one in (0.0, lost[-1])]).T
 
 
 @dataclass
@@ -398,8 +370,11 @@ class _KnownBounds:
     """Of the part of ‖u − Kx‖ that does not come from the present e_s."""
     received: float = math.inf
     """Of ‖u − Kx‖ while no event is missing."""
-    inputs: dict[BoundMethod, Vector] = field(default_factory=dict)
-    """Of ‖p‖ while at most 0, 1, … events are missing."""
+
+    def reduce_errors(self, sizes: Vector) -> None:
+        """Take smaller bounds of sup‖C e_c‖, (o,)."""
+        for output, size in zip(self.errors, sizes.tolist(), strict=True):
+            self.errors[output] = min(self.errors[output], size)
 
     @property
     def input_error(self) -> float:
@@ -429,29 +404,21 @@ class _Inserted(ErrorInequalities):
         for name, (free, forced) in self._timed_states.items():
             states[name] = min(states[name], float((free + forced * input_error).max()))
         b = np.array([growth.after_test(states) for row in self._growths for growth in row])
-        for method, by_number in self._by_number(spacing_s).items():
-            inputs, before = np.full(by_number.count + 1, input_error), np.inf
-            if len(known.inputs.get(method, ())) == len(inputs):
-                inputs = np.minimum(inputs, known.inputs[method])
-            while (inputs < _NEARLY * before).any():
-                whole, missing = by_number.bound(b, inputs, input_error, mismatch, self.start_error)
-                inputs, before = np.minimum(inputs, whole[place] + held), inputs
-            known.inputs[method] = inputs
-            for output, size in zip(self._error.outputs, whole[:, -1].tolist(), strict=True):
-                errors[output] = min(errors[output], size)
+        for method, sums in self._sums(spacing_s).items():
+            each, begun = sums.bound(b, input_error, mismatch, self.start_error)
+            sizes = each.sum(axis=1) + begun[:, -1]
             if method is BoundMethod.MISSING:
-                known.earlier = min(known.earlier, float(missing[place, -1]) + held)
-                known.received = min(known.received, float(whole[place, 0]) + held)
-        followed = self._followed(spacing_s).bound(b, held, max(input_error, self.start_error), mismatch)
-        for output, size in zip(self._error.outputs, followed[:, -1].tolist(), strict=True):
-            errors[output] = min(errors[output], size)
-        for inputs in known.inputs.values():
-            numbers = np.minimum(np.arange(len(inputs)), followed.shape[1] - 1)
-            np.minimum(inputs, followed[place, numbers] + held, out=inputs)
-        known.received = min(known.received, float(followed[place, 0]) + held)
+                known.earlier = min(known.earlier, float(sizes[place] - each[place, 0]) + held)
+                known.received = min(known.received, float(each[place, 0] + begun[place, 0]) + held)
+            known.reduce_errors(sizes)
+        received, sizes = (
+            self._followed(spacing_s).bound(b, held, max(input_error, self.start_error), mismatch).T
+        )
+        known.reduce_errors(sizes)
+        known.received = min(known.received, float(received[place]) + held)
         rows = iter(b.tolist())
-        sizes = [max(self._grown(one, next(rows), *v[3:5]) for one in row) for row in self._growths]
-        known.sensor = min(known.sensor, *sizes)
+        grown = [max(self._grown(one, next(rows), *v[3:5]) for one in row) for row in self._growths]
+        known.sensor = min(known.sensor, *grown)
         age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
         found_v = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
         known.signals = np.minimum(v, np.array(found_v, dtype=np.float64))
@@ -475,21 +442,14 @@ class _Inserted(ErrorInequalities):
         return float(growth.stretch * b + by_input * input_error + mismatched * mismatch + begun)
 
     @cached_method
-    def _by_number(self, spacing_s: float) -> Mapping[BoundMethod, _ErrorsByNumber]:
+    def _sums(self, spacing_s: float) -> Mapping[BoundMethod, _SumOfErrors]:
         conditions = self._conditions
         numbers = {
             BoundMethod.DRIFTING: (conditions.dropouts, conditions.delay_s),
             BoundMethod.MISSING: (self._missing_events(spacing_s), 0.0),
         }
         return {
-            method: _ErrorsByNumber(
-                self._plant,
-                self._growths,
-                conditions.delay_s,
-                self._begin_s,
-                spacing_s,
-                *numbers[method],
-            )
+            method: _SumOfErrors(self._plant, self._growths, self._begin_s, spacing_s, *numbers[method])
             for method in self.methods
         }
 

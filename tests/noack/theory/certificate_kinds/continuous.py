@@ -69,7 +69,7 @@ def no_lost_errors() -> AbstractContextManager[Any]:
     exact = _OpenLoopErrors.bound
 
     def bound(errors: _OpenLoopErrors, *known: Any) -> Matrix:
-        return np.repeat(exact(errors, *known)[:, :1], errors.lost + 1, axis=1)
+        return np.repeat(exact(errors, *known)[:, :1], 2, axis=1)
 
     return patch.object(_OpenLoopErrors, "bound", bound)
 
