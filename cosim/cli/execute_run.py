@@ -34,6 +34,7 @@ with lazy_modules():
     from noack.theory.certificates import assumptions
 
 if TYPE_CHECKING:
+    from cosim.analysis.run_summary import Outcome
     from cosim.output.figures.figure_format import FigureFiles
 
 _PER_CORE = 4
@@ -178,11 +179,20 @@ def warn_of_other_runs() -> None:
         )
 
 
+_COMPLETING = "replaying the run, checking its claims, writing its report"
+
+
+def reopened(run_dir: Path) -> "Outcome":
+    """Return the outcome of an earlier run; show that its record is completed, if that is necessary."""
+    with cli.status(f"{run_dir}: {_COMPLETING}"):
+        return finalize.reopen(run_dir)
+
+
 def finalize_run(ending: "run_directory.RunEnding", options: OutputOptions) -> int:
     """Finish a run's record, print its verdict, and return its exit status."""
     try:
         # This takes minutes for a run of an hour.
-        with cli.status("replaying the run and checking its claims"):
+        with cli.status(_COMPLETING):
             outcome = finalize.finalize(ending, report=options.report)
     except KeyboardInterrupt as error:
         error.add_note(f"`noack summary {ending.run_dir}` completes its record")

@@ -18,12 +18,16 @@ int64_t noack_queue_enters(noack_link *link, int64_t number, int64_t now_ns) {
     return queue->count < stage->queue_places;
 }
 
-/* Occupy a place in the queue until a time; a packet that must pass may exceed the size. */
+/* Occupy a place in the queue until a time; a packet that must pass may exceed the size. The ring
+   has the departures of the newest packets. So, if it is full, what is older does not matter: while
+   the oldest one of the ring has not left, at least as many packets wait as there are places. */
 void queue_occupy(noack_link *link, int64_t number, int64_t until_ns) {
     const noack_stage *stage = &link->stages[number];
     noack_queue *queue = &link->queues[number];
     if (queue->count < stage->queue_places)
         queue->count++;
+    else
+        queue->head = (queue->head + 1) % stage->queue_places;
     int64_t last = (queue->head + queue->count - 1) % stage->queue_places;
     link->departures_ns[stage->queue_begin + last] = until_ns;
 }

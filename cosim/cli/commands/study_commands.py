@@ -386,7 +386,8 @@ class StudyOptions(opt.ScenarioOptions):
         policy: Compare another trigger, too, e.g. fast='{ policy = "periodic", period_s = 0.1 }'.
         disturbance: Amplitude of a pulse of 0.5 s on the inputs of all loops at once; 0: no such
             runs, the default. With --thorough 1.
-        draws: Runs at each number of loops; 1 by default, 10 with --thorough.
+        draws: Runs at each number of loops; 6 by default, the fewest that can decide, 10 with
+            --thorough.
     """
 
     thorough: bool = False
@@ -472,7 +473,7 @@ class StudyOptions(opt.ScenarioOptions):
         return found
 
 
-@cli.command(cli.CAMPAIGNS, 30, takes="some 10 s with its defaults")
+@cli.command(cli.CAMPAIGNS, 30, takes="minutes with its defaults")
 def capacity(
     study: StudyOptions,
     *,

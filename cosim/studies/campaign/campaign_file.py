@@ -75,10 +75,7 @@ def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
             raise ValueError(f"{place}: {new} replaces {old}, which is given before it")
 
 
-_UNITS = {
-    "_per_s": "1/s", "_s": "s", "_ms": "ms", "_us": "µs", "_ns": "ns", "_hz": "Hz", "_bps": "bit/s",
-    "_bytes": "bytes",
-}  # fmt: skip
+_UNITS = {"_per_s": "1/s", "_s": "s", "_ms": "ms", "_us": "µs", "_ns": "ns", "_hz": "Hz", "_bps": "bit/s"}
 """Units by the ends of keys, the longer ends first."""
 
 

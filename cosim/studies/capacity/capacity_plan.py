@@ -177,7 +177,7 @@ class Depth(NamedTuple):
     """Amplitude of the common disturbance; 0: no such runs."""
 
 
-QUICK = Depth((0.5, 1.0, 1.5), 1, 0.0)
+QUICK = Depth((0.5, 1.0, 1.5), 6, 0.0)
 THOROUGH = Depth((0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0), 10, 1.0)
 _PULSE_S = 0.5
 _QUEUE = 10

@@ -21,6 +21,7 @@ from noack.impairments.disciplines.codel import Codel
 from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
 from noack.impairments.disciplines.maximum_error import MaximumError
 from noack.impairments.disciplines.priority import Priority
+from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.feature import Scheduler
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
@@ -497,6 +498,7 @@ def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
     st.sampled_from([None, 0, 1, 3]),
 )
 @example(9_600, 6, (1,), [(0, flow, 72, level) for flow, level in WAITING], None)
+@example(9_600, 2, (1,), [*((0, flow, 72, 0) for flow in (0, 1, 2, 2, 3, 3)), (100 * MS, 0, 72, 0)], 1)
 def test_the_first_of_what_waits_is_sent_when_the_link_is_free(
     kind: type[Scheduler], rate_bps: int, queue: int, numbers: Any, steps: Any, mansd: int | None
 ) -> None:
@@ -514,6 +516,11 @@ def test_the_first_of_what_waits_is_sent_when_the_link_is_free(
     for flow in range(4):
         of_flow = [t for t, one in zip(found[0], arrivals, strict=True) if one[1] == flow and t > 0]
         assert of_flow == sorted(of_flow)
+    # As many wait in any order: of packets of one size, the same are lost as by tail drop.
+    alike = [(t, flow, 72, level) for t, flow, _, level in arrivals]
+    plain = rate.model_copy(update={"discipline": TailDrop()})
+    of_both = [left(LinkSettings(impairments=(one,), mansd=mansd), alike)[1] for one in (rate, plain)]
+    assert of_both[0] == of_both[1]
 
 
 def test_a_change_makes_the_order_of_what_waits_final() -> None:

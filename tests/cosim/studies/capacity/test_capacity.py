@@ -110,12 +110,12 @@ def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
     result = capacity("shared_bottleneck", *out, *SHORT[2:])
     assert result.exit_code == 0, result.output
     assert re.search(
-        r"18 runs of 0.5 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
+        r"108 runs of 0.5 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
         r"--thorough: \d+ (s|min)\n",
         result.stderr,
     )
     found = json.loads(result.stdout)
-    assert (found["loops"], found["draws"], found["thorough"]) == ([11, 22, 33], 1, False)
+    assert (found["loops"], found["draws"], found["thorough"]) == ([11, 22, 33], 6, False)
     for one in found["capacities"]:
         if one["median"] is not None:
             assert one["loops_by_kind"]["pendulum"] == 10 * one["factor"] == one["median"] / 1.1
