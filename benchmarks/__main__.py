@@ -1,6 +1,6 @@
 """Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE]``.
 
-The modules of this folder declare them (:func:`benchmarks.report.benchmark`). ``--list`` lists
+The modules in ``cases/`` declare them (:func:`benchmarks.report.benchmark`). ``--list`` lists
 them. The name ``goals`` stands for those that have the figures which the project wants to reach
 (:data:`FIGURES`); they are printed once more at the end, and ``--docs docs/benchmarks.md`` writes
 them into the page, between two marks.
@@ -23,6 +23,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from rich.console import Console
 
+from benchmarks import cases
 from benchmarks.programs import provide
 from benchmarks.report import BENCHMARKS, Benchmark, Load, MeasurementError, Row, table_of
 
@@ -67,10 +68,9 @@ OF_GOALS = tuple(dict.fromkeys(figure.benchmark for figure in FIGURES))
 
 
 def all_benchmarks() -> Mapping[str, Benchmark]:
-    """Return the benchmarks of this folder by name."""
-    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
-        if not module.name.startswith("_"):
-            import_module(f"benchmarks.{module.name}")
+    """Return all benchmarks by name."""
+    for module in pkgutil.iter_modules(cases.__path__):
+        import_module(f"{cases.__name__}.{module.name}")
     return dict(sorted(BENCHMARKS.items()))
 
 

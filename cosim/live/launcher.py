@@ -44,7 +44,7 @@ from noack.runtime import run_registry
 from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, stop_reason
 from noack.runtime.control_plane import run_name
-from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, published
+from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, ticket_file
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import resolve_run, resolved_loops, tables_of
 from noack.scenario.scenario import Scenario
@@ -151,7 +151,7 @@ def _open_to_others(
         opened = stack.enter_context(remote_access.open_to_hosts(listening, ticket, coordinator))
     if session is not None:
         by_hand = ticket.model_copy(update={"launched": False})
-        stack.enter_context(published(by_hand, session))
+        stack.enter_context(ticket_file(by_hand, session))
     if opened is not None and listening is not None and listening.invitation is not None:
         # last: it replaces that of an earlier run
         stack.enter_context(invitation_file(listening.invitation, opened.invitation))
@@ -171,7 +171,7 @@ def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
 def _publish_run(stack: contextlib.ExitStack, ticket: Ticket, session: str | None) -> None:
     """Let `noack set` find the run; without that the run goes on."""
     try:
-        stack.enter_context(run_registry.published(ticket, session))
+        stack.enter_context(run_registry.registered_run(ticket, session))
     except NoackError as error:
         print(f"noack: warning: `noack set` cannot reach this run: {error}", file=sys.stderr)
 

@@ -40,7 +40,7 @@ def _in_use(name: str) -> CallerError:
 
 
 @contextmanager
-def published(name: str, folder: str = EMULATORS) -> Iterator[Path]:
+def registered_emulator(name: str, folder: str = EMULATORS) -> Iterator[Path]:
     """Keep an emulator's file within the context.
 
     Raises:
@@ -65,7 +65,7 @@ def starting(name: str | None) -> Iterator[None]:
     if name is None:
         yield
         return
-    with published(name, _STARTING):
+    with registered_emulator(name, _STARTING):
         if name in running():
             raise _in_use(name)
         yield
@@ -153,7 +153,7 @@ class ControlServer:
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            stack.enter_context(published(self._name))
+            stack.enter_context(registered_emulator(self._name))
             try:
                 self._session = open_session(EMULATORS, self._name, listen=True)
             except zenoh.ZError as error:

@@ -98,7 +98,7 @@ def loads(text: str) -> Ticket:
 
 
 @contextmanager
-def published(ticket: Ticket, session: str) -> Iterator[Path]:
+def ticket_file(ticket: Ticket, session: str) -> Iterator[Path]:
     """Publish the ticket in a file that only its owner can read, while the context lasts.
 
     The file is locked: if several runs use a session's name, one succeeds. Raise CallerError if

@@ -35,7 +35,7 @@ _OPEN_RUN = TypeAdapter(OpenRun, config=ConfigDict(defer_build=True))
 
 
 @contextmanager
-def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
+def registered_run(ticket: Ticket, session: str | None) -> Iterator[Path]:
     """Keep a run's lock file while the context lasts."""
     run = OpenRun(run_name(ticket.run_id), ticket.run_dir, session)
     with private_folder.lock_file(RUNS, run.name, run._asdict()) as path:

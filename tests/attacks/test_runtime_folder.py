@@ -25,7 +25,7 @@ from netem.relay_links import LinkSpec
 from noack.core.errors import CallerError, NoackError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime import run_registry
-from noack.runtime.join_ticket import Ticket, find_ticket, new_ticket, published, write_invitation
+from noack.runtime.join_ticket import Ticket, find_ticket, new_ticket, ticket_file, write_invitation
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.matrix_files import write_matrices
 from noack.scenario.resolution import resolve
@@ -71,11 +71,11 @@ def join() -> Ticket:
 
 Use = Callable[[Ticket], object]
 USES: dict[str, Use] = {
-    "publish a ticket": lambda ticket: published(ticket, "default").__enter__(),
+    "publish a ticket": lambda ticket: ticket_file(ticket, "default").__enter__(),
     "join a run": lambda _: join(),
-    "publish a run": lambda ticket: run_registry.published(ticket, None).__enter__(),
+    "publish a run": lambda ticket: run_registry.registered_run(ticket, None).__enter__(),
     "find a run": lambda _: run_registry.find(),
-    "publish an emulator": lambda _: emulator_session.published(EMULATOR).__enter__(),
+    "publish an emulator": lambda _: emulator_session.registered_emulator(EMULATOR).__enter__(),
     "list emulators": lambda _: emulator_session.running(),
 }
 
@@ -115,10 +115,10 @@ def test_a_ticket_is_not_written_into_a_folder_swapped_in_meanwhile(shared: Path
         (shared / OWN).symlink_to(theirs)
         (theirs / f"default.{os.getpid()}").touch(mode=0o666)  # theirs if opened, not created
 
-    with published(ticket, "other"):
+    with ticket_file(ticket, "other"):
         pass  # creates the folder, as an earlier run does
     _swaps.append(swap)
-    with published(ticket, "default"):
+    with ticket_file(ticket, "default"):
         assert not _swaps
         assert not any(file.read_text() for file in theirs.iterdir())
 
@@ -143,7 +143,7 @@ def test_a_ticket_is_not_read_from_a_folder_swapped_in_meanwhile(
             away.rename(path)
         return real(path, **options)
 
-    with published(ticket, "default"):
+    with ticket_file(ticket, "default"):
         _swaps.append(swap)
         monkeypatch.setattr(Path, "stat", swap_back)
         assert join().run_dir == ticket.run_dir
@@ -153,7 +153,7 @@ def test_a_ticket_is_not_read_from_a_folder_swapped_in_meanwhile(
 @needs_root
 @pytest.mark.parametrize("theirs", ["folder", "file"])
 def test_a_file_of_another_user_is_not_read(theirs: str, shared: Path, ticket: Ticket) -> None:
-    with published(ticket, "default") as path:
+    with ticket_file(ticket, "default") as path:
         os.chown(path if theirs == "file" else path.parent, NOBODY, NOBODY)
         with pytest.raises(CallerError, match="of yours"):
             join()

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.guarantees import COMBINATIONS, REORDERING, Decider, check_row, loop_named, row_of, triggers
+from benchmarks.cases import guarantees as bench
 from cosim.analysis.adversary import Objective, find_worst
 from noack.scenario.sections import POLICIES
 from tests.oracles.receiver import Limits, outcomes_of, violations
 
 
-@pytest.mark.parametrize("words", COMBINATIONS)
+@pytest.mark.parametrize("words", bench.COMBINATIONS)
 def test_no_combination_is_violated_and_each_would_be_without_it(words: str) -> None:
-    for before in ("loss 50%", f"loss 30% {REORDERING}"):
-        row = check_row(f"{before} {words}", COMBINATIONS[words], 1_000_000)
+    for before in ("loss 50%", f"loss 30% {bench.REORDERING}"):
+        row = bench.check_row(f"{before} {words}", bench.COMBINATIONS[words], 1_000_000)
         assert row.value == 0
-        free = outcomes_of(Decider(f"{before} limit 1000000").decide())
-        assert violations(free, COMBINATIONS[words]) > 1000
+        free = outcomes_of(bench.Decider(f"{before} limit 1000000").decide())
+        assert violations(free, bench.COMBINATIONS[words]) > 1000
 
 
 def test_the_check_counts_windows_and_gaps() -> None:
@@ -30,17 +30,17 @@ def test_the_check_counts_windows_and_gaps() -> None:
 
 def test_every_policy_that_is_a_rule_is_compared() -> None:
     paper = {"beta": 0.5, "alpha_per_s": 0.25, "floor": 0.0}
-    found = triggers(paper, np.eye(2)).values()
+    found = bench.triggers(paper, np.eye(2)).values()
     names = {one["policy"] for one in found} | {one["rule"]["policy"] for one in found if "rule" in one}
     assert names == {name for name, made in POLICIES.items() if made.example(2) is not None}
 
 
 def test_a_bound_below_the_worst_run_is_reported() -> None:
-    loop = loop_named("double_integrator", 2.0, "identity")
+    loop = bench.loop_named("double_integrator", 2.0, "identity")
     worst = find_worst(loop, Objective.ERROR, beam=0)
     assert worst.certified is not None
     assert worst.value is not None
-    row = row_of("double_integrator", worst)
+    row = bench.row_of("double_integrator", worst)
     assert row.holds
     assert 0.1 < (row.value or 0.0) < 1.0
-    assert row_of("", replace(worst, certified=worst.value * 0.99)).holds is False
+    assert bench.row_of("", replace(worst, certified=worst.value * 0.99)).holds is False

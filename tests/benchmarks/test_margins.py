@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from benchmarks.margins import random_loop
+from benchmarks.cases.margins import random_loop
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import LossHistory
 from noack.theory.margins.exact_matrices import exponential, fixed, stacked

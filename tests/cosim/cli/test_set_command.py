@@ -82,11 +82,11 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
     ticket: Ticket, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = new_ticket(ticket.scenario, Path("elsewhere"), launched=True)
-    with run_registry.published(other, "lab"):
+    with run_registry.registered_run(other, "lab"):
         assert run_registry.find().run_dir == "elsewhere"
         warn_of_other_runs()
         assert "elsewhere is active, too" in capsys.readouterr().err
-    with run_registry.published(other, "lab"), run_registry.published(ticket, None) as path:
+    with run_registry.registered_run(other, "lab"), run_registry.registered_run(ticket, None) as path:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
         assert ticket.key.hex() not in path.read_text()

@@ -16,7 +16,7 @@ from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.topology import RECORDER, ROLES
 from noack.runtime.command_line import Signals
-from noack.runtime.join_ticket import new_ticket, published
+from noack.runtime.join_ticket import new_ticket, ticket_file
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 
@@ -239,7 +239,7 @@ def test_a_refused_session_leaves_no_run_directory(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     scenario = validate(content | {"ports": {}}, "")
     ticket = new_ticket(resolve(scenario), tmp_path, launched=False)
-    with published(ticket, "lab"), pytest.raises(CallerError, match="another run is open in it"):
+    with ticket_file(ticket, "lab"), pytest.raises(CallerError, match="another run is open in it"):
         launch(scenario, tmp_path / "runs", spawn=(), session="lab")
     assert list((tmp_path / "runs").iterdir()) == []
 

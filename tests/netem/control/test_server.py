@@ -15,7 +15,7 @@ from zenoh.handlers import FifoChannel
 
 from netem import stand_alone
 from netem.control import control_server, emulator_commands
-from netem.control.control_server import EMULATORS, ControlServer, find, published, running
+from netem.control.control_server import EMULATORS, ControlServer, find, registered_emulator, running
 from netem.control.emulator_commands import Client
 from netem.control.emulator_statistics import CommandQueue
 from netem.control.statistics_view import Screen
@@ -41,12 +41,12 @@ def test_a_session_is_found_while_it_lasts() -> None:
     """Its file is private, and is not removed if another emulator has replaced it."""
     with pytest.raises(CallerError, match="no emulator accepts commands; start one"):
         find(None)
-    with published("lab") as path:
+    with registered_emulator("lab") as path:
         assert running() == ["lab"]
         assert find("lab") == find(None) == "lab"
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
-        with published("b"):
+        with registered_emulator("b"):
             with pytest.raises(CallerError, match=r"which emulator\? Running: b, lab"):
                 find(None)
             with pytest.raises(CallerError, match="no emulator 'lba'; running: b, lab"):
@@ -55,14 +55,14 @@ def test_a_session_is_found_while_it_lasts() -> None:
         other.write_text("mine")
         other.replace(path)
     assert path.read_text() == "mine"
-    with pytest.raises(FileExistsError, match="capture"), published("d"):
+    with pytest.raises(FileExistsError, match="capture"), registered_emulator("d"):
         raise FileExistsError("capture.pcapng")  # an error of the emulator itself
     assert running() == []
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 65])
 def test_unfit_names_are_refused(name: str) -> None:
-    with pytest.raises(CallerError, match="use letters, digits"), published(name):
+    with pytest.raises(CallerError, match="use letters, digits"), registered_emulator(name):
         pass
 
 
@@ -72,12 +72,12 @@ def test_statistics_are_published(
     monkeypatch.setattr(control_server, "_PUBLISH_S", 0.2)
     relay.counters["up", "forward"].received = 1
     with ControlServer("lab", commands), Client(find("lab")) as client:
-        published = (document["links"][0]["forward"] for document in client.follow(lambda: False))
-        first = next(published)["received"]
+        statistics = (document["links"][0]["forward"] for document in client.follow(lambda: False))
+        first = next(statistics)["received"]
         relay.counters["up", "forward"].received = 1001
         # The server may have sampled the counters just before the change.
-        assert next(published)["received"] - first in (0, 1000)
-        recent = next(published)["recent"]
+        assert next(statistics)["received"] - first in (0, 1000)
+        recent = next(statistics)["recent"]
         assert recent is not None
         assert recent["seconds"] > 0
 

@@ -21,8 +21,8 @@ from noack.runtime.join_ticket import (
     loads,
     new_ticket,
     own_host,
-    published,
     read_invitation,
+    ticket_file,
     write_invitation,
 )
 from noack.runtime.private_folder import private_folder
@@ -167,14 +167,14 @@ def test_exactly_one_of_many_concurrent_runs_opens_a_session(
     ticket, at_once = loads(json.dumps(fields)), 8
     together = Barrier(at_once)
     if left_behind:  # left by a process that was killed
-        with published(ticket, "lab") as path:
+        with ticket_file(ticket, "lab") as path:
             text = path.read_text()
         path.write_text(text)
 
     def opened(number: int, stack: ExitStack) -> str:
         together.wait()
         try:
-            stack.enter_context(published(ticket.model_copy(update={"run_id": number}), "lab"))
+            stack.enter_context(ticket_file(ticket.model_copy(update={"run_id": number}), "lab"))
         except CallerError as error:
             return str(error)
         return ""

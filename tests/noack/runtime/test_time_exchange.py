@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.hosts import DrivenClocks
+from benchmarks.cases.hosts import DrivenClocks
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Record

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from benchmarks.latency import KERNEL, cyclictest
+from benchmarks.cases.latency import KERNEL, cyclictest
 from benchmarks.programs import BEFORE_OTHERS, LOAD_CORE, RELAY_CORE, compiled, on_core, scheduled
 from benchmarks.relay_load import (
     BURST,

@@ -2,7 +2,7 @@
 
 The hosts are network namespaces with time namespaces, which a veth link connects: their monotonic
 clocks differ by a second, exactly, and the client's has an added drift, so that the true offset is
-known at any time. ``python -m benchmarks.hosts END EXCHANGE`` is one end of an exchange of
+known at any time. ``python -m benchmarks.cases.hosts END EXCHANGE`` is one end of an exchange of
 timestamps (:class:`Exchange`, as JSON). The reference prints its port and answers until its
 standard input closes. The client compares its clock with the reference's and prints its figures as
 JSON; errors are those after the first half second. Both ends of a bare exchange are what a plain
@@ -256,7 +256,7 @@ def measured(hosts: TwoHosts, ahead_s: int, drift_ppb: int, case: Case, *, bare:
     def command(end: str, port: int = 0) -> list[str]:
         content = json.dumps(own._asdict() | {"port": port, **case.settings})
         is_client = end == "client"
-        program = (sys.executable, "-m", "benchmarks.hosts", end, content)
+        program = (sys.executable, "-m", "benchmarks.cases.hosts", end, content)
         return hosts.inside(is_client, *program, monotonic_s=ahead_s * is_client)
 
     with subprocess.Popen(

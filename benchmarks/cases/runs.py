@@ -36,7 +36,7 @@ from benchmarks.report import (
 from cosim.record.run_directory import LATEST
 from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 CAP = 2
 _SCENARIO = """
 name = "fleet"

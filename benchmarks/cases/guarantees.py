@@ -196,9 +196,7 @@ def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]
         deadline | {"rule": {"policy": "lyapunov", "rate_per_s": 0.2} | W},
         deadline | {"rule": dynamic | W},
     ]
-    return {
-        rule["policy"] + (f"({rule['rule']['policy']})" if "rule" in rule else ""): rule for rule in rules
-    }
+    return {row["policy"] + (f"({row['rule']['policy']})" if "rule" in row else ""): row for row in rules}
 
 
 def loop_named(name: str, horizon_s: float, norm: str) -> Scenario:

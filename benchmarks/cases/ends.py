@@ -1,6 +1,6 @@
 """The end of a run against its length: peak memory, and time as a multiple of real time.
 
-Its programs are ``python -m benchmarks.ends spool SECONDS FOLDER [SCENARIO]``, which makes the
+Its programs are ``python -m benchmarks.cases.ends spool SECONDS FOLDER [SCENARIO]``, which makes the
 directory of a run that ended without a recorder, and prints its path, and ``finalize RUN_DIR``,
 which finalises it, and prints the CPU time of its replay, which takes place in another process. A run
 is simulated; its rows are spooled as those of a live run are: in batches of 50 ms, with the rows of
@@ -65,7 +65,7 @@ def print_spooled(horizon_s: str, folder: str, path: str = "") -> None:
 
 def print_finalized(run_dir: str) -> None:
     """Finalise a run; print the CPU time of its replay, s."""
-    from benchmarks.ends import timed_verdict  # the other process has no __main__
+    from benchmarks.cases.ends import timed_verdict  # the other process has no __main__
 
     reopen = finalize.reopen  # first: a lazy module that is loaded later would replace the function
     vars(finalize)["stored_verdict"] = timed_verdict
@@ -102,7 +102,7 @@ def end_of(horizon_s: float, folder: Path) -> End:
         MeasurementError: a step failed.
     """
     say(f"a run of {horizon_s:g} s")
-    program = [sys.executable, "-m", "benchmarks.ends"]
+    program = [sys.executable, "-m", "benchmarks.cases.ends"]
     run_dir = Path(execute([*program, "spool", f"{horizon_s:g}", str(folder)]).stdout.strip())
     begun_s = time.monotonic()
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
