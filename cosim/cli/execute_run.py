@@ -34,7 +34,7 @@ with lazy_modules():
     from noack.theory.certificates import assumptions
 
 if TYPE_CHECKING:
-    from cosim.analysis.run_summary import Outcome
+    from cosim.analysis.summary.run_summary import Outcome
     from cosim.output.figures.figure_format import FigureFiles
 
 _PER_CORE = 4
