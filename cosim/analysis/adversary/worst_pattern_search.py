@@ -133,10 +133,20 @@ def _find_sampled(
         _, worst = _push(pushed, bounds, max(_run(pushed, again.pattern), worst))
         search.nodes, search.runs = search.nodes + again.nodes, search.runs + again.runs
     return Worst(
-        objective, flow.horizon_s, reported(worst.value, objective), worst.at_s, worst.delivered,
-        worst.event_s, exact, search.nodes, search.runs, reported(lossless.value, objective),
-        reported(own.value, objective), flow.certified, time.monotonic() - began_s,
-    )  # fmt: skip
+        objective,
+        flow.horizon_s,
+        value=reported(worst.value, objective),
+        at_s=worst.at_s,
+        pattern=worst.delivered,
+        event_s=worst.event_s,
+        exact=exact,
+        nodes=search.nodes,
+        runs=search.runs,
+        lossless=reported(lossless.value, objective),
+        own=reported(own.value, objective),
+        certified=flow.certified,
+        elapsed_s=time.monotonic() - began_s,
+    )
 
 
 def _run(flow: SampledFlow, pattern: Pattern) -> SampledRun:
@@ -193,17 +203,17 @@ def _find_continuous(
     return Worst(
         objective,
         horizon_s,
-        reported(valued.value, objective),
-        valued.at_s,
-        tuple(run.delivered.tolist()),
-        tuple(run.event_s.tolist()),
-        exact and math.isclose(valued.value, search.value, rel_tol=_CONFIRMED),
-        search.nodes,
-        search.runs,
-        reported(evaluate(simulated(()), measure).value, objective),
-        reported(evaluate(own, measure).value, objective),
-        certified_value(certificate, measure, horizon_s, valued),
-        time.monotonic() - began_s,
+        value=reported(valued.value, objective),
+        at_s=valued.at_s,
+        pattern=tuple(run.delivered.tolist()),
+        event_s=tuple(run.event_s.tolist()),
+        exact=exact and math.isclose(valued.value, search.value, rel_tol=_CONFIRMED),
+        nodes=search.nodes,
+        runs=search.runs,
+        lossless=reported(evaluate(simulated(()), measure).value, objective),
+        own=reported(evaluate(own, measure).value, objective),
+        certified=certified_value(certificate, measure, horizon_s, valued),
+        elapsed_s=time.monotonic() - began_s,
     )
 
 
