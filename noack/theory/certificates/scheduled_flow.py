@@ -23,12 +23,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.bounds.contraction import spectral_norm
+from noack.theory.bounds.enclosure import response
 from noack.theory.bounds.gains import Output, PlantGains
 from noack.theory.bounds.terms import MEASURED, Constants, NetworkConditions, Part
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth
@@ -36,6 +38,7 @@ from noack.theory.certificates.delivery_flow import (
     ROUNDING,
     Disturbed,
     Reach,
+    SensorErrors,
     Starts,
     bend_of_error,
     error_after,
@@ -46,7 +49,7 @@ from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
 
 _ROUNDS, _SETTLED = 20, 0.99
 _MOST_INSERTED, _NEARLY = 60, 0.9999
-_SHORTEST_S, _LEAST_SHARE = 1e-9, 1e-6
+_SHORTEST_S, _LEAST_SHARE, _LEAST = 1e-9, 1e-6, 1e-200
 _SHORT, _MOST_STEPS = 0.005, 16
 
 
@@ -140,7 +143,8 @@ class _ScheduledFlow:
         known.errors[Output.GAIN] = min(known.errors[Output.GAIN], size)
         if self.spacing_s >= max(self._late_s, _SHORTEST_S):  # before, the last update has acted
             size = max(self._after_losses(reach), reach.by.late)
-            known.errors[Output.WEIGHTED] = min(limit, size)
+            for output, most in known.errors.items():
+                known.errors[output] = min(most, size * self._part.plant.error.now(output))
         self.insert()
         self.spacing_s = max(self.spacing_s, self._step.next_event_s(known))
         self.insert()
@@ -159,38 +163,61 @@ class _ScheduledFlow:
         R_E = plant.outputs[Output.MISMATCH] @ plant.error.inverse_weight
         of_mismatch = size * float(spectral_norm(R_E @ starts.inverse)) * ROUNDING
         mismatch = min(float(known.signals[4]), of_mismatch)
-        return Disturbed(held, self._entered(self._late_s, input_error, mismatch), self._late_s)
-
-    def _entered(self, until_s: float, input_error: float, mismatch: float) -> float:
-        """Bound the e_s that enters within some time."""
-        if until_s == 0:
-            return 0.0
-        by_input, mismatched, _ = self._part.plant.growth(until_s, COARSE_CELLS).totals
-        return float(by_input * input_error + mismatched * mismatch)
+        return Disturbed(held, self._step.entered(self._late_s, input_error, mismatch), self._late_s)
 
     def _after_losses(self, reach: Reach) -> float:
         """Bound ‖e_c‖_W after as many losses as there may be, until the next update acts."""
         known, error, conditions = self.known, self._part.plant.error, self._conditions
-        missing = [
-            float(error.missing(Output.WEIGHTED, lost, self.spacing_s))
-            for lost in range(conditions.dropouts + 1)
-        ]
-        plain, bound = (1 + np.array(missing)) * known.sensor, self._part.bound
-        errors = plain if self._errors is None else np.minimum(plain, self._errors)
-        is_level = bound.forced_s == math.inf and not bound.ago_s  # otherwise an event needs no e_s
-        level = bound.reached if is_level else None
-        bend = 0.0 if level is None else bend_of_error(reach, level)
-        if level is not None and reach.by.is_none:
+        errors = known.lost if self._errors is None else np.minimum(known.lost, self._errors)
+        of_sensor = self._of_sensor
+        level = 0.0 if of_sensor.integrates else of_sensor.level
+        bend = bend_of_error(reach, level or float(of_sensor.sizes.max())) if of_sensor.level else 0.0
+        if level and reach.by.is_none:
             at_event = max(float(errors_at_events(errors)[-1]), _LEAST_SHARE * reach.limit)
             at_events = replace(reach, limit=at_event)
-            next_s, grid_s = _next_event_s(at_events, level, self.spacing_s, bend), conditions.spacing_s
-            self.spacing_s = grid_s * math.ceil(next_s / grid_s - 1e-9) if grid_s else next_s
+            next_s = _next_event_s(at_events, level, self.spacing_s, bend)
+            self.spacing_s = self._tested_s(next_s)
         kernel = error.kernels[Output.WEIGHTED]
-        errors = errors_after_losses(reach, errors, known.sensor, level, self.spacing_s, kernel, bend)
+        errors, apart_s = errors_after_losses(
+            reach, errors, of_sensor, self._bounded, self.spacing_s, kernel, bend
+        )
         self._errors = errors
-        _, _, _, input_error, mismatch, _ = known.signals.tolist()
-        entered = self._entered(conditions.delay_s, max(input_error, self._step.start_error), mismatch)
-        return error.stretch(conditions.delay_s) * float(errors[-1]) + entered
+        self.spacing_s = self._tested_s(apart_s)
+        # An event comes after the first input has been applied.
+        entered = self._step.entered(conditions.delay_s, *known.signals[3:5].tolist())
+        later = error.stretch(conditions.delay_s) * errors + entered
+        most = np.maximum(errors, errors_at_events(later))
+        known.inputs_after_losses = error.now(Output.GAIN) * most + float(known.signals[0])
+        return float(later[-1])
+
+    @property
+    def _bounded(self) -> list[Matrix]:
+        """Matrices Y with ‖Y z‖ ≤ 1 at all times: the bounds of W x, E x and K e_c."""
+        plant, known = self._part.plant, self.known
+        gain, inverse = plant.error.split_K[1], plant.error.inverse_weight
+        of_x = [plant.outputs[C] / max(known.states[C], _LEAST) for C in (Output.WEIGHTED, Output.MISMATCH)]
+        rows = [np.hstack([C @ inverse, np.zeros((len(C), len(inverse)))]) for C in of_x]
+        gain = gain @ inverse / max(known.errors[Output.GAIN], _LEAST)
+        return [*rows, np.hstack([np.zeros_like(gain), gain])]
+
+    @property
+    def _of_sensor(self) -> SensorErrors:
+        """What is known of e_s between two events."""
+        known, bound, conditions = self.known, self._part.bound, self._conditions
+        level, h_s = bound.reached or 0.0, conditions.sampling_s
+        if bound.is_mean:  # of an integral, over any time
+            level *= bound.ago_s
+        if bound.forced_s < math.inf or (bound.ago_s and not bound.is_mean):
+            level = 0.0  # an event may need no e_s
+        tested = known.tested if h_s == conditions.spacing_s else math.inf
+        begin_s = bound.untested_s + h_s if bound.untested_s else 0.0
+        sizes = np.minimum(known.present, known.sensor)
+        return SensorErrors(sizes, tested, begin_s, conditions.spacing_s, level, bound.is_mean)
+
+    def _tested_s(self, time_s: float) -> float:
+        """Round a time up to the tests."""
+        grid_s = self._conditions.spacing_s
+        return grid_s * math.ceil(time_s / grid_s - 1e-9) if grid_s else time_s
 
 
 def errors_at_events(errors: Vector) -> Vector:
@@ -244,7 +271,8 @@ class _ErrorsByNumber:
     ) -> None:
         error, each = plant.error, [growth for row in growths for growth in row]
         self.count = count
-        self._ends = np.cumsum([0, *map(len, growths)])
+        ends = np.cumsum([0, *map(len, growths)]).tolist()
+        self._spans = [*pairwise(ends)]
         self._is_staged = 0 < count <= MOST_STAGES
         numbers = np.arange(count + 1, dtype=np.float64)
         ages_s = spacing_s * numbers[:-1]
@@ -285,8 +313,11 @@ class _ErrorsByNumber:
 
     def bound(
         self, b: Vector, inputs: Vector, input_error: float, mismatch: float, start_error: float
-    ) -> tuple[Matrix, Matrix]:
-        """Bound sup‖C e_c‖ while at most 0, 1, … events are missing, and its part from these, (o, j).
+    ) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+        """Bound sup‖C e_c‖ while at most 0, 1, … events are missing, and its parts, (o, j).
+
+        They are that of these events, with what enters before the first input, and that of e_s. The
+        last result is that of e_s while no event is missing, for each bound of it, (row, o).
 
         Given are bounds of ‖e_s‖_W after a test for each growth, of π_i, π and sup‖R_E x‖.
         """
@@ -294,10 +325,10 @@ class _ErrorsByNumber:
         i = stages[: max(len(stages) - 1, 1)]
         errors = self._gains[:, None] * b[:, None] + self._mismatched * mismatch
         errors = errors[..., None] + (self._entered[..., None] - self._late) * i + self._late * input_error
-        errors = self._best(errors)
+        errors = self._rows(errors).min(axis=0)
         now = self._now * b + self._now_mismatched * mismatch
         now = now[..., None] + (self._now_entered[..., None] - self._now_late) * stages
-        present = self._best(now + self._now_late * input_error)
+        rows = self._rows(now + self._now_late * input_error)
         count, last = errors.shape[1], errors.shape[2] - 1
         older = np.arange(count)
         missing = [
@@ -305,13 +336,13 @@ class _ErrorsByNumber:
             for number in range(count + 1)
         ]
         alone = np.array(missing).T + self._begun * max(start_error - float(stages[0]), 0.0)
-        whole = np.broadcast_to(present, alone.shape) + alone
-        return np.maximum.accumulate(whole, axis=1), np.maximum.accumulate(alone, axis=1)
+        present = np.broadcast_to(rows.min(axis=0), alone.shape)
+        whole, alone = (np.maximum.accumulate(part, axis=1) for part in (present + alone, alone))
+        return whole, alone, present, rows[:, :, 0]
 
-    def _best(self, values: Matrix) -> Matrix:
-        """Return the smallest over all bounds of e_s of the largest over its growths, (o, …)."""
-        rows = [values[:, a:b].max(axis=1) for a, b in zip(self._ends, self._ends[1:], strict=False)]
-        return np.asarray(np.min(rows, axis=0))
+    def _rows(self, values: Matrix) -> Matrix:
+        """Return the largest over the growths of each bound of e_s, (row, o, …)."""
+        return np.array([values[:, a:b].max(axis=1) for a, b in self._spans])
 
 
 @dataclass
@@ -330,8 +361,16 @@ class _KnownBounds:
     """Of the part of ‖u − Kx‖ that does not come from the present e_s."""
     received: float = math.inf
     """Of ‖u − Kx‖ while no event is missing."""
+    lost: Vector = field(default_factory=lambda: np.array(math.inf))
+    """Of ‖e_c‖_W while at most 0, 1, … events have been lost since the last one was received."""
+    present: Vector = field(default_factory=lambda: np.array(math.inf))
+    """Of ‖e_s‖_W meanwhile: from the first lost event on, the input is that of the controller."""
+    tested: float = math.inf
+    """Of ‖e_s‖_W after a test."""
     inputs: dict[BoundMethod, Vector] = field(default_factory=dict)
     """Of ‖p‖ while at most 0, 1, … events are missing."""
+    inputs_after_losses: Vector = field(default_factory=lambda: np.array(math.inf))
+    """The same from the flow between updates, up to the longest burst."""
 
     @property
     def input_error(self) -> float:
@@ -353,21 +392,29 @@ class _Inserted(ErrorInequalities):
 
     def insert(self, known: _KnownBounds, spacing_s: float) -> None:
         """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
-        v, states, errors = known.signals, known.states, known.errors
+        v, states, errors, h_s = known.signals, known.states, known.errors, self._conditions.sampling_s
         (held, input_error, mismatch), place = (
             v[[0, 3, 4]].tolist(),
             [*self._error.outputs].index(Output.GAIN),
         )
-        for name, (free, gain) in self._states.items():
-            states[name] = min(states[name], float(free + gain * input_error))
+        for name, (free, gains) in self._rising.items():
+            states[name] = min(states[name], float((free + gains * input_error).max()))
         growths = [growth for row in self._growths for growth in row]
         b = np.array([g.fixed + sum(share * states[C] for C, share in g.shares.items()) for g in growths])
+        of_last = [one for g, one in zip(growths, b.tolist(), strict=True) if g.longest_s == h_s]
+        known.tested = min([known.tested, *of_last])
+        lost = np.arange(self._conditions.dropouts + 1)
         for method, by_number in self._by_number(spacing_s).items():
             inputs, before = np.full(by_number.count + 1, input_error), np.inf
             if len(known.inputs.get(method, ())) == len(inputs):
                 inputs = np.minimum(inputs, known.inputs[method])
+            if method is BoundMethod.MISSING:
+                count = len(lost)
+                inputs[:count] = np.minimum(inputs[:count], known.inputs_after_losses)
             while (inputs < _NEARLY * before).any():
-                whole, missing = by_number.bound(b, inputs, input_error, mismatch, self.start_error)
+                whole, missing, now, rows = by_number.bound(
+                    b, inputs, input_error, mismatch, self.start_error
+                )
                 inputs, before = np.minimum(inputs, whole[place] + held), inputs
             known.inputs[method] = inputs
             for output, size in zip(self._error.outputs, whole[:, -1].tolist(), strict=True):
@@ -375,12 +422,48 @@ class _Inserted(ErrorInequalities):
             if method is BoundMethod.MISSING:
                 known.earlier = min(known.earlier, float(missing[place, -1]) + held)
                 known.received = min(known.received, float(whole[place, 0]) + held)
+                own = [*self._error.outputs].index(Output.WEIGHTED)
+                first = self._first_error(rows[:, own], float(inputs[0]), input_error, mismatch)
+                found = np.append(min(first, whole[own, 0]), whole[own, lost[1:]])
+                known.lost = np.minimum(known.lost, found)
+                known.present = np.minimum(known.present, np.append(found[0], now[own, lost[1:]]))
         rows = iter(b.tolist())
         sizes = [max(self._grown(one, next(rows), *v[3:5]) for one in row) for row in self._growths]
         known.sensor = min(known.sensor, *sizes)
         age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
         found_v = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
         known.signals = np.minimum(v, np.array(found_v, dtype=np.float64))
+
+    @cached_property
+    def _rising(self) -> Mapping[str, tuple[Vector, Vector]]:
+        """For every output C x: what x(0) causes from times on, and gains of p until the next one."""
+        plant, found = self._plant, {}
+        begun = response(plant.closed_loop, plant.start).through_each(plant.stacked)
+        for name, kernel in plant.forced.items():
+            free = begun[name].sups(kernel.edges_s) + self._states[name].free - plant.states[name].free
+            found[name] = free, np.append(np.cumsum(kernel.area), kernel.integral())
+        return found
+
+    def entered(self, until_s: float, input_error: float, mismatch: float) -> float:
+        """Bound the e_s that enters within some time."""
+        if until_s == 0:
+            return 0.0
+        by_input, mismatched, _ = self._plant.growth(until_s, COARSE_CELLS).totals
+        return float(by_input * input_error + mismatched * mismatch)
+
+    def _first_error(self, rows: Vector, received: float, input_error: float, mismatch: float) -> float:
+        """Bound ‖e_s‖_W while no event is missing, from when an update acts on.
+
+        ``rows``: each bound of it without the start, which holds after its own time.
+        """
+        late_s = max(self._conditions.delay_s, self._conditions.start_s)
+        late = self.entered(late_s, max(input_error, self.start_error), mismatch)
+        times_s = [max(growth.longest_s for growth in row) for row in self._growths]
+        grown = [
+            self._error.stretch(until_s) * late + self.entered(until_s, received, mismatch)
+            for until_s in times_s
+        ]
+        return float(np.maximum(rows, grown).min())
 
     def _grown(self, growth: ErrorGrowth, b: float, input_error: float, mismatch: float) -> float:
         """Return how large e_s may become under one bound."""

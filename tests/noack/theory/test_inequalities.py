@@ -65,10 +65,10 @@ def test_a_spectral_radius_of_1_or_more_has_no_bound() -> None:
 @pytest.mark.parametrize(
     ("rule", "burst_only", "with_windows"),
     [
-        (LongestBurst(4), 6.33, 6.33),
-        (LossesInWindow(4, 20), 6.33, 4.50),
-        (LossesInWindow(2, 20), 4.60, 3.35),
-        (LossesInWindow(1, 10), 3.70, 2.87),
+        (LongestBurst(4), 5.33, 5.33),
+        (LossesInWindow(4, 20), 5.33, 4.50),
+        (LossesInWindow(2, 20), 3.60, 3.35),
+        (LossesInWindow(1, 10), 2.70, 2.70),
     ],
     ids=str,
 )
