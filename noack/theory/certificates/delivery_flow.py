@@ -30,14 +30,14 @@ one direction. But until the next delivery everything follows from z at one time
 lost at least w after the delivery, and ‖e_c‖_W ≤ D up to it. z is the value w before it, z' =
 e^{Fw} z:
 
-    ‖Λx‖ ≤ c,  ‖e_c‖ ≤ D at z, half way and at z',  ‖e_s‖ = ‖C_r z'‖ ≤ β for r until the next event
+    ‖Λx‖ ≤ c and ‖e_c‖ ≤ D at z and z',  ‖e_s‖ = ‖C_r z'‖ ≤ β for r until the next event
 
 With positive weights of sum 1, z is in the ellipsoid of the sum of these forms, which bounds e_c =
 (0, I) e^{Fr} z' after r. The weights are improved step by step; all weights give a bound.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -54,7 +54,7 @@ from noack.theory.bounds.contraction import (
     spectral_norm,
     spectral_norms,
 )
-from noack.theory.bounds.enclosure import KernelBounds, response
+from noack.theory.bounds.enclosure import KernelBounds, response, response_until
 from noack.theory.bounds.gains import Output, PlantGains
 
 _CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
@@ -88,11 +88,11 @@ _HALVINGS = 12
 _TAYLOR_TERMS = 4
 ROUNDING = 1 + 1e-5
 """Exceeds the error of e^{Fτ}: measured below 1e-12 of its norm, which is up to 1e6; no proof."""
-_NEAR, _RATIO, _MOST_NODES = (0.0, 0.5, 0.75, 1.0), 1.1, 80
+_NEAR, _RATIO, _MOST_NODES = np.linspace(0.0, 1.0, 20).tolist(), 1.03, 300
 """First nodes of r in units of δ; then the ratio from node to node."""
 _LATEST = 6.0
 """Largest r in units of δ at which events are looked for."""
-_SOUGHT = 0.8
+_SOUGHT = 0.6
 """‖e^{(H+αI)r}‖_W at the last r, if possible."""
 _NEARLY_PLAIN = 0.999
 """Share of the bound without the flow from which on nothing is gained."""
@@ -544,51 +544,75 @@ def _columns(stacks: list[Stack]) -> Matrix:
     return np.asarray(np.concatenate(stacks).transpose(1, 0, 2).reshape(stacks[0].shape[1], -1))
 
 
+class SensorErrors(NamedTuple):
+    """What is known of ‖e_s‖_W between two events."""
+
+    sizes: Vector
+    """Its bounds, while 0, 1, … events have been lost since the delivery."""
+    tested: float
+    """Its bound after a test; infinite if there is none."""
+    begin_s: float
+    """The first test is that long after an event."""
+    grid_s: float
+    """Tests are multiples of this after an event; 0 if the trigger is tested at all times."""
+    level: float
+    """At an event it, or what is compared, is at least this large; 0 if nothing is known."""
+    integrates: bool
+    """Whether its integral since the event is compared."""
+    forced_s: float
+    """So long after an event the next one may be due without any of this."""
+
+
 def errors_after_losses(
     reach: Reach,
     plain: Vector,
-    size: float,
-    level: float | None,
+    known: SensorErrors,
+    outputs: Sequence[Matrix],
     spacing_s: float,
     kernel: KernelBounds,
     bend: float,
-) -> Vector:
+) -> tuple[Vector, float]:
     """Bound ‖e_c‖_W while at most 0, 1, … events have been lost since the delivery.
 
     Args:
         reach: the flow from a delivery; it is invariant.
         plain: bounds without the flow, for 0, 1, … events.
-        size: bound of ‖e_s‖_W.
-        level: ‖e_s‖_W at an event, at least.
+        known: bounds of e_s.
+        outputs: matrices Y with ‖Y z‖ ≤ 1 at all times.
         spacing_s: the least time between events.
         kernel: of ‖e^{(H+αI)τ}‖_W.
         bend: that of e_s, see :func:`bend_of_error`.
+
+    Returns:
+        The bounds, and a time between events that is at least ``spacing_s``.
     """
     errors, since_s, flow, size_of_x = plain.copy(), -reach.by.late_s, reach.starts.flow, reach.size
     first_s = float(flow.edges_s[reach.first]) if reach.first else math.inf
     most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
     if spacing_s >= most_s or len(plain) == 1:
-        return errors
-    r_s = _nodes_s(spacing_s, kernel, 2 * most_s)
+        return errors, spacing_s
+    r_s, apart_s = _nodes_s(spacing_s, kernel, 2 * most_s, known.grid_s), math.inf
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
-    for lost in range(len(plain)):
+    tested = np.where(r_s * ROUNDING >= known.begin_s, known.tested, math.inf)
+    for lost, size in enumerate(known.sizes.tolist()):
         earlier = float(errors[lost - 1]) if lost else max(_NOTHING * size, reach.by.late)
-        stage = _Stage(reach, min(max(since_s, 0.0), most_s), earlier, size_of_x, r_s, flows, kernel)
+        window_s = min(max(since_s, 0.0), most_s)
+        stage = _Stage(reach, window_s, earlier, size_of_x, outputs, r_s, flows)
         if lost:
             added = size + kernel.sups(r_s) * earlier
-            largest = max(stage.largest_error(size, added), float(added[-1]), earlier)
-            errors[lost] = min(plain[lost], largest)
+            largest = stage.largest_error(np.minimum(tested, size), added)
+            errors[lost] = min(plain[lost], max(largest, float(added[-1]), earlier))
             if lost > 1 and errors[lost] > _NEARLY_PLAIN * float(added[0]):
-                break  # later stages gain nothing, either
-        if lost + 1 < len(plain):
-            # After a delivery e_s is at most ‖e^{(H+αI)r}‖ · late larger than C_r z.
-            most = (level or 0.0) - (0.0 if lost else flow.stretch * reach.by.late)
-            later_s = stage.next_event_s(most, bend, _LATEST * spacing_s) if most > 0 else 0.0
-            since_s += max(spacing_s, later_s)
-            if not lost:  # x(0) itself may be outside the ellipsoid
-                since_s = min(since_s, first_s)
-                size_of_x = reach.largest(first_s - since_s)
-    return errors
+                return errors, spacing_s  # later stages gain nothing, either
+        # After a delivery e_s is at most ‖e^{(H+αI)r}‖ · late larger than C_r z.
+        more = 0.0 if lost else flow.stretch * reach.by.late
+        later_s = stage.next_event_s(known, more, bend, min(_LATEST * spacing_s, known.forced_s))
+        since_s += max(spacing_s, later_s)
+        if not lost:  # x(0) itself may be outside the ellipsoid
+            since_s, later_s = min(since_s, first_s), min(later_s, first_s)
+            size_of_x = reach.largest(first_s - since_s)
+        apart_s = min(apart_s, max(spacing_s, later_s))
+    return errors, apart_s
 
 
 def bend_of_error(reach: Reach, level: float) -> float:
@@ -603,16 +627,20 @@ def bend_rows(flow: DeliveryFlow) -> Matrix:
     return np.asarray((F @ F)[n:] - np.hstack([np.zeros((n, n)), H @ H]))
 
 
-def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float) -> Vector:
+def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float, grid_s: float) -> Vector:
     """Return times r, if possible up to one at which ‖e^{(H+αI)r}‖_W has fallen below a value."""
     nodes_s = [spacing_s * share for share in _NEAR]
     while len(nodes_s) < _MOST_NODES and kernel.sup(nodes_s[-1]) > _SOUGHT:
         nodes_s.append(nodes_s[-1] * _RATIO)
-    return np.array([time_s for time_s in nodes_s if time_s <= most_s])
+    found_s = np.array([time_s for time_s in nodes_s if time_s <= most_s])
+    return grid_s * np.unique(np.rint(found_s / grid_s)) if grid_s else found_s
 
 
 class _Stage:
-    """What follows an event, a time w or more after the delivery, for times r since it."""
+    """What follows an event, a time w or more after the delivery, for times r since it.
+
+    z is e^{Fw} ζ at the event. What q has changed since some time before is bounded with e^{−Fs} (BU, −BU).
+    """
 
     def __init__(
         self,
@@ -620,43 +648,46 @@ class _Stage:
         window_s: float,
         earlier: float,
         size_of_x: float,
+        outputs: Sequence[Matrix],
         r_s: Vector,
         flows: Stack,
-        kernel: KernelBounds,
     ) -> None:
         self._flow, self._r_s, self._earlier = reach.starts.flow, r_s, earlier
-        n, identity = self._flow.n, np.eye(2 * self._flow.n)
-        half = exponential(self._flow.generator * window_s / 2)
-        times_s = np.concatenate([[window_s / 2, window_s], window_s + r_s])
-        half_way, at_event, *later = (
-            reach.by.held
-            * self._flow.of_error[1][[self._flow.cell_at(time_s) for time_s in times_s.tolist()]]
-            if reach.by.held
-            else np.zeros(len(times_s))
-        )
-        self._window_s, self._held, sups = window_s, reach.by.held, kernel.sups(r_s) * at_event
-        self._later, self._seen = np.array(later), np.array(later) + sups
-        self._cells = self._later[1:] + sups[:-1]
+        self._held, self._late_s = reach.by.held, reach.by.late_s
+        n, shape, identity = self._flow.n, reach.starts.shape, np.eye(2 * self._flow.n)
+        event = exponential(self._flow.generator * window_s)
+        pushed = self._flow.of_error[1][[self._flow.cell_at(time_s) for time_s in r_s.tolist()]]
+        self._later = self._held * pushed if self._held else np.zeros(len(r_s))
+        error, of_x = (self._held * self._pushed_back(C, window_s) for C in (identity[n:, n:], shape))
         rows = [
-            identity[n:] / earlier,
-            half[n:] / (earlier + half_way),
-            (half @ half)[n:] / (earlier + at_event),
+            identity[n:] / (earlier + error),
+            shape @ identity[:n] / (size_of_x + of_x),
+            event[n:] / earlier,
+            shape @ event[:n] / size_of_x,
+            *(Y @ event for Y in outputs),
         ]
-        rows.append(reach.starts.shape @ identity[:n] / size_of_x)
         forms = np.array([row.T @ row for row in rows])
         self._forms = np.broadcast_to(forms, (len(r_s), *forms.shape))
-        self._z = flows @ half @ half
+        self._z = flows @ event
         # x + e_c follows the models: e^{Hr} is the sum of both rows of e^{Fr} (I, 0).
         models = flows[:, :n, :n] + flows[:, n:, :n]
-        self._e_s = self._z[:, n:] - models @ (half @ half)[n:]
+        self._e_s = self._z[:, n:] - models @ event[n:]
 
-    def largest_error(self, size: float, added: Vector) -> float:
-        """Bound ‖e_c‖_W up to the last r, given bounds without the flow for the nodes."""
-        n = self._flow.n
-        sizes = (size + self._seen[:-1]) ** 2
-        events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1, None] / sizes[:, None, None, None]
-        forms = np.concatenate([self._forms[:-1], events], axis=1)
-        ends, weights = _largest(forms, self._z[1:, n:], float(added[-1]))
+    def _pushed_back(self, C: Matrix, ago_s: float) -> float:
+        """Bound ∫ ‖C e^{−As} BU‖ ds over some time; (I, 0) e^{−Fs} (BU, −BU) = e^{−As} BU."""
+        if not (self._held and ago_s):
+            return 0.0
+        flow = self._flow
+        followed = response_until(flow.BK - flow.closed_loop, flow.input_error, ago_s)
+        return float(followed.through(C).integral_on_grid())
+
+    def largest_error(self, sizes: Vector, added: Vector) -> float:
+        """Bound ‖e_c‖_W up to the last r, given those of e_s, and bounds without the flow."""
+        n, sizes = self._flow.n, (sizes + self._later)[:-1, None, None] ** 2
+        events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1] / sizes
+        forms = np.concatenate([self._forms[:-1], events[:, None]], axis=1)
+        used = added[:-1] - self._later[1:]
+        ends, weights = _largest(forms, self._z[1:, n:], float(added[-1]), used=used)
         cells = np.maximum(ends, np.append(self._earlier, ends[:-1])) + self._sags(forms, weights)
         return float(np.minimum(cells + self._later[1:], added[:-1]).max())
 
@@ -674,17 +705,25 @@ class _Stage:
         bends += growth * np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", terms, inverse, terms)))
         return np.asarray(steps_s[:, 0, 0] ** 2 / 8 * bends * ROUNDING)
 
-    def next_event_s(self, level: float, bend: float, most_s: float) -> float:
-        """Return a time before which ‖e_s‖_W does not reach a level."""
-        near, flow = self._r_s <= most_s, self._flow
+    def next_event_s(self, known: SensorErrors, more: float, bend: float, most_s: float) -> float:
+        """Return a time before which there is no event; e_s may be larger than C_r z by ``more``."""
+        near, flow, level = self._r_s <= most_s, self._flow, known.level
+        level -= more * self._late_s if known.integrates else more
+        if level <= 0:
+            return 0.0
         if self._held:  # what is followed differs from e_s
-            pushed = flow.disturbed(bend_rows(flow))[1][flow.cell_at(self._window_s + most_s)]
-            differs = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._cells.max())
+            pushed = flow.disturbed(bend_rows(flow))[1][flow.cell_at(most_s)]
+            differs = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._later.max())
             bend = bend + self._held * float(pushed) + differs
-        ends, _ = _largest(self._forms[near], self._e_s[near], 0.9 * level, all_of_them=True)
-        sags = np.diff(self._r_s[near]) ** 2 / 8 * bend
-        reached = np.maximum(ends[1:], ends[:-1]) + sags + self._cells[near[1:]] >= level
-        return float(self._r_s[np.append(reached, True).argmax()])
+        enough = 0.0 if known.integrates else 0.9 * level
+        ends, _ = _largest(self._forms[near], self._e_s[near], enough, all_of_them=True)
+        steps_s = np.diff(self._r_s[near])
+        cells = np.maximum(ends[1:], ends[:-1]) + steps_s**2 / 8 * bend + self._later[1:][near[1:]]
+        if known.integrates:
+            cells = np.cumsum(steps_s * (np.maximum.accumulate(cells) + more))
+        found_s = float(self._r_s[np.append(cells >= level, True).argmax()])
+        # Tests may lie beside the nodes if times are not those since an event.
+        return max(found_s - known.grid_s, 0.0) if more and known.integrates else found_s
 
 
 def _balancing(rows: Stack) -> Stack:
@@ -704,11 +743,18 @@ def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
 
 
 def _largest(
-    forms: Stack, Y: Stack, enough: float, begin: Stack | None = None, *, all_of_them: bool = False
+    forms: Stack,
+    Y: Stack,
+    enough: float,
+    begin: Stack | None = None,
+    *,
+    all_of_them: bool = False,
+    used: Vector | float = math.inf,
 ) -> tuple[Vector, Stack]:
     """Bound ‖Y z‖ for all z with forms of at most 1, (j,), by weights, (j, i), from some on.
 
     None below ``enough`` is improved, and only the largest ones unless all of them are wanted.
+    Bounds above ``used`` count as that.
     """
     bounds = np.full(len(forms), np.inf)
     weights = np.full(forms.shape[:2], 1 / forms.shape[1]) if begin is None else begin
@@ -723,12 +769,13 @@ def _largest(
         bounds[active] = np.minimum(bounds[active], sizes)
         # The forms of the z with the largest ‖Y z‖: those above the mean need more weight.
         z = (Z @ vectors[:, :, -1:])[..., 0]
-        sizes = np.einsum("ja,jiab,jb->ji", z, some, z)
+        sizes = np.einsum("ja,jiab,jb->ji", z, some, z).clip(min=0.0)
         weights[active] *= (sizes / sizes.max(axis=1, keepdims=True).clip(min=1e-300)) ** _POWER
         weights = weights.clip(min=_LEAST_WEIGHT)
         weights /= weights.sum(axis=1, keepdims=True)
-        least = enough if all_of_them else max(enough, _NEARLY * float(bounds.max()))
-        active = np.flatnonzero(bounds > least)
+        sizes = np.minimum(bounds, used)
+        least = enough if all_of_them else max(enough, _NEARLY * float(sizes.max()))
+        active = np.flatnonzero(sizes > least)
         if not len(active):
             break
     sums = np.linalg.eigvalsh(np.einsum("ji,jiab->jab", best, forms))

@@ -20,7 +20,7 @@ time.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -37,6 +37,7 @@ from noack.theory.certificates.delivery_flow import (
     ROUNDING,
     Disturbed,
     Reach,
+    SensorErrors,
     Starts,
     bend_of_error,
     error_after,
@@ -47,7 +48,7 @@ from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
 
 _ROUNDS, _SETTLED = 20, 0.99
 _MOST_INSERTED, _NEARLY = 60, 0.9999
-_SHORTEST_S, _LEAST_SHARE = 1e-9, 1e-6
+_SHORTEST_S, _LEAST_SHARE, _LEAST = 1e-9, 1e-6, 1e-200
 _SHORT, _MOST_STEPS = 0.005, 16
 
 
@@ -102,9 +103,7 @@ class _ScheduledFlow:
         self._part, self._conditions, self.spacing_s = part, conditions, spacing_s
         self._step = _Inserted(part, conditions, 0.0)
         self.known = self._step.known(spacing_s)
-        self._late_s = max(conditions.delay_s, conditions.start_s)
-        self._errors: Vector | None = None
-        """Bounds of ‖e_c‖_W at events while at most 0, 1, … have been lost."""
+        self._late_s = self._step.late_s
 
     @cached_property
     def _ellipsoids(self) -> InvariantEllipsoids:
@@ -141,7 +140,8 @@ class _ScheduledFlow:
         known.errors[Output.GAIN] = min(known.errors[Output.GAIN], size)
         if self.spacing_s >= max(self._late_s, _SHORTEST_S):  # before, the last update has acted
             size = max(self._after_losses(reach), reach.by.late)
-            known.errors[Output.WEIGHTED] = min(limit, size)
+            for output, most in known.errors.items():
+                known.errors[output] = min(most, size * self._part.plant.error.now(output))
         self.insert()
         self.spacing_s = max(self.spacing_s, self._step.next_event_s(known))
         self.insert()
@@ -160,38 +160,57 @@ class _ScheduledFlow:
         R_E = plant.outputs[Output.MISMATCH] @ plant.error.inverse_weight
         of_mismatch = size * float(spectral_norm(R_E @ starts.inverse)) * ROUNDING
         mismatch = min(float(known.signals[4]), of_mismatch)
-        return Disturbed(held, self._entered(self._late_s, input_error, mismatch), self._late_s)
-
-    def _entered(self, until_s: float, input_error: float, mismatch: float) -> float:
-        """Bound the e_s that enters within some time."""
-        if until_s == 0:
-            return 0.0
-        by_input, mismatched, _ = self._part.plant.growth(until_s, COARSE_CELLS).totals
-        return float(by_input * input_error + mismatched * mismatch)
+        return Disturbed(held, self._step.entered(self._late_s, input_error, mismatch), self._late_s)
 
     def _after_losses(self, reach: Reach) -> float:
         """Bound ‖e_c‖_W after as many losses as there may be, until the next update acts."""
         known, error, conditions = self.known, self._part.plant.error, self._conditions
-        missing = [
-            float(error.missing(Output.WEIGHTED, lost, self.spacing_s))
-            for lost in range(conditions.dropouts + 1)
-        ]
-        plain, bound = (1 + np.array(missing)) * known.sensor, self._part.bound
-        errors = plain if self._errors is None else np.minimum(plain, self._errors)
-        is_level = bound.forced_s == math.inf and not bound.ago_s  # otherwise an event needs no e_s
-        level = bound.reached if is_level else None
-        bend = 0.0 if level is None else bend_of_error(reach, level)
-        if level is not None and reach.by.is_none:
-            at_event = max(float(errors_at_events(errors)[-1]), _LEAST_SHARE * reach.limit)
+        of_sensor = self._of_sensor
+        level = 0.0 if of_sensor.integrates else of_sensor.level
+        bend = bend_of_error(reach, level or float(of_sensor.sizes.max())) if of_sensor.level else 0.0
+        if level and reach.by.is_none:
+            at_event = max(float(errors_at_events(known.lost)[-1]), _LEAST_SHARE * reach.limit)
             at_events = replace(reach, limit=at_event)
-            next_s, grid_s = _next_event_s(at_events, level, self.spacing_s, bend), conditions.spacing_s
-            self.spacing_s = grid_s * math.ceil(next_s / grid_s - 1e-9) if grid_s else next_s
+            later_s = _next_event_s(at_events, level, self.spacing_s, bend)
+            later_s = min(later_s, self._part.bound.forced_s)
+            self.spacing_s = max(self.spacing_s, self._tested_s(later_s))
         kernel = error.kernels[Output.WEIGHTED]
-        errors = errors_after_losses(reach, errors, known.sensor, level, self.spacing_s, kernel, bend)
-        self._errors = errors
-        _, _, _, input_error, mismatch, _ = known.signals.tolist()
-        entered = self._entered(conditions.delay_s, max(input_error, self._step.start_error), mismatch)
-        return error.stretch(conditions.delay_s) * float(errors[-1]) + entered
+        known.lost, apart_s = errors_after_losses(
+            reach, known.lost, of_sensor, self._bounded, self.spacing_s, kernel, bend
+        )
+        self.spacing_s = self._tested_s(apart_s)
+        # An event comes after the first input has been applied.
+        entered = self._step.entered(conditions.delay_s, *known.signals[3:5].tolist())
+        return error.stretch(conditions.delay_s) * float(known.lost[-1]) + entered
+
+    @property
+    def _bounded(self) -> list[Matrix]:
+        """Matrices Y with ‖Y z‖ ≤ 1 at all times: the bounds of W x, E x and K e_c."""
+        plant, known = self._part.plant, self.known
+        gain, inverse = plant.error.split_K[1], plant.error.inverse_weight
+        of_x = [plant.outputs[C] / max(known.states[C], _LEAST) for C in (Output.WEIGHTED, Output.MISMATCH)]
+        rows = [np.hstack([C @ inverse, np.zeros((len(C), len(inverse)))]) for C in of_x]
+        gain = gain @ inverse / max(known.errors[Output.GAIN], _LEAST)
+        return [*rows, np.hstack([np.zeros_like(gain), gain])]
+
+    @property
+    def _of_sensor(self) -> SensorErrors:
+        """What is known of e_s between two events."""
+        known, bound, conditions = self.known, self._part.bound, self._conditions
+        level, h_s = bound.reached or 0.0, conditions.sampling_s
+        if bound.is_mean:  # of an integral, over any time
+            level *= bound.ago_s
+        if bound.ago_s and not bound.is_mean:
+            level = 0.0  # an event may need no e_s
+        tested = known.tested if h_s == conditions.spacing_s else math.inf
+        begin_s = bound.untested_s + h_s if bound.untested_s else 0.0
+        test_s, forced_s = conditions.spacing_s, bound.forced_s
+        return SensorErrors(known.present, tested, begin_s, test_s, level, bound.is_mean, forced_s)
+
+    def _tested_s(self, time_s: float) -> float:
+        """Round a time up to the tests."""
+        grid_s = self._conditions.spacing_s
+        return grid_s * math.ceil(time_s / grid_s - 1e-9) if grid_s else time_s
 
 
 def errors_at_events(errors: Vector) -> Vector:
@@ -274,8 +293,7 @@ class _SumOfErrors:
         self._gains = np.dstack([present, np.broadcast_to(missing, (*present.shape, count))])
         """(o, g, i), like those of what has entered."""
         highest = np.array([kernel.sup() for kernel, _ in kernels])
-        self._begun = np.fmin(begin_s * highest[:, None], self._entered.max(axis=1).cumsum(axis=1))
-        """(o, i): of what enters before the first input, beyond the bounds of later times."""
+        self._highest, self._begin_s = highest[:, None], begin_s
 
     def bound(
         self, b: Vector, input_error: float, mismatch: float, start_error: float
@@ -284,8 +302,26 @@ class _SumOfErrors:
 
         Given are bounds of ‖e_s‖_W after a test for each growth, of π and sup‖R_E x‖.
         """
-        errors = self._gains * b[:, None] + self._entered * input_error + self._mismatched * mismatch
-        return _smallest(errors, self._growths), self._begun * max(start_error - input_error, 0.0)
+        each = self._each(b, mismatch, np.array([input_error]))[..., 0]
+        return each, self._begun(self._begin_s) * max(start_error - input_error, 0.0)
+
+    def after_losses(self, b: Vector, inputs: Vector, mismatch: float, late_s: float, late: float) -> Matrix:
+        """Bound ‖C e_c‖ after 0, 1, … lost events, which are at least ``late_s`` apart, (o, j).
+
+        ``inputs``: bounds of ‖p‖ meanwhile, and ``late`` until an update acts, for ``late_s``.
+        """
+        each, lost = self._each(b, mismatch, inputs), np.arange(len(inputs))
+        sums = [each[:, 0, j] + each[:, lost[1 : j + 1], lost[:j][::-1]].sum(axis=1) for j in lost.tolist()]
+        return np.array(sums).T + self._begun(late_s)[:, lost] * max(late - float(inputs[0]), 0.0)
+
+    def _each(self, b: Vector, mismatch: float, inputs: Vector) -> Stack:
+        """Bound each error's part of ‖C e_c‖ for each bound of ‖p‖, (o, i, j)."""
+        known = self._gains * b[:, None] + self._mismatched * mismatch
+        return _smallest(known[..., None] + self._entered[..., None] * inputs, self._growths)
+
+    def _begun(self, late_s: float) -> Matrix:
+        """Bound what enters within a time at first, into the first i errors together, by a p of 1, (o, i)."""
+        return np.asarray(np.fmin(late_s * self._highest, self._entered.max(axis=1).cumsum(axis=1)))
 
 
 class _OpenLoopErrors:
@@ -331,13 +367,15 @@ class _OpenLoopErrors:
             turned = np.array([*left.values()]) + entered_by[2] * left[Output.GAIN]
             return np.array([stay, np.minimum(stay * left[Output.WEIGHTED], turned), *entered_by])
 
-        self._step, self._whole = gains(0.0, spacing_s)[:, :1], gains(conditions.delay_s, 0.0)
+        self._step, self._between = gains(0.0, spacing_s)[:, :1], gains(0.0, 0.0)[:, :1]
+        self._whole = gains(conditions.delay_s, 0.0)
         until_s = max(conditions.delay_s, conditions.start_s)
         self._late = plant.growth(until_s, COARSE_CELLS).totals[:2] if until_s else (0.0, 0.0)
 
-    def bound(self, b: Vector, held: float, input_error: float, mismatch: float) -> Matrix:
-        """Bound sup‖C e_c‖ without a lost event, and after as many as there may be, (o, 2).
+    def bound(self, b: Vector, held: float, input_error: float, mismatch: float) -> tuple[Vector, Matrix]:
+        """Bound ‖e_c‖_W after at most 0, 1, … lost events until the next event, (j,).
 
+        The other result is sup‖C e_c‖ without a lost event, and after as many as there may be, (o, 2).
         ``input_error`` bounds π before the first input, too.
         """
         late = float(self._late[0] * input_error + self._late[1] * mismatch)
@@ -351,7 +389,8 @@ class _OpenLoopErrors:
         lost = [0.0]
         for _ in range(self._lost):
             lost.append(max(float(followed(self._step, lost[-1])[0]), lost[-1]))
-        return np.array([followed(self._whole, one) for one in (0.0, lost[-1])]).T
+        between = np.array([followed(self._between, one)[0] for one in lost])
+        return between, np.array([followed(self._whole, one) for one in (0.0, lost[-1])]).T
 
 
 @dataclass
@@ -370,6 +409,14 @@ class _KnownBounds:
     """Of the part of ‖u − Kx‖ that does not come from the present e_s."""
     received: float = math.inf
     """Of ‖u − Kx‖ while no event is missing."""
+    lost: Vector = field(default_factory=lambda: np.array(math.inf))
+    """Of ‖e_c‖_W after at most 0, 1, … lost events, from when an update acts until the next event."""
+    present: Vector = field(default_factory=lambda: np.array(math.inf))
+    """Of ‖e_s‖_W meanwhile, if the update acts before the first lost event."""
+    inputs: Vector = field(default_factory=lambda: np.array(math.inf))
+    """Of ‖p‖ likewise."""
+    tested: float = math.inf
+    """Of ‖e_s‖_W after a test."""
 
     def reduce_errors(self, sizes: Vector) -> None:
         """Take smaller bounds of sup‖C e_c‖, (o,)."""
@@ -396,32 +443,73 @@ class _Inserted(ErrorInequalities):
 
     def insert(self, known: _KnownBounds, spacing_s: float) -> None:
         """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
-        v, states, errors = known.signals, known.states, known.errors
-        (held, input_error, mismatch), place = (
-            v[[0, 3, 4]].tolist(),
-            [*self._error.outputs].index(Output.GAIN),
-        )
+        v, states, errors, h_s = known.signals, known.states, known.errors, self._conditions.sampling_s
+        held, input_error, mismatch = v[[0, 3, 4]].tolist()
+        own, place = map([*self._error.outputs].index, (Output.WEIGHTED, Output.GAIN))
         for name, (free, forced) in self._timed_states.items():
             states[name] = min(states[name], float((free + forced * input_error).max()))
-        b = np.array([growth.after_test(states) for row in self._growths for growth in row])
+        growths = [growth for row in self._growths for growth in row]
+        b = np.array([growth.after_test(states) for growth in growths])
+        of_last = [one for growth, one in zip(growths, b.tolist(), strict=True) if growth.longest_s == h_s]
+        known.tested = min([known.tested, *of_last])
         for method, sums in self._sums(spacing_s).items():
             each, begun = sums.bound(b, input_error, mismatch, self.start_error)
-            sizes = each.sum(axis=1) + begun[:, -1]
+            whole = each.cumsum(axis=1) + begun
             if method is BoundMethod.MISSING:
-                known.earlier = min(known.earlier, float(sizes[place] - each[place, 0]) + held)
-                known.received = min(known.received, float(each[place, 0] + begun[place, 0]) + held)
-            known.reduce_errors(sizes)
-        received, sizes = (
-            self._followed(spacing_s).bound(b, held, max(input_error, self.start_error), mismatch).T
-        )
-        known.reduce_errors(sizes)
-        known.received = min(known.received, float(received[place]) + held)
-        rows = iter(b.tolist())
-        grown = [max(self._grown(one, next(rows), *v[3:5]) for one in row) for row in self._growths]
-        known.sensor = min(known.sensor, *grown)
+                known.earlier = min(known.earlier, float(whole[place, -1] - each[place, 0]) + held)
+                known.received = min(known.received, float(whole[place, 0]) + held)
+                known.lost = np.minimum(known.lost, whole[own, : self._conditions.dropouts + 1])
+            known.reduce_errors(whole[:, -1])
+        start_error = max(input_error, self.start_error)
+        between, whole = self._followed(spacing_s).bound(b, held, start_error, mismatch)
+        known.reduce_errors(whole[:, -1])
+        known.received = min(known.received, float(whole[place, 0]) + held)
+        known.lost = np.minimum(known.lost, between)
+        if spacing_s >= self.late_s:
+            inputs = np.minimum(known.inputs, self._error.now(Output.GAIN) * known.lost + held)
+            inputs[0] = min(inputs[0], known.received)
+            sums = self._sums(spacing_s)[BoundMethod.MISSING]
+            # While one more event is in flight, π bounds the input that drives the present error.
+            stages = np.append(inputs, input_error)[: self._missing_events(spacing_s) + 1]
+            summed = sums.after_losses(b, stages, mismatch, self.late_s, start_error)
+            known.reduce_errors(summed[:, -1])
+            known.lost = np.minimum(known.lost, summed[own, : len(inputs)])
+            known.inputs = np.minimum(inputs, summed[place, : len(inputs)] + held)
+        self._insert_sensor(known, b)
         age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
         found_v = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
         known.signals = np.minimum(v, np.array(found_v, dtype=np.float64))
+
+    def _insert_sensor(self, known: _KnownBounds, b: Vector) -> None:
+        """Insert bounds of e_s, given those after a test."""
+        input_error, mismatch = known.signals[3:5].tolist()
+        inputs = np.minimum(known.inputs + np.zeros_like(known.lost), input_error)
+        received = inputs[0] = min(float(inputs[0]), known.received)
+        inputs = np.append(input_error, inputs)
+        late = self.entered(self.late_s, max(input_error, self.start_error), mismatch)
+        ends, found = iter(b.tolist()), []
+        for row in self._growths:
+            sizes = np.max([self._grown(growth, next(ends), inputs, mismatch) for growth in row], axis=0)
+            until_s = max(growth.longest_s for growth in row)
+            # In this time after an update acts, e_s is what was there and what has entered since.
+            first = self._error.stretch(until_s) * late + self.entered(until_s, received, mismatch)
+            found.append([sizes[0], max(float(sizes[1]), first), *sizes[2:]])
+        smallest = np.min(found, axis=0)
+        known.sensor = min(known.sensor, float(smallest[0]))
+        known.present = np.minimum(known.present, np.minimum(smallest[1:], known.sensor))
+        known.lost[0] = min(known.lost[0], known.present[0])
+
+    def entered(self, until_s: float, input_error: float, mismatch: float) -> float:
+        """Bound the e_s that enters within some time."""
+        if until_s == 0:
+            return 0.0
+        by_input, mismatched, _ = self._plant.growth(until_s, COARSE_CELLS).totals
+        return float(by_input * input_error + mismatched * mismatch)
+
+    @property
+    def late_s(self) -> float:
+        """An update acts at most so long after its event, the first one after the start."""
+        return max(self._conditions.delay_s, self._conditions.start_s)
 
     @cached_property
     def _timed_states(self) -> Mapping[str, tuple[Vector, Vector]]:
@@ -435,11 +523,13 @@ class _Inserted(ErrorInequalities):
             for (name, free), forced in zip(plant.free.items(), plant.forced.values(), strict=True)
         }
 
-    def _grown(self, growth: ErrorGrowth, b: float, input_error: float, mismatch: float) -> float:
-        """Return how large e_s may become under one bound."""
+    def _grown(self, growth: ErrorGrowth, b: float, inputs: Vector, mismatch: float) -> Vector:
+        """Return how large e_s may become under one bound, given those of ‖p‖; the start is in the first."""
         by_input, mismatched, _ = growth.driven
-        begun = np.fmin(by_input, self._begin_s * growth.highest) * max(self.start_error - input_error, 0.0)
-        return float(growth.stretch * b + by_input * input_error + mismatched * mismatch + begun)
+        begun = np.fmin(by_input, self._begin_s * growth.highest)
+        sizes = growth.stretch * b + by_input * inputs + mismatched * mismatch
+        sizes[0] += begun * max(self.start_error - float(inputs[0]), 0.0)
+        return np.asarray(sizes)
 
     @cached_method
     def _sums(self, spacing_s: float) -> Mapping[BoundMethod, _SumOfErrors]:

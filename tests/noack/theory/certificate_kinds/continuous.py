@@ -13,7 +13,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix
+from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
@@ -68,8 +68,9 @@ def no_lost_errors() -> AbstractContextManager[Any]:
     """In open loop a lost update has left nothing."""
     exact = _OpenLoopErrors.bound
 
-    def bound(errors: _OpenLoopErrors, *known: Any) -> Matrix:
-        return np.repeat(exact(errors, *known)[:, :1], 2, axis=1)
+    def bound(errors: _OpenLoopErrors, *known: Any) -> tuple[Vector, Matrix]:
+        between, whole = exact(errors, *known)
+        return np.full_like(between, between[0]), np.repeat(whole[:, :1], 2, axis=1)
 
     return patch.object(_OpenLoopErrors, "bound", bound)
 
