@@ -30,7 +30,7 @@ LINES = {
     "noack/protocol": 1240,
     "noack/runtime": 5665,
     "noack/settings": 585,
-    "noack/theory": 11115,
+    "noack/theory": 11250,
     "noack/traces": 1320,
     "noack/trigger": 1065,
     "netem": 6500,
@@ -51,7 +51,7 @@ LINES = {
     "controller_node": 410,
     "benchmarks": 4525,
     "native": 11030,
-    "tests": 46385,
+    "tests": 46390,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
