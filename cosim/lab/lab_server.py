@@ -117,6 +117,7 @@ def refused_message(record: logging.LogRecord) -> bool:
 
 
 _END_S, _STDERR = 60.0, 2
+"""The end may take so long; a live run that is being judged is a process of its own and goes on."""
 _CAN_CHECK = sys.platform == "linux"
 """Whether the user of a connection can be seen."""
 _RECONNECT_S = 60.0
