@@ -5,7 +5,6 @@ escaped; figures are drawn where they are used.
 """
 
 import tomllib
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -15,8 +14,6 @@ from markupsafe import Markup
 from cosim.analysis.fidelity import is_against
 from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.figure_files import inline
-from cosim.output.figures.figure_format import WIDTHS_IN
-from cosim.output.figures.figure_layout import figure_width
 from cosim.output.run_tables import interval_text
 from noack.core.number_format import number, percent
 
@@ -55,13 +52,7 @@ def templates(folder: Path = PAGES) -> Environment:
 
 
 def _markup(figure: FigureDescription) -> Markup:
-    """Draw a figure twice: for wide pages, and for narrow ones as wide as a paper's column.
-
-    The style sheet shows the one whose texts are large enough.
-    """
-    with figure_width(WIDTHS_IN["column"]):
-        narrow = inline(replace(figure, name=f"{figure.name}-narrow"))
-    return Markup(f'<div class="wide">{inline(figure)}</div><div class="narrow">{narrow}</div>')
+    return Markup(inline(figure))
 
 
 def words(key: str) -> str:

@@ -70,7 +70,7 @@ def test_json_tables_and_page_have_the_same_numbers(tmp_path: Path) -> None:
     assert found["certificate"]["share"] == pytest.approx(0.57, abs=0.01)
     assert found["written"] == [str(page)]
     html = page.read_text()
-    assert html.count("<svg") + html.count("<img") == 8  # four figures, for wide and for narrow screens
+    assert html.count("<svg") + html.count("<img") == 4
     shown = measure(*words)
     assert shown.exit_code == 0
     for text in ("616 (28.3 %)", "175 packets, 10.9 s, from 81.312 s"):

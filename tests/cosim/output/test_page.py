@@ -153,14 +153,14 @@ OUTSIDE = """(() => {
     && r.top > box.top - by && r.bottom < box.bottom + by))(e.getBoundingClientRect());
   const page = document.documentElement.getBoundingClientRect();
   const figures = [...document.querySelectorAll('figure svg')].filter(e => e.clientWidth);
-  const fonts = e => (e.closest('.narrow') ? 8 : 9) * e.clientWidth / e.viewBox.baseVal.width;
-  const scrolled = [...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth);
+  const fonts = e => 9 * e.clientWidth / e.viewBox.baseVal.width;
+  const scrolled = [...document.querySelectorAll('.scroll:has(table)')].filter(e => e.scrollWidth > e.clientWidth);
   scrolled.forEach(e => { e.scrollLeft = 30; });
   const lost = scrolled.filter(e => !within(e.querySelector('tbody tr').firstElementChild, page, 0));
   return [figures.length, lost.length, document.scrollingElement.scrollWidth - innerWidth,
     figures.filter(e => fonts(e) < 10).length,
-    figures.flatMap(e => [...e.querySelectorAll('use')].filter(u => !within(u, page, 1)
-      || !within(u, e.getBoundingClientRect(), 4))).length,
+    figures.flatMap(e => [...e.querySelectorAll('use')].filter(
+      u => !within(u, e.getBoundingClientRect(), 4))).length,
     [...document.querySelectorAll('main *')].filter(e => !e.closest('.scroll, pre, svg')
       && !within(e, page, 1)).map(e => e.outerHTML.slice(0, 80)).join()];
 })()"""

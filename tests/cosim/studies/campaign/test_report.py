@@ -148,7 +148,7 @@ def test_the_page_is_one_file_and_escapes_user_text(write: Write, plan: dict[str
     assert "<script" not in html
     assert "http" not in html.replace('"http-equiv', "").replace("http-equiv=", "")
     assert html.count("<figure id=") == len(campaign.figures)
-    assert html.count("<svg") == 2 * len(campaign.figures)  # for wide and for narrow screens
+    assert html.count("<svg") == len(campaign.figures)
 
 
 points = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12)
