@@ -169,7 +169,7 @@ function labStyle(pen, item) {
 function labSwatch(item) {
   const swatch = labNode('canvas', {width: 44, height: 28, 'aria-hidden': 'true'});
   const pen = swatch.getContext('2d', {willReadFrequently: true});
-  const outline = {line: 'M0 7h22', band: 'M0 1h22v12h-22z', dot: 'M11 7h0',
+  const outline = {line: 'M0 7h22', band: 'M0 1h22v12h-22z', dot: 'M11 7h.01',
     cross: 'M7 3l8 8m0 -8l-8 8'};
   pen.scale(2, 2);
   labStyle(pen, item);

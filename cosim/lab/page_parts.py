@@ -161,7 +161,7 @@ class TextPanel:
         with ui.expansion("all settings (TOML)").classes("w-full").props("dense") as expansion:
             self._mistakes = ui.column().classes("gap-0 w-full").props("role=status")
             self._editor = ui.codemirror(
-                draft.text, language="TOML", line_wrapping=False, on_change=self._edited
+                draft.text, language="TOML", line_wrapping=True, on_change=self._edited
             ).classes("w-full h-96")
         expansion.on("after-show", js_handler="labNameEditor")
 

@@ -52,6 +52,7 @@ from cosim.output.figures.figure_layout import (
     place_panels,
     rgb,
     settings,
+    turned_in,
 )
 from cosim.record.align import Reals
 
@@ -361,6 +362,9 @@ def _finish_axis(axes: Axes, letter: Literal["x", "y"], described: Axis, has_num
         axis.set_major_locator(MaxNLocator(integer=True, nbins=5 if few else "auto"))
     if described.ticks is not None:
         axis.set_ticks([*described.ticks], labels=[*map(_for_font, described.ticks.values())])
+        if letter == "x" and turned_in(described, box / axes.figure.dpi):
+            for text in axis.get_ticklabels():
+                text.set(rotation=45, horizontalalignment="right", rotation_mode="anchor")
     if not has_numbers:
         axis.set_tick_params(which="both", labelbottom=False, labelleft=False)
     if described.about is not None and described.logarithmic:

@@ -9,6 +9,7 @@ This module does not use pyplot, and does not change matplotlib's global setting
 
 import io
 import logging
+import math
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +22,7 @@ from typing import NamedTuple
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from cosim.output.figures.figure_description import FigureDescription, Panel, Row
+from cosim.output.figures.figure_description import Axis, FigureDescription, Panel, Row
 from cosim.output.figures.figure_format import SCREEN_IN
 from cosim.output.figures.palette import Colour
 
@@ -212,6 +213,7 @@ def place_panels(described: FigureDescription) -> tuple[list[Place], tuple[float
             box = line[0].box
             numbered = any(place.has_x for place in line)
             top_in = box.top + box.height + (space.below_in if numbered else space.gap_in)
+            top_in += max(turned_in(place.panel.x, place.box.width) for place in line)
     return places, (space.width_in, top_in)
 
 
@@ -267,6 +269,13 @@ def _left_in(panel: Panel) -> float:
     label_in = 2 * space.character_in if panel.y.label else 0.0
     longest_in = max(map(len, texts), default=0) * space.character_in
     return max(space.left_in, longest_in + BAR_IN + label_in)
+
+
+def turned_in(axis: Axis, width_in: float) -> float:
+    """Return the height of the texts at a horizontal axis turned by 45°; 0 if they have room."""
+    texts = (axis.ticks or {}).values()
+    longest_in = max(map(len, texts), default=0) * layout().character_in
+    return longest_in * math.sin(math.pi / 4) if len(texts) * longest_in > width_in else 0.0
 
 
 def _head_in(labels: Sequence[str], width_in: float, *, titled: bool = True) -> float:

@@ -22,6 +22,7 @@ from cosim.record.run_record import RunRecord
 from noack.core.errors import ExitStatus
 from noack.scenario.scenario_file import dumps as scenario_toml
 from tests.command_line import invoke
+from tests.cosim.lab.conftest import started
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
 from tests.cosim.summaries import alone, summary_of
 
@@ -145,6 +146,40 @@ def test_the_report_of_a_live_run_is_complete(record: RunRecord, tmp_path: Path)
     assert scenario_toml(record.scenario) in parsed.text
     assert "guarantee broken since 0.000 s: violated: controller error" in parsed.text
     assert "started 2020-01-02" in parsed.text
+
+
+OUTSIDE = """(() => {
+  const within = (e, box, by) => (r => !r.width || (r.left > box.left - by && r.right < box.right + by
+    && r.top > box.top - by && r.bottom < box.bottom + by))(e.getBoundingClientRect());
+  const page = document.documentElement.getBoundingClientRect();
+  const figures = [...document.querySelectorAll('figure svg')].filter(e => e.clientWidth);
+  const fonts = e => 9 * e.clientWidth / e.viewBox.baseVal.width;
+  const scrolled = [...document.querySelectorAll('.scroll:has(table)')].filter(e => e.scrollWidth > e.clientWidth);
+  scrolled.forEach(e => { e.scrollLeft = 30; });
+  const lost = scrolled.filter(e => !within(e.querySelector('tbody tr').firstElementChild, page, 0));
+  return [figures.length, lost.length, document.scrollingElement.scrollWidth - innerWidth,
+    figures.filter(e => fonts(e) < 10).length,
+    figures.flatMap(e => [...e.querySelectorAll('use')].filter(
+      u => !within(u, e.getBoundingClientRect(), 4))).length,
+    [...document.querySelectorAll('main *')].filter(e => !e.closest('.scroll, pre, svg')
+      && !within(e, page, 1)).map(e => e.outerHTML.slice(0, 80)).join()];
+})()"""
+"""Numbers of figures, of names that were scrolled away, of pixels beyond the page, of figures with
+texts below 10 pixels, of their glyphs that are cut, and what is wider than the page."""
+
+
+def test_nothing_is_cut_or_too_small_to_read_on_any_screen(record: RunRecord, tmp_path: Path) -> None:
+    written(record, tmp_path, claims=CLAIMS)
+    with started(tmp_path / "profile") as browser:
+        browser.open("about:blank", 390, 844)
+        browser.call("Page.navigate", url=(tmp_path / REPORT_FILE).as_uri())
+        loaded = "new Promise(done => document.readyState === 'complete' ? done() : onload = done)"
+        browser.call("Runtime.evaluate", expression=loaded, awaitPromise=True)
+        for width in (390, 768, 847, 849, 1366, 1920):
+            size = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": False}
+            browser.call("Emulation.setDeviceMetricsOverride", **size)
+            found = browser.call("Runtime.evaluate", expression=OUTSIDE, returnByValue=True)["result"]
+            assert found["value"] == [len(FIGURES + TIMED), 0, 0, 0, 0, ""], width
 
 
 def test_user_text_is_escaped(content: dict[str, Any], tmp_path: Path) -> None:
