@@ -71,8 +71,10 @@ static int64_t carry_packet(
     queue->left_bytes += more * OPPORTUNITY_BYTES - line_bytes;
     queue->busy_until_ns = opportunity_ns(own, times_ms, number);
     queue->used = number - opportunity_after(own, times_ms, queue->busy_until_ns - 1) + 1;
-    if (queue->count < stage->queue_places) /* a packet that must pass may exceed the size */
+    if (queue->count < stage->queue_places)
         queue->count += 2;
+    else /* a packet that must pass; as in queue_occupy, what is older does not matter */
+        queue->head = (queue->head + 2) % stage->queue_places;
     int64_t place = (queue->head + queue->count - 2) % stage->queue_places;
     ring[stage->queue_begin + place] = begin_ns;
     ring[stage->queue_begin + place + 1] = queue->total_bytes;

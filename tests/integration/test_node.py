@@ -127,7 +127,8 @@ def test_what_is_no_node_is_refused_in_one_line(script: str | None, line: str, t
     if script is not None:
         program.write_text(f"#!/bin/sh\n{script}\n")
         program.chmod(0o600 if script == "not executable" else 0o700)
-    done = invoke("run", "lane_following", "--json", "--runs", tmp_path / "runs", *by(program))
+    runs = ("--json", "--runs", tmp_path / "runs", *live.BARE)
+    done = invoke("run", "lane_following", *runs, *by(program))
     assert done.exit_code == 2, done.stderr
     error = json.loads(done.stdout)["error"]
     assert line in error

@@ -293,39 +293,41 @@ class Mahimahi:
                 if self.in_transit is None:
                     self.departures[number] = time_ns
 
-    def enqueue(self, number: int, size_bytes: int, now_ns: int) -> None:
+    def enqueue(self, number: int, size_bytes: int, now_ns: int, *, must_pass: bool) -> bool:
         self.run_until(now_ns)
         size, (packets, most_bytes) = size_bytes + OVERHEAD_BYTES, self.limits
         waiting = sum(size for _, size in self.queue)
-        if len(self.queue) < packets and (most_bytes is None or waiting + size <= most_bytes):
+        enters = len(self.queue) < packets and (most_bytes is None or waiting + size <= most_bytes)
+        if enters or must_pass:
             self.queue.append((number, size))
         else:
             self.departures[number] = -1
+        return enters or must_pass
 
 
-times = st.lists(st.integers(0, 12), min_size=1, max_size=8).map(sorted).filter(lambda t: t[-1] > 0)
-packets = st.lists(
-    st.tuples(st.integers(0, 3 * MS) | st.sampled_from([0, MS]), st.integers(0, 4000)), max_size=40
-)
-
-
-@given(times, packets, st.integers(1, 9), st.none() | st.integers(1, 9000), st.integers(0, 11))
-def test_each_packet_leaves_as_in_mahimahi(
-    times_ms: list[int], steps: Any, queue: int, queue_bytes: int | None, offset: int
-) -> None:
-    offset_ms = offset % times_ms[-1]
+@given(st.integers(0, 2**32 - 1), st.sampled_from([None, 1, 2]))
+def test_each_packet_leaves_as_in_mahimahi(seed: int, mansd: int | None) -> None:
+    """With a cap, packets that must pass enter a full queue, too, and count as others do."""
+    rng = np.random.default_rng(seed)
+    times_ms = sorted(rng.integers(0, 13, rng.integers(1, 9)).tolist())
+    times_ms[-1] += times_ms[-1] == 0
+    offset_ms, queue = int(rng.integers(times_ms[-1])), int(rng.integers(1, 10))
+    queue_bytes = int(rng.integers(1, 9001)) if rng.random() < 0.3 else None
     settings = Opportunities(
         times_ms=tuple(times_ms), queue=queue, queue_bytes=queue_bytes, offset_s=offset_ms / 1e3
     )
-    link = Link(LinkSettings(impairments=(settings,), limit=1000), 0, "test")
+    link = Link(LinkSettings(impairments=(settings,), mansd=mansd, limit=1000), 0, "test")
     model = Mahimahi(times_ms, queue, queue_bytes)
-    now_ns, found = 0, []
-    for number, (gap_ns, size) in enumerate(steps):
-        now_ns += gap_ns
-        model.enqueue(number, size, now_ns + offset_ms * MS)
-        found.append(link.decide(number % 3, size, now_ns).release_ns)
+    now_ns, found, lost = 0, [], [0, 0, 0]
+    for number in range(40):
+        now_ns += int(rng.choice([0, MS, rng.integers(3 * MS)]))
+        size, flow = int(rng.choice([0, 1472, rng.integers(4001)])), number % 3
+        must_pass = lost[flow] == mansd
+        passes = model.enqueue(number, size, now_ns + offset_ms * MS, must_pass=must_pass)
+        lost[flow] = 0 if passes else lost[flow] + 1
+        found.append(link.decide(flow, size, now_ns).release_ns)
     model.run_until(now_ns + 2_000 * MS)  # 40 packets need at most 120 opportunities
-    expected = [model.departures[number] for number in range(len(steps))]
+    expected = [model.departures[number] for number in range(40)]
     assert found == [-1 if at < 0 else at - offset_ms * MS for at in expected]
 
 
