@@ -118,55 +118,55 @@ class ExplorerWidget:
 
     def _show_controls(self) -> None:
         controls = controls_of(self._results.draft)
-        self._known = {one.key: one for one in controls.sliders}
+        self._known = {slider.key: slider for slider in controls.sliders}
         if controls.shape == self._shape:
-            for one in controls.sliders:
-                made = self._inputs[one.key]
-                if abs(one.place(made.value) - one.position) > one.step / 2:
-                    made.value = one.value
+            for slider in controls.sliders:
+                widget = self._inputs[slider.key]
+                if abs(slider.place(widget.value) - slider.position) > slider.step / 2:
+                    widget.value = slider.value
             return
         self._shape, self._inputs = controls.shape, {}
-        rows: list[widgets.Widget] = [self._choice(one) for one in controls.choices]
-        for one in controls.sliders:
-            self._inputs[one.key] = self._slider(one)
-            rows += [widgets.Label(one.label), self._inputs[one.key]]
+        rows: list[widgets.Widget] = [self._choice(choice) for choice in controls.choices]
+        for slider in controls.sliders:
+            self._inputs[slider.key] = self._slider(slider)
+            rows += [widgets.Label(slider.label), self._inputs[slider.key]]
         self._controls.children = rows
 
     def _choice(self, choice: Choice) -> widgets.Widget:
-        made = widgets.Dropdown(
+        dropdown = widgets.Dropdown(
             options=[(text, value) for value, text in choice.options.items()],
             value=choice.value,
             layout=_WIDE,
         )
-        made.observe(
+        dropdown.observe(
             lambda change: self._change(lambda draft: chosen(draft, choice.key, change["new"])),
             "value",
         )
-        return widgets.VBox([widgets.Label(choice.label), made], layout=_WIDE)
+        return widgets.VBox([widgets.Label(choice.label), dropdown], layout=_WIDE)
 
     def _slider(self, slider: Slider) -> widgets.Widget:
         low, high = slider.ends
         if slider.logarithmic:
-            made = widgets.FloatLogSlider(
+            widget = widgets.FloatLogSlider(
                 value=slider.value, min=low, max=high, step=slider.step, readout_format=".3g"
             )
         elif slider.whole:
-            made = widgets.IntSlider(value=round(slider.value), min=int(low), max=int(high))
+            widget = widgets.IntSlider(value=round(slider.value), min=int(low), max=int(high))
         else:
-            made = widgets.FloatSlider(
+            widget = widgets.FloatSlider(
                 value=slider.value, min=low, max=high, step=slider.step, readout_format=".3g"
             )
-        made.layout = _WIDE
+        widget.layout = _WIDE
         key = slider.key
 
         def moved(change: Mapping[str, float]) -> None:
-            now = self._known[key]
-            value = now.value_at(now.place(change["new"]))
-            if value != now.value:
-                self._change(lambda draft: dragged(draft, now, value))
+            current = self._known[key]
+            value = current.value_at(current.place(change["new"]))
+            if value != current.value:
+                self._change(lambda draft: dragged(draft, current, value))
 
-        made.observe(moved, "value")
-        return made
+        widget.observe(moved, "value")
+        return widget
 
     def _change(self, change: Callable[[Draft], Draft]) -> None:
         if self._quiet:

@@ -21,7 +21,7 @@ with lazy_modules():
 
 @cli.command(cli.FILES, 10, takes="some 10 s", on_linux=True)
 def doctor(
-    given: opt.ExampleOptions,
+    source: opt.ExampleOptions,
     *,
     seconds: Annotated[float, Option(min=0.1, max=3600)] = 2.0,
     runs: opt.RunsOption = cli.DEFAULT_RUNS,
@@ -42,25 +42,25 @@ def doctor(
         noack doctor lane_weighted --set speed=4   for another scenario
         noack doctor --seconds 10 --json   measure longer; all numbers as JSON
     """
-    resolved = resolution.resolve(given.load())
-    wanted = machine_measures.requirements_of(resolved)
+    resolved = resolution.resolve(source.load())
+    required = machine_measures.requirements_of(resolved)
     with cli.status("measuring"):
-        machine = machine_measures.measure(resolved, wanted, runs, seconds)
-    found = findings.judge(machine, wanted)
+        machine = machine_measures.measure(resolved, required, runs, seconds)
+    results = findings.judge(machine, required)
     cli.show(
         json,
-        lambda: findings.document(machine, wanted, found),
+        lambda: findings.document(machine, required, results),
         findings.print_findings,
-        wanted,
-        found,
+        required,
+        results,
     )
-    is_bad = findings.worst(found) is findings.FindingStatus.BAD
+    is_bad = findings.worst(results) is findings.FindingStatus.BAD
     return ExitStatus.FAILED if is_bad else ExitStatus.OK
 
 
 @cli.command(cli.RUNS, 5, on_linux=True)
 def lab(
-    given: opt.ExampleOptions,
+    source: opt.ExampleOptions,
     *,
     runs: opt.RunsOption = cli.DEFAULT_RUNS,
     port: Annotated[int, Option(min=0, max=65535)] = 0,
@@ -84,12 +84,12 @@ def lab(
         raise CallerError(
             "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the repository"
         )
-    edited = draft.open_draft(given.scenario)
-    for key, value in map(scenario_file.setting_of, given.settings or ()):
+    edited = draft.open_draft(source.scenario)
+    for key, value in map(scenario_file.setting_of, source.settings or ()):
         edited = edited.with_value(key, value)
     _ = edited.scenario  # report mistakes here
-    query = edited.query() if given.settings else ""
-    options = lab_server.LabOptions(given.scenario, query, Path.cwd(), runs, port, browser)
+    query = edited.query() if source.settings else ""
+    options = lab_server.LabOptions(source.scenario, query, Path.cwd(), runs, port, browser)
 
     def announce(address: str) -> None:
         cli.print_lines(json, {"address": address}, f"noack lab: {address}  (Ctrl-C ends)")

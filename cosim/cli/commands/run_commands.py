@@ -31,7 +31,7 @@ _EVENTS_SHOWN = 40
 @cli.command(cli.RUNS, 20, takes="as long as the scenario's horizon, and a few seconds", on_linux=True)
 def run(
     context: typer.Context,
-    given: opt.ScenarioOptions,
+    source: opt.ScenarioOptions,
     *,
     hosts: Annotated[Path | None, Option(metavar="FILE")] = None,
     options: LiveOptions,
@@ -48,7 +48,7 @@ def run(
         noack run lane_following --hosts hosts.toml   some processes on other hosts, over ssh
     """
     listening = None if hosts is None else remote_access.listening_for(hosts)
-    return run_processes(given.load(), options, server=context.obj, listening=listening)
+    return run_processes(source.load(), options, server=context.obj, listening=listening)
 
 
 @cli.command(cli.RUNS, 10, takes="20 s and a few", on_linux=True)
@@ -69,14 +69,14 @@ def demo(
         noack demo --zoh --live   zero-order hold, with the live viewer
         noack demo --set speed=4 --set horizon_s=8   takes 2 s of wall time
     """
-    wanted = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
-    return run_processes(opt.load_scenario("lane_following", wanted), options, server=context.obj)
+    all_settings = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
+    return run_processes(opt.load_scenario("lane_following", all_settings), options, server=context.obj)
 
 
 @cli.command(cli.RUNS, 22, takes="as long as the scenario's horizon, and a few seconds", on_linux=True)
 def bridge(
     context: typer.Context,
-    given: opt.ScenarioOptions,
+    source: opt.ScenarioOptions,
     *,
     router: Annotated[str, Option(metavar="ENDPOINT")] = "tcp/127.0.0.1:7447",
     listen: Annotated[bool, Option("--listen")] = False,
@@ -94,14 +94,14 @@ def bridge(
         noack bridge lane_following --listen   without an installation of ROS
         noack bridge lane_following --router tcp/127.0.0.1:7447 --json   with rmw_zenohd
     """
-    loaded = given.load()
+    loaded = source.load()
     with ros2_bridge.bridge_process(router, domain, listen=listen) as watcher:
         return run_processes(loaded, options, server=context.obj, watcher=watcher)
 
 
 @cli.command(cli.RUNS, 30, takes="about a second; the report, some more")
 def simulate(
-    given: opt.ScenarioOptions,
+    source: opt.ScenarioOptions,
     *,
     trigger: opt.TriggerOption = opt.TriggerMode.SAMPLED,
     runs: opt.RunsOption = cli.DEFAULT_RUNS,
@@ -116,7 +116,7 @@ def simulate(
         noack simulate lane_following --trigger continuous   the paper's loop, exactly
         noack simulate reactor_petc --no-report --json   print the summary as JSON
     """
-    loaded = given.load()
+    loaded = source.load()
     link_load.require_capacity(loaded)
     warn_of_violations(loaded)
     if trigger is opt.TriggerMode.CONTINUOUS:
@@ -130,39 +130,39 @@ def _simulate_continuously(loaded: "scenario.Scenario", *, json: bool) -> int:
     resolved = resolution.resolve(loaded)
     with cli.status("simulating"):
         run = continuous.run_continuous(resolved)
-    found = continuous.summary(run, resolved)
-    cli.show(json, lambda: continuous.document(run, resolved), _print_run, run, found)
-    return found.exit_status
+    summary = continuous.summary(run, resolved)
+    cli.show(json, lambda: continuous.document(run, resolved), _print_run, run, summary)
+    return summary.exit_status
 
 
 def _print_run(
-    console: "Console", run: "continuous.ContinuousRun", found: "continuous.ContinuousSummary"
+    console: "Console", run: "continuous.ContinuousRun", summary: "continuous.ContinuousSummary"
 ) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
     import numpy as np  # help and completion need neither of the two
     from rich.text import Text
 
-    ended = summary_model.ExitPart(status=int(found.exit_status), reason=found.reason)
+    ended = summary_model.ExitPart(status=int(summary.exit_status), reason=summary.reason)
     state = (
         ""
-        if found.diverged_at_s
+        if summary.diverged_at_s
         else run_verdict.state_text(
-            found.initial_state_norm, found.sup_state_norm, found.final_state_norm, None
+            summary.initial_state_norm, summary.sup_state_norm, summary.final_state_norm, None
         )
     )
-    ending = run_verdict.ending_line(ended, found.reached_s, found.horizon_s, state)
-    for line in (ending, run_verdict.transmission_line(found.events, found.deliveries)):
+    ending = run_verdict.ending_line(ended, summary.reached_s, summary.horizon_s, state)
+    for line in (ending, run_verdict.transmission_line(summary.events, summary.deliveries)):
         console.print(Text(line.text, line.style), soft_wrap=True)
     rows = (
-        run_tables.lost_row(found.drops, found.deliveries),
-        run_tables.longest_burst(found.mansd, (), found.longest_loss_burst),
+        run_tables.lost_row(summary.drops, summary.deliveries),
+        run_tables.longest_burst(summary.mansd, (), summary.longest_loss_burst),
         *run_tables.interval_rows(
-            found.inter_event_min_s, found.inter_event_median_s, found.inter_delivery_median_s
+            summary.inter_event_min_s, summary.inter_event_median_s, summary.inter_delivery_median_s
         ),
-        ("‖x‖ at the start", number(found.initial_state_norm)),
-        ("‖x‖ at the end", number(found.final_state_norm)),
+        ("‖x‖ at the start", number(summary.initial_state_norm)),
+        ("‖x‖ at the end", number(summary.final_state_norm)),
     )
-    title = run_tables.title_of(found.scenario, found.mode, found.mansd, (), "continuous")
+    title = run_tables.title_of(summary.scenario, summary.mode, summary.mansd, (), "continuous")
     run_verdict.print_numbers(console, title, rows)
     since_s = np.diff(run.event_s, prepend=0.0)
     with np.errstate(all="ignore"):  # a run may diverge
@@ -217,15 +217,15 @@ def set_(
         noack set loss.p 0.9   lose nine in ten packets from now on
         noack set mansd 2 trigger.beta 0.3 --json   change M − 1 and β at once
     """
-    wanted = parsed(settings or ())
-    answer = run_registry.request_change(run_registry.find(session, run), wanted)
+    changes = parsed(settings or ())
+    answer = run_registry.request_change(run_registry.find(session, run), changes)
     if json:
         cli.print_json(answer.fields())
-    elif wanted:
+    elif changes:
         loops, entries = answer.changed_loops, answer.loops
-        which = "" if len(entries) == 1 else f"; changed: {', '.join(loops) or 'no loop'}"
-        text = runtime_parameters.text_of(wanted)
-        print(f"{answer.name}: {text} from {answer.from_s or 0.0:.3f} s on{which}")
+        suffix = "" if len(entries) == 1 else f"; changed: {', '.join(loops) or 'no loop'}"
+        text = runtime_parameters.text_of(changes)
+        print(f"{answer.name}: {text} from {answer.from_s or 0.0:.3f} s on{suffix}")
     else:
         _print_parameters(cli.console(), answer)
 
@@ -235,22 +235,22 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, object]:
 
     Raise CallerError if a value is missing, or a key is given twice.
     """
-    found: dict[str, object] = {}
-    left = list(words)
-    while left:
-        word = left.pop(0)
+    settings: dict[str, object] = {}
+    remaining = list(words)
+    while remaining:
+        word = remaining.pop(0)
         name, equals, text = word.partition("=")
         if not equals:
             if Path(word).is_dir():
                 raise CallerError(f"{word}: a folder, not a key; a run is given by --run {word}")
-            if not left:
+            if not remaining:
                 raise CallerError(f"{word}: needs a value, e.g. `noack set loss.p 0.9`")
-            text = left.pop(0)
+            text = remaining.pop(0)
         key = runtime_parameters.full_key(name.strip())
-        if key in found:
+        if key in settings:
             raise CallerError(f"{key}: is given twice")
-        found[key] = scenario_file.value_of(text, name)
-    return found
+        settings[key] = scenario_file.value_of(text, name)
+    return settings
 
 
 def _print_parameters(console: "Console", answer: "control_messages.ChangeReply") -> None:
@@ -263,8 +263,8 @@ def _print_parameters(console: "Console", answer: "control_messages.ChangeReply"
                 text = runtime_parameters.text_of({"": values[key]}).removeprefix(" = ")
                 names.setdefault(text, []).append(name)
         for value, loops in names.items():
-            which = "all" if len(loops) == len(entries) else ", ".join(loops)
-            rows.append((key, short.get(key, ""), which, value))
+            loop_text = "all" if len(loops) == len(entries) else ", ".join(loops)
+            rows.append((key, short.get(key, ""), loop_text, value))
     title = f"{answer.name}, at {answer.t_s:.1f} s"
     table = result_tables.ResultTable("", title, ("key", "short", "loops", "value"), rows)
     console.print(result_tables.terminal_table(table, left=range(4)))

@@ -101,8 +101,8 @@ def test_a_round_trip_tells_on_which_way_each_datagram_was_lost(forward: set[int
     # Fewer than 128 are lost in a row, so that each answer covers what was lost before it.
     answered = [k for k in arrived if k not in back]
     known = {k: way for k, way in truth.items() if answered and k < answered[-1]}
-    assert {k: way for k, way in found.sender.lost_ways().items() if k in known} == known
-    after = {way for k, way in found.sender.lost_ways().items() if k not in known}
+    assert {k: way for k, way in found.sender.lost_directions().items() if k in known} == known
+    after = {way for k, way in found.sender.lost_directions().items() if k not in known}
     assert after <= {"unknown"}
 
 
@@ -169,7 +169,7 @@ WAIT_S = 0.05
 @on_linux
 def test_an_arrival_has_the_time_at_which_it_came_not_that_of_reading() -> None:
     receiver = ProbeSocket(listen=("127.0.0.1", 0))
-    sender = ProbeSocket(to=receiver.endpoint.getsockname())
+    sender = ProbeSocket(peer=receiver.endpoint.getsockname())
     with receiver.endpoint, sender.endpoint:
         for _ in range(20):  # a process that is stalled meanwhile cannot compare its clocks
             before_ns = time.monotonic_ns()
@@ -203,7 +203,7 @@ def test_a_send_that_nobody_receives_is_counted() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
         closed.bind(("127.0.0.1", 0))
         address = closed.getsockname()
-    sender = ProbeSocket(to=address)
+    sender = ProbeSocket(peer=address)
     with sender.endpoint:
         for _ in range(3):
             sender.send(b"datagram")
