@@ -119,16 +119,16 @@ class MissedEvents:
         self._errors = errors[lasting]
         lengths = ends - begins
         totals = np.cumsum(lengths)
-        first, most = 0, max(_PART_NUMBERS // errors.shape[1], 1)
-        while first < len(lengths):
-            done = totals[first - 1] if first else 0
-            last = max(int(np.searchsorted(totals, done + most, "right")), first + 1)
-            which = np.repeat(np.arange(first, last), lengths[first:last])
-            at = np.arange(len(which)) - (totals - lengths)[which] + done + begins[which]
-            periods = (t_ns[at] - times_ns[which]) // self._period_ns
-            jumps = self._propagate.leaps(errors[which], periods, self._period_ns)
-            yield MissedJumps(at, times_ns[which], periods, jumps)
-            first = last
+        begin, batch = 0, max(_PART_NUMBERS // errors.shape[1], 1)
+        while begin < len(lengths):
+            earlier = totals[begin - 1] if begin else 0
+            last = max(int(np.searchsorted(totals, earlier + batch, "right")), begin + 1)
+            event = np.repeat(np.arange(begin, last), lengths[begin:last])
+            measurement = np.arange(len(event)) - (totals - lengths)[event] + earlier + begins[event]
+            periods = (t_ns[measurement] - times_ns[event]) // self._period_ns
+            jumps = self._propagate.leaps(errors[event], periods, self._period_ns)
+            yield MissedJumps(measurement, times_ns[event], periods, jumps)
+            begin = last
 
 
 class ErrorBounds(NamedTuple):

@@ -65,17 +65,17 @@ class Gaps(NamedTuple):
         Raises:
             NoCertificateError: they are not covered.
         """
-        most, step_s = conditions.dropouts + 1, conditions.spacing_s
+        most_events, step_s = conditions.dropouts + 1, conditions.spacing_s
         least_s = max(bound.apart_s, step_s)
         if step_s == 0 or not math.isfinite(bound.due_s):
             raise NoCertificateError("events are not due at sampling times")
-        least, due = (math.floor(one / step_s + 1e-9) for one in (least_s, bound.due_s))
-        if least == due:
-            return cls(least * step_s, np.arange(1, most + 1), least * step_s)
-        if most * due > _MOST_GAPS:
+        fewest_steps, most_steps = (math.floor(time_s / step_s + 1e-9) for time_s in (least_s, bound.due_s))
+        if fewest_steps == most_steps:
+            return cls(fewest_steps * step_s, np.arange(1, most_events + 1), fewest_steps * step_s)
+        if most_events * most_steps > _MOST_GAPS:
             raise NoCertificateError("too many times between deliveries")
-        counts = {n for j in range(1, most + 1) for n in range(j * least, j * due + 1)}
-        return cls(step_s, np.array(sorted(counts)), least * step_s)
+        counts = {n for j in range(1, most_events + 1) for n in range(j * fewest_steps, j * most_steps + 1)}
+        return cls(step_s, np.array(sorted(counts)), fewest_steps * step_s)
 
 
 class _Norm(NamedTuple):
@@ -98,8 +98,8 @@ class _Norm(NamedTuple):
     pulse: Vector
     """‖Λξ‖ after a gap, J of the next event, and what is left of S, for S = 1."""
     late_pulse: Vector
-    left: Vector
-    both: Vector
+    remaining: Vector
+    weighted_sum: Vector
     """‖Λξ‖/θ + S after a gap for S = 1."""
     theta: float
     """θ"""
@@ -132,16 +132,16 @@ class _Loop:
         self.until_s = self.cells * self.cell_s
         self.flows = self._powers(self.F)[:, :, : self.n]
         """e^{Fr} (I; 0) at all nodes, (cells + 1, 2n, n)."""
-        after = np.arange(0, self.late_cells or 1, per_step)
-        after = after[(after == 0) | (after >= gaps.least_s / self.cell_s - 1e-9)]
-        self.windows = self.late_cells - after
+        event_cells = np.arange(0, self.late_cells or 1, per_step)
+        event_cells = event_cells[(event_cells == 0) | (event_cells >= gaps.least_s / self.cell_s - 1e-9)]
+        self.windows = self.late_cells - event_cells
         """Cells for which updates may still be in flight, by times at which their events can have been."""
         self.shares = self.windows / self.late_cells if self.late_cells else np.ones(1)
         """What J of these events counts in S."""
-        none, still = np.zeros((self.n, self.n)), np.zeros_like(self.R)
+        no_state, no_input = np.zeros((self.n, self.n)), np.zeros_like(self.R)
         self.outputs = {
-            _ERROR: np.hstack([none, plant.error.weight]),
-            _INPUT: np.hstack([still, self.R]),
+            _ERROR: np.hstack([no_state, plant.error.weight]),
+            _INPUT: np.hstack([no_input, self.R]),
         }
         for name in (Output.STATE, Output.WEIGHTED, Output.MISMATCH):
             self.outputs[name] = np.hstack([plant.outputs[name], 0 * plant.outputs[name]])
@@ -156,10 +156,10 @@ class _Loop:
         """R(e^{−Hτ} − I)e^{Hr} at nodes of r and τ, (cells + 1, ages, q, n)."""
 
     def _powers(self, generator: Matrix) -> Stack:
-        step, found = exponential(generator * self.cell_s), [np.eye(len(generator))]
+        step, powers = exponential(generator * self.cell_s), [np.eye(len(generator))]
         for _ in range(self.cells):
-            found.append(step @ found[-1])
-        return np.array(found)
+            powers.append(step @ powers[-1])
+        return np.array(powers)
 
     @cached_property
     def late(self) -> tuple[Matrix, float]:
@@ -172,8 +172,8 @@ class _Loop:
         nodes_s = np.linspace(-s, d + s, 4 * _AGES + 1)
         curvature = 0.0
         for G, until_s in ((H, d + s), (-H, s)):
-            followed = response_until(G, self.plant.error.inverse_weight, until_s or 1e-9)
-            curvature = max(curvature, float(followed.through(self.R @ H @ H).sup_on_grid()))
+            response_ = response_until(G, self.plant.error.inverse_weight, until_s or 1e-9)
+            curvature = max(curvature, float(response_.through(self.R @ H @ H).sup_on_grid()))
         bend = grown * float(nodes_s[1] - nodes_s[0]) ** 2 / 8 * curvature
         nodes = [grown * self.R @ exponential(H * u_s) for u_s in nodes_s.tolist()]
         return np.array(nodes), bend * _ROUNDING
@@ -189,8 +189,8 @@ class _Loop:
     def late_outputs(self) -> dict[str, Matrix]:
         """C of the outputs whose largest one bounds J."""
         nodes, bend = self.late
-        each = [*nodes, bend * self.plant.error.weight]
-        return {f"{number}": np.hstack([0 * C, C]) for number, C in enumerate(each)}
+        rows = [*nodes, bend * self.plant.error.weight]
+        return {f"{number}": np.hstack([0 * C, C]) for number, C in enumerate(rows)}
 
     @cached_property
     def late_areas(self) -> Vector:
@@ -201,8 +201,8 @@ class _Loop:
 
     def at_ends(self, areas: Vector) -> Matrix:
         """Return ∫k(g − r) over each cell of r, for each gap g, (gaps, cells)."""
-        places = self.ends[:, None] - 1 - np.arange(self.cells)
-        return np.asarray(np.where(places >= 0, areas[places.clip(min=0)], 0.0))
+        distances = self.ends[:, None] - 1 - np.arange(self.cells)
+        return np.asarray(np.where(distances >= 0, areas[distances.clip(min=0)], 0.0))
 
     def within_windows(self, areas: Stack) -> Stack:
         """Sum (…, cells) over the cells of each window, (…, windows)."""
@@ -212,13 +212,13 @@ class _Loop:
     @cached_property
     def driven(self) -> Stack:
         """∫‖C e^{F(s−r)} (B; −B) U‖ over r in each cell, for s in each, (outputs, s, r)."""
-        places = np.subtract.outer(np.arange(self.cells), np.arange(self.cells))
-        found = []
+        distances = np.subtract.outer(np.arange(self.cells), np.arange(self.cells))
+        areas = []
         for kernel in self._response.through_each(Outputs(self.outputs)).values():
-            before = np.append(kernel.highest[:1], kernel.highest[:-1])
-            near = np.maximum(kernel.highest, before) * self.cell_s * _ROUNDING
-            found.append(np.where(places >= 0, near[places.clip(min=0)], 0.0))
-        return np.array(found)
+            previous = np.append(kernel.highest[:1], kernel.highest[:-1])
+            largest = np.maximum(kernel.highest, previous) * self.cell_s * _ROUNDING
+            areas.append(np.where(distances >= 0, largest[distances.clip(min=0)], 0.0))
+        return np.array(areas)
 
     def norm(self, shape: Matrix) -> _Norm:
         """Return what one gap makes of ‖Λξ‖ ≤ 1."""
@@ -234,16 +234,16 @@ class _Loop:
         late = late * _ROUNDING + late_aged @ ages
         aged = self.at_ends(self._response.through(np.hstack([shape, 0 * shape])).area)
         stretch = self._stretch(shape, inverse) + aged @ curved
-        pulses, late_pulses = (self.within_windows(one) / self.shares for one in (aged, late_aged))
-        left = (self.windows - self.ends[:, None]).clip(min=0) / (self.late_cells or 1) / self.shares
-        least = pulses / (1 - late_pulses - left).clip(min=1e-9)
+        pulses, late_pulses = (self.within_windows(areas) / self.shares for areas in (aged, late_aged))
+        remaining = (self.windows - self.ends[:, None]).clip(min=0) / (self.late_cells or 1) / self.shares
+        least = pulses / (1 - late_pulses - remaining).clip(min=1e-9)
         thetas = (float(least.max()) * _ROUNDING or _LEAST) * _THETAS[:, None]
-        both = (pulses / thetas[..., None] + late_pulses + left).max(axis=-1)
-        gains = np.maximum(stretch + thetas * late, both).max(axis=1)
+        weighted_sum = (pulses / thetas[..., None] + late_pulses + remaining).max(axis=-1)
+        gains = np.maximum(stretch + thetas * late, weighted_sum).max(axis=1)
         best = int(gains.argmin())
         return _Norm(
             shape, bends, ages, stretch, aged, late, late_aged,
-            pulses.max(axis=1), late_pulses.max(axis=1), left.max(axis=1), both[best],
+            pulses.max(axis=1), late_pulses.max(axis=1), remaining.max(axis=1), weighted_sum[best],
             float(thetas[best, 0]), float(gains[best]),
         )  # fmt: skip
 
@@ -265,22 +265,22 @@ class _Loop:
         sag = self.cell_s**2 / 8 * float(bend) * float(models)
         left, right = row @ self._powers(F) @ pushed, self._powers(G) @ inverse
         signs = np.array(list(itertools.product((-s, s), repeat=_PIECES)))
-        found = []
-        for end, map_ in zip(self.ends.tolist(), moved, strict=True):
-            at = left[end::-1] @ right[: end + 1]
-            rest, means = 0.0, np.zeros((_PIECES, n, n))
+        stretches = []
+        for end, undriven in zip(self.ends.tolist(), moved, strict=True):
+            products = left[end::-1] @ right[: end + 1]
+            deviation, means = 0.0, np.zeros((_PIECES, n, n))
             for number, piece in enumerate(np.array_split(np.arange(end), _PIECES)):
                 if len(piece):
-                    nodes = at[piece[0] : piece[-1] + 2]
+                    nodes = products[piece[0] : piece[-1] + 2]
                     mean = nodes.mean(axis=0)
-                    away = _of_cells(np.linalg.norm(nodes - mean, axis=(1, 2))) + sag
-                    rest += s * self.cell_s * float(away.sum())
+                    deviations = _of_cells(np.linalg.norm(nodes - mean, axis=(1, 2))) + sag
+                    deviation += s * self.cell_s * float(deviations.sum())
                     means[number] = mean * self.cell_s * len(piece)
-            ends = map_ + np.einsum("sp,pij->sij", signs, means)
-            found.append((float(_norms(ends).max()) + rest) * _ROUNDING)
-            if found[-1] >= 1:  # of no use: the other gaps do not matter
+            ends = undriven + np.einsum("sp,pij->sij", signs, means)
+            stretches.append((float(_norms(ends).max()) + deviation) * _ROUNDING)
+            if stretches[-1] >= 1:  # of no use: the other gaps do not matter
                 break
-        return np.array(found + found[-1:] * (len(moved) - len(found)))
+        return np.array(stretches + stretches[-1:] * (len(moved) - len(stretches)))
 
     def _age_bends(self, shape: Matrix, inverse: Matrix) -> tuple[Vector, Vector]:
         """Bound, over each cell, how far ‖w‖ may lie above its nodes, and from the first order."""
@@ -290,9 +290,9 @@ class _Loop:
         outputs = Outputs({"τ": self.R @ H @ H, "r": self.R @ H @ G @ G})
         kernels = response_until(G, inverse, self.until_s, self.cells).through_each(outputs)
         # e^{−Hτ} commutes with e^{Hr}.
-        both = [response_until(one, inverse, s).through(shape).sup_on_grid() for one in (H, -H)]
-        second = max(map(float, both)) * kernels["τ"].highest
-        turned = max(map(float, both)) * kernels["r"].highest
+        models = [response_until(generator, inverse, s).through(shape).sup_on_grid() for generator in (H, -H)]
+        second = max(map(float, models)) * kernels["τ"].highest
+        turned = max(map(float, models)) * kernels["r"].highest
         bends = (s / _AGES) ** 2 / 8 * second + self.cell_s**2 / 8 * s * turned
         return np.asarray(bends), np.asarray(s**2 / 2 * second)
 
@@ -337,14 +337,14 @@ class Deliveries:
         self._started = 0.0
         """‖w‖ from the start, which goes on after the next events; 0 if it ends before."""
         if loop.starts_late:
-            begun = response_until(loop.scaled_H, plant.start, conditions.start_s)
-            self._started = float(begun.through(loop.R).sup_on_grid()) * _ROUNDING
+            started = response_until(loop.scaled_H, plant.start, conditions.start_s)
+            self._started = float(started.through(loop.R).sup_on_grid()) * _ROUNDING
         at_rest = np.vstack([np.linalg.inv(self._norm.shape), np.zeros((n, n))])
         followed = response_until(loop.F, at_rest, loop.until_s, loop.cells)
         C = loop.outputs
         self._of_ball = _highest(followed.through_each(Outputs(C)))
         """‖C e^{Fr} (Λ⁻¹; 0)‖ over each cell, (outputs, cells)."""
-        curved = {name: one @ loop.F @ loop.F for name, one in C.items()}
+        curved = {name: output @ loop.F @ loop.F for name, output in C.items()}
         sags = _highest(followed.through_each(Outputs(curved)))
         self._sags = loop.cell_s**2 / 8 * sags
         self._of_late = (loop.within_windows(loop.driven) / loop.shares).max(axis=-1)
@@ -386,53 +386,53 @@ class Deliveries:
 
     def _sizes(self) -> Vector:
         """Return the bounds of all outputs, (outputs,)."""
-        counts, places = self._loop.gaps.counts, int(self._loop.gaps.counts[-1]) + 1
+        counts, slots = self._loop.gaps.counts, int(self._loop.gaps.counts[-1]) + 1
         # Before, what the start causes is not among the balls yet.
-        settled = max(places, math.ceil(self._loop.conditions.start_s / self._loop.gaps.step_s))
-        highest, of_start = self._start()
+        settled = max(slots, math.ceil(self._loop.conditions.start_s / self._loop.gaps.step_s))
+        highest, start_balls = self._start()
         # What follows from the balls of the last times, by their time modulo the longest gap + 1.
-        after = [np.zeros((places, *part.shape)) for part in of_start]
-        known, gaps = np.zeros(places, dtype=bool), np.arange(len(counts))
-        _keep(after, known, [0], of_start)
-        balls, unseen, tail = dict[int, _Ball](), list[_Ball](), np.full_like(highest, np.inf)
+        following = [np.zeros((slots, *array.shape)) for array in start_balls]
+        has_balls, gaps = np.zeros(slots, dtype=bool), np.arange(len(counts))
+        _store(following, has_balls, [0], start_balls)
+        balls, pending, tail = dict[int, _Ball](), list[_Ball](), np.full_like(highest, np.inf)
         width = int(counts[0])  # so many successive times do not depend on each other
-        for first in range(1, _MOST_TIMES, width):
-            new = list[_Ball]()
-            for k in range(first, first + width):
-                before = (k - counts) % places
-                here = known[before]
-                if here.any():
-                    ball = self._enclosing(*(part[before[here], gaps[here]] for part in after))
-                    new.append(ball._replace(time=k))
-            known[np.arange(first, first + width) % places] = False
-            if new:
-                _keep(after, known, [ball.time for ball in new], self._after(new))
-                balls |= {ball.time: ball for ball in new}
-                unseen += new
-            is_last = first + width >= _MOST_TIMES
-            if len(unseen) >= _AT_ONCE or is_last:
-                highest = np.maximum(highest, self._seen(unseen))
-                unseen.clear()
-                now = first + width - 1
-                if now < settled:
+        for first_time in range(1, _MOST_TIMES, width):
+            new_balls = list[_Ball]()
+            for k in range(first_time, first_time + width):
+                earlier = (k - counts) % slots
+                is_known = has_balls[earlier]
+                if is_known.any():
+                    ball = self._enclosing(*(array[earlier[is_known], gaps[is_known]] for array in following))
+                    new_balls.append(ball._replace(time=k))
+            has_balls[np.arange(first_time, first_time + width) % slots] = False
+            if new_balls:
+                _store(following, has_balls, [ball.time for ball in new_balls], self._after_gaps(new_balls))
+                balls |= {ball.time: ball for ball in new_balls}
+                pending += new_balls
+            is_last = first_time + width >= _MOST_TIMES
+            if len(pending) >= _AT_ONCE or is_last:
+                highest = np.maximum(highest, self._until_next_delivery(pending))
+                pending.clear()
+                current = first_time + width - 1
+                if current < settled:
                     continue
-                tail = self._tail([balls[s] for s in range(now - places + 1, now + 1) if s in balls])
+                tail = self._tail([balls[s] for s in range(current - slots + 1, current + 1) if s in balls])
                 if (tail <= highest).all():
                     break
         return np.asarray(np.maximum(tail, highest) * _ROUNDING)
 
-    def _enclosing(self, c: Matrix, rho: Vector, J: Vector, both: Vector) -> "_Ball":
+    def _enclosing(self, c: Matrix, rho: Vector, J: Vector, weighted_sum: Vector) -> "_Ball":
         """Return a small ball around balls."""
         shape = self._norm.shape
         middle, rounding = c.mean(axis=0), 1e-12 * float(_lengths(c @ shape.T).max())
         for number in range(1, _CENTRED + 1):
-            furthest = int((_lengths((c - middle) @ shape.T) + both).argmax())
+            furthest = int((_lengths((c - middle) @ shape.T) + weighted_sum).argmax())
             middle = middle + (c[furthest] - middle) / (number + 2)
         away = _lengths((c - middle) @ shape.T) + rounding
-        most, most_of_both = (float((away + one).max()) * _ROUNDING for one in (rho, both))
-        return _Ball(middle, most, float(J.max()), most_of_both, self._norm.theta)
+        largest_rho, largest_sum = (float((away + size).max()) * _ROUNDING for size in (rho, weighted_sum))
+        return _Ball(middle, largest_rho, float(J.max()), largest_sum, self._norm.theta)
 
-    def _after(self, balls: Sequence["_Ball"]) -> "_Balls":
+    def _after_gaps(self, balls: Sequence["_Ball"]) -> "_Balls":
         """Return what follows from balls after each gap, (k, gaps)."""
         loop, norm, n = self._loop, self._norm, self._loop.n
         points, ages = np.array([ball.c for ball in balls]), self._driving(balls)
@@ -441,22 +441,24 @@ class Deliveries:
         late, aged = (late + ages @ norm.late_aged.T)[..., None], (ages @ norm.aged.T)[..., None]
         corners = np.array([ball.corners for ball in balls])  # (k, 2, corners)
         rho, J = corners[:, None, 0], corners[:, None, 1]
-        stretch, of_rho, carried = (
-            one[:, None] for one in (norm.stretch, norm.late, norm.late_pulse + norm.left)
+        stretch, late_of_rho, carried = (
+            factor[:, None] for factor in (norm.stretch, norm.late, norm.late_pulse + norm.remaining)
         )
-        both = stretch * rho + aged + norm.theta * (of_rho * rho + norm.both[:, None] * J + late)
-        rho, J = stretch * rho + norm.pulse[:, None] * J + aged, of_rho * rho + carried * J + late
-        return _Balls(moved[..., :n], rho.max(axis=-1), J.max(axis=-1), both.max(axis=-1))
+        weighted_sum = (
+            stretch * rho + aged + norm.theta * (late_of_rho * rho + norm.weighted_sum[:, None] * J + late)
+        )
+        rho, J = stretch * rho + norm.pulse[:, None] * J + aged, late_of_rho * rho + carried * J + late
+        return _Balls(moved[..., :n], rho.max(axis=-1), J.max(axis=-1), weighted_sum.max(axis=-1))
 
     def _tail(self, balls: "list[_Ball]") -> Vector:
         """Bound all outputs from now on, given the balls within a longest gap."""
         norm, loop = self._norm, self._loop
-        size = max(float(np.linalg.norm(norm.shape @ ball.c)) + ball.both for ball in balls)
-        left = 1 - float((norm.late_pulse + norm.left).max())
-        J = float(norm.late.max()) * size / left if left > 0 else math.inf
+        size = max(float(np.linalg.norm(norm.shape @ ball.c)) + ball.weighted_sum for ball in balls)
+        remaining = 1 - float((norm.late_pulse + norm.remaining).max())
+        J = float(norm.late.max()) * size / remaining if remaining > 0 else math.inf
         J = min(max(J, *(ball.J for ball in balls)), size / norm.theta)
-        seen = self._of_ball + self._ages_seen * norm.ages + loop.driven @ norm.ages
-        return np.asarray((seen * size + self._of_late * J).max(axis=1))
+        of_ball = self._of_ball + self._ages_seen * norm.ages + loop.driven @ norm.ages
+        return np.asarray((of_ball * size + self._of_late * J).max(axis=1))
 
     def _ages_of(self, points: Matrix) -> Matrix:
         """Bound ‖w‖ over each cell, as far as it comes from the input's age, for ξ (k, n)."""
@@ -472,7 +474,7 @@ class Deliveries:
         ages = self._ages_of(np.array([ball.c for ball in balls]))
         return np.asarray(ages + self._started * (cells_s < loop.conditions.start_s))
 
-    def _seen(self, balls: "list[_Ball]") -> Vector:
+    def _until_next_delivery(self, balls: "list[_Ball]") -> Vector:
         """Bound all outputs from events with these balls until the next delivery."""
         loop, norm = self._loop, self._norm
         points = np.array([ball.c for ball in balls])
@@ -482,12 +484,12 @@ class Deliveries:
         sizes = np.linalg.norm(points @ norm.shape.T, axis=-1)
         highest = []
         for number, C in enumerate(loop.outputs.values()):
-            seen, pushed = self._ages_seen[number], loop.driven[number]
-            of_ball = self._of_ball[number] + seen * norm.ages + pushed @ norm.ages
+            ages_seen, pushed = self._ages_seen[number], loop.driven[number]
+            of_ball = self._of_ball[number] + ages_seen * norm.ages + pushed @ norm.ages
             corner = (of_ball * corners[:, 0] + self._of_late[number] * corners[:, 1]).max(axis=1)
             cells = _of_cells(np.linalg.norm(nodes @ C.T, axis=-1))
             cells = cells + self._sags[number] * sizes[:, None] + corner
-            highest.append((cells + driving @ pushed.T + seen * ages).max())
+            highest.append((cells + driving @ pushed.T + ages_seen * ages).max())
         return np.array(highest)
 
     def _start(self) -> tuple[Vector, "_Balls"]:
@@ -498,34 +500,36 @@ class Deliveries:
         """
         loop, norm, x0, T = self._loop, self._norm, self._x0, self._loop.conditions.start_s
         if loop.starts_late:
-            begun = _Ball(x0, 0.0, 0.0, 0.0, norm.theta)
-            return self._seen([begun]), _Balls(*(part[0] for part in self._after([begun])))
+            start_ball = _Ball(x0, 0.0, 0.0, 0.0, norm.theta)
+            return self._until_next_delivery([start_ball]), _Balls(
+                *(array[0] for array in self._after_gaps([start_ball]))
+            )
         n, alpha = loop.n, loop.plant.alpha_per_s
         free, models = (
-            exponential(one * T) @ x0 for one in (loop.plant.A + alpha * np.eye(n), loop.scaled_H)
+            exponential(generator * T) @ x0 for generator in (loop.plant.A + alpha * np.eye(n), loop.scaled_H)
         )
-        first = math.ceil(T / loop.cell_s - 1e-9)
+        first_cell = math.ceil(T / loop.cell_s - 1e-9)
         pushed = np.append(free, models - free) - exponential(loop.F * T)[:, :n] @ x0
         step = exponential(loop.F * loop.cell_s)
-        added = [exponential(loop.F * max(first * loop.cell_s - T, 0.0)) @ pushed]
-        for _ in range(loop.cells - first):
+        added = [exponential(loop.F * max(first_cell * loop.cell_s - T, 0.0)) @ pushed]
+        for _ in range(loop.cells - first_cell):
             added.append(step @ added[-1])
         F, BK = loop.F, loop.BK
         turn = F @ BK - BK @ loop.scaled_H
         ages = self._ages_of(x0[None])[0]
         nodes, highest = loop.flows @ x0, []
-        with_start = nodes[first:] + np.array(added)
+        with_start = nodes[first_cell:] + np.array(added)
         for number, C in enumerate(loop.outputs.values()):
             cells = _of_cells(np.linalg.norm(nodes @ C.T, axis=-1))
             later = np.linalg.norm(with_start @ C.T, axis=-1)
-            cells[first:] = np.maximum(cells[first:], _of_cells(later))
-            cells[first:] += T**2 / 8 * self._carried(C, turn, loop.cells)
-            cells[first:] += loop.cell_s**2 / 8 * T * self._carried(C @ F @ F, BK, loop.cells)
-            cells[:first] += T * self._carried(C, BK, max(first, 1))
+            cells[first_cell:] = np.maximum(cells[first_cell:], _of_cells(later))
+            cells[first_cell:] += T**2 / 8 * self._carried(C, turn, loop.cells)
+            cells[first_cell:] += loop.cell_s**2 / 8 * T * self._carried(C @ F @ F, BK, loop.cells)
+            cells[:first_cell] += T * self._carried(C, BK, max(first_cell, 1))
             cells += self._sags[number] * np.linalg.norm(norm.shape @ x0)
             cells += loop.driven[number] @ ages
             highest.append((cells + self._ages_seen[number] * ages).max())
-        ends = np.array(added)[loop.ends - first]
+        ends = np.array(added)[loop.ends - first_cell]
         moved = nodes[loop.ends]
         bent = T**2 / 8 * self._carried(np.hstack([norm.shape, 0 * norm.shape]), turn, loop.cells)
         half = np.linalg.norm(ends[:, :n] @ norm.shape.T, axis=-1) / 2
@@ -533,8 +537,8 @@ class Deliveries:
         J = np.maximum(loop.late_sizes(moved[:, n:]), loop.late_sizes((moved + ends)[:, n:]))
         J = J + max(late) + weighted + norm.late_aged @ ages
         rho = half * _ROUNDING + bent + norm.aged @ ages
-        both = rho + norm.theta * J
-        return np.array(highest), _Balls(moved[:, :n] + ends[:, :n] / 2, rho, J, both)
+        weighted_sum = rho + norm.theta * J
+        return np.array(highest), _Balls(moved[:, :n] + ends[:, :n] / 2, rho, J, weighted_sum)
 
     def _carried(self, C: Matrix, Y: Matrix, cells: int) -> float:
         """Bound ‖C e^{Fr} Y e^{Hs} x(0)‖ over cells of r, and s up to T."""
@@ -556,16 +560,19 @@ class _Ball(NamedTuple):
     c: Vector
     rho: float
     J: float
-    both: float
+    weighted_sum: float
     theta: float
     time: int = 0
 
     @property
     def corners(self) -> Matrix:
         """ρ and J where linear functions of both, that do not fall, are largest, (2, corners)."""
-        rho, J = min(self.rho, self.both), min(self.J, self.both / self.theta)
-        others = min(J, (self.both - rho) / self.theta), min(rho, self.both - self.theta * J)
-        return np.array([[rho, others[1]], [others[0], J]]).clip(min=0.0) * _ROUNDING
+        rho, J = min(self.rho, self.weighted_sum), min(self.J, self.weighted_sum / self.theta)
+        partners = (
+            min(J, (self.weighted_sum - rho) / self.theta),
+            min(rho, self.weighted_sum - self.theta * J),
+        )
+        return np.array([[rho, partners[1]], [partners[0], J]]).clip(min=0.0) * _ROUNDING
 
 
 class _Balls(NamedTuple):
@@ -574,7 +581,7 @@ class _Balls(NamedTuple):
     c: Matrix
     rho: Vector
     J: Vector
-    both: Vector
+    weighted_sum: Vector
 
 
 def _shapes(plant: PlantGains) -> Iterator[Matrix]:
@@ -585,20 +592,20 @@ def _shapes(plant: PlantGains) -> Iterator[Matrix]:
     if decay_per_s <= 0:
         raise NotDecayingError(f"a mode of the loop grows at {-decay_per_s:.3g} /s")
     rate = plant.error.split_K[1] @ plant.error.H
-    seen = rate.T @ rate + _LEAST * np.linalg.norm(rate) ** 2 * identity
-    for share, right in itertools.product(_SHIFTS, (seen, identity)):
+    rate_form = rate.T @ rate + _LEAST * np.linalg.norm(rate) ** 2 * identity
+    for share, right in itertools.product(_SHIFTS, (rate_form, identity)):
         shifted = plant.closed_loop + share * decay_per_s * identity
         form = solve_continuous_lyapunov(shifted.T, -right)
         with contextlib.suppress(np.linalg.LinAlgError):
             yield np.linalg.cholesky(0.5 * (form + form.T)).T
 
 
-def _keep(after: list[Stack], known: NDArray[np.bool_], times: list[int], balls: _Balls) -> None:
+def _store(following: list[Stack], has_balls: NDArray[np.bool_], times: list[int], balls: _Balls) -> None:
     """Remember what follows from the balls of some times."""
-    places = np.array(times) % len(known)
-    for kept, part in zip(after, balls, strict=True):
-        kept[places] = part
-    known[places] = True
+    slots = np.array(times) % len(has_balls)
+    for store, array in zip(following, balls, strict=True):
+        store[slots] = array
+    has_balls[slots] = True
 
 
 def _highest(kernels: dict[str, KernelBounds]) -> Matrix:

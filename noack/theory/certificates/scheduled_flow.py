@@ -33,18 +33,11 @@ from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.gains import Growth, Output, PlantGains
 from noack.theory.bounds.terms import MEASURED, Constants, NetworkConditions, Part
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth
-from noack.theory.certificates.delivery_flow import (
-    ROUNDING,
-    Disturbed,
-    Reach,
-    SensorErrors,
-    Starts,
-    bend_of_error,
-    error_after,
-    errors_after_losses,
-)
+from noack.theory.certificates.delivery_flow import ROUNDING, InputEffects, error_after
+from noack.theory.certificates.delivery_reach import Reach, Starts
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
+from noack.theory.certificates.lost_events import SensorErrors, bend_of_error, errors_after_losses
 
 _ROUNDS, _SETTLED = 20, 0.99
 _MOST_INSERTED, _NEARLY = 60, 0.9999
@@ -75,14 +68,14 @@ def scheduled_constants(constants: Constants, part: Part, conditions: NetworkCon
         return constants
     flow.insert()
     for _ in range(_ROUNDS):
-        before = known.errors[Output.WEIGHTED], known.states[Output.WEIGHTED]
+        earlier = known.errors[Output.WEIGHTED], known.states[Output.WEIGHTED]
         if not flow.follow():
             break
-        after = known.errors[Output.WEIGHTED], known.states[Output.WEIGHTED]
-        if all(new > _SETTLED * old for new, old in zip(after, before, strict=True)):
+        later = known.errors[Output.WEIGHTED], known.states[Output.WEIGHTED]
+        if all(new > _SETTLED * old for new, old in zip(later, earlier, strict=True)):
             break
     unit = part.bound.beta if part.bound.unit is None else part.bound.unit
-    found = {
+    sharpened = {
         "delta": known.errors[Output.WEIGHTED] / unit,
         "overshoot": known.sensor / unit,
         "input_error": known.input_error,
@@ -91,7 +84,7 @@ def scheduled_constants(constants: Constants, part: Part, conditions: NetworkCon
         "mismatch": known.states[Output.MISMATCH],
         "received_input_error": known.received,
     }
-    smaller = {name: min(value, getattr(constants, name)) for name, value in found.items()}
+    smaller = {name: min(value, getattr(constants, name)) for name, value in sharpened.items()}
     later_s = constants.inter_event_s and max(flow.spacing_s, constants.inter_event_s)
     return constants._replace(**smaller, inter_event_s=later_s)
 
@@ -118,57 +111,57 @@ class _ScheduledFlow:
     def insert(self) -> None:
         """Insert bounds into the inequalities until they have settled."""
         for _ in range(_MOST_INSERTED):
-            before = self.known.signals
+            previous = self.known.signals
             self._step.insert(self.known, self.spacing_s)
-            if (self.known.signals >= _NEARLY * before).all():
+            if (self.known.signals >= _NEARLY * previous).all():
                 break
 
     def follow(self) -> bool:
         """Make bounds smaller by the flow; return whether there is an ellipsoid."""
         known, conditions = self.known, self._conditions
         limit = known.errors[Output.WEIGHTED]
-        disturbed = None if self._is_ideal else self._disturbed
-        reach = self._ellipsoids.within(limit, disturbed, conditions.start_s)
+        effects_of = None if self._is_ideal else self._input_effects
+        reach = self._ellipsoids.within(limit, effects_of, conditions.start_s)
         if reach is None:
             return False
-        known.signals[0] = min(known.signals[0], reach.by.held)
+        known.signals[0] = min(known.signals[0], reach.effects.held)
         inverse = self._part.plant.error.inverse_weight
         for name, C in self._part.plant.outputs.items():
             known.states[name] = min(known.states[name], reach.sup_state(C @ inverse))
         gain = reach.starts.flow.gain
-        size = max(reach.sup(np.hstack([0 * gain, gain])), float(spectral_norm(gain)) * reach.by.late)
+        size = max(reach.sup(np.hstack([0 * gain, gain])), float(spectral_norm(gain)) * reach.effects.late)
         known.errors[Output.GAIN] = min(known.errors[Output.GAIN], size)
         if self.spacing_s >= max(self._late_s, _SHORTEST_S):  # before, the last update has acted
-            size = max(self._after_losses(reach), reach.by.late)
-            for output, most in known.errors.items():
-                known.errors[output] = min(most, size * self._part.plant.error.now(output))
+            size = max(self._after_losses(reach), reach.effects.late)
+            for output, bound in known.errors.items():
+                known.errors[output] = min(bound, size * self._part.plant.error.now(output))
         self.insert()
         self.spacing_s = max(self.spacing_s, self._step.next_event_s(known))
         self.insert()
         return True
 
-    def _disturbed(self, starts: Starts, size: float) -> Disturbed:
+    def _input_effects(self, starts: Starts, size: float) -> InputEffects:
         """Return what delay and hold change as long as ‖ΛWx‖ ≤ c, ``size``.
 
         x_c, from which the input is computed, is e^{(H+αI)τ} x of the event of the last update.
         """
         known, plant = self.known, self._part.plant
         gains = self._step.age_gains.items()
-        held = sum(gain * starts.model_sups[C] for C, gain in gains) * size
-        held = min(float(known.signals[0]), held)
-        input_error = max(known.errors[Output.GAIN] + held, self._step.start_error)
+        age_input = sum(gain * starts.model_sups[C] for C, gain in gains) * size
+        age_input = min(float(known.signals[0]), age_input)
+        input_error = max(known.errors[Output.GAIN] + age_input, self._step.start_error)
         R_E = plant.outputs[Output.MISMATCH] @ plant.error.inverse_weight
-        of_mismatch = size * float(spectral_norm(R_E @ starts.inverse)) * ROUNDING
-        mismatch = min(float(known.signals[4]), of_mismatch)
-        return Disturbed(held, self._step.entered(self._late_s, input_error, mismatch), self._late_s)
+        mismatch_in_ellipsoid = size * float(spectral_norm(R_E @ starts.inverse)) * ROUNDING
+        mismatch = min(float(known.signals[4]), mismatch_in_ellipsoid)
+        return InputEffects(age_input, self._step.entered(self._late_s, input_error, mismatch), self._late_s)
 
     def _after_losses(self, reach: Reach) -> float:
         """Bound ‖e_c‖_W after as many losses as there may be, until the next update acts."""
         known, error, conditions = self.known, self._part.plant.error, self._conditions
-        of_sensor = self._of_sensor
-        level = 0.0 if of_sensor.integrates else of_sensor.level
-        bend = bend_of_error(reach, level or float(of_sensor.sizes.max())) if of_sensor.level else 0.0
-        if level and reach.by.is_none:
+        sensor = self._of_sensor
+        level = 0.0 if sensor.integrates else sensor.level
+        bend = bend_of_error(reach, level or float(sensor.sizes.max())) if sensor.level else 0.0
+        if level and reach.effects.is_none:
             at_event = max(float(errors_at_events(known.lost)[-1]), _LEAST_SHARE * reach.limit)
             at_events = replace(reach, limit=at_event)
             later_s = _next_event_s(at_events, level, self.spacing_s, bend)
@@ -176,7 +169,7 @@ class _ScheduledFlow:
             self.spacing_s = max(self.spacing_s, self._tested_s(later_s))
         kernel = error.kernels[Output.WEIGHTED]
         known.lost, apart_s = errors_after_losses(
-            reach, known.lost, of_sensor, self._bounded, self.spacing_s, kernel, bend
+            reach, known.lost, sensor, self._bounded, self.spacing_s, kernel, bend
         )
         self.spacing_s = self._tested_s(apart_s)
         # An event comes after the first input has been applied.
@@ -224,25 +217,25 @@ def _next_event_s(at_events: Reach, level: float, known_s: float, bend: float) -
     It is at least the known one. Over a step s, e_s differs from its chord by at most s²/8 times a
     bound of its second derivative, which holds as long as ‖e_s‖_W is below the level.
     """
-    flow, found_s = at_events.starts.flow, known_s
+    flow, reached_s = at_events.starts.flow, known_s
     if not (0 < known_s < math.inf and 0 < bend < math.inf):
         return known_s
-    size, tries = at_events.sup(error_after(flow, found_s)), 0
-    slope = size / found_s
+    size, evaluations = at_events.sup(error_after(flow, reached_s)), 0
+    slope = size / reached_s
     while size < level:
-        step_s = min(math.sqrt(4 * (level - size) / bend), found_s)
+        step_s = min(math.sqrt(4 * (level - size) / bend), reached_s)
         if slope * step_s > 0.99 * (level - size):
             step_s = 0.99 * (level - size) / slope
-        while tries < _MOST_STEPS and step_s > _SHORT * found_s:
-            later, tries = at_events.sup(error_after(flow, found_s + step_s)), tries + 1
+        while evaluations < _MOST_STEPS and step_s > _SHORT * reached_s:
+            later, evaluations = at_events.sup(error_after(flow, reached_s + step_s)), evaluations + 1
             if max(size, later) + step_s**2 / 8 * bend < level:
                 break
             step_s *= 0.6
         else:
-            return found_s
+            return reached_s
         slope = (later - size) / step_s
-        found_s, size = found_s + step_s, later
-    return found_s
+        reached_s, size = reached_s + step_s, later
+    return reached_s
 
 
 Growths = Sequence[Sequence[ErrorGrowth]]
@@ -272,21 +265,21 @@ class _SumOfErrors:
         count: int,
         later_s: float,
     ) -> None:
-        error, each = plant.error, [growth for row in growths for growth in row]
+        error, all_growths = plant.error, [growth for row in growths for growth in row]
         self._growths, ages_s = growths, spacing_s * np.arange(count, dtype=np.float64)
         missing = np.array([error.kernels[C].sups(ages_s) for C in error.outputs])[:, None]
         kernels = [plant.driven[C] for C in error.outputs]
-        sups = [np.array([pair[k].sups(ages_s) for pair in kernels])[:, None] for k in (0, 1)]
-        grown = np.array([growth.driven[:2] for growth in each])
-        means_s = np.array([growth.mean_s for growth in each])[:, None]
-        now = [error.now_until(later_s + growth.longest_s) for growth in each]
-        present = np.array([[gains[C] for gains in now] for C in error.outputs])
-        driven = np.zeros((2, len(kernels), len(each)))
-        for place, growth in enumerate(each):
+        sups = [np.array([kernel_pair[k].sups(ages_s) for kernel_pair in kernels])[:, None] for k in (0, 1)]
+        grown = np.array([growth.driven[:2] for growth in all_growths])
+        means_s = np.array([growth.mean_s for growth in all_growths])[:, None]
+        present_gains = [error.now_until(later_s + growth.longest_s) for growth in all_growths]
+        present = np.array([[gains[C] for gains in present_gains] for C in error.outputs])
+        driven = np.zeros((2, len(kernels), len(all_growths)))
+        for index, growth in enumerate(all_growths):
             if (until_s := later_s + growth.longest_s) > 0:
                 followed = plant.growths(until_s, COARSE_CELLS)
                 means = [followed[C].means(growth.ages_s + later_s)[:2] for C in error.outputs]
-                driven[:, :, place] = np.array(means).T
+                driven[:, :, index] = np.array(means).T
         self._entered, self._mismatched = (
             np.dstack([driven[k], np.minimum(missing * grown[:, k, None], means_s * sups[k])]) for k in (0, 1)
         )
@@ -302,16 +295,16 @@ class _SumOfErrors:
 
         Given are bounds of ‖e_s‖_W after a test for each growth, of π and sup‖R_E x‖.
         """
-        each = self._each(b, mismatch, np.array([input_error]))[..., 0]
-        return each, self._begun(self._begin_s) * max(start_error - input_error, 0.0)
+        parts = self._each(b, mismatch, np.array([input_error]))[..., 0]
+        return parts, self._begun(self._begin_s) * max(start_error - input_error, 0.0)
 
     def after_losses(self, b: Vector, inputs: Vector, mismatch: float, late_s: float, late: float) -> Matrix:
         """Bound ‖C e_c‖ after 0, 1, … lost events, which are at least ``late_s`` apart, (o, j).
 
         ``inputs``: bounds of ‖p‖ meanwhile, and ``late`` until an update acts, for ``late_s``.
         """
-        each, lost = self._each(b, mismatch, inputs), np.arange(len(inputs))
-        sums = [each[:, 0, j] + each[:, lost[1 : j + 1], lost[:j][::-1]].sum(axis=1) for j in lost.tolist()]
+        parts, lost = self._each(b, mismatch, inputs), np.arange(len(inputs))
+        sums = [parts[:, 0, j] + parts[:, lost[1 : j + 1], lost[:j][::-1]].sum(axis=1) for j in lost.tolist()]
         return np.array(sums).T + self._begun(late_s)[:, lost] * max(late - float(inputs[0]), 0.0)
 
     def _each(self, b: Vector, mismatch: float, inputs: Vector) -> Stack:
@@ -339,33 +332,36 @@ class _OpenLoopErrors:
         conditions: NetworkConditions,
         spacing_s: float,
     ) -> None:
-        error, each = plant.error, [growth for row in growths for growth in row]
+        error, all_growths = plant.error, [growth for row in growths for growth in row]
         self._growths, self._lost = growths, conditions.dropouts
         generator = error.scaled_H - plant.B @ error.K
         driven = np.hstack([plant.columns.input_error, plant.columns.mismatch])
-        groups, still = (0, plant.columns.input_error.shape[1]), np.ones(1)
+        groups, zero = (0, plant.columns.input_error.shape[1]), np.ones(1)
 
         def gains(later_s: float, apart_s: float) -> Stack:
             """Return those of b, of a lost error, and of q and R_E x, then without means, (6, o, g)."""
-            found = []
-            for growth in each:
+            gains_by_growth = []
+            for growth in all_growths:
                 ages_s = growth.ages_s + later_s
                 until_s = float(ages_s.max())
                 alone = response_until(generator, error.inverse_weight, until_s, COARSE_CELLS)
                 pairs = response_until(generator, driven, until_s, COARSE_CELLS, groups=groups)
-                kept, entered = alone.through_each(error.stacked), pairs.through_groups(error.stacked)
+                alone_by_output, entered = (
+                    alone.through_each(error.stacked),
+                    pairs.through_groups(error.stacked),
+                )
                 rows = []
                 for C in error.outputs:
                     by_input, mismatched = entered[C]
-                    one = Growth(mismatched, by_input, np.zeros(COARSE_CELLS))
-                    means = one.means(ages_s if until_s else still)
-                    rows.append((kept[C].sup_on_grid(), *means[:2], *one.totals[:2]))
-                found.append(rows)
-            stay, *entered_by = np.array(found).transpose(2, 1, 0)
-            left_s = np.array([max(apart_s - growth.longest_s, 0.0) for growth in each])
-            left = {C: error.kernels[C].sups(left_s) for C in error.outputs}
-            turned = np.array([*left.values()]) + entered_by[2] * left[Output.GAIN]
-            return np.array([stay, np.minimum(stay * left[Output.WEIGHTED], turned), *entered_by])
+                    growth_sizes = Growth(mismatched, by_input, np.zeros(COARSE_CELLS))
+                    means = growth_sizes.means(ages_s if until_s else zero)
+                    rows.append((alone_by_output[C].sup_on_grid(), *means[:2], *growth_sizes.totals[:2]))
+                gains_by_growth.append(rows)
+            stay, *entered_by = np.array(gains_by_growth).transpose(2, 1, 0)
+            remaining_s = np.array([max(apart_s - growth.longest_s, 0.0) for growth in all_growths])
+            remaining = {C: error.kernels[C].sups(remaining_s) for C in error.outputs}
+            redirected = np.array([*remaining.values()]) + entered_by[2] * remaining[Output.GAIN]
+            return np.array([stay, np.minimum(stay * remaining[Output.WEIGHTED], redirected), *entered_by])
 
         self._step, self._between = gains(0.0, spacing_s)[:, :1], gains(0.0, 0.0)[:, :1]
         self._whole = gains(conditions.delay_s, 0.0)
@@ -381,16 +377,16 @@ class _OpenLoopErrors:
         late = float(self._late[0] * input_error + self._late[1] * mismatch)
 
         def followed(gains: Stack, lost: float) -> Vector:
-            stay, after, by_input, mismatched, *totals = gains
-            tested = stay * b + after * lost + by_input * held + mismatched * mismatch
-            values = np.maximum(tested, stay * late + totals[0] * held + totals[1] * mismatch)
+            kept, remaining, by_input, mismatched, *totals = gains
+            tested = kept * b + remaining * lost + by_input * held + mismatched * mismatch
+            values = np.maximum(tested, kept * late + totals[0] * held + totals[1] * mismatch)
             return _smallest(values, self._growths)
 
         lost = [0.0]
         for _ in range(self._lost):
             lost.append(max(float(followed(self._step, lost[-1])[0]), lost[-1]))
-        between = np.array([followed(self._between, one)[0] for one in lost])
-        return between, np.array([followed(self._whole, one) for one in (0.0, lost[-1])]).T
+        between = np.array([followed(self._between, error)[0] for error in lost])
+        return between, np.array([followed(self._whole, error) for error in (0.0, lost[-1])]).T
 
 
 @dataclass
@@ -444,41 +440,43 @@ class _Inserted(ErrorInequalities):
     def insert(self, known: _KnownBounds, spacing_s: float) -> None:
         """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
         v, states, errors, h_s = known.signals, known.states, known.errors, self._conditions.sampling_s
-        held, input_error, mismatch = v[[0, 3, 4]].tolist()
-        own, place = map([*self._error.outputs].index, (Output.WEIGHTED, Output.GAIN))
+        age_input, input_error, mismatch = v[[0, 3, 4]].tolist()
+        weighted, place = map([*self._error.outputs].index, (Output.WEIGHTED, Output.GAIN))
         for name, (free, forced) in self._timed_states.items():
             states[name] = min(states[name], float((free + forced * input_error).max()))
         growths = [growth for row in self._growths for growth in row]
         b = np.array([growth.after_test(states) for growth in growths])
-        of_last = [one for growth, one in zip(growths, b.tolist(), strict=True) if growth.longest_s == h_s]
-        known.tested = min([known.tested, *of_last])
+        after_last_test = [
+            tested for growth, tested in zip(growths, b.tolist(), strict=True) if growth.longest_s == h_s
+        ]
+        known.tested = min([known.tested, *after_last_test])
         for method, sums in self._sums(spacing_s).items():
-            each, begun = sums.bound(b, input_error, mismatch, self.start_error)
-            whole = each.cumsum(axis=1) + begun
+            parts, at_start = sums.bound(b, input_error, mismatch, self.start_error)
+            whole = parts.cumsum(axis=1) + at_start
             if method is BoundMethod.MISSING:
-                known.earlier = min(known.earlier, float(whole[place, -1] - each[place, 0]) + held)
-                known.received = min(known.received, float(whole[place, 0]) + held)
-                known.lost = np.minimum(known.lost, whole[own, : self._conditions.dropouts + 1])
+                known.earlier = min(known.earlier, float(whole[place, -1] - parts[place, 0]) + age_input)
+                known.received = min(known.received, float(whole[place, 0]) + age_input)
+                known.lost = np.minimum(known.lost, whole[weighted, : self._conditions.dropouts + 1])
             known.reduce_errors(whole[:, -1])
         start_error = max(input_error, self.start_error)
-        between, whole = self._followed(spacing_s).bound(b, held, start_error, mismatch)
+        between_events, whole = self._followed(spacing_s).bound(b, age_input, start_error, mismatch)
         known.reduce_errors(whole[:, -1])
-        known.received = min(known.received, float(whole[place, 0]) + held)
-        known.lost = np.minimum(known.lost, between)
+        known.received = min(known.received, float(whole[place, 0]) + age_input)
+        known.lost = np.minimum(known.lost, between_events)
         if spacing_s >= self.late_s:
-            inputs = np.minimum(known.inputs, self._error.now(Output.GAIN) * known.lost + held)
+            inputs = np.minimum(known.inputs, self._error.now(Output.GAIN) * known.lost + age_input)
             inputs[0] = min(inputs[0], known.received)
             sums = self._sums(spacing_s)[BoundMethod.MISSING]
             # While one more event is in flight, π bounds the input that drives the present error.
             stages = np.append(inputs, input_error)[: self._missing_events(spacing_s) + 1]
             summed = sums.after_losses(b, stages, mismatch, self.late_s, start_error)
             known.reduce_errors(summed[:, -1])
-            known.lost = np.minimum(known.lost, summed[own, : len(inputs)])
-            known.inputs = np.minimum(inputs, summed[place, : len(inputs)] + held)
+            known.lost = np.minimum(known.lost, summed[weighted, : len(inputs)])
+            known.inputs = np.minimum(inputs, summed[place, : len(inputs)] + age_input)
         self._insert_sensor(known, b)
         age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
-        found_v = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
-        known.signals = np.minimum(v, np.array(found_v, dtype=np.float64))
+        new_signals = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
+        known.signals = np.minimum(v, np.array(new_signals, dtype=np.float64))
 
     def _insert_sensor(self, known: _KnownBounds, b: Vector) -> None:
         """Insert bounds of e_s, given those after a test."""
@@ -487,14 +485,14 @@ class _Inserted(ErrorInequalities):
         received = inputs[0] = min(float(inputs[0]), known.received)
         inputs = np.append(input_error, inputs)
         late = self.entered(self.late_s, max(input_error, self.start_error), mismatch)
-        ends, found = iter(b.tolist()), []
+        ends, by_bound = iter(b.tolist()), []
         for row in self._growths:
             sizes = np.max([self._grown(growth, next(ends), inputs, mismatch) for growth in row], axis=0)
             until_s = max(growth.longest_s for growth in row)
             # In this time after an update acts, e_s is what was there and what has entered since.
-            first = self._error.stretch(until_s) * late + self.entered(until_s, received, mismatch)
-            found.append([sizes[0], max(float(sizes[1]), first), *sizes[2:]])
-        smallest = np.min(found, axis=0)
+            after_update = self._error.stretch(until_s) * late + self.entered(until_s, received, mismatch)
+            by_bound.append([sizes[0], max(float(sizes[1]), after_update), *sizes[2:]])
+        smallest = np.min(by_bound, axis=0)
         known.sensor = min(known.sensor, float(smallest[0]))
         known.present = np.minimum(known.present, np.minimum(smallest[1:], known.sensor))
         known.lost[0] = min(known.lost[0], known.present[0])
@@ -514,10 +512,10 @@ class _Inserted(ErrorInequalities):
     @cached_property
     def _timed_states(self) -> Mapping[str, tuple[Vector, Vector]]:
         """Bounds of ‖C x‖ from the start, and of what a p of 1 has added, up to some times, (k,)."""
-        plant, (_, begun) = self._plant, self._plant.start_up(self._conditions.start_s)
+        plant, (_, at_start) = self._plant, self._plant.start_up(self._conditions.start_s)
         return {
             name: (
-                np.append(free.highest, free.tail_highest) + begun[name],
+                np.append(free.highest, free.tail_highest) + at_start[name],
                 forced.integral_until(np.append(free.edges_s[1:], forced.edges_s[-1] + 1.0)),
             )
             for (name, free), forced in zip(plant.free.items(), plant.forced.values(), strict=True)
@@ -526,9 +524,9 @@ class _Inserted(ErrorInequalities):
     def _grown(self, growth: ErrorGrowth, b: float, inputs: Vector, mismatch: float) -> Vector:
         """Return how large e_s may become under one bound, given those of ‖p‖; the start is in the first."""
         by_input, mismatched, _ = growth.driven
-        begun = np.fmin(by_input, self._begin_s * growth.highest)
+        at_start = np.fmin(by_input, self._begin_s * growth.highest)
         sizes = growth.stretch * b + by_input * inputs + mismatched * mismatch
-        sizes[0] += begun * max(self.start_error - float(inputs[0]), 0.0)
+        sizes[0] += at_start * max(self.start_error - float(inputs[0]), 0.0)
         return np.asarray(sizes)
 
     @cached_method
@@ -562,9 +560,9 @@ class _Inserted(ErrorInequalities):
         """Return the time between two events that follows from bounds; 0 if there is none."""
         if all(bound.reached is None for bound in self._bound.every):
             return 0.0
-        still, never = np.zeros(1), np.zeros(1, dtype=bool)
+        zero, never = np.zeros(1), np.zeros(1, dtype=bool)
         events = np.zeros(1, dtype=np.int64)
-        mismatch, earlier = known.signals[4:5], still + known.earlier
-        before, after = (still,) * 6, (still,) * 3
+        mismatch, earlier = known.signals[4:5], zero + known.earlier
+        before, after = (zero,) * 6, (zero,) * 3
         constants = LoopConstants(events, *before, mismatch, *after, earlier, ~never)
         return float(self.inter_event_s(constants, never, ~never)[0])
