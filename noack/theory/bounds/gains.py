@@ -331,8 +331,8 @@ class PlantGains:
         """
         if self.forcing is not None:
             return None
-        values = [getattr(self, field_.name) for field_ in fields(self)]
-        shapes = [field_.shape for field_ in values if isinstance(field_, np.ndarray)]
+        values = [getattr(self, entry.name) for entry in fields(self)]
+        shapes = [entry.shape for entry in values if isinstance(entry, np.ndarray)]
         outputs = [(name, matrix_key(C)) for name, C in self.further_outputs.items()]
         rank = int(ranks(self.error.weight @ self._mismatch))
         return type(self), id(self.error), self.alpha_per_s, rank, *shapes, *outputs
@@ -350,7 +350,7 @@ class PlantGains:
         if not others:
             return first
         changed: dict[str, Any] = {}
-        for name in (field_.name for field_ in fields(first)):
+        for name in (entry.name for entry in fields(first)):
             values = [getattr(plant, name) for plant in plants]
             if isinstance(values[0], np.ndarray):
                 stack = np.array(values)

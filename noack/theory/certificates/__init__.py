@@ -12,13 +12,8 @@ loop"):
    effect of all losses together, if windows limit them.
 2. ``solution.py``. The minimum inter-event time δ is the time that e_s needs from 0 to the
    threshold under these bounds (eq:miet_errdyn; the paper's is eq:tau). N and D_C depend on δ, so
-   the largest consistent δ is used. Under the paper's conditions ``invariant_ellipsoids.py``
-   sharpens the bounds by an ellipsoid that x never leaves: the flow between two deliveries leads
-   back into it. Read ``delivery_flow.py`` (the flow itself), ``delivery_reach.py`` (its bounds, for
-   all states of an ellipsoid at the delivery), ``lost_events.py`` (bounds of e_c after lost
-   events) and ``scheduled_flow.py`` (all bounds inserted into each other, with sampled tests,
-   delay and hold). Where events are due, ``due_deliveries.py`` follows x from delivery to delivery
-   by balls instead.
+   the largest consistent δ is used. For one known plant ``deliveries/`` sharpens the bounds by what
+   holds from one delivery to the next.
 3. ``disturbed.py``. With persistent disturbances, noise, an observer or a constant threshold, each
    bound has a decaying part and a persistent part. All inequalities are linear in functions of
    time, so the bounds of the two parts are added.

@@ -25,8 +25,8 @@ from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
+from noack.theory.certificates.deliveries.due_deliveries import Deliveries
 from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate, tenth_s
-from noack.theory.certificates.due_deliveries import Deliveries
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 MOST_S = 10.0

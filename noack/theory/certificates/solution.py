@@ -4,7 +4,7 @@ The bounds are the solution of the inequalities of :mod:`noack.theory.certificat
 The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
 assumed δ gives a time of at least δ, it holds by induction over the events; the largest such δ is
 used. The constants are sharpened by the flow between two updates
-(:mod:`noack.theory.certificates.scheduled_flow`).
+(:mod:`noack.theory.certificates.deliveries.scheduled_flow`).
 """
 
 import contextlib
@@ -29,8 +29,8 @@ from noack.theory.bounds.terms import (
     TriggerBound,
 )
 from noack.theory.bounds.trigger_bounds import LONGEST_S
+from noack.theory.certificates.deliveries.scheduled_flow import is_scheduled_flow, scheduled_constants
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
-from noack.theory.certificates.scheduled_flow import is_scheduled_flow, scheduled_constants
 
 _SETTLED = 1e-3
 _ATTEMPTS = 200
@@ -159,7 +159,7 @@ def sharpened(problem: Problem) -> Search[Constants]:
     (constants,) = yield problem
     (part,), conditions, *_ = problem
     is_plain = problem.structured and problem.earlier_error == 0.0
-    if problem.longest and is_plain and is_scheduled_flow(part, conditions):
+    if problem.longest and is_plain and is_scheduled_flow(part):
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
             return scheduled_constants(constants, part, conditions)
     return constants

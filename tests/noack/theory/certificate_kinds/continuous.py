@@ -17,11 +17,12 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
-from noack.theory.certificates import scheduled_flow
-from noack.theory.certificates.delivery_flow import NO_EFFECTS, DeliveryFlow
-from noack.theory.certificates.delivery_reach import Reach
-from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
-from noack.theory.certificates.scheduled_flow import _OpenLoopErrors, _ScheduledFlow
+from noack.theory.certificates.deliveries import scheduled_flow
+from noack.theory.certificates.deliveries.delivery_flow import NO_EFFECTS, DeliveryFlow
+from noack.theory.certificates.deliveries.delivery_reach import Reach
+from noack.theory.certificates.deliveries.inserted_bounds import _OpenLoopErrors
+from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
+from noack.theory.certificates.deliveries.scheduled_flow import _ScheduledFlow
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import bounds_of, certified_by, dominated_by_errors, search
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time

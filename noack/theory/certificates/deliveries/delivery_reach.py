@@ -1,6 +1,6 @@
 """What x and e_c can be after a delivery, for all states ξ of an ellipsoid.
 
-All that is uncertain of the flow (:mod:`noack.theory.certificates.delivery_flow`) is ξ, and the
+All that is uncertain of the flow (:mod:`noack.theory.certificates.deliveries.delivery_flow`) is ξ, and the
 time of the next delivery. Let ‖Λξ‖ ≤ 1 and ‖e_c‖_W ≤ D at all times. At the time τ, ξ has ‖Λξ‖ ≤ 1
 and ‖Nξ‖_W ≤ D, N the rows of e_c in e^{Fs} (I, 0) for an s ≤ τ. So ξ is in the ellipsoid λ‖Λξ‖² +
 (1 − λ)‖Nξ‖²/D² ≤ 1, for each λ in [0, 1]. So ‖C z(τ)‖ is at most the norm of C e^{Fτ} on this
@@ -36,7 +36,7 @@ from noack.theory.bounds.contraction import (
 )
 from noack.theory.bounds.enclosure import response
 from noack.theory.bounds.gains import Output
-from noack.theory.certificates.delivery_flow import (
+from noack.theory.certificates.deliveries.delivery_flow import (
     NO_EFFECTS,
     ROUNDING,
     TAYLOR_TERMS,

@@ -2,13 +2,13 @@
 
 Without the flow, each missing event adds its ‖e_s‖_W in full, as if all had one direction. But
 until the next delivery everything follows from z at one time
-(:mod:`noack.theory.certificates.delivery_flow`). Let an event be lost at least w after the
+(:mod:`noack.theory.certificates.deliveries.delivery_flow`). Let an event be lost at least w after the
 delivery, and ‖e_c‖_W ≤ D up to it. z is the value w before it, z' = e^{Fw} z:
 
     ‖Λx‖ ≤ c and ‖e_c‖ ≤ D at z and z',  ‖e_s‖ = ‖C_r z'‖ ≤ β for r until the next event
 
 With positive weights of sum 1, z is in the ellipsoid of the sum of these forms, which bounds e_c =
-(0, I) e^{Fr} z' after r (:func:`noack.theory.certificates.delivery_reach.largest_outputs`).
+(0, I) e^{Fr} z' after r (:func:`noack.theory.certificates.deliveries.delivery_reach.largest_outputs`).
 
 After an event e_s begins at 0, so the same forms bound the time until the next event, too.
 """
@@ -22,8 +22,8 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector, exponential
 from noack.theory.bounds.contraction import Stack, logarithmic_norm
 from noack.theory.bounds.enclosure import KernelBounds, response_until
-from noack.theory.certificates.delivery_flow import ROUNDING, bend_rows
-from noack.theory.certificates.delivery_reach import Reach, largest_outputs
+from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, bend_rows
+from noack.theory.certificates.deliveries.delivery_reach import Reach, largest_outputs
 
 _NEAR, _RATIO, _MOST_NODES = np.linspace(0.0, 1.0, 20).tolist(), 1.03, 300
 """First nodes of r in units of δ; then the ratio from node to node."""

@@ -1,7 +1,7 @@
 """An ellipsoid that x never leaves.
 
 Given ‖e_c‖_W ≤ D at all times, an ellipsoid ‖Λx‖ ≤ 1 is found that x never leaves, by the flow
-between two deliveries (:mod:`noack.theory.certificates.delivery_reach`). It bounds x and E x, and
+between two deliveries (:mod:`noack.theory.certificates.deliveries.delivery_reach`). It bounds x and E x, and
 the flow from it bounds K e_c. Λ comes from a Lyapunov equation with three parameters. They are
 chosen by samples; what they give is checked with all enclosures.
 """
@@ -19,8 +19,13 @@ from noack.core.linear_systems import Matrix, Vector, solve_lyapunov, spectral_a
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.certificates.delivery_flow import NO_EFFECTS, ROUNDING, DeliveryFlow, InputEffects
-from noack.theory.certificates.delivery_reach import Reach, Starts
+from noack.theory.certificates.deliveries.delivery_flow import (
+    NO_EFFECTS,
+    ROUNDING,
+    DeliveryFlow,
+    InputEffects,
+)
+from noack.theory.certificates.deliveries.delivery_reach import Reach, Starts
 
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 _WIDE_MARGINS = (1.0, 1.15, 1.4, 1.8, 2.5, 3.5)
