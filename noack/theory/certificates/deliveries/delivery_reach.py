@@ -247,6 +247,7 @@ class Reach:
         """
         flow, n, shape, windows = self.starts.flow, self.starts.flow.n, self.starts.shape, []
         last_s, limit, identity = float(flow.edges_s[self._cells]), self.limit / self.size, np.eye(n)
+        # By how much held inputs change ‖e_c‖, and the bound of ‖Λx‖, over each cell.
         errors = np.zeros(len(flow.edges_s) - 1)
         levels = np.ones(len(errors))
         if not self.effects.is_none:
@@ -254,6 +255,7 @@ class Reach:
             errors = held.sizes(flow.error_effects) / self.size
             levels = levels + held.sizes(self.starts.state_bounds.unit_effects) / self.size
         for share in _WINDOWS:
+            # h bounds x_c = x + e_c, which follows the model, at the node T' ago.
             node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
             since_s = last_s - float(flow.edges_s[node])
             x_c = flow.states[node, :n] + flow.states[node, n:]
@@ -261,6 +263,7 @@ class Reach:
             h = h + float(np.linalg.norm(x_c, 2)) * self.effects.late / self.size
             if self.first_cell:
                 h = max(h, float(np.linalg.norm(x_c @ flow.start)) / self.size)
+            # The conditions at times from T' ago until now, as rows for (x_c, e_c) T' ago.
             level = 1.0 if node >= self.first_cell else self.largest() / self.size
             rows = [np.hstack([identity, np.zeros((n, n))]) / (flow.stretch * h)]
             moved = np.block([[identity, -identity], [np.zeros((n, n)), identity]])
@@ -272,6 +275,7 @@ class Reach:
                 if number < _EARLIER:
                     rows.append(shape @ moved[:n] / (level + added[1]))
                     moved = step @ moved
+            # Semi-axes of the ellipsoids of the first weights, in balanced coordinates.
             turn = _balancing_coordinates(np.array(rows)[None])[0]
             balanced = np.array(rows) @ turn
             forms = balanced.swapaxes(-1, -2) @ balanced
@@ -423,16 +427,14 @@ def largest_outputs(
     """Bound ‖Y z‖ for all z with forms of at most 1, (j,), by weights, (j, i), from some on.
 
     None below ``enough`` is improved, and only the largest ones unless all of them are wanted.
-    Bounds above ``used`` count as that.
+    Bounds above ``cap`` count as that.
     """
     bounds = np.full(len(forms), np.inf)
     weights = np.full(forms.shape[:2], 1 / forms.shape[1]) if first_weights is None else first_weights
     active, best = np.arange(len(forms)), weights.copy()
     for _ in range(_ROUNDS):
-        active_forms = forms[active]
-        Z = np.linalg.solve(
-            np.einsum("ji,jiab->jab", weights[active], active_forms), Y[active].swapaxes(1, 2)
-        )
+        chosen = forms[active]
+        Z = np.linalg.solve(np.einsum("ji,jiab->jab", weights[active], chosen), Y[active].swapaxes(1, 2))
         values, vectors = np.linalg.eigh(Y[active] @ Z)
         sizes = np.sqrt(values[:, -1].clip(min=0.0)) * ROUNDING
         better = sizes < bounds[active]
@@ -440,7 +442,7 @@ def largest_outputs(
         bounds[active] = np.minimum(bounds[active], sizes)
         # The forms of the z with the largest ‖Y z‖: those above the mean need more weight.
         z = (Z @ vectors[:, :, -1:])[..., 0]
-        sizes = np.einsum("ja,jiab,jb->ji", z, active_forms, z).clip(min=0.0)
+        sizes = np.einsum("ja,jiab,jb->ji", z, chosen, z).clip(min=0.0)
         weights[active] *= (sizes / sizes.max(axis=1, keepdims=True).clip(min=1e-300)) ** _POWER
         weights = weights.clip(min=_LEAST_WEIGHT)
         weights /= weights.sum(axis=1, keepdims=True)

@@ -52,11 +52,13 @@ class _SumOfErrors:
     ) -> None:
         error, all_growths = plant.error, [growth for row in growths for growth in row]
         self._growths, ages_s = growths, spacing_s * np.arange(count, dtype=np.float64)
+        # Gains of the errors of missing events, and of what had entered before them.
         missing = np.array([error.kernels[C].sups(ages_s) for C in error.outputs])[:, None]
         kernels = [plant.driven[C] for C in error.outputs]
         sups = [np.array([kernel_pair[k].sups(ages_s) for kernel_pair in kernels])[:, None] for k in (0, 1)]
         grown = np.array([growth.driven[:2] for growth in all_growths])
         means_s = np.array([growth.mean_s for growth in all_growths])[:, None]
+        # The same of the present error.
         present_gains = [error.now_until(later_s + growth.longest_s) for growth in all_growths]
         present = np.array([[gains[C] for gains in present_gains] for C in error.outputs])
         driven = np.zeros((2, len(kernels), len(all_growths)))
@@ -80,24 +82,24 @@ class _SumOfErrors:
 
         Given are bounds of ‖e_s‖_W after a test for each growth, of π and sup‖R_E x‖.
         """
-        parts = self._each(b, mismatch, np.array([input_error]))[..., 0]
-        return parts, self._begun(self._begin_s) * max(start_error - input_error, 0.0)
+        parts = self._parts(b, mismatch, np.array([input_error]))[..., 0]
+        return parts, self._entered_at_start(self._begin_s) * max(start_error - input_error, 0.0)
 
     def after_losses(self, b: Vector, inputs: Vector, mismatch: float, late_s: float, late: float) -> Matrix:
         """Bound ‖C e_c‖ after 0, 1, … lost events, which are at least ``late_s`` apart, (o, j).
 
         ``inputs``: bounds of ‖p‖ meanwhile, and ``late`` until an update acts, for ``late_s``.
         """
-        parts, lost = self._each(b, mismatch, inputs), np.arange(len(inputs))
+        parts, lost = self._parts(b, mismatch, inputs), np.arange(len(inputs))
         sums = [parts[:, 0, j] + parts[:, lost[1 : j + 1], lost[:j][::-1]].sum(axis=1) for j in lost.tolist()]
-        return np.array(sums).T + self._begun(late_s)[:, lost] * max(late - float(inputs[0]), 0.0)
+        return np.array(sums).T + self._entered_at_start(late_s)[:, lost] * max(late - float(inputs[0]), 0.0)
 
-    def _each(self, b: Vector, mismatch: float, inputs: Vector) -> Stack:
+    def _parts(self, b: Vector, mismatch: float, inputs: Vector) -> Stack:
         """Bound each error's part of ‖C e_c‖ for each bound of ‖p‖, (o, i, j)."""
         known = self._gains * b[:, None] + self._mismatched * mismatch
         return _smallest(known[..., None] + self._entered[..., None] * inputs, self._growths)
 
-    def _begun(self, late_s: float) -> Matrix:
+    def _entered_at_start(self, late_s: float) -> Matrix:
         """Bound what enters within a time at first, into the first i errors together, by a p of 1, (o, i)."""
         return np.asarray(np.fmin(late_s * self._highest, self._entered.max(axis=1).cumsum(axis=1)))
 
@@ -121,7 +123,7 @@ class _OpenLoopErrors:
         self._growths, self._lost = growths, conditions.dropouts
         generator = error.scaled_H - plant.B @ error.K
         driven = np.hstack([plant.columns.input_error, plant.columns.mismatch])
-        groups, zero = (0, plant.columns.input_error.shape[1]), np.ones(1)
+        groups, any_age = (0, plant.columns.input_error.shape[1]), np.ones(1)
 
         def gains(later_s: float, apart_s: float) -> Stack:
             """Return those of b, of a lost error, and of q and R_E x, then without means, (6, o, g)."""
@@ -131,18 +133,17 @@ class _OpenLoopErrors:
                 until_s = float(ages_s.max())
                 alone = response_until(generator, error.inverse_weight, until_s, COARSE_CELLS)
                 pairs = response_until(generator, driven, until_s, COARSE_CELLS, groups=groups)
-                alone_by_output, entered = (
-                    alone.through_each(error.stacked),
-                    pairs.through_groups(error.stacked),
-                )
+                kept_by_output = alone.through_each(error.stacked)
+                entered = pairs.through_groups(error.stacked)
                 rows = []
                 for C in error.outputs:
                     by_input, mismatched = entered[C]
                     growth_sizes = Growth(mismatched, by_input, np.zeros(COARSE_CELLS))
-                    means = growth_sizes.means(ages_s if until_s else zero)
-                    rows.append((alone_by_output[C].sup_on_grid(), *means[:2], *growth_sizes.totals[:2]))
+                    means = growth_sizes.means(ages_s if until_s else any_age)
+                    rows.append((kept_by_output[C].sup_on_grid(), *means[:2], *growth_sizes.totals[:2]))
                 gains_by_growth.append(rows)
             stay, *entered_by = np.array(gains_by_growth).transpose(2, 1, 0)
+            # A lost error has been followed by its model since, and by the open loop from then on.
             remaining_s = np.array([max(apart_s - growth.longest_s, 0.0) for growth in all_growths])
             remaining = {C: error.kernels[C].sups(remaining_s) for C in error.outputs}
             redirected = np.array([*remaining.values()]) + entered_by[2] * remaining[Output.GAIN]
@@ -224,44 +225,61 @@ class InsertedInequalities(ErrorInequalities):
 
     def insert(self, known: KnownBounds, spacing_s: float) -> None:
         """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
-        v, states, errors, h_s = known.signals, known.states, known.errors, self._conditions.sampling_s
-        age_input, input_error, mismatch = v[[0, 3, 4]].tolist()
-        weighted, place = map([*self._error.outputs].index, (Output.WEIGHTED, Output.GAIN))
+        v, states, errors = known.signals, known.states, known.errors
+        # x from the start on.
         for name, (free, forced) in self._timed_states.items():
-            states[name] = min(states[name], float((free + forced * input_error).max()))
+            states[name] = min(states[name], float((free + forced * known.signals[3]).max()))
+        # e_s after a test, for each way in which it may grow from there.
         growths = [growth for row in self._growths for growth in row]
         b = np.array([growth.after_test(states) for growth in growths])
-        after_last_test = [
-            tested for growth, tested in zip(growths, b.tolist(), strict=True) if growth.longest_s == h_s
-        ]
-        known.tested = min([known.tested, *after_last_test])
+        is_last = [growth.longest_s == self._conditions.sampling_s for growth in growths]
+        known.tested = min([known.tested, *b[is_last].tolist()])
+        self._insert_errors(known, b, spacing_s)
+        if spacing_s >= self.late_s:
+            self._insert_lost(known, b, spacing_s)
+        self._insert_sensor(known, b)
+        age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
+        new_signals = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
+        known.signals = np.minimum(v, np.array(new_signals, dtype=np.float64))
+
+    def _insert_errors(self, known: KnownBounds, b: Vector, spacing_s: float) -> None:
+        """Insert bounds of e_c, given those of e_s after a test: as a sum, and in open loop."""
+        age_input, input_error, mismatch = known.signals[[0, 3, 4]].tolist()
+        weighted, gain = self._rows
         for method, sums in self._sums(spacing_s).items():
             parts, at_start = sums.bound(b, input_error, mismatch, self.start_error)
             whole = parts.cumsum(axis=1) + at_start
             if method is BoundMethod.MISSING:
-                known.earlier = min(known.earlier, float(whole[place, -1] - parts[place, 0]) + age_input)
-                known.received = min(known.received, float(whole[place, 0]) + age_input)
+                known.earlier = min(known.earlier, float(whole[gain, -1] - parts[gain, 0]) + age_input)
+                known.received = min(known.received, float(whole[gain, 0]) + age_input)
                 known.lost = np.minimum(known.lost, whole[weighted, : self._conditions.dropouts + 1])
             known.reduce_errors(whole[:, -1])
         start_error = max(input_error, self.start_error)
         between_events, whole = self._followed(spacing_s).bound(b, age_input, start_error, mismatch)
         known.reduce_errors(whole[:, -1])
-        known.received = min(known.received, float(whole[place, 0]) + age_input)
+        known.received = min(known.received, float(whole[gain, 0]) + age_input)
         known.lost = np.minimum(known.lost, between_events)
-        if spacing_s >= self.late_s:
-            inputs = np.minimum(known.inputs, self._error.now(Output.GAIN) * known.lost + age_input)
-            inputs[0] = min(inputs[0], known.received)
-            sums = self._sums(spacing_s)[BoundMethod.MISSING]
-            # While one more event is in flight, π bounds the input that drives the present error.
-            stages = np.append(inputs, input_error)[: self._missing_events(spacing_s) + 1]
-            summed = sums.after_losses(b, stages, mismatch, self.late_s, start_error)
-            known.reduce_errors(summed[:, -1])
-            known.lost = np.minimum(known.lost, summed[weighted, : len(inputs)])
-            known.inputs = np.minimum(inputs, summed[place, : len(inputs)] + age_input)
-        self._insert_sensor(known, b)
-        age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
-        new_signals = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
-        known.signals = np.minimum(v, np.array(new_signals, dtype=np.float64))
+
+    def _insert_lost(self, known: KnownBounds, b: Vector, spacing_s: float) -> None:
+        """Insert bounds of e_c after 0, 1, … lost events, if an update acts before the next event."""
+        age_input, input_error, mismatch = known.signals[[0, 3, 4]].tolist()
+        weighted, gain = self._rows
+        inputs = np.minimum(known.inputs, self._error.now(Output.GAIN) * known.lost + age_input)
+        inputs[0] = min(inputs[0], known.received)
+        # While one more event is in flight, π bounds the input that drives the present error.
+        stages = np.append(inputs, input_error)[: self._missing_events(spacing_s) + 1]
+        start_error = max(input_error, self.start_error)
+        sums = self._sums(spacing_s)[BoundMethod.MISSING]
+        summed = sums.after_losses(b, stages, mismatch, self.late_s, start_error)
+        known.reduce_errors(summed[:, -1])
+        known.lost = np.minimum(known.lost, summed[weighted, : len(inputs)])
+        known.inputs = np.minimum(inputs, summed[gain, : len(inputs)] + age_input)
+
+    @property
+    def _rows(self) -> tuple[int, int]:
+        """The rows of ‖e_c‖_W and of ‖K e_c‖ among the outputs of e_c."""
+        outputs = [*self._error.outputs]
+        return outputs.index(Output.WEIGHTED), outputs.index(Output.GAIN)
 
     def _insert_sensor(self, known: KnownBounds, b: Vector) -> None:
         """Insert bounds of e_s, given those after a test."""

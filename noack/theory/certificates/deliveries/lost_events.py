@@ -200,7 +200,7 @@ class _Stage:
         return np.asarray(steps_s[:, 0, 0] ** 2 / 8 * bends * ROUNDING)
 
     def next_event_s(self, sensor: SensorErrors, late_part: float, bend: float, most_s: float) -> float:
-        """Return a time before which there is no event; e_s may be larger than C_r z by ``more``."""
+        """Return a time before which there is no event; e_s may be larger than C_r z by ``late_part``."""
         is_near, flow, level = self._r_s <= most_s, self._flow, sensor.level
         level -= late_part * self._late_s if sensor.integrates else late_part
         if level <= 0:
