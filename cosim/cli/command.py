@@ -334,9 +334,7 @@ def _describe_options(described: Any) -> tuple[str, list[tuple[str, str]]]:
     return text, [(example, description) for example, _, description in lines]
 
 
-def _parameters(
-    function: Callable[..., int | None],
-) -> tuple[list[inspect.Parameter], dict[str, type[Any]]]:
+def _parameters(function: Callable[..., int | None]) -> tuple[list[inspect.Parameter], dict[str, type[Any]]]:
     """Return the options of a command, and the dataclasses that group them, by parameter."""
     parameters, groups = [], {}
     for parameter in inspect.signature(function).parameters.values():

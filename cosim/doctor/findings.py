@@ -74,9 +74,7 @@ Outcome = tuple[FindingStatus, *tuple[str, ...]]
 _checks: list[Callable[[MachineFacts, RunRequirements], Iterator[MachineFinding]]] = []
 
 
-def _check(
-    title: str,
-) -> Callable[[Callable[[MachineFacts, RunRequirements], Iterator[Outcome]]], None]:
+def _check(title: str) -> Callable[[Callable[[MachineFacts, RunRequirements], Iterator[Outcome]]], None]:
     """Register a check with this title; {} in it is the scenario's name."""
 
     def register(check: Callable[[MachineFacts, RunRequirements], Iterator[Outcome]]) -> None:

@@ -239,11 +239,7 @@ def _wake_ups(
     command = _probe("wake", required.period_ns, duration_s, required.fifo_priority, required.spin_us)
     try:
         probe = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=_PATIENCE_S + 10 * duration_s,
+            command, capture_output=True, text=True, check=True, timeout=_PATIENCE_S + 10 * duration_s
         )
     except (OSError, subprocess.SubprocessError) as error:
         reason = one_line(error)
@@ -298,10 +294,7 @@ def _round_trips() -> RoundTrips:
 
 
 def _buffer() -> Buffer:
-    with (
-        closing(bind(0, "nothing")) as endpoint,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-    ):
+    with closing(bind(0, "nothing")) as endpoint, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.connect(endpoint.getsockname())
         for _ in range(_FLOOD):
             sender.send(_DATAGRAM)

@@ -267,10 +267,7 @@ def quantile_m(bursts: LossBursts, share: float) -> QuantileM:
     rank = int(binom.ppf(LEVEL, count, share)) + 1
     confident = int(ordered[rank - 1]) + 1 if rank <= count else None
     return QuantileM(
-        share,
-        int(ordered[covered - 1]) + 1 if covered > 0 else 1,
-        confident,
-        _packet_quantile(bursts, share),
+        share, int(ordered[covered - 1]) + 1 if covered > 0 else 1, confident, _packet_quantile(bursts, share)
     )
 
 

@@ -94,11 +94,7 @@ class MissedEvents:
         self._errors = np.zeros((0, len(H)))
 
     def take(
-        self,
-        t_ns: NDArray[np.int64],
-        e_s: Matrix,
-        events: NDArray[np.int64],
-        received: NDArray[np.int64],
+        self, t_ns: NDArray[np.int64], e_s: Matrix, events: NDArray[np.int64], received: NDArray[np.int64]
     ) -> Iterator[MissedJumps]:
         """Add k measurements; yield the jumps that are missed at them, some at a time.
 
@@ -156,11 +152,7 @@ class ErrorMonitor:
         self._growths = _growths(matrix_key(H), matrix_key(self._weight), period_ns)
 
     def take(
-        self,
-        t_ns: NDArray[np.int64],
-        e_s: Matrix,
-        events: NDArray[np.int64],
-        received: NDArray[np.int64],
+        self, t_ns: NDArray[np.int64], e_s: Matrix, events: NDArray[np.int64], received: NDArray[np.int64]
     ) -> ErrorBounds:
         """Add k measurements, as :meth:`MissedEvents.take` does."""
         count = len(t_ns)
@@ -284,14 +276,7 @@ def _theorem_2(
     F = max(start, 0.0) / (a_hat + alpha_bar_per_s) + forced / (a_hat + alpha_per_s)
     inter_event_s = math.log1p(beta / F) / (a_hat + alpha_bar_per_s) if F > 0 else math.inf
     return Theorem2(
-        c,
-        alpha_bar_per_s,
-        delta,
-        a_hat,
-        a_tilde,
-        inter_event_s,
-        c * x0,
-        beta * c * delta * BK / gap,
+        c, alpha_bar_per_s, delta, a_hat, a_tilde, inter_event_s, c * x0, beta * c * delta * BK / gap
     )
 
 

@@ -419,17 +419,7 @@ class SampledFlow:
 
 def _states(runs: Runs) -> tuple[Matrix, ...]:
     """Return the arrays of which a run's state consists."""
-    return (
-        runs.x,
-        runs.y,
-        runs.x_s,
-        runs.x_c,
-        runs.u,
-        runs.u_next,
-        runs.sent,
-        runs.updates,
-        runs.auxiliary,
-    )
+    return (runs.x, runs.y, runs.x_s, runs.x_c, runs.u, runs.u_next, runs.sent, runs.updates, runs.auxiliary)
 
 
 def _packed(runs: Runs) -> Matrix:

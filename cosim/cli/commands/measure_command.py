@@ -64,13 +64,7 @@ class ProbeOptions:
     def live(self, deadline_s: float | None) -> "live_measurement.LiveOptions":
         """Return the options of a live measurement."""
         return live_measurement.LiveOptions(
-            self.rate,
-            self.duration,
-            self.size,
-            self.round_trip,
-            self.silence,
-            self.save,
-            deadline_s,
+            self.rate, self.duration, self.size, self.round_trip, self.silence, self.save, deadline_s
         )
 
 

@@ -223,9 +223,7 @@ class NetworkOptions:
     effort: Annotated[int, Option(min=0)] = 1500
 
     def wish(
-        self,
-        weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]",
-        bounds: "design_search.Bounds",
+        self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]", bounds: "design_search.Bounds"
     ) -> "network_search.Wish":
         """Return what is asked for; raise CallerError if an option is wrong."""
         modes = [mode.strip() for mode in self.holds.split(",")]
@@ -413,10 +411,7 @@ class StudyOptions(opt.ScenarioOptions):
                 for impairment in loaded.network.impairments
             ]
         capacity_plan.bottleneck(loaded)
-        for option, seconds in (
-            ("--update-period", self.update_period),
-            ("--late-after", self.late_after),
-        ):
+        for option, seconds in (("--update-period", self.update_period), ("--late-after", self.late_after)):
             if seconds is not None and not 0 < seconds < loaded.horizon_s:
                 raise CallerError(f"{option} {seconds:g}: between 0 and the horizon of the scenario")
         kinds = capacity_plan.kinds_of(loaded, self.update_period)

@@ -52,8 +52,7 @@ class BoxGains(PlantGains):
         free, gain = self._free_model_error, self._forced_model_error
         states = {
             output: Coefficients(
-                self._from_start[output] + free @ peaks.from_w,
-                peaks.forced + gain @ peaks.from_w,
+                self._from_start[output] + free @ peaks.from_w, peaks.forced + gain @ peaks.from_w
             )
             for output, peaks in self._peaks.items()
         }

@@ -420,11 +420,7 @@ def _straight(generator: Matrix, state: Matrix, step_s: Stack, decay: Decay) -> 
 
 
 def response_until(
-    generator: Matrix,
-    D: Matrix,
-    until_s: float | Stack,
-    cells: int = 64,
-    groups: tuple[int, ...] = (0,),
+    generator: Matrix, D: Matrix, until_s: float | Stack, cells: int = 64, groups: tuple[int, ...] = (0,)
 ) -> ResponseBounds:
     """Compute e^{Gτ} D over 0 ≤ τ ≤ ``until_s``, (…), on a grid of ``cells`` equal cells."""
     step_s = np.asarray(until_s) / cells
@@ -480,11 +476,7 @@ def _propagate(generator: Matrix, state: Matrix, step_s: Stack, cells: int) -> S
 
 @lru_cache(maxsize=8)
 def _powers(
-    entries: bytes,
-    shape: tuple[int, ...],
-    steps: bytes,
-    of_steps: tuple[int, ...],
-    least: int,
+    entries: bytes, shape: tuple[int, ...], steps: bytes, of_steps: tuple[int, ...], least: int
 ) -> tuple[Stack, Matrix]:
     """Return e^{G k s} for k < 2^j, at least so many, and e^{G 2^j s}.
 

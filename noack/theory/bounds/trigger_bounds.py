@@ -228,11 +228,7 @@ class TriggerBounds:
         if self.is_homogeneous:
             apart_s = max(apart_s, conditions.spacing_s)
         return bounds[0]._replace(
-            unit=level or 1.0,
-            apart_s=apart_s,
-            due_s=due_s,
-            forced_s=forced_s,
-            also=tuple(bounds[1:]),
+            unit=level or 1.0, apart_s=apart_s, due_s=due_s, forced_s=forced_s, also=tuple(bounds[1:])
         )
 
     def divided(
@@ -248,12 +244,7 @@ class TriggerBounds:
         whole = self.bound(conditions, self.floor, self.floor or None)
         alone = [
             bound._replace(
-                apart_s=apart_s,
-                due_s=whole.due_s,
-                forced_s=whole.forced_s,
-                unit=1.0,
-                reached=None,
-                also=(),
+                apart_s=apart_s, due_s=whole.due_s, forced_s=whole.forced_s, unit=1.0, reached=None, also=()
             )
             for bound in whole.every
         ]
@@ -393,12 +384,7 @@ def _mean_ages_s(bound: TriggerBound, sampling_s: float) -> Vector | None:
 
 
 def first_passage_s(
-    plant: PlantGains,
-    level: Vector,
-    mismatch: Vector,
-    input_error: Vector,
-    error_gain: Vector,
-    start: Vector,
+    plant: PlantGains, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector, start: Vector
 ) -> Vector:
     """Return times before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
 
@@ -451,12 +437,7 @@ def first_passage_s(
 
 
 def _first_crossed(
-    growth: Growth,
-    level: Vector,
-    mismatch: Vector,
-    input_error: Vector,
-    error_gain: Vector,
-    started: Vector,
+    growth: Growth, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector, started: Vector
 ) -> list[int]:
     """Return the first cell of each loop in which the level may be reached, or their number."""
     areas = growth.mismatch.area * mismatch[:, None]

@@ -248,7 +248,7 @@ def certificate_assumptions(
 
     ``decay`` has the decay rates per second of "the models" (infinite if they hold) and "A + BK".
     Without a certificate, ``constants`` is None and ``void`` is the reason. ``promise`` is what the
-    trigger's rule says about e_s, or empty. ``kept`` is the probability that a run keeps a
+    trigger's rule says about e_s, or empty. ``probability`` is that of a run that keeps a
     guarantee that nothing enforces, if it is known.
     """
     alpha = policy_of(resolved).fading_per_s

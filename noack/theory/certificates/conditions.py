@@ -40,10 +40,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     applies the one whose time has come.
     """
     step_ns, tick_ns = resolved.timing.plant_period_ns, resolved.timing.controller_period_ns
-    phase_ns, sample_ns = (
-        resolved.timing.controller_phase_ns,
-        step_ns * resolved.plant.measure_every,
-    )
+    phase_ns, sample_ns = resolved.timing.controller_phase_ns, step_ns * resolved.plant.measure_every
     # Age of the newest tick at a step: 0 < age ≤ tick and age ≡ −phase modulo the gcd; all these
     # values occur. Time from a measurement to the next tick: 0 ≤ wait < tick.
     newest_ns = tick_ns - phase_ns % math.gcd(step_ns, tick_ns)

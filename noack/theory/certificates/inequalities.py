@@ -248,15 +248,11 @@ class ErrorInequalities:
         return self._bound.beta if self._bound.unit is None else self._bound.unit
 
     def _signals(
-        self,
-        method: BoundMethod,
-        events: Counts,
-        spacing_s: Vector,
-        own_growth: ErrorGrowth | None,
+        self, method: BoundMethod, events: Counts, spacing_s: Vector, own_growth: ErrorGrowth | None
     ) -> "_Signals":
         """Return how all outputs depend on (q, b, η, π, sup‖R_E x‖, 1).
 
-        Every ‖e_s‖_W has grown by ``own`` from at most b at the last test; without it b is β̃. An
+        Every ‖e_s‖_W has grown by ``own_growth`` from at most b at the last test; without it b is β̃. An
         event's x_s − x̂ is at most this plus η, the present x_s − x is at most this.
         """
         held_unit, test_unit, estimate_unit, *_ = np.eye(_SIGNALS)
@@ -460,10 +456,7 @@ class ErrorInequalities:
         return bounds
 
     def inter_event_s(
-        self,
-        constants: LoopConstants,
-        drifts: NDArray[np.bool_],
-        searched: NDArray[np.bool_],
+        self, constants: LoopConstants, drifts: NDArray[np.bool_], searched: NDArray[np.bool_]
     ) -> Vector:
         """Return the times that ‖e_s‖_W needs to the next event, given the constants until then.
 

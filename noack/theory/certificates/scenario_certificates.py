@@ -83,10 +83,7 @@ def box(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | Non
     loop, plant = loop_of(resolved), resolved.plant
     if plant.uncertainty_A is None and plant.uncertainty_B is None:
         return None
-    half_A, half_B = (
-        _halfwidth(plant.uncertainty_A, loop.A),
-        _halfwidth(plant.uncertainty_B, loop.B),
-    )
+    half_A, half_B = _halfwidth(plant.uncertainty_A, loop.A), _halfwidth(plant.uncertainty_B, loop.B)
 
     def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
         return BoxGains(error, loop.A_model, loop.B_model, start, alpha_per_s, half_A, half_B)
@@ -310,11 +307,7 @@ class CertificateScope:
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
         return DisturbedCertificate(
-            self._resolved,
-            self._plant_at,
-            self._trigger,
-            self._start_error,
-            min(self._decay.values()),
+            self._resolved, self._plant_at, self._trigger, self._start_error, min(self._decay.values())
         )
 
     def _checked(self, main: Constants, added: Constants | None) -> tuple[Constants, Constants | None]:
@@ -421,36 +414,24 @@ def _first_equal(known: _KnownPlant) -> PlantGains:
     return known.plant
 
 
+_BOUNDS = ("input_error", "state", "state_weighted", "mismatch", "received_input_error")
+"""Constants that bound a signal themselves, not in units of the threshold."""
+
+
 def _at_floor(constants: Constants, share: float) -> Constants:
     """Return the constants from the floor on, ``share`` = ε/β.
 
     With θ(t) = max(βe^{−αt}, ε) in place of βe^{−αt}, all bounds of the first phase hold at all
     times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
     """
-    scaled = (
-        "input_error",
-        "start_error",
-        "state",
-        "state_weighted",
-        "mismatch",
-        "received_input_error",
-    )
-    return constants._replace(rate_per_s=0.0, **{name: share * getattr(constants, name) for name in scaled})
+    names = ("start_error", *_BOUNDS)
+    return constants._replace(rate_per_s=0.0, **{name: share * getattr(constants, name) for name in names})
 
 
 def _is_within(inner: Constants, outer: Constants) -> bool:
-    """Return whether no bound of the others is below ours at any time."""
-    names = (
-        "delta",
-        "overshoot",
-        "input_error",
-        "state",
-        "state_weighted",
-        "mismatch",
-        "received_input_error",
-    )
+    """Return whether no bound of ``outer`` is below that of ``inner`` at any time."""
     return inner.rate_per_s >= outer.rate_per_s and all(
-        getattr(inner, name) <= getattr(outer, name) for name in names
+        getattr(inner, name) <= getattr(outer, name) for name in ("delta", "overshoot", *_BOUNDS)
     )
 
 

@@ -144,8 +144,7 @@ class _SampledPlant(PlantGains):
             nodes_s, states = self.samples.plant
             followed = product(C, states)
             coefficients[output] = Coefficients(
-                _sampled(nodes_s, followed[:, :, :1]).sup(),
-                _sampled(nodes_s, followed[:, :, 1:]).integral(),
+                _sampled(nodes_s, followed[:, :, :1]).sup(), _sampled(nodes_s, followed[:, :, 1:]).integral()
             )
         return coefficients
 
@@ -154,10 +153,7 @@ class _SampledPlant(PlantGains):
         nodes_s, states = self.samples.models
         by_input, mismatched = self.columns.input_error, self.columns.mismatch
         return {
-            output: (
-                _sampled(nodes_s, C @ states @ by_input),
-                _sampled(nodes_s, C @ states @ mismatched),
-            )
+            output: (_sampled(nodes_s, C @ states @ by_input), _sampled(nodes_s, C @ states @ mismatched))
             for output, C in self.error.outputs.items()
         }
 

@@ -349,11 +349,7 @@ def loop_times(resolved: Scenario, unit_ns: int) -> LoopTimes:
             f"than the period between {pair}, {unit_ns / NS_PER_S:g} s"
         )
     return LoopTimes(
-        timing.plant_period_ns,
-        timing.controller_period_ns,
-        timing.controller_phase_ns,
-        unit_ns,
-        delay_ns,
+        timing.plant_period_ns, timing.controller_period_ns, timing.controller_phase_ns, unit_ns, delay_ns
     )
 
 

@@ -264,11 +264,7 @@ def _symmetric_basis(n: int) -> Matrix:
 
 
 def _log_growths(
-    P: _Stack,
-    matrices: _Stack,
-    sources: NDArray[np.int64],
-    targets: NDArray[np.int64],
-    durations: Vector,
+    P: _Stack, matrices: _Stack, sources: NDArray[np.int64], targets: NDArray[np.int64], durations: Vector
 ) -> Vector:
     """Return log γ of every edge, (k,)."""
     forms = np.linalg.cholesky(P).swapaxes(1, 2)

@@ -353,10 +353,8 @@ class _CellBounds:
 
     def _tight(self, limits: Vector, cells: NDArray[np.int64], logits: Stack) -> Stack:
         """Return bounds in the spectral norm for some cells, each with its own λ, (k, j)."""
-        ends, d = (
-            self._ends[:, :, cells],
-            _semi_axes(self._singular[cells] / limits[cells, None], logits),
-        )
+        ends = self._ends[:, :, cells]
+        d = _semi_axes(self._singular[cells] / limits[cells, None], logits)
         grams = np.einsum("qoki,qokj->koij", ends, ends)[:, None]
         scaled = grams * d[:, :, None, :, None] * d[:, :, None, None, :]
         sizes = largest_eigenvalues(scaled.reshape(-1, *scaled.shape[-2:])).clip(min=0.0)

@@ -113,11 +113,7 @@ class _OpenLoopErrors:
     """
 
     def __init__(
-        self,
-        plant: PlantGains,
-        growths: Growths,
-        conditions: NetworkConditions,
-        spacing_s: float,
+        self, plant: PlantGains, growths: Growths, conditions: NetworkConditions, spacing_s: float
     ) -> None:
         error, all_growths = plant.error, [growth for row in growths for growth in row]
         self._growths, self._lost = growths, conditions.dropouts
