@@ -1,5 +1,7 @@
-"""``noack run``, ``demo``, ``simulate``, ``set``: make a run, or change one that goes on."""
+"""``noack lab``, ``run``, ``demo``, ``bridge``, ``simulate``: make a run; ``set``: change a live one."""
 
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +17,8 @@ from noack.core.number_format import number
 
 with lazy_modules():
     from cosim.analysis.summary import summary_model
+    from cosim.interactive import draft
+    from cosim.lab import lab_server
     from cosim.live import remote_access, simulated_run
     from cosim.live.monitoring import progress, ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict
@@ -26,6 +30,46 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _EVENTS_SHOWN = 40
+
+
+@cli.command(cli.RUNS, 5, on_linux=True)
+def lab(
+    source: opt.ExampleOptions,
+    *,
+    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    port: Annotated[int, Option(min=0, max=65535)] = 0,
+    browser: bool = True,
+    json: opt.JsonOption = False,
+) -> None:
+    """Open a page in the browser: drag settings, watch the loop, run it live.
+
+    The page is on 127.0.0.1, at an address with a secret. Ctrl-C ends it.
+
+    Options:
+        port: Port on 127.0.0.1; 0: a free one.
+        browser: Open the page in a browser.
+
+    Examples:
+        noack lab   open the paper's example
+        noack lab mine.toml --set trigger.beta=0.3   open a file with other settings
+        noack lab --no-browser --port 8080   print the address, for a browser elsewhere
+    """
+    if find_spec("nicegui") is None:
+        raise CallerError(
+            "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the repository"
+        )
+    edited = draft.open_draft(source.scenario)
+    for key, value in map(scenario_file.setting_of, source.settings or ()):
+        edited = edited.with_value(key, value)
+    _ = edited.scenario  # report mistakes here
+    query = edited.query() if source.settings else ""
+    options = lab_server.LabOptions(source.scenario, query, Path.cwd(), runs, port, browser)
+
+    def announce(address: str) -> None:
+        cli.print_lines(json, {"address": address}, f"noack lab: {address}  (Ctrl-C ends)")
+        sys.stdout.flush()  # somebody waits for it
+
+    lab_server.serve(options, announce)
 
 
 @cli.command(cli.RUNS, 20, takes="as long as the scenario's horizon, and a few seconds", on_linux=True)

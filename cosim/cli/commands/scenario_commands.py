@@ -1,6 +1,6 @@
-"""``noack scenarios``, ``check``, ``schema``; ``linearise``, ``gain``, ``new``: scenario files.
+"""``noack doctor``: this machine; ``scenarios``, ``check``, ``schema``, ``linearise``, ``gain``, ``new``.
 
-The last three lead from a plant to a scenario.
+The other six are about scenario files. The last three lead from a plant to a scenario.
 """
 
 import json as json_format
@@ -16,12 +16,13 @@ from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, MachineError, why
+from noack.core.errors import CallerError, ExitStatus, MachineError, why
 from noack.core.file_access import new_file
 
 with lazy_modules():
     from controller_node import controller
     from cosim.analysis.summary import run_summary
+    from cosim.doctor import findings, machine_measures
     from cosim.live import launcher
     from cosim.live.processes import child_processes
     from cosim.output import run_verdict
@@ -48,6 +49,45 @@ PlantArgument = Annotated[
         "scenario, or a file that linearise or gain wrote.",
     ),
 ]
+
+
+@cli.command(cli.FILES, 10, takes="some 10 s", on_linux=True)
+def doctor(
+    source: opt.ExampleOptions,
+    *,
+    seconds: Annotated[float, Option(min=0.1, max=3600)] = 2.0,
+    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    json: opt.JsonOption = False,
+) -> int:
+    """Check this machine: real-time settings, timers, ports, disk.
+
+    Each finding is good, limited or bad, with its meaning for a run and a remedy. The scenario
+    determines rates, ports and the allowed lateness.
+
+    Exit status 1: a finding is bad, so that no run is possible.
+
+    Options:
+        seconds: Seconds of each measurement of wake-ups: without and with real-time settings.
+
+    Examples:
+        noack doctor   for the paper's example
+        noack doctor lane_weighted --set speed=4   for another scenario
+        noack doctor --seconds 10 --json   measure longer; all numbers as JSON
+    """
+    resolved = resolution.resolve(source.load())
+    required = machine_measures.requirements_of(resolved)
+    with cli.status("measuring"):
+        machine = machine_measures.measure(resolved, required, runs, seconds)
+    results = findings.judge(machine, required)
+    cli.show(
+        json,
+        lambda: findings.document(machine, required, results),
+        findings.print_findings,
+        required,
+        results,
+    )
+    is_bad = findings.worst(results) is findings.FindingStatus.BAD
+    return ExitStatus.FAILED if is_bad else ExitStatus.OK
 
 
 @cli.command(cli.FILES, 20)
