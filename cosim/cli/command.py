@@ -286,24 +286,13 @@ def command(
             as_json = bool(arguments.get("json"))
             for name, group in groups.items():
                 arguments[name] = group(**{field.name: arguments.pop(field.name) for field in fields(group)})
-            try:
-                with stop_requests_raised():
-                    if on_linux:
-                        core_library.require_live_runs()
-                    status = function(**arguments) or ExitStatus.OK
-                if sys.stdout is not None:  # closed by the shell: >&-
-                    sys.stdout.flush()
-            except KeyboardInterrupt as error:
-                stop = error if isinstance(error, StopRequestError) else StopRequestError()
-                message = "; ".join([str(stop), *getattr(error, "__notes__", ())])
-                status = failed(message, stop.exit_status, who=NAME, as_json=as_json)
-            except NoackError as error:
-                status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
-            except Exception as error:
-                if (line := exhausted_limit(error) or _why_not_written(error)) is None:
-                    raise
-                status = failed(line, ExitStatus.FAILED, who=NAME, as_json=as_json)
-            raise typer.Exit(int(status))
+
+            def call() -> int | None:
+                if on_linux:
+                    core_library.require_live_runs()
+                return function(**arguments)
+
+            raise typer.Exit(_status_of(call, as_json=as_json))
 
         reported.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         reported.__annotations__ = {option.name: option.annotation for option in parameters}
@@ -317,6 +306,27 @@ def command(
         return registered
 
     return register
+
+
+def _status_of(call: Callable[[], int | None], *, as_json: bool) -> int:
+    """Return the exit status of a command; print an error or Ctrl-C as one line."""
+    try:
+        with stop_requests_raised():
+            status = call() or ExitStatus.OK
+        if sys.stdout is not None:  # closed by the shell: >&-
+            sys.stdout.flush()
+        return int(status)
+    except KeyboardInterrupt as error:
+        stop = error if isinstance(error, StopRequestError) else StopRequestError()
+        line, status = "; ".join([str(stop), *getattr(error, "__notes__", ())]), stop.exit_status
+    except NoackError as error:
+        line, status = str(error), error.exit_status
+    except Exception as error:
+        reason = exhausted_limit(error) or _why_not_written(error)
+        if reason is None:
+            raise
+        line, status = reason, ExitStatus.FAILED
+    return int(failed(line, status, who=NAME, as_json=as_json))
 
 
 def _describe_options(described: Any) -> tuple[str, list[tuple[str, str]]]:

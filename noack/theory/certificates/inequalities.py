@@ -277,21 +277,19 @@ class ErrorInequalities:
 
         stages = self._stages(present[Output.GAIN], counted, spacing_s, own_growth)
         errors = {output: with_missing(output, row, counted, stages) for output, row in present.items()}
-        whole = errors[Output.GAIN]
-        earlier = whole if drifts else with_missing(Output.GAIN, 0 * _ONE, counted, stages)
+        input_error = errors[Output.GAIN]
+        earlier = input_error if drifts else with_missing(Output.GAIN, 0 * _ONE, counted, stages)
         received = with_missing(Output.GAIN, at_present[Output.GAIN], 0 * events)
-        near_errors = with_missing(Output.GAIN, present[Output.GAIN], flying)
+        in_flight = with_missing(Output.GAIN, present[Output.GAIN], flying)
         lost = self._missing_gain(Output.GAIN, counted, spacing_s)
         lost = lost - self._missing_gain(Output.GAIN, flying, spacing_s)
         alone = self._alone(lost, spacing_s)
         states = []
         for name, (_, gain) in self._states.items():
             gain = np.asarray(gain)[..., None]
-            row = gain * (held_unit + whole)
+            row = gain * (held_unit + input_error)
             if name in alone:
-                in_windows = gain * (held_unit + near_errors) + alone[name][:, None] * (
-                    sensor + estimate_unit
-                )
+                in_windows = gain * (held_unit + in_flight) + alone[name][:, None] * (sensor + estimate_unit)
                 row = np.where((alone[name] < gain[..., 0] * lost)[:, None], in_windows, row)
             states.append(row)
         free = _columns(*(state.free for state in self._states.values()))
