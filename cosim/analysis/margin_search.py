@@ -124,8 +124,8 @@ def undecided_text(stability: Stability, effort: float) -> str:
     text = f"growth between {lower:.6g} and {upper:.6g}, gap {upper - lower:.2g}; if it is the "
     if not needed_effort < _LARGEST_EFFORT:
         return f"{text}lower bound, no effort up to {_LARGEST_EFFORT:g} is estimated to prove it"
-    about = duration(stability.took_s * needed_effort / effort)
-    return f"{text}lower bound, --effort {needed_effort:.2g} is estimated to prove it, in about {about}"
+    time_text = duration(stability.took_s * needed_effort / effort)
+    return f"{text}lower bound, --effort {needed_effort:.2g} is estimated to prove it, in about {time_text}"
 
 
 class LossCap(NamedTuple):

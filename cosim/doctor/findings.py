@@ -100,12 +100,12 @@ def worst(findings: Sequence[MachineFinding]) -> FindingStatus:
 
 @_check("cores")
 def _cores(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
-    known = [f"{machine.cores} of {machine.cores_online} usable"]
+    facts = [f"{machine.cores} of {machine.cores_online} usable"]
     if machine.load is not None:
-        known.append(f"load {machine.load:.1f}")
+        facts.append(f"load {machine.load:.1f}")
     if machine.governor is not None:
-        known.append(f"governor {machine.governor}")
-    text = ", ".join(known)
+        facts.append(f"governor {machine.governor}")
+    text = ", ".join(facts)
     if machine.cores < 2:
         means = f"the {LOOP_PROCESSES} processes of a run compete for one core"
         yield LIMITED, text, means, "use two cores or more"
@@ -287,13 +287,13 @@ def _extras(machine: MachineFacts, _: RunRequirements) -> Iterator[MachineFindin
 
 @_check("versions")
 def _versions(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
-    known = [f"{name} {version}" for name, version in machine.versions.items() if version]
+    installed = [f"{name} {version}" for name, version in machine.versions.items() if version]
     missing = [name for name, version in machine.versions.items() if not version]
     means = f"{', '.join(missing)}: not installed as a package, so runs cannot record the version"
     if missing:
-        yield LIMITED, ", ".join(known), means, "`pip install noack`"
+        yield LIMITED, ", ".join(installed), means, "`pip install noack`"
     else:
-        yield GOOD, ", ".join(known)
+        yield GOOD, ", ".join(installed)
 
 
 def document(

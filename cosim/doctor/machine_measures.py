@@ -186,9 +186,9 @@ def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_
         duration_s: length of each of the two measurements of wake-ups.
     """
     plain, realtime, granted = _wake_ups(required, duration_s)
-    about = environment("live")
+    recorded = environment("live")
     return MachineFacts(
-        cores=about["cores"],
+        cores=recorded["cores"],
         cores_online=os.cpu_count() or 1,
         load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         governor=_read(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")),
@@ -204,9 +204,9 @@ def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_
         disk=_or_why(lambda: _disk(runs, needed_bytes(resolved))),
         runtime_folder=_runtime_folder(),
         display=has_display(),
-        viewer=about["packages"].get("rerun-sdk") if is_installed() else None,
+        viewer=recorded["packages"].get("rerun-sdk") if is_installed() else None,
         extras={name: find_spec(module) is not None for name, (module, _) in EXTRAS.items()},
-        versions={"python": about["python"], **about["packages"]},
+        versions={"python": recorded["python"], **recorded["packages"]},
     )
 
 

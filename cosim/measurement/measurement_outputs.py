@@ -238,8 +238,8 @@ def measurement_tables(
     if measurement.windows:
         columns = 3 if suffix else 2
         windows = [
-            (str(window), str(every), NONE if usual is None else str(usual))[:columns]
-            for window, (every, usual) in measurement.windows.items()
+            (str(window), str(in_all), NONE if without_outages is None else str(without_outages))[:columns]
+            for window, (in_all, without_outages) in measurement.windows.items()
         ]
         heads = ("K", "m", "m in windows without an outage")
         caption = "(m, K): most losses m in any K consecutive packets"
@@ -493,13 +493,13 @@ def _correlation(measurement: Measurement) -> Panel:
 def _windows(measurement: Measurement) -> Panel:
     longest = max(min(_LONGEST_WINDOW, len(measurement.trace)), 1)
     windows = np.unique(np.geomspace(1, longest, _WINDOWS).round().astype(int)).tolist()
-    every = most_losses(measurement.bursts, windows)
-    items = [_curve([*every], [*every.values()], "all packets", _OUTAGES)]
+    in_all = most_losses(measurement.bursts, windows)
+    items = [_curve([*in_all], [*in_all.values()], "all packets", _OUTAGES)]
     if measurement.is_outage.any():
-        usual = most_losses(measurement.bursts, windows, measurement.is_outage)
-        items.append(_curve([*usual], [*usual.values()], "without outages", _BURSTS))
+        without_outages = most_losses(measurement.bursts, windows, measurement.is_outage)
+        items.append(_curve([*without_outages], [*without_outages.values()], "without outages", _BURSTS))
     all_lost = np.array(windows, np.float64)
-    largest = max(every.values())
+    largest = max(in_all.values())
     ends = (0.8, 1.4 * largest) if largest else (None, None)
     return Panel(
         title="Most losses in a window",

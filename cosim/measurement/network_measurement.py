@@ -219,9 +219,9 @@ class Measurement:
     @cached_property
     def windows(self) -> dict[int, tuple[int, int | None]]:
         """By K: most losses in K consecutive packets, in all and in windows without an outage."""
-        every = most_losses(self.bursts, self.options.windows)
-        usual = most_losses(self.bursts, self.options.windows, self.is_outage)
-        return {window: (most, usual.get(window)) for window, most in every.items()}
+        in_all = most_losses(self.bursts, self.options.windows)
+        without_outages = most_losses(self.bursts, self.options.windows, self.is_outage)
+        return {window: (most, without_outages.get(window)) for window, most in in_all.items()}
 
     @cached_property
     def delays(self) -> DelayStatistics:
@@ -231,8 +231,8 @@ class Measurement:
     @cached_property
     def loss_correlation(self) -> tuple[tuple[int, ...], tuple[float, ...]]:
         """Lags, and the correlation of the effective losses of two packets."""
-        every = np.ones(len(self.trace), bool)
-        return autocorrelation(self.outcomes.effective.astype(np.int64), every)
+        all_known = np.ones(len(self.trace), bool)
+        return autocorrelation(self.outcomes.effective.astype(np.int64), all_known)
 
     @cached_property
     def _fits(self) -> ChainFits:

@@ -327,6 +327,6 @@ def theorem_1(H: Matrix, alpha_per_s: float, longest_s: Sequence[float]) -> floa
         reach_s = math.fsum(longest_s[k:])
         if not math.isfinite(reach_s) or alpha_per_s * reach_s > 700:
             return math.inf
-        followed = response_until(H, identity, reach_s, _CELLS)
-        delta += math.exp(alpha_per_s * reach_s) * float(followed.through(identity).sup_on_grid())
+        responses = response_until(H, identity, reach_s, _CELLS)
+        delta += math.exp(alpha_per_s * reach_s) * float(responses.through(identity).sup_on_grid())
     return delta

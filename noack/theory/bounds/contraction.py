@@ -37,8 +37,8 @@ class Decay(NamedTuple):
     @property
     def area_s(self) -> Stack:
         """Upper bound of ∫‖e^{Gs}‖ds over all times, (…); infinite where no L was found."""
-        found = self.rate_per_s > 0
-        return np.where(found, self.stretch / np.where(found, self.rate_per_s, 1.0), np.inf)
+        decays = self.rate_per_s > 0
+        return np.where(decays, self.stretch / np.where(decays, self.rate_per_s, 1.0), np.inf)
 
     def bounds(self, C: Matrix, states: Stack) -> Stack:
         """Return bounds of ‖C e^{Gs} Y‖ over all s ≥ 0, for stacks of Y, (…, k, n, r) → (…, k)."""

@@ -92,10 +92,10 @@ class KernelBounds:
 
     def sups(self, after_s: Stack) -> Stack:
         """Sup of k(τ) over τ ≥ a for each a, (…, j)."""
-        first = cells_at(self.edges_s, after_s)
+        first_cells = cells_at(self.edges_s, after_s)
         beyond_s = np.maximum(after_s - self.edges_s[..., -1:], 0.0)
         decayed = np.exp(-np.asarray(self.tail_rate_per_s)[..., None] * beyond_s)
-        return np.asarray(take_rows(self._from_cell, first) * decayed)
+        return np.asarray(take_rows(self._from_cell, first_cells) * decayed)
 
     @cached_property
     def _from_cell(self) -> Stack:
@@ -113,9 +113,9 @@ class KernelBounds:
         sums = np.append(0.0, np.cumsum(self.area))
         cell = np.searchsorted(self.edges_s, age_s, side="right") - 1
         inside = np.minimum(cell, len(self.area) - 1)
-        within = self.highest[inside] * (age_s - self.edges_s[inside])
-        part = sums[inside] + np.minimum(within, self.area[inside])
-        return np.asarray(np.where(cell < len(self.area), part, self.integral()))
+        in_cell = self.highest[inside] * (age_s - self.edges_s[inside])
+        until_age = sums[inside] + np.minimum(in_cell, self.area[inside])
+        return np.asarray(np.where(cell < len(self.area), until_age, self.integral()))
 
     def sup_on_grid(self) -> Stack:
         """Sup of k over the grid only, (…)."""
@@ -399,8 +399,8 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
         state = states[..., -1, :, :]
         area = area + step_s * frobenius_norms(parts[-1]).sum(axis=-1)
         cells += _CELLS_PER_BLOCK
-        rest = decay.bounds(everything.stacked, state[..., None, :, :])[..., 0] / decay.rate_per_s
-        ends = ends | (rest <= _TAIL_SHARE * area)
+        remainder = decay.bounds(everything.stacked, state[..., None, :, :])[..., 0] / decay.rate_per_s
+        ends = ends | (remainder <= _TAIL_SHARE * area)
         if ends.all() or cells >= most_cells:
             break
         while (bent := (step_s > usual_s) & ~_straight(generator, state, step_s, decay)).any():

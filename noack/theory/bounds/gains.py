@@ -182,8 +182,8 @@ class ErrorGains:
         """
         if not self.scaled_H.any():  # a hold: a missed update's contribution does not decay
             return {output: constant_kernel(self.now(output)) for output in self.outputs}
-        followed = response(self.scaled_H, self.inverse_weight)
-        kernels = followed.through_each(self.stacked)
+        responses = response(self.scaled_H, self.inverse_weight)
+        kernels = responses.through_each(self.stacked)
         if self.contracts:  # ‖·‖_W is a Lyapunov function: no sum of missing events exceeds M
             norm = kernels[Output.WEIGHTED]
             kernels[Output.WEIGHTED] = replace(norm, highest=np.minimum(norm.highest, 1.0))
@@ -219,8 +219,8 @@ class ErrorGains:
         totals = dict.fromkeys(self.outputs, 0.0)
         for number in range(events):
             until_s = (number + 1) * due_s
-            followed = response_until(self.scaled_H, self.inverse_weight, until_s)
-            for output, kernel in followed.through_each(self.stacked).items():
+            responses = response_until(self.scaled_H, self.inverse_weight, until_s)
+            for output, kernel in responses.through_each(self.stacked).items():
                 totals[output] += float(kernel.sup_on_grid())
         return totals
 
@@ -256,8 +256,8 @@ class ErrorGains:
         """Return sup‖C e^{(H+αI)τ} W^{−1}‖ over τ ≤ ``until_s`` for every output."""
         if until_s == 0:
             return {output: self.now(output) for output in self.outputs}
-        followed = response_until(self.scaled_H, self.inverse_weight, until_s)
-        kernels = followed.through_each(self.stacked)
+        responses = response_until(self.scaled_H, self.inverse_weight, until_s)
+        kernels = responses.through_each(self.stacked)
         return {output: float(kernel.sup_on_grid()) for output, kernel in kernels.items()}
 
     @cached_method

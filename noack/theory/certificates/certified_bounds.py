@@ -216,8 +216,8 @@ class KnownStatePart:
 
     @cached_property
     def _estimated(self) -> KernelBounds:
-        followed = response(self.plant.closed_loop, self.plant.error.inverse_weight)
-        return followed.through(np.eye(len(self.plant.A)))
+        responses = response(self.plant.closed_loop, self.plant.error.inverse_weight)
+        return responses.through(np.eye(len(self.plant.A)))
 
     def level(self, t_s: Vector) -> Vector:
         """Return what the scaled bounds are multiplied with, (k,)."""
@@ -322,12 +322,12 @@ class KnownStateBounds:
         """Nodes, and Σ_i ∫‖e^{Ms} D_i‖ds up to each node and over all times."""
         plant, total = self.parts[-1].plant, 0.0
         unscaled = plant.closed_loop - plant.alpha_per_s * np.eye(len(plant.A))
-        followed = response(unscaled, self.disturbances)
+        responses = response(unscaled, self.disturbances)
         identity = np.eye(len(plant.A))
         for column in self.disturbances.T:
             total += float(response(unscaled, column[:, None]).through(identity).integral())
-        sums = np.append(0.0, np.cumsum(followed.areas_of_columns(identity)))
-        return followed.edges_s, np.append(sums, max(total, float(sums[-1])))
+        sums = np.append(0.0, np.cumsum(responses.areas_of_columns(identity)))
+        return responses.edges_s, np.append(sums, max(total, float(sums[-1])))
 
 
 def _together(parts: Sequence[tuple[Vector, float]]) -> list[Vector]:

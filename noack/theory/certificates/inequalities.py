@@ -43,7 +43,7 @@ from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_
 from noack.theory.certificates.loss_accumulation import LossAccumulation
 
 _SIGNALS = 6
-_HELD, _INPUT, _ONE = (np.eye(_SIGNALS)[place] for place in (0, 3, 5))
+_HELD, _INPUT, _ONE = (np.eye(_SIGNALS)[index] for index in (0, 3, 5))
 MOST_STAGES = 16
 """With more missing events π is used for all of them."""
 _EPSILON = float(np.finfo(float).eps)

@@ -184,7 +184,7 @@ class CertificateScope:
             )  # fmt: skip
 
         unchecked = certificate(*phases)
-        first, rest = unchecked.constants, unchecked.persistent_constants
+        main, persistent = unchecked.constants, unchecked.persistent_constants
         probability = None
         if not self._resolved.network.enforce_mansd:
             probability = kept_probability(self._resolved, conditions.guarantee, unchecked.inter_event_s)
@@ -192,9 +192,9 @@ class CertificateScope:
             self._resolved,
             conditions,
             self._decay,
-            first,
+            main,
             void,
-            max((phase.loop_gain for phase in (first, rest) if phase is not None), default=0.0),
+            max((phase.loop_gain for phase in (main, persistent) if phase is not None), default=0.0),
             trigger.text(),
             probability,
         )

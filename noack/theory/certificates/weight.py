@@ -165,9 +165,9 @@ class _SampledPlant(PlantGains):
 
 def _thinned(generator: Matrix, D: Matrix) -> tuple[Vector, Stack]:
     """Return some of the nodes of a response, and e^{Gτ} D there."""
-    followed = response(generator, D)
-    nodes = np.unique(np.linspace(0, len(followed.edges_s) - 1, _NODES).astype(int))
-    return followed.edges_s[nodes], followed.states[nodes]
+    responses = response(generator, D)
+    nodes = np.unique(np.linspace(0, len(responses.edges_s) - 1, _NODES).astype(int))
+    return responses.edges_s[nodes], responses.states[nodes]
 
 
 def _sampled(nodes_s: Vector, values: Stack) -> KernelBounds:

@@ -179,10 +179,10 @@ class _Inequalities:
                 return best._replace(loop_gain=min(best.loop_gain, loop_gain))
             signals = (_A, controller[Output.WEIGHTED], _PI, state)
             a, e_c, pi, x = (float(row @ values) for row in signals)
-            found = Moments(self._order, rate_per_s, a, e_c, pi, x, loop_gain)
-            if found.state > _SETTLED * best.state:
+            refined = Moments(self._order, rate_per_s, a, e_c, pi, x, loop_gain)
+            if refined.state > _SETTLED * best.state:
                 break
-            best = found
+            best = refined
         return best
 
     def _rows(self, controller: Mapping[Output, Vector]) -> Matrix:

@@ -121,8 +121,8 @@ class Starts:
     def model_sups(self) -> Mapping[Output, float]:
         """The largest ‖C e^{(H+αI)τ} ξ‖ for all τ and all these ξ, of every output C of e_c."""
         error = self.flow.error
-        followed = response(error.scaled_H, error.inverse_weight @ self.inverse)
-        return {C: float(k.sup()) for C, k in followed.through_each(error.stacked).items()}
+        responses = response(error.scaled_H, error.inverse_weight @ self.inverse)
+        return {C: float(k.sup()) for C, k in responses.through_each(error.stacked).items()}
 
     @cached_property
     def drive_limit(self) -> tuple[float, Vector, "_CellBounds"]:
@@ -338,10 +338,10 @@ class _CellBounds:
                 rounds[settled], joint = rounds[settled] + 1, joint + 1
                 continue
             cells = cells[rounds[cells] < len(_WIDTHS)]
-            tried = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
-            values = self._tight(limits, cells, tried)
+            candidates = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
+            values = self._tight(limits, cells, candidates)
             index = values.argmin(axis=1)
-            logits[cells] = tried[np.arange(len(cells)), index]
+            logits[cells] = candidates[np.arange(len(cells)), index]
             highest[cells] = np.minimum(highest[cells], values.min(axis=1) + added[cells])
             rounds[cells] += 1
 

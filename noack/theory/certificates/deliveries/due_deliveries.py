@@ -62,12 +62,12 @@ class Deliveries:
             started = response_until(loop.scaled_H, plant.start, conditions.start_s)
             self._started = float(started.through(loop.R).sup_on_grid()) * ROUNDING
         at_rest = np.vstack([np.linalg.inv(self._norm.shape), np.zeros((n, n))])
-        followed = response_until(loop.F, at_rest, loop.until_s, loop.cells)
+        responses = response_until(loop.F, at_rest, loop.until_s, loop.cells)
         C = loop.outputs
-        self._of_ball = _highest(followed.through_each(Outputs(C)))
+        self._of_ball = _highest(responses.through_each(Outputs(C)))
         """‖C e^{Fr} (Λ⁻¹; 0)‖ over each cell, (outputs, cells)."""
         curved = {name: output @ loop.F @ loop.F for name, output in C.items()}
-        sags = _highest(followed.through_each(Outputs(curved)))
+        sags = _highest(responses.through_each(Outputs(curved)))
         self._sags = loop.cell_s**2 / 8 * sags
         self._of_late = (loop.within_windows(loop.driven) / loop.shares).max(axis=-1)
         self._ages_seen = np.zeros_like(self._of_ball)

@@ -74,8 +74,8 @@ class InvariantEllipsoids:
         (size,) = self._sizes(starts.inverse[None], limit)
         if start_s > 0:
             drift = self.plant.A + self.plant.alpha_per_s * np.eye(self.flow.n)
-            begun = response_until(drift, self.plant.start, start_s)
-            size = max(size, float(begun.through(starts.shape @ self.flow.weight).sup_on_grid()))
+            responses = response_until(drift, self.plant.start, start_s)
+            size = max(size, float(responses.through(starts.shape @ self.flow.weight).sup_on_grid()))
         if self._first:  # the first delivery
             Y = np.hstack([starts.shape, np.zeros_like(starts.shape)])
             size = max(size, self.flow.from_start(Y, limit, self._first))
@@ -103,14 +103,14 @@ class InvariantEllipsoids:
     def _starts(self) -> Starts | None:
         """Λ for a small bound of ‖x‖: a pattern search over its three parameters."""
         with np.errstate(all="ignore"):
-            tried = np.array(_STARTS)
-            merits = self._merits(tried)
-            best, merit = tried[merits.argmin()], merits.min()
+            candidates = np.array(_STARTS)
+            merits = self._merits(candidates)
+            best, merit = candidates[merits.argmin()], merits.min()
             for width in _WIDTHS:
-                tried = best + width * _DIRECTIONS
-                merits = self._merits(tried)
+                candidates = best + width * _DIRECTIONS
+                merits = self._merits(candidates)
                 if merits.min() < merit:
-                    best, merit = tried[merits.argmin()], merits.min()
+                    best, merit = candidates[merits.argmin()], merits.min()
             (factor,) = self._factors(best[None])
         return Starts(self.flow, np.linalg.inv(factor)) if math.isfinite(merit) else None
 

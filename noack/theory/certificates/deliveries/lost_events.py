@@ -172,8 +172,8 @@ class _Stage:
         if not (self._held and ago_s):
             return 0.0
         flow = self._flow
-        followed = response_until(flow.BK - flow.closed_loop, flow.input_error, ago_s)
-        return float(followed.through(C).integral_on_grid())
+        responses = response_until(flow.BK - flow.closed_loop, flow.input_error, ago_s)
+        return float(responses.through(C).integral_on_grid())
 
     def largest_error(self, sizes: Vector, added: Vector) -> float:
         """Bound ‖e_c‖_W up to the last r, given those of e_s, and bounds without the flow."""
