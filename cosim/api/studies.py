@@ -352,14 +352,9 @@ def campaign(
     temporary = None if folder is not None else Path(tempfile.mkdtemp(prefix="noack-"))
     start = partial(campaign_workers.local, workers or cores())
     try:
+        bar, runs_folder = _runs_bar() if progress else None, Path(folder or temporary or "")
         finished = campaign_report.finish_campaign(
-            plan,
-            path,
-            Path(folder or temporary or ""),
-            start,
-            draws=draws,
-            show=lambda text: nullcontext(),
-            bar=_runs_bar() if progress else None,
+            plan, path, runs_folder, start, draws=draws, show=lambda text: nullcontext(), bar=bar
         )
     except BaseException:
         if temporary is not None:

@@ -137,14 +137,14 @@ def _comment(measurement: Measurement, form: Form) -> str:
     late = "" if deadline_s is None else f", deadline {deadline_s:g} s"
     lines = [f"Measured: {printable(measurement.name)}, {len(measurement.trace)} packets{late}."]
     if form == "trace":
-        lines += [
-            'Each update gets what was recorded at its time. With by = "packet", update k gets record k.',
-        ]
+        lines.append(
+            'Each update gets what was recorded at its time. With by = "packet", update k gets record k.'
+        )
     else:
-        lines += ["A model, fitted per packet: it assumes updates at the trace's rate."]
-    lines += ["mansd is not enforced, so that the network behaves as measured."]
+        lines.append("A model, fitted per packet: it assumes updates at the trace's rate.")
+    lines.append("mansd is not enforced, so that the network behaves as measured.")
     if measurement.is_outage.any():
-        lines += ["mansd does not cover the outages; no certificate does."]
+        lines.append("mansd does not cover the outages; no certificate does.")
     return "".join(f"# {line}\n" for line in lines)
 
 
@@ -199,11 +199,7 @@ def _delay(measurement: Measurement) -> list[Mapping[str, object]]:
     ]
 
 
-_MODELS = {
-    "bernoulli": "independent losses",
-    "gilbert": "Gilbert",
-    "gilbert_elliott": "Gilbert–Elliott",
-}
+_MODELS = {"bernoulli": "independent losses", "gilbert": "Gilbert", "gilbert_elliott": "Gilbert–Elliott"}
 _PARAMETERS = {
     "probability": "loss probability",
     "good_to_bad": "p, good to bad",

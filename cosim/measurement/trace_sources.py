@@ -70,21 +70,19 @@ FILE_OPTIONS = {
 """Options of the command line, by field of :class:`SourceOptions`."""
 
 
-def refuse_unused(
-    options: "DataclassInstance", names: Mapping[str, str], source_kind: str, *used: str
-) -> None:
+def refuse_unused(options: "DataclassInstance", names: Mapping[str, str], source: str, *used: str) -> None:
     """Raise CallerError for an option that differs from its default, but has no effect.
 
     Args:
         options: a dataclass with defaults.
         names: the options of the command line, by field.
-        source_kind: the kind of source that the options are given for.
+        source: the kind of source that the options are given for.
         used: the fields that have an effect there.
     """
     for field in fields(options):
         is_given = getattr(options, field.name) != field.default
         if is_given and field.name in names and field.name not in used:
-            raise CallerError(f"{names[field.name]}: has no effect on {source_kind}")
+            raise CallerError(f"{names[field.name]}: has no effect on {source}")
 
 
 def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> PacketTrace:

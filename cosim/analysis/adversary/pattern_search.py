@@ -48,13 +48,7 @@ class Nodes(NamedTuple):
 
     def take(self, selection: Indices | Flags | slice) -> "Nodes":
         """Return a selection of the runs."""
-        return Nodes(
-            self.t_s[selection],
-            self.z[selection],
-            self.state[selection],
-            self.value[selection],
-            self.entry[selection],
-        )
+        return Nodes._make(column[selection] for column in self)
 
 
 def root(flow: PatternFlow) -> Nodes:
@@ -360,13 +354,13 @@ def _candidates(guarantee: LossGuarantee, events: int, rng: np.random.Generator)
     longest = events if guarantee.longest_burst is None else guarantee.longest_burst
     if longest == 0:
         return [()]
-    window_lengths = [window.packets for window in guarantee.windows[1:] if window.packets <= _PERIODS]
+    lengths = [window.packets for window in guarantee.windows[1:] if window.packets <= _PERIODS]
     regular = [
         tuple((i + phase) % period >= lost for i in range(events))
         for lost in range(1, longest + 1)
         for period in (
             lost + 1,
-            *(window_length for window_length in window_lengths if window_length > lost + 1),
+            *(length for length in lengths if length > lost + 1),
         )
         for phase in range(period)
     ]

@@ -81,7 +81,7 @@ class JointSpectralRadius(NamedTuple):
     """Numbers of the edges of the cycle that attains the lower bound, in their order of time."""
     vertices: int
     """Number of vertices of the polytopes that prove the upper bound; 0: it has another proof."""
-    needed: float = 0.0
+    needed_effort: float = 0.0
     """If the threshold is between the bounds: an estimate of the effort that would prove the radius
     to be below, if it is the lower bound; infinity if the two hardly differ."""
 
@@ -246,7 +246,7 @@ class _Enclosure:
         except FloatingPointError:  # an overflow, where the caller has asked for it
             return math.inf
         self._improve(bound.upper)
-        return bound.needed / entries
+        return bound.needed_products / entries
 
 
 def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _CycleSearch) -> Cycle:
@@ -272,7 +272,7 @@ class ProductBound(NamedTuple):
     """Upper bound of the joint spectral radius."""
     products: int
     """Number of products that were examined."""
-    needed: float
+    needed_products: float
     """Number of products that would prove γ; an estimate if the work was limited."""
 
 

@@ -270,12 +270,12 @@ class LossMargin:
         path = [bursts[number] for number in radius.cycle]
         # In another slot than the first update's the pattern may grow less.
         slots = [burst.slot for burst in path]
-        first = slots.index(self._first_slot) if self._first_slot in slots else 0
-        path = path[first:] + path[:first]
+        begin = slots.index(self._first_slot) if self._first_slot in slots else 0
+        path = path[begin:] + path[:begin]
         pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
         if path and self._times == EVERY_STEP:
-            first = (self._first_slot - path[0].slot) % self.loop.times.slots
-            pattern = pattern[first:] + pattern[:first]
+            begin = (self._first_slot - path[0].slot) % self.loop.times.slots
+            pattern = pattern[begin:] + pattern[:begin]
         intervals_s = (
             steps * self._unit_ns / NS_PER_S for burst in path for steps in burst.intervals(self._times)
         )
@@ -285,10 +285,10 @@ class LossMargin:
             tuple(pattern),
             tuple(intervals_s),
             radius.vertices,
-            radius.needed,
+            radius.needed_effort,
         )
 
-    def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
+    def coarse_bounds(self, guarantee: LossGuarantee | None = None) -> Stability:
         """Return coarser bounds, which decide whether all patterns are stable."""
         return self.stability(guarantee, _FIRST_ACCURACY)
 
