@@ -41,8 +41,8 @@ class ExplorerWidget:
         self._quiet = False
         self._shape: tuple[object, ...] = ()
         self._inputs: dict[str, widgets.Widget] = {}
-        self._known: dict[str, Slider] = {}
-        self._later: asyncio.Handle | None = None
+        self._sliders: dict[str, Slider] = {}
+        self._pending: asyncio.Handle | None = None
         names = results.run.state_names
         self._state = widgets.Dropdown(
             options=[(name, i) for i, name in enumerate(names)],
@@ -74,8 +74,8 @@ class ExplorerWidget:
         finally:
             self._quiet = False
         self._draw()
-        if self._later is not None:
-            self._later.cancel()
+        if self._pending is not None:
+            self._pending.cancel()
         try:
             loop = asyncio.get_running_loop()
         except RuntimeError:  # no kernel: nothing will ever be dragged while this computes
@@ -91,14 +91,14 @@ class ExplorerWidget:
             if names[1:]:
                 self._schedule(loop, 0.0, names[1:])
 
-        self._later = loop.call_later(after_s, compute)
+        self._pending = loop.call_later(after_s, compute)
 
     def _compute_rest(self, names: list[str]) -> None:
         try:
             for name in names:
                 getattr(self._results, name)
         except NoackError as error:
-            self._say(str(error))
+            self._show_message(str(error))
             return
         self._draw()
 
@@ -107,18 +107,18 @@ class ExplorerWidget:
             states = self._results.run.x.shape[1]
             self._image.value = _png(self._results, self._state.value % states)
         except NoackError as error:
-            self._say(str(error))
+            self._show_message(str(error))
             return
-        self._say(self._results.warning if CERTIFICATE in self._results.known else "")
+        self._show_message(self._results.warning if CERTIFICATE in self._results.known else "")
         self._facts.value = as_html([row for rows in self._results.facts.values() for row in rows])
 
-    def _say(self, text: str) -> None:
+    def _show_message(self, text: str) -> None:
         lines = "<br>".join(map(html.escape, text.splitlines()))
         self._message.value = f'<b style="color: #b3261e">{lines}</b>' if text else ""
 
     def _show_controls(self) -> None:
         controls = controls_of(self._results.draft)
-        self._known = {slider.key: slider for slider in controls.sliders}
+        self._sliders = {slider.key: slider for slider in controls.sliders}
         if controls.shape == self._shape:
             for slider in controls.sliders:
                 widget = self._inputs[slider.key]
@@ -160,7 +160,7 @@ class ExplorerWidget:
         key = slider.key
 
         def moved(change: Mapping[str, float]) -> None:
-            current = self._known[key]
+            current = self._sliders[key]
             value = current.value_at(current.place(change["new"]))
             if value != current.value:
                 self._change(lambda draft: dragged(draft, current, value))
@@ -174,7 +174,7 @@ class ExplorerWidget:
         try:
             self._results.take(change(self._results.draft))
         except NoackError as error:
-            self._say(str(error))
+            self._show_message(str(error))
 
 
 def _png(results: DraftResults, state: int) -> bytes:

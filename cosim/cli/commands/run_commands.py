@@ -183,8 +183,7 @@ def _print_run(
     console: "Console", run: "continuous.ContinuousRun", summary: "continuous.ContinuousSummary"
 ) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
-    import numpy as np  # help and completion need neither of the two
-    from rich.text import Text
+    from rich.text import Text  # help and completion need none
 
     ended = summary_model.ExitPart(status=int(summary.exit_status), reason=summary.reason)
     state = (
@@ -208,6 +207,16 @@ def _print_run(
     )
     title = run_tables.title_of(summary.scenario, summary.mode, summary.mansd, (), "continuous")
     run_verdict.print_numbers(console, title, rows)
+    table = _event_table(run)
+    console.print(result_tables.terminal_table(table, left=(), styles={"lost": "red"}))
+    if len(run.before) > _EVENTS_SHOWN:
+        console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")
+
+
+def _event_table(run: "continuous.ContinuousRun") -> "result_tables.ResultTable":
+    """Return the table of a run's first 40 events."""
+    import numpy as np  # help and completion need none
+
     since_s = np.diff(run.event_s, prepend=0.0)
     with np.errstate(all="ignore"):  # a run may diverge
         norms = [
@@ -226,10 +235,7 @@ def _print_run(
         for i, (state, (x, e_c)) in enumerate(zip(run.before, norms, strict=False))
     ]
     headings = ("event", "t, s", "inter-event time, s", "‖x‖", "‖e_c‖ before", "fate")
-    table = result_tables.ResultTable("events", "events", headings, events)
-    console.print(result_tables.terminal_table(table, left=(), styles={"lost": "red"}))
-    if len(run.before) > _EVENTS_SHOWN:
-        console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")
+    return result_tables.ResultTable("events", "events", headings, events)
 
 
 @cli.command(
