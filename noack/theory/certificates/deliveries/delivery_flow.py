@@ -12,8 +12,8 @@ Between two nodes the bounds are those of :mod:`noack.theory.bounds.enclosure`.
 the age of inputs drives it; :class:`InputEffects` bounds both. What they change is added to the
 bounds.
 
-:mod:`noack.theory.certificates.deliveries.delivery_reach` bounds z for all states ξ of an ellipsoid,
-:mod:`noack.theory.certificates.deliveries.lost_events` bounds e_c after lost events.
+``delivery_reach.py`` bounds z for all states ξ of an ellipsoid, ``lost_events.py`` bounds e_c after
+lost events.
 """
 
 import math

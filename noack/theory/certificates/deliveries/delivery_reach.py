@@ -1,12 +1,11 @@
 """What x and e_c can be after a delivery, for all states ξ of an ellipsoid.
 
-All that is uncertain of the flow (:mod:`noack.theory.certificates.deliveries.delivery_flow`) is ξ, and the
-time of the next delivery. Let ‖Λξ‖ ≤ 1 and ‖e_c‖_W ≤ D at all times. At the time τ, ξ has ‖Λξ‖ ≤ 1
-and ‖Nξ‖_W ≤ D, N the rows of e_c in e^{Fs} (I, 0) for an s ≤ τ. So ξ is in the ellipsoid λ‖Λξ‖² +
-(1 − λ)‖Nξ‖²/D² ≤ 1, for each λ in [0, 1]. So ‖C z(τ)‖ is at most the norm of C e^{Fτ} on this
-ellipsoid, and the λ with the smallest is used. If no ‖Λx(τ)‖ found in this way exceeds 1, ‖Λx‖ ≤ 1
-holds at the next delivery, whenever it happens, and by induction at all times: the set ‖Λx‖ ≤ 1 is
-invariant.
+All that is uncertain of the flow (``delivery_flow.py``) is ξ, and the time of the next delivery.
+Let ‖Λξ‖ ≤ 1 and ‖e_c‖_W ≤ D at all times. At the time τ, ξ has ‖Λξ‖ ≤ 1 and ‖Nξ‖_W ≤ D, N the rows
+of e_c in e^{Fs} (I, 0) for an s ≤ τ. So ξ is in the ellipsoid λ‖Λξ‖² + (1 − λ)‖Nξ‖²/D² ≤ 1, for
+each λ in [0, 1]. So ‖C z(τ)‖ is at most the norm of C e^{Fτ} on this ellipsoid, and the λ with the
+smallest is used. If no ‖Λx(τ)‖ found in this way exceeds 1, ‖Λx‖ ≤ 1 holds at the next delivery,
+whenever it happens, and by induction at all times: the set ‖Λx‖ ≤ 1 is invariant.
 
 Over a cell of the grid, s is the left node. From the last node T on, x + e_c = e^{Hτ} ξ has
 decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D and ‖Λx‖ ≤ 1. If inputs

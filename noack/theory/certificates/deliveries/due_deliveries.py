@@ -1,9 +1,9 @@
 """Bounds of a loop whose events are at most some time apart, by what x can be at a delivery.
 
 Let ξ = x at a delivered event. If events are due, the next delivered event is one of finitely many
-times g later, and :mod:`noack.theory.certificates.deliveries.delivery_gaps` bounds what g makes of
-ξ. So of every time t at which there may be a delivered event, a ball ‖Λ(ξ − c)‖ ≤ ρ and a bound J
-of what the update removes follow from those a time g before:
+times g later, and ``delivery_gaps.py`` bounds what g makes of ξ. So of every time t at which there
+may be a delivered event, a ball ‖Λ(ξ − c)‖ ≤ ρ and a bound J of what the update removes follow from
+those a time g before:
 
     ρ(t) = max_g ‖Λ(Φ_g c − c(t))‖ + γ_g ρ + ∫‖ΛΨ‖ ‖w‖,      Φ_g = (I 0) e^{Fg} (I; 0)
 

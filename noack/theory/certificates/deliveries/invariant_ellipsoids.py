@@ -1,9 +1,9 @@
 """An ellipsoid that x never leaves.
 
 Given ‖e_c‖_W ≤ D at all times, an ellipsoid ‖Λx‖ ≤ 1 is found that x never leaves, by the flow
-between two deliveries (:mod:`noack.theory.certificates.deliveries.delivery_reach`). It bounds x and E x, and
-the flow from it bounds K e_c. Λ comes from a Lyapunov equation with three parameters. They are
-chosen by samples; what they give is checked with all enclosures.
+between two deliveries (``delivery_reach.py``). It bounds x and E x, and the flow from it bounds K
+e_c. Λ comes from a Lyapunov equation with three parameters. They are chosen by samples; what they
+give is checked with all enclosures.
 """
 
 import contextlib

@@ -1,14 +1,14 @@
 """Bounds of e_c after lost events, by the flow from the last delivery.
 
 Without the flow, each missing event adds its ‖e_s‖_W in full, as if all had one direction. But
-until the next delivery everything follows from z at one time
-(:mod:`noack.theory.certificates.deliveries.delivery_flow`). Let an event be lost at least w after the
-delivery, and ‖e_c‖_W ≤ D up to it. z is the value w before it, z' = e^{Fw} z:
+until the next delivery everything follows from z at one time (``delivery_flow.py``). Let an event
+be lost at least w after the delivery, and ‖e_c‖_W ≤ D up to it. z is the value w before it, z' =
+e^{Fw} z:
 
     ‖Λx‖ ≤ c and ‖e_c‖ ≤ D at z and z',  ‖e_s‖ = ‖C_r z'‖ ≤ β for r until the next event
 
 With positive weights of sum 1, z is in the ellipsoid of the sum of these forms, which bounds e_c =
-(0, I) e^{Fr} z' after r (:func:`noack.theory.certificates.deliveries.delivery_reach.largest_outputs`).
+(0, I) e^{Fr} z' after r (``largest_outputs`` in ``delivery_reach.py``).
 
 After an event e_s begins at 0, so the same forms bound the time until the next event, too.
 """

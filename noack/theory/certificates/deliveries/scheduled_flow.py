@@ -1,11 +1,11 @@
 """Constants sharpened by the flow from the moment an update acts to the next one.
 
 Tests may be sampled, updates act within d of their events, and inputs may be held. From the moment
-an update acts on, the plant's input is K x_c + q with ‖q‖ ≤ q̂, the part due to the age of the input.
-So z = (x, e_c) follows the system of :mod:`noack.theory.certificates.deliveries.delivery_flow`, with two
-changes: e_c begins with what has entered within d, at most ``late``, and q drives z through
-(BU, −BU). Both are bounded by the certificate's constants; what they change is added to every
-bound. Each bound that becomes smaller is inserted into all others.
+an update acts on, the plant's input is K x_c + q with ‖q‖ ≤ q̂, the part due to the age of the
+input. So z = (x, e_c) follows the system of ``delivery_flow.py``, with two changes: e_c begins with
+what has entered within d, at most ``late``, and q drives z through (BU, −BU). Both are bounded by
+the certificate's constants; what they change is added to every bound. Each bound that becomes
+smaller is inserted into all others.
 
 **The next event.** After an event e_s begins at 0. If updates act at once and no input is held, it
 is C_r z(t_k) after r, C_r = (0, I) e^{Fr} − e^{(H+αI)r} (0, I), as long as no update is received.
