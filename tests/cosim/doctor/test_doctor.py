@@ -41,10 +41,9 @@ IDEAL = MachineFacts(
 
 def about(title: str, required: RunRequirements = WANTED, **changed: Any) -> MachineFinding:
     """The first finding of a kind that is not good, or the first one if all are good."""
-    findings = [
-        finding for finding in judge(replace(IDEAL, **changed), required) if finding.what.startswith(title)
-    ]
-    return next((finding for finding in findings if finding.verdict is not FindingStatus.GOOD), findings[0])
+    findings = judge(replace(IDEAL, **changed), required)
+    of_kind = [finding for finding in findings if finding.what.startswith(title)]
+    return next((finding for finding in of_kind if finding.verdict is not FindingStatus.GOOD), of_kind[0])
 
 
 def test_a_machine_without_limits_is_good() -> None:

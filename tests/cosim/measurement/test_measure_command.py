@@ -284,20 +284,17 @@ def test_shares_are_those_of_a_step_through_the_time(delays: list[int | None]) -
     received = [None if d is None else 10 * k + d for k, d in enumerate(delays)]
     lost = np.array([d is None for d in delays])
     trace = packet_trace(sent * MS, (sent + np.array([d or 0 for d in delays])) * MS, lost)
-    end = max(sent[-1], *(arrival_ms for arrival_ms in received if arrival_ms is not None), 0)
+    end = max(sent[-1], *(t_ms for t_ms in received if t_ms is not None), 0)
 
     def replaced(k: int) -> float:
-        return min((arrival_ms for arrival_ms in received[k + 1 :] if arrival_ms is not None), default=np.inf)
+        return min((t_ms for t_ms in received[k + 1 :] if t_ms is not None), default=np.inf)
 
-    stale = [arrival_ms is not None and replaced(k) < arrival_ms for k, arrival_ms in enumerate(received)]
-    is_lost = [
-        arrival_ms is None or (stale[k] and replaced(k) - 10 * k > 4) for k, arrival_ms in enumerate(received)
-    ]
+    stale = [t_ms is not None and replaced(k) < t_ms for k, t_ms in enumerate(received)]
+    is_lost = [t_ms is None or (stale[k] and replaced(k) - 10 * k > 4) for k, t_ms in enumerate(received)]
     late = void = 0
     for ms in range(end):
         overdue = any(
-            arrival_ms is not None and not stale[k] and 10 * k + 4 <= ms < arrival_ms
-            for k, arrival_ms in enumerate(received)
+            t_ms is not None and not stale[k] and 10 * k + 4 <= ms < t_ms for k, t_ms in enumerate(received)
         )
         missing = False
         for k in range(2, len(delays)):
