@@ -109,7 +109,9 @@ class Certificates:
             if REGION not in void_at_setpoint(nonlinear) and nonlinear.coverage.can_be_certified:
                 self._scopes.append(RegionScope(nonlinear))
         self._certificates = [
-            (under, scope.certificate(of)) for under, of in conditions.items() for scope in self._scopes
+            (under, scope.certificate(assumed))
+            for under, assumed in conditions.items()
+            for scope in self._scopes
         ]
         self._given = np.eye(loop_of(scenario).n) if given is None else given
         self.theorem_2 = _theorem_2(scenario, self.paper)
@@ -160,9 +162,9 @@ class Certificates:
             return None
         error = error_gains(loop_of(self.scenario), constants.rate_per_s)
         kernel = response(error.scaled_H, error.inverse_weight).through(self._given)
-        now = float(norm_bounds(self._given, error.inverse_weight[None])[0])
+        present_gain = float(norm_bounds(self._given, error.inverse_weight[None])[0])
         missing = sum_of_sups(kernel, constants.missing_events, constants.inter_event_s or 0.0)
-        return min(now * constants.delta, (now + float(missing)) * constants.overshoot)
+        return min(present_gain * constants.delta, (present_gain + float(missing)) * constants.overshoot)
 
     @property
     def limits(self) -> NetworkLimits:
@@ -311,17 +313,17 @@ def certificates_of(
     Raises:
         CallerError: the choice is unknown, or no certificate covers this scenario.
     """
-    resolved, is_model = resolve(scenario), False
-    if of_model and not resolved.coverage.is_linear:
-        is_model, own = True, resolved.plant
-        resolved = with_linear_plant(resolved)
-    allowed = resolved.certificate.late_periods if late_periods is None else late_periods
-    if not 0 <= allowed <= MOST_LATE:
-        raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
-    weighted, W = with_weight(resolved, weight, allowed, progress)
-    given = getattr(resolved.trigger, "weight", None)
-    nonlinear = weighted.model_copy(update={"plant": own}) if is_model else None
-    return Certificates(weighted, allowed, W, None if given is None else np.array(given), nonlinear)
+    original = resolve(scenario)
+    is_model = of_model and not original.coverage.is_linear
+    resolved = with_linear_plant(original) if is_model else original
+    late = resolved.certificate.late_periods if late_periods is None else late_periods
+    if not 0 <= late <= MOST_LATE:
+        raise CallerError(f"late: {late} steps; give 0 to {MOST_LATE}")
+    weighted, W = with_weight(resolved, weight, late, progress)
+    rows = getattr(resolved.trigger, "weight", None)
+    given = None if rows is None else np.array(rows)
+    nonlinear = weighted.model_copy(update={"plant": original.plant}) if is_model else None
+    return Certificates(weighted, late, W, given, nonlinear)
 
 
 def in_chosen_norm(

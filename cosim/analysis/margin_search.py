@@ -96,9 +96,9 @@ def compare_guarantees(
     return GuaranteeComparison(tuple(map(ComparedGuarantee, meanings, stabilities)), relations)
 
 
-def _relation(one: tuple[str, Pattern | None], other: tuple[str, Pattern | None]) -> str:
+def _relation(first: tuple[str, Pattern | None], second: tuple[str, Pattern | None]) -> str:
     """Return the relation of two guarantees, each with a pattern that the other one forbids."""
-    (meaning, pattern), (other_meaning, other_pattern) = one, other
+    (meaning, pattern), (other_meaning, other_pattern) = first, second
     if pattern is None and other_pattern is None:
         return f"“{meaning}” and “{other_meaning}” allow the same patterns"
     if pattern is None:
@@ -120,12 +120,12 @@ _NOT_COMPARED = GuaranteeComparison()
 
 def undecided_text(stability: Stability, effort: float) -> str:
     """Return the bounds of an undecided growth, and what more time would give."""
-    lower, upper, needed = stability.lower, stability.upper, max(stability.needed_effort, 2 * effort)
+    lower, upper, needed_effort = stability.lower, stability.upper, max(stability.needed_effort, 2 * effort)
     text = f"growth between {lower:.6g} and {upper:.6g}, gap {upper - lower:.2g}; if it is the "
-    if not needed < _LARGEST_EFFORT:
+    if not needed_effort < _LARGEST_EFFORT:
         return f"{text}lower bound, no effort up to {_LARGEST_EFFORT:g} is estimated to prove it"
-    about = duration(stability.took_s * needed / effort)
-    return f"{text}lower bound, --effort {needed:.2g} is estimated to prove it, in about {about}"
+    time_text = duration(stability.took_s * needed_effort / effort)
+    return f"{text}lower bound, --effort {needed_effort:.2g} is estimated to prove it, in about {time_text}"
 
 
 class LossCap(NamedTuple):
@@ -231,12 +231,12 @@ class MarginResult:
     @property
     def verdict(self) -> str:
         """The margin in words."""
-        most = self.stable_m
+        stable_m = self.stable_m
         parts = []
-        if most is not None and self.every_m:
-            parts = [f"stable for every pattern that the constraints allow, with every M ≥ {most}"]
-        elif most is not None:
-            parts = [f"stable for every pattern with M ≤ {most}"]
+        if stable_m is not None and self.every_m:
+            parts = [f"stable for every pattern that the constraints allow, with every M ≥ {stable_m}"]
+        elif stable_m is not None:
+            parts = [f"stable for every pattern with M ≤ {stable_m}"]
         parts += [
             f"{guarantee.meaning}: undecided, {undecided_text(guarantee.stability, self.effort)}"
             for guarantee in self.compared.guarantees
@@ -245,7 +245,7 @@ class MarginResult:
         parts += [
             f"M = {cap.m} is undecided: {undecided_text(cap.stability, self.effort)}"
             for cap in self.caps  # of fewer losses all are stable
-            if cap.stability.verdict == "undecided" and cap.m > (most or 0)
+            if cap.stability.verdict == "undecided" and cap.m > (stable_m or 0)
         ]
         if (last := self.destabilised) is not None:
             parts.append(f"this pattern destabilises M = {last.m}: {last.stability.text}")
@@ -260,8 +260,8 @@ class MarginResult:
     @property
     def random_text(self) -> str:
         """What holds for random losses without the guarantee, as a sentence."""
-        without = self.without_guarantee
-        return f"without the guarantee: {without if isinstance(without, str) else without.text}"
+        growth = self.without_guarantee
+        return f"without the guarantee: {growth if isinstance(growth, str) else growth.text}"
 
     def to_json(self) -> dict[str, object]:
         """Return all fields and the verdicts for JSON."""
@@ -270,7 +270,7 @@ class MarginResult:
             period = limit._asdict() | {"text": limit.text}
             del period["stability"]
             period["found"] = None if limit.stability is None else stability_document(limit.stability)
-        without = self.without_guarantee
+        growth = self.without_guarantee
         return vars(self) | {
             "verdict": self.verdict,
             "stable_m": self.stable_m,
@@ -281,7 +281,7 @@ class MarginResult:
             ],
             "relations": self.compared.relations,
             "period": period,
-            "without_guarantee": without if isinstance(without, str) else without._asdict(),
+            "without_guarantee": growth if isinstance(growth, str) else growth._asdict(),
         }
 
 
@@ -374,27 +374,27 @@ def find_longest_period(resolved: Scenario, progress: MarginProgress = lambda te
 
     def is_stable(steps: int) -> bool:
         progress(f"period {steps * step_ns / NS_PER_S:g} s")
-        examined[steps] = LossMargin(resolved, steps * step_ns).is_stable()
+        examined[steps] = LossMargin(resolved, steps * step_ns).coarse_bounds()
         return examined[steps].verdict == "stable"
 
-    first = LossMargin(resolved)
-    is_longest = first.shortest_ns < first.longest_ns
-    longest = max(resolved.timing.horizon_ns, first.longest_ns) // step_ns
-    shortest = first.loop.times.delay_ns // step_ns + 1
+    own_margin = LossMargin(resolved)
+    is_longest = own_margin.shortest_ns < own_margin.longest_ns
+    longest = max(resolved.timing.horizon_ns, own_margin.longest_ns) // step_ns
+    shortest = own_margin.loop.times.delay_ns // step_ns + 1
     stable, unstable = 0, 0
-    steps = first.longest_ns // step_ns
+    steps = own_margin.longest_ns // step_ns
     while not stable or not unstable:
         if is_stable(steps):
             stable = steps
             if steps == longest:
                 return PeriodLimit(steps * step_ns / NS_PER_S, None, is_longest, None)
-            following = min(2 * steps, longest)
+            next_steps = min(2 * steps, longest)
         else:
             unstable = steps
             if steps == shortest:
                 break
-            following = max(steps // 2, shortest)
-        steps = following
+            next_steps = max(steps // 2, shortest)
+        steps = next_steps
     while stable and unstable - stable > 1:
         steps = (stable + unstable) // 2
         stable, unstable = (steps, unstable) if is_stable(steps) else (stable, steps)

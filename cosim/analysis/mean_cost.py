@@ -93,8 +93,8 @@ def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None
     loop, link = loop_of(resolved), resolved.network.link
     n, size = loop.n, loop.n + loop.m
     forms = np.zeros((size + 1, size, size))
-    each = np.arange(size)
-    forms[each, each, each] = 1.0
+    entries = np.arange(size)
+    forms[entries, entries, entries] = 1.0  # one form for each entry's square
     for name, weight, width in (("Q", Q, n), ("R", R, loop.m)):
         if weight is not None and weight.shape != (width, width):
             raise CallerError(f"{name}: expected {width} x {width} numbers")
@@ -128,16 +128,16 @@ def _under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarantee) -
     fixed_point, n = moments.stationary(), loop_of(resolved).n
     stationary = None
     if fixed_point is not None:
-        means, at = fixed_point[1], np.diag(fixed_point[0].moments.sum(axis=0))
-        roots = np.sqrt(np.maximum(np.concatenate([means[:-1], at[:n]]), 0.0)).tolist()
+        means, second_moments = fixed_point[1], np.diag(fixed_point[0].moments.sum(axis=0))
+        roots = np.sqrt(np.maximum(np.concatenate([means[:-1], second_moments[:n]]), 0.0)).tolist()
         stationary = Stationary(tuple(roots[:n]), tuple(roots[-n:]), tuple(roots[n:-n]), float(means[-1]))
     with np.errstate(over="ignore"):
-        _, until = moments.until(start, resolved.timing.horizon_ns)
+        _, horizon_costs = moments.until(start, resolved.timing.horizon_ns)
     transient = moments.transient(start)
     return CostUnder(
         guarantee.meaning,
         moments.growth,
         stationary,
-        float(until[-1]),
+        float(horizon_costs[-1]),
         None if transient is None else float(transient[-1]),
     )

@@ -62,5 +62,5 @@ def __getattr__(name: str) -> object:
         module = "cosim.api.lossy_channel"
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found: object = getattr(import_module(module), name)
-    return found
+    member: object = getattr(import_module(module), name)
+    return member

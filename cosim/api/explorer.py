@@ -110,8 +110,8 @@ class Explorer:
             NoackError: there is no such state.
         """
         _ = self.certificate
-        shown = self._results.shown(self._state(state))
-        return figure_drawing.draw(explored.exploration_figure(shown))
+        content = self._results.shown(self._state(state))
+        return figure_drawing.draw(explored.exploration_figure(content))
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write the scenario as TOML, with the comments of the file that it came from.
@@ -150,11 +150,11 @@ class Explorer:
         raise CallerError(f"state: {state!r}: no such state; there are {', '.join(names)}")
 
     def __repr__(self) -> str:
-        found = self.certificate
+        certificate = self.certificate
         rows = [
             ("scenario", self.scenario.name),
             *self.run.numbers,
-            ("certificate", f"{found.verdict}: {found.reason}"),
+            ("certificate", f"{certificate.verdict}: {certificate.reason}"),
         ]
         return as_text([*rows, *([("warning", self.warning)] if self.warning else [])])
 

@@ -41,8 +41,8 @@ class ExplorerWidget:
         self._quiet = False
         self._shape: tuple[object, ...] = ()
         self._inputs: dict[str, widgets.Widget] = {}
-        self._known: dict[str, Slider] = {}
-        self._later: asyncio.Handle | None = None
+        self._sliders: dict[str, Slider] = {}
+        self._pending: asyncio.Handle | None = None
         names = results.run.state_names
         self._state = widgets.Dropdown(
             options=[(name, i) for i, name in enumerate(names)],
@@ -74,8 +74,8 @@ class ExplorerWidget:
         finally:
             self._quiet = False
         self._draw()
-        if self._later is not None:
-            self._later.cancel()
+        if self._pending is not None:
+            self._pending.cancel()
         try:
             loop = asyncio.get_running_loop()
         except RuntimeError:  # no kernel: nothing will ever be dragged while this computes
@@ -91,14 +91,14 @@ class ExplorerWidget:
             if names[1:]:
                 self._schedule(loop, 0.0, names[1:])
 
-        self._later = loop.call_later(after_s, compute)
+        self._pending = loop.call_later(after_s, compute)
 
     def _compute_rest(self, names: list[str]) -> None:
         try:
             for name in names:
                 getattr(self._results, name)
         except NoackError as error:
-            self._say(str(error))
+            self._show_message(str(error))
             return
         self._draw()
 
@@ -107,66 +107,66 @@ class ExplorerWidget:
             states = self._results.run.x.shape[1]
             self._image.value = _png(self._results, self._state.value % states)
         except NoackError as error:
-            self._say(str(error))
+            self._show_message(str(error))
             return
-        self._say(self._results.warning if CERTIFICATE in self._results.known else "")
+        self._show_message(self._results.warning if CERTIFICATE in self._results.known else "")
         self._facts.value = as_html([row for rows in self._results.facts.values() for row in rows])
 
-    def _say(self, text: str) -> None:
+    def _show_message(self, text: str) -> None:
         lines = "<br>".join(map(html.escape, text.splitlines()))
         self._message.value = f'<b style="color: #b3261e">{lines}</b>' if text else ""
 
     def _show_controls(self) -> None:
         controls = controls_of(self._results.draft)
-        self._known = {one.key: one for one in controls.sliders}
+        self._sliders = {slider.key: slider for slider in controls.sliders}
         if controls.shape == self._shape:
-            for one in controls.sliders:
-                made = self._inputs[one.key]
-                if abs(one.place(made.value) - one.position) > one.step / 2:
-                    made.value = one.value
+            for slider in controls.sliders:
+                widget = self._inputs[slider.key]
+                if abs(slider.place(widget.value) - slider.position) > slider.step / 2:
+                    widget.value = slider.value
             return
         self._shape, self._inputs = controls.shape, {}
-        rows: list[widgets.Widget] = [self._choice(one) for one in controls.choices]
-        for one in controls.sliders:
-            self._inputs[one.key] = self._slider(one)
-            rows += [widgets.Label(one.label), self._inputs[one.key]]
+        rows: list[widgets.Widget] = [self._choice(choice) for choice in controls.choices]
+        for slider in controls.sliders:
+            self._inputs[slider.key] = self._slider(slider)
+            rows += [widgets.Label(slider.label), self._inputs[slider.key]]
         self._controls.children = rows
 
     def _choice(self, choice: Choice) -> widgets.Widget:
-        made = widgets.Dropdown(
+        dropdown = widgets.Dropdown(
             options=[(text, value) for value, text in choice.options.items()],
             value=choice.value,
             layout=_WIDE,
         )
-        made.observe(
+        dropdown.observe(
             lambda change: self._change(lambda draft: chosen(draft, choice.key, change["new"])),
             "value",
         )
-        return widgets.VBox([widgets.Label(choice.label), made], layout=_WIDE)
+        return widgets.VBox([widgets.Label(choice.label), dropdown], layout=_WIDE)
 
     def _slider(self, slider: Slider) -> widgets.Widget:
         low, high = slider.ends
         if slider.logarithmic:
-            made = widgets.FloatLogSlider(
+            widget = widgets.FloatLogSlider(
                 value=slider.value, min=low, max=high, step=slider.step, readout_format=".3g"
             )
         elif slider.whole:
-            made = widgets.IntSlider(value=round(slider.value), min=int(low), max=int(high))
+            widget = widgets.IntSlider(value=round(slider.value), min=int(low), max=int(high))
         else:
-            made = widgets.FloatSlider(
+            widget = widgets.FloatSlider(
                 value=slider.value, min=low, max=high, step=slider.step, readout_format=".3g"
             )
-        made.layout = _WIDE
+        widget.layout = _WIDE
         key = slider.key
 
         def moved(change: Mapping[str, float]) -> None:
-            now = self._known[key]
-            value = now.value_at(now.place(change["new"]))
-            if value != now.value:
-                self._change(lambda draft: dragged(draft, now, value))
+            current = self._sliders[key]
+            value = current.value_at(current.place(change["new"]))
+            if value != current.value:
+                self._change(lambda draft: dragged(draft, current, value))
 
-        made.observe(moved, "value")
-        return made
+        widget.observe(moved, "value")
+        return widget
 
     def _change(self, change: Callable[[Draft], Draft]) -> None:
         if self._quiet:
@@ -174,7 +174,7 @@ class ExplorerWidget:
         try:
             self._results.take(change(self._results.draft))
         except NoackError as error:
-            self._say(str(error))
+            self._show_message(str(error))
 
 
 def _png(results: DraftResults, state: int) -> bytes:

@@ -46,7 +46,7 @@ class _Receiver(Generic[Value]):
         if number > self.number:
             self.arrived, self.number = True, number
             self.sent_step, self.held = self.steps[number]
-            self.steps = {one: kept for one, kept in self.steps.items() if one > number}
+            self.steps = {later: entry for later, entry in self.steps.items() if later > number}
 
     def info(self, step: int) -> dict[str, object]:
         """Return what ``info`` says of this direction since the last call."""
@@ -158,28 +158,28 @@ class LossyChannel(
         self._now_ns += self._step_ns
         self._send(0, self._observations, observation)
         network["observation"] = self._observations.info(self._step)
-        held = deepcopy(self._observations.held)
-        return held, reward, terminated, truncated, {**info, "network": network}
+        newest = deepcopy(self._observations.held)
+        return newest, reward, terminated, truncated, {**info, "network": network}
 
     def _send(self, direction: int, receiver: _Receiver[Value], value: Value) -> None:
         """Send a packet now, after what is due has arrived."""
         receiver.steps[receiver.sent] = self._step, deepcopy(value)
         self._take(self._channel.release(self._now_ns))
-        left, copies = self._channel.send(direction, receiver.sent, receiver.size_bytes, self._now_ns)
+        leaving, copies = self._channel.send(direction, receiver.sent, receiver.size_bytes, self._now_ns)
         if not copies:
             del receiver.steps[receiver.sent]
         receiver.sent += 1
-        self._take(left)
+        self._take(leaving)
         self._take(self._channel.release(self._now_ns))
         for table, rows in self._channel.take_rows():
             for row in rows if table == NETEM_PACKET else ():
                 receiver.losses = int(row["consecutive_losses"])
 
-    def _take(self, left: Iterable[Leaving]) -> None:
+    def _take(self, leaving: Iterable[Leaving]) -> None:
         """Let what leaves the channel arrive."""
-        for one in left:
-            if one.bit < 0:  # a receiver rejects a damaged datagram
-                self._receivers[one.flow].take(one.number)
+        for packet in leaving:
+            if packet.bit < 0:  # a receiver rejects a damaged datagram
+                self._receivers[packet.flow].take(packet.number)
 
 
 def _loaded(network: Source | ReadTable) -> Scenario:

@@ -313,10 +313,10 @@ def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
     link_load.require_slots(loaded := load(scenario))
     with _folder(runs) as (folder, temporary):
         ending, view = simulated_run.simulate_run(loaded, folder), temporary is None
-        made = Run(ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary)
+        simulated = Run(ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary)
     if temporary is None:
-        made.summary  # noqa: B018  # writes it into the run directory
-    return made
+        simulated.summary  # noqa: B018  # writes it into the run directory
+    return simulated
 
 
 def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False) -> Run:
@@ -397,10 +397,11 @@ def compare(*runs: Run | Folder) -> "run_comparison.RunComparison":
         NoackError: there are fewer than two or more than seven runs, or their plants have different
             numbers of states.
     """
-    for one in runs:
-        if isinstance(one, Run):
-            one.summary  # noqa: B018  # a temporary run computes it at the first access
-    return run_comparison.compare_runs([one.directory if isinstance(one, Run) else Path(one) for one in runs])
+    for source in runs:
+        if isinstance(source, Run):
+            source.summary  # noqa: B018  # a temporary run computes it at the first access
+    directories = [source.directory if isinstance(source, Run) else Path(source) for source in runs]
+    return run_comparison.compare_runs(directories)
 
 
 @contextmanager

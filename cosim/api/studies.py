@@ -20,8 +20,8 @@ from cosim.api.runs import Run
 from cosim.api.scenarios import Source, load
 from cosim.lazy_modules import lazy_modules
 from cosim.measurement.measurement_outputs import write_network
+from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions
 from cosim.measurement.network_measurement import Measurement as NetworkMeasurement
-from cosim.measurement.network_measurement import MeasurementOptions
 from cosim.measurement.trace_sources import read_source
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError
@@ -57,10 +57,10 @@ def certify(scenario: Source, *, weight: str = "given", late: int | None = None)
     """Return the certificates of a scenario, with their constants and conditions.
 
     >>> import noack
-    >>> found = noack.certify("lane_following")
-    >>> found.schedule.constants is None  # there is one
+    >>> certificates = noack.certify("lane_following")
+    >>> certificates.schedule.constants is None  # there is one
     False
-    >>> print(f"no two events closer than {1e3 * found.schedule.inter_event_s:.0f} ms")
+    >>> print(f"no two events closer than {1e3 * certificates.schedule.inter_event_s:.0f} ms")
     no two events closer than 10 ms
 
     If the plant is not linear, the model is certified as the plant, and ``nonlinear`` says so.
@@ -123,8 +123,8 @@ def cost(
     """Return the mean cost ∫ xᵀQx + uᵀRu dt, and the rms of all states, under random losses.
 
     >>> import noack
-    >>> found = noack.cost("lane_periodic")
-    >>> round(found.with_guarantee.growth, 6)  # below 1: stable in mean square
+    >>> mean_cost = noack.cost("lane_periodic")
+    >>> round(mean_cost.with_guarantee.growth, 6)  # below 1: stable in mean square
     0.862511
 
     Args:
@@ -138,8 +138,8 @@ def cost(
             setting.
     """
     resolved = resolve(load(scenario))
-    given = (None if one is None else np.array(one, np.float64) for one in (Q, R))
-    return find_mean_cost(resolved, *given)
+    weights = (None if weight is None else np.array(weight, np.float64) for weight in (Q, R))
+    return find_mean_cost(resolved, *weights)
 
 
 class Measurement(NetworkMeasurement):
@@ -171,8 +171,8 @@ def measure(
     """Measure a network from a packet trace, as ``noack measure`` does.
 
     >>> import noack
-    >>> found = noack.measure("rural_n8_10kmh", deadline_s=0.1)
-    >>> found.longest_loss_burst >= 1
+    >>> network = noack.measure("rural_n8_10kmh", deadline_s=0.1)
+    >>> network.longest_loss_burst >= 1
     True
 
     Args:
@@ -185,10 +185,10 @@ def measure(
         NoackError: a file cannot be read, or is not a trace.
     """
     trace = read_source([find_trace(str(source)) for source in sources])
-    options = MeasurementOptions(deadline_s=deadline_s, outage_s=outage_s)
-    if shares is not None:
-        options = MeasurementOptions(deadline_s, tuple(shares), outage_s=outage_s)
-    return Measurement(trace, options, " ".join(str(Path(one)) for one in sources), trace.notes)
+    quantiles = QUANTILES if shares is None else tuple(shares)
+    options = MeasurementOptions(deadline_s, quantiles, outage_s=outage_s)
+    name = " ".join(str(Path(source)) for source in sources)
+    return Measurement(trace, options, name, trace.notes)
 
 
 class CampaignResult:
@@ -223,9 +223,9 @@ class CampaignResult:
             ``largest``; the number of ``draws``, and how many of them are ``finite``.
         """
         rows = [
-            {**found.point.labels, "metric": str(metric), **one._asdict()}
-            for found in self._finished.summary.results
-            for metric, one in found.estimates.items()
+            {**result.point.labels, "metric": str(metric), **estimate._asdict()}
+            for result in self._finished.summary.results
+            for metric, estimate in result.estimates.items()
         ]
         return _table(rows)
 
@@ -238,14 +238,14 @@ class CampaignResult:
         """
         rows = [
             {
-                **one.point.labels,
+                **compared.point.labels,
                 "metric": str(metric),
-                **found.estimate._asdict(),
-                "larger": found.larger,
-                "smaller": found.smaller,
+                **difference.estimate._asdict(),
+                "larger": difference.larger,
+                "smaller": difference.smaller,
             }
-            for one in self._finished.summary.compared
-            for metric, found in one.differences.items()
+            for compared in self._finished.summary.compared
+            for metric, difference in compared.differences.items()
         ]
         return _table(rows)
 
@@ -258,10 +258,10 @@ class CampaignResult:
         Raises:
             NoackError: there is no such grid point.
         """
-        wanted = {name: campaign_file.label_of(value) for name, value in axes.items()}  # type: ignore[arg-type]
-        points = [one.point for one in self._finished.summary.results]
+        labels = {name: campaign_file.label_of(value) for name, value in axes.items()}  # type: ignore[arg-type]
+        points = [result.point for result in self._finished.summary.results]
         for point in points:
-            if dict(point.labels) == wanted:
+            if dict(point.labels) == labels:
                 metrics, _ = campaign_summary.runs_at(point, self._finished.store)
                 # importing pyarrow takes 0.1 s
                 import pyarrow as pa
@@ -282,10 +282,10 @@ class CampaignResult:
             NoackError: the campaign has no such figure.
         """
         known = []
-        for described in campaign_figures.figures(self._finished.summary, self._finished.store):
-            if figure in (None, described.name):
-                return figure_drawing.draw(described)
-            known.append(described.name)
+        for description in campaign_figures.figures(self._finished.summary, self._finished.store):
+            if figure in (None, description.name):
+                return figure_drawing.draw(description)
+            known.append(description.name)
         named = f'"{figure}": no such figure' if figure else "no figure"
         raise CallerError(f"{named} in this campaign; it has {', '.join(known) or 'none'}")
 
@@ -315,7 +315,7 @@ def campaign(
     """Run a scenario over a grid of settings, with many random draws at each point.
 
     >>> import noack
-    >>> found = noack.campaign(
+    >>> result = noack.campaign(
     ...     {
     ...         "name": "losses",
     ...         "scenario": "double_integrator",
@@ -325,9 +325,9 @@ def campaign(
     ...     },
     ...     workers=1,
     ... )
-    >>> found.estimates().column_names[:3]
+    >>> result.estimates().column_names[:3]
     ['loss', 'metric', 'draws']
-    >>> found.breaches
+    >>> result.breaches
     0
 
     Args:
@@ -352,9 +352,9 @@ def campaign(
     temporary = None if folder is not None else Path(tempfile.mkdtemp(prefix="noack-"))
     start = partial(campaign_workers.local, workers or cores())
     try:
-        bar, where = _runs_bar() if progress else None, Path(folder or temporary or "")
+        bar, runs_folder = _runs_bar() if progress else None, Path(folder or temporary or "")
         finished = campaign_report.finish_campaign(
-            plan, path, where, start, draws=draws, show=lambda text: nullcontext(), bar=bar
+            plan, path, runs_folder, start, draws=draws, show=lambda text: nullcontext(), bar=bar
         )
     except BaseException:
         if temporary is not None:

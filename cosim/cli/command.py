@@ -62,19 +62,19 @@ class Program(TyperGroup):
         """
         if self._words and not self._words[0].startswith("-"):
             return []
-        found = super().get_params(ctx)
-        for parameter in found:
+        parameters = super().get_params(ctx)
+        for parameter in parameters:
             if isinstance(parameter, TyperOption) and parameter.name in _COMPLETION:
                 parameter.hidden = True
-        return found
+        return parameters
 
     def format_commands(self, ctx: "Context", formatter: "HelpFormatter") -> None:
         """Write the commands, a section for each panel."""
         by_panel = groupby(self.commands.values(), lambda command: getattr(command, "rich_help_panel", ""))
-        for panel, some in by_panel:
+        for panel, group in by_panel:
             with formatter.section(panel):
                 formatter.write_dl(
-                    [(command.name or "", command.get_short_help_str(200)) for command in some]
+                    [(command.name or "", command.get_short_help_str(200)) for command in group]
                 )
 
     def main(
@@ -203,7 +203,7 @@ PANELS = (RUNS, THEORY, CAMPAIGNS, MEASURING, FILES, PROCESSES)
 """The panels of the help, in order."""
 
 P = ParamSpec("P")
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 _order: dict[object, tuple[int, int]] = {}
 """By command function: panel, and place in the panel."""
 durations: dict[str, str] = {}
@@ -214,11 +214,11 @@ def _columns(rows: Iterable[tuple[str, str]]) -> list[str]:
     """Return commands and their descriptions as lines, at most 78 columns wide."""
     rows = list(rows)
     width = max(len(command) for command, _ in rows)
-    wide = width + max(len(what) for _, what in rows) + len("     ") > _MOST_COLUMNS
+    wide = width + max(len(description) for _, description in rows) + len("     ") > _MOST_COLUMNS
     lines: list[str] = []
-    for command, what in rows:
+    for command, description in rows:
         gap = f"\n{'':6}" if wide else " " * (width - len(command) + 3)
-        lines.append(f"  {command}{gap if what else ''}{what}")
+        lines.append(f"  {command}{gap if description else ''}{description}")
     return lines
 
 
@@ -260,7 +260,7 @@ def options(
 
 
 def command(
-    panel: str, place: int, *, takes: str = "", on_linux: bool = False, **settings: Any
+    panel: str, position: int, *, takes: str = "", on_linux: bool = False, **settings: Any
 ) -> Callable[[Callable[..., int | None]], Callable[..., None]]:
     """Register a command. Its result is the exit status; an error or Ctrl-C is printed as one line.
 
@@ -270,7 +270,7 @@ def command(
 
     Args:
         panel: panel of the help, one of :data:`PANELS`.
-        place: sort key within the panel, ascending.
+        position: sort key within the panel, ascending.
         takes: how long it takes, for its help and the manual, unless it is instant.
         on_linux: Linux only: elsewhere an error.
         settings: keyword arguments of :meth:`typer.Typer.command`.
@@ -282,60 +282,69 @@ def command(
         parameters, groups = _parameters(function)
 
         @wraps(function)
-        def reported(**given: Any) -> None:
-            as_json = bool(given.get("json"))
+        def reported(**arguments: Any) -> None:
+            as_json = bool(arguments.get("json"))
             for name, group in groups.items():
-                given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
-            try:
-                with stop_requests_raised():
-                    if on_linux:
-                        core_library.require_live_runs()
-                    status = function(**given) or ExitStatus.OK
-                if sys.stdout is not None:  # closed by the shell: >&-
-                    sys.stdout.flush()
-            except KeyboardInterrupt as error:
-                stop = error if isinstance(error, StopRequestError) else StopRequestError()
-                what = "; ".join([str(stop), *getattr(error, "__notes__", ())])
-                status = failed(what, stop.exit_status, who=NAME, as_json=as_json)
-            except NoackError as error:
-                status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
-            except Exception as error:
-                if (line := exhausted_limit(error) or _why_not_written(error)) is None:
-                    raise
-                status = failed(line, ExitStatus.FAILED, who=NAME, as_json=as_json)
-            raise typer.Exit(int(status))
+                arguments[name] = group(**{field.name: arguments.pop(field.name) for field in fields(group)})
+
+            def call() -> int | None:
+                if on_linux:
+                    core_library.require_live_runs()
+                return function(**arguments)
+
+            raise typer.Exit(_status_of(call, as_json=as_json))
 
         reported.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         reported.__annotations__ = {option.name: option.annotation for option in parameters}
-        _order[reported] = PANELS.index(panel), place
+        _order[reported] = PANELS.index(panel), position
         if takes:
             durations[settings.get("name", function.__name__)] = takes
-        shown = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
+        epilog = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
         registered: Callable[..., None] = app.command(
-            rich_help_panel=panel, epilog=shown, help=text, **settings
+            rich_help_panel=panel, epilog=epilog, help=text, **settings
         )(reported)
         return registered
 
     return register
 
 
+def _status_of(call: Callable[[], int | None], *, as_json: bool) -> int:
+    """Return the exit status of a command; print an error or Ctrl-C as one line."""
+    try:
+        with stop_requests_raised():
+            status = call() or ExitStatus.OK
+        if sys.stdout is not None:  # closed by the shell: >&-
+            sys.stdout.flush()
+        return int(status)
+    except KeyboardInterrupt as error:
+        stop = error if isinstance(error, StopRequestError) else StopRequestError()
+        line, status = "; ".join([str(stop), *getattr(error, "__notes__", ())]), stop.exit_status
+    except NoackError as error:
+        line, status = str(error), error.exit_status
+    except Exception as error:
+        reason = exhausted_limit(error) or _why_not_written(error)
+        if reason is None:
+            raise
+        line, status = reason, ExitStatus.FAILED
+    return int(failed(line, status, who=NAME, as_json=as_json))
+
+
 def _describe_options(described: Any) -> tuple[str, list[tuple[str, str]]]:
     """Give options the help of the docstring; return the text before it, and the examples."""
     text, *sections = _SECTION.split(inspect.cleandoc(described.__doc__ or ""))
-    parts = dict(zip(sections[::2], sections[1::2], strict=True))
-    for name, words in _ARGUMENT.findall(parts.get("Options", "")):
-        of = described.__annotations__[name]
-        metadata = getattr(of, "__metadata__", ())
+    section = dict(zip(sections[::2], sections[1::2], strict=True))
+    for name, words in _ARGUMENT.findall(section.get("Options", "")):
+        annotation = described.__annotations__[name]
+        metadata = getattr(annotation, "__metadata__", ())
         option = copy(metadata[0]) if metadata else Option()
         option.help = " ".join(words.split())
-        described.__annotations__[name] = Annotated[of.__origin__ if metadata else of, option]
-    lines = (line.strip().partition("   ") for line in parts.get("Examples", "").splitlines())
-    return text, [(example, what) for example, _, what in lines]
+        option_type = annotation.__origin__ if metadata else annotation
+        described.__annotations__[name] = Annotated[option_type, option]
+    lines = (line.strip().partition("   ") for line in section.get("Examples", "").splitlines())
+    return text, [(example, description) for example, _, description in lines]
 
 
-def _parameters(
-    function: Callable[..., int | None],
-) -> tuple[list[inspect.Parameter], dict[str, type[Any]]]:
+def _parameters(function: Callable[..., int | None]) -> tuple[list[inspect.Parameter], dict[str, type[Any]]]:
     """Return the options of a command, and the dataclasses that group them, by parameter."""
     parameters, groups = [], {}
     for parameter in inspect.signature(function).parameters.values():
@@ -358,13 +367,13 @@ def _why_not_written(error: Exception) -> str | None:
     if not isinstance(error, OSError):
         return None
     try:
-        here = Path.cwd().is_dir()
+        folder_exists = Path.cwd().is_dir()
     except OSError:
-        here = False
-    return f"cannot write: {why(error)}" if here else "the current folder was deleted"
+        folder_exists = False
+    return f"cannot write: {why(error)}" if folder_exists else "the current folder was deleted"
 
 
-def register_commands(wanted: str = "") -> None:
+def register_commands(name: str = "") -> None:
     """Import the module that declares a command; otherwise import all, sorted for the help.
 
     It is found by its source, since importing all of them takes 0.05 s.
@@ -372,9 +381,9 @@ def register_commands(wanted: str = "") -> None:
     folder = Path(commands.__path__[0])
     modules = [module.name for module in pkgutil.iter_modules([str(folder)])]
     texts = {module: (folder / f"{module}.py").read_text("utf-8") for module in modules}
-    declarations = f"\ndef {wanted}(", f'\n_join("{wanted}",'
-    own = [module for module in modules if any(line in texts[module] for line in declarations)]
-    for module in own or modules:
+    declarations = f"\ndef {name}(", f'\n_join("{name}",'
+    declaring = [module for module in modules if any(line in texts[module] for line in declarations)]
+    for module in declaring or modules:
         import_module(f"{commands.__name__}.{module}")
     app.registered_commands.sort(key=lambda command: _order[command.callback])
 
@@ -387,9 +396,9 @@ def console() -> "Console":
     return Console()
 
 
-def status(what: str) -> "AbstractContextManager[Status]":
+def status(activity: str) -> "AbstractContextManager[Status]":
     """Show within the context what a command is doing, on a terminal only."""
-    return progress.error_console().status(what)
+    return progress.error_console().status(activity)
 
 
 def write_tables(tables: "Iterable[result_tables.ResultTable]", folder: Path | None, *, json: bool) -> None:
@@ -404,12 +413,12 @@ def show_with_files(
     json: bool,
     document: dict[str, object],
     files: Iterable[Path],
-    show_text: "Callable[[Console, Found], object]",
-    found: Found,
+    show_text: "Callable[[Console, Result], object]",
+    result: Result,
 ) -> None:
     """Print a result as :func:`show` does, with the paths of the files that were written."""
     names = [str(file) for file in files]
-    show(json, lambda: document | {"files": names}, show_text, found)
+    show(json, lambda: document | {"files": names}, show_text, result)
     if not json:
         print(*names, sep="\n")
 
@@ -426,14 +435,14 @@ def show(
     json: bool,
     document: Callable[[], object],
     show_text: "Callable[Concatenate[Console, P], object]",
-    *found: P.args,
-    **how: P.kwargs,
+    *arguments: P.args,
+    **keywords: P.kwargs,
 ) -> None:
-    """Print a result: the document of ``--json``, or ``show_text(console, *found, **how)``."""
+    """Print a result: the document of ``--json``, or ``show_text(console, *arguments, **keywords)``."""
     if json:
         print_json(document())
     else:
-        show_text(console(), *found, **how)
+        show_text(console(), *arguments, **keywords)
 
 
 def print_json(document: object) -> None:

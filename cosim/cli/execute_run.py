@@ -55,12 +55,12 @@ class OutputOptions:
     json: opt.JsonOption = False
 
 
-def _log_format(context: typer.Context, wanted: LogFormat) -> LogFormat:
+def _log_format(context: typer.Context, chosen: LogFormat) -> LogFormat:
     """Write standard error in this format until the command ends."""
     stack = ExitStack()
-    stack.enter_context(log_format(wanted))
+    stack.enter_context(log_format(chosen))
     context.find_root().call_on_close(stack.close)
-    return wanted
+    return chosen
 
 
 @opt.option_group
@@ -139,13 +139,13 @@ def run_processes(
 
 
 @contextmanager
-def _served_metrics(loaded: "scenario.Scenario", where: str) -> "Iterator[run_watcher.Watcher]":
+def _served_metrics(loaded: "scenario.Scenario", requested_address: str) -> "Iterator[run_watcher.Watcher]":
     """Serve the metrics of a run within the context; yield what updates them."""
     metrics_server.require_package()
-    found = run_metrics.RunMetrics(loaded)
-    with metrics_server.metrics_server(where, found.collect) as at:
-        print_to_stderr(f"noack: metrics: http://{address.address_text(at)}/metrics")
-        yield found.watcher()
+    metrics = run_metrics.RunMetrics(loaded)
+    with metrics_server.metrics_server(requested_address, metrics.collect) as bound:
+        print_to_stderr(f"noack: metrics: http://{address.address_text(bound)}/metrics")
+        yield metrics.watcher()
 
 
 def warn_of_violations(loaded: "scenario.Scenario") -> None:
@@ -157,21 +157,23 @@ def warn_of_violations(loaded: "scenario.Scenario") -> None:
     for line in link_load.load_warnings(link_load.link_loads(loaded), loaded) if shares else ():
         print(f"noack: warning: {line}", file=sys.stderr)
     for section in scenario.loop_sections(loaded):
-        whose = f"{section.name}: " if shares else ""
+        prefix = f"{section.name}: " if shares else ""
         resolved = resolution.resolve(scenario.loop_scenario(loaded, section))
-        for found in assumptions.assumptions(resolved):
-            is_violated = found.verdict == assumptions.AssumptionStatus.VIOLATED
-            if is_violated and found.source == "Theorem 2":
-                print(f"noack: warning: {whose}violated: {found.what}: {found.why}", file=sys.stderr)
+        for assumption in assumptions.assumptions(resolved):
+            is_violated = assumption.verdict == assumptions.AssumptionStatus.VIOLATED
+            if is_violated and assumption.source == "Theorem 2":
+                print(
+                    f"noack: warning: {prefix}violated: {assumption.what}: {assumption.why}", file=sys.stderr
+                )
 
 
 def warn_of_other_runs() -> None:
     """Print on standard error which runs are active: each may make the others late."""
     try:
-        others = run_registry.active_runs()
+        other_runs = run_registry.active_runs()
     except PeerError:  # a damaged file of another run must not prevent this one
         return
-    for run in others:
+    for run in other_runs:
         print(
             f"noack: warning: {run.run_dir} is active, too: runs at the same time share the cores "
             "and may miss deadlines",
@@ -212,11 +214,11 @@ def worker_pool(workers: int | None, scheduler: str | None = None) -> StartWorke
     if scheduler is not None:
         if workers is not None:
             raise CallerError("--workers: with --scheduler the cluster's workers are used")
-        return lambda say: campaign_workers.cluster(scheduler, say)
+        return lambda print_line: campaign_workers.cluster(scheduler, print_line)
     number = workers or cli.cores()
-    if number > (most := _PER_CORE * cli.cores()):
-        raise CallerError(f"--workers {number}: on this machine at most {most}")
-    return lambda say: campaign_workers.local(number)
+    if number > (limit := _PER_CORE * cli.cores()):
+        raise CallerError(f"--workers {number}: on this machine at most {limit}")
+    return lambda print_line: campaign_workers.local(number)
 
 
 def execute_campaign(
@@ -240,14 +242,14 @@ def execute_campaign(
     """
     console = progress.error_console()
 
-    def say(line: str) -> None:
+    def print_line(line: str) -> None:
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
     return campaign_report.finish_campaign(
         plan,
         path,
         folder,
-        lambda: start(say),
+        lambda: start(print_line),
         draws=draws,
         figure_files=figure_files,
         show=console.status,

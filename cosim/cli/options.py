@@ -50,8 +50,8 @@ def complete_papers(incomplete: str) -> list[str]:
 
 def complete_runs(incomplete: str) -> list[str]:
     """Return matching run directories below ``runs``, the newest first."""
-    found = [path.parent for path in DEFAULT_RUNS.glob(f"*/{SCENARIO_FILE}")]
-    by_name = sorted(found, key=lambda path: (path.name == LATEST, path.name), reverse=True)
+    directories = [path.parent for path in DEFAULT_RUNS.glob(f"*/{SCENARIO_FILE}")]
+    by_name = sorted(directories, key=lambda path: (path.name == LATEST, path.name), reverse=True)
     return _matching(incomplete, [str(path) for path in by_name])
 
 
@@ -131,10 +131,10 @@ WidthOption = Annotated[
 def _usable_folder(folder: Path | None) -> Path | None:
     """Refuse a folder in which nothing can be written, before anything is computed."""
     if folder is not None:
-        place = next(one for one in (folder, *folder.absolute().parents) if one.exists())
-        if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
-            reason = "may not be written to" if place.is_dir() else "is not a folder"
-            raise typer.BadParameter(f"{place} {reason}")
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
+            reason = "may not be written to" if existing.is_dir() else "is not a folder"
+            raise typer.BadParameter(f"{existing} {reason}")
     return folder
 
 
@@ -244,9 +244,9 @@ class CostOptions:
     Q: Annotated[str | None, Option("--Q")] = None
     R: Annotated[str | None, Option("--R")] = None
 
-    def matrices(self, given: "Scenario") -> "tuple[Matrix, Matrix]":
+    def matrices(self, loaded: "Scenario") -> "tuple[Matrix, Matrix]":
         """Return Q and R; raise CallerError if one is wrong."""
-        n, m = given.model.dimensions
+        n, m = loaded.model.dimensions
         return weight_matrix("--Q", self.Q, n), weight_matrix("--R", self.R, m)
 
 

@@ -74,24 +74,22 @@ Outcome = tuple[FindingStatus, *tuple[str, ...]]
 _checks: list[Callable[[MachineFacts, RunRequirements], Iterator[MachineFinding]]] = []
 
 
-def _check(
-    what: str,
-) -> Callable[[Callable[[MachineFacts, RunRequirements], Iterator[Outcome]]], None]:
-    """Register a check of ``what``; {} in it is the scenario's name."""
+def _check(title: str) -> Callable[[Callable[[MachineFacts, RunRequirements], Iterator[Outcome]]], None]:
+    """Register a check with this title; {} in it is the scenario's name."""
 
     def register(check: Callable[[MachineFacts, RunRequirements], Iterator[Outcome]]) -> None:
         _checks.append(
-            lambda machine, wanted: (
-                MachineFinding(what.format(wanted.name), *outcome) for outcome in check(machine, wanted)
+            lambda machine, required: (
+                MachineFinding(title.format(required.name), *outcome) for outcome in check(machine, required)
             )
         )
 
     return register
 
 
-def judge(machine: MachineFacts, wanted: RunRequirements) -> list[MachineFinding]:
+def judge(machine: MachineFacts, required: RunRequirements) -> list[MachineFinding]:
     """Return the findings for a scenario's runs on this machine."""
-    return [finding for check in _checks for finding in check(machine, wanted)]
+    return [finding for check in _checks for finding in check(machine, required)]
 
 
 def worst(findings: Sequence[MachineFinding]) -> FindingStatus:
@@ -102,27 +100,27 @@ def worst(findings: Sequence[MachineFinding]) -> FindingStatus:
 
 @_check("cores")
 def _cores(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
-    known = [f"{machine.cores} of {machine.cores_online} usable"]
+    facts = [f"{machine.cores} of {machine.cores_online} usable"]
     if machine.load is not None:
-        known.append(f"load {machine.load:.1f}")
+        facts.append(f"load {machine.load:.1f}")
     if machine.governor is not None:
-        known.append(f"governor {machine.governor}")
-    found = ", ".join(known)
+        facts.append(f"governor {machine.governor}")
+    text = ", ".join(facts)
     if machine.cores < 2:
         means = f"the {LOOP_PROCESSES} processes of a run compete for one core"
-        yield LIMITED, found, means, "use two cores or more"
+        yield LIMITED, text, means, "use two cores or more"
     elif machine.load is not None and machine.load > machine.cores:
         means = "other programs use the cores: the measurements below are of a busy machine"
-        yield LIMITED, found, means, "measure again when it is idle"
+        yield LIMITED, text, means, "measure again when it is idle"
     elif machine.governor == "powersave":
         remedy = "`sudo cpupower frequency-set --governor performance`"
-        yield LIMITED, found, "cores run slowly after waking up", remedy
+        yield LIMITED, text, "cores run slowly after waking up", remedy
     else:
-        yield GOOD, found
+        yield GOOD, text
 
 
 @_check("real-time settings")
-def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
+def _settings(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
     applied = [name for key, name in _SETTINGS.items() if machine.granted.get(key) == "applied"]
     if applied:
         yield GOOD, f"applied: {', '.join(applied)}"
@@ -130,8 +128,8 @@ def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcom
         answer = machine.granted.get(key, "not known")
         if not answer.startswith("not permitted"):
             continue
-        verdict, means = GOOD, f"{wanted.name} does not use it"
-        if wanted.realtime:
+        verdict, means = GOOD, f"{required.name} does not use it"
+        if required.realtime:
             verdict, means = LIMITED, "runs work without it, and report it"
         yield verdict, f"{name}: {answer}", means, _REMEDIES.get(key, "")
 
@@ -139,44 +137,44 @@ def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcom
 @_check("timers")
 def _timer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     slack = machine.timer_slack_ns
-    found = f"resolution {duration(machine.timer_resolution_ns * 1e-9)}"
+    text = f"resolution {duration(machine.timer_resolution_ns * 1e-9)}"
     if slack is not None:
-        found += f", default slack {duration(slack * 1e-9)}"
+        text += f", default slack {duration(slack * 1e-9)}"
     if machine.timer_resolution_ns >= _SLOW_TIMER_NS:
-        yield LIMITED, found, "shorter steps cannot be distinguished", "lower plant.rate_hz"
+        yield LIMITED, text, "shorter steps cannot be distinguished", "lower plant.rate_hz"
     else:
-        yield GOOD, found
+        yield GOOD, text
 
 
 @_check("wake-ups without real-time settings")
-def _plain_wake_ups(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
-    yield _wake_ups(machine.plain, wanted, in_force=not wanted.realtime)
+def _plain_wake_ups(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
+    yield _wake_ups(machine.plain, required, in_force=not required.realtime)
 
 
 @_check("wake-ups with the real-time settings applied")
-def _realtime_wake_ups(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
-    yield _wake_ups(machine.realtime, wanted, in_force=wanted.realtime)
+def _realtime_wake_ups(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
+    yield _wake_ups(machine.realtime, required, in_force=required.realtime)
 
 
-def _wake_ups(found: Lateness | str, wanted: RunRequirements, *, in_force: bool) -> Outcome:
+def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, in_force: bool) -> Outcome:
     """Compare the lateness of an idle loop with the lateness that the certificates allow."""
-    if isinstance(found, str):
-        return LIMITED, found, "the lateness of a run cannot be predicted"
+    if isinstance(lateness, str):
+        return LIMITED, lateness, "the lateness of a run cannot be predicted"
     late = (
-        f"late by {found.p50_us:.3g} µs (median), {duration(found.p99_us * 1e-6)} (p99), "
-        f"{duration(found.max_us * 1e-6)} (max) over {found.wakes:,} wake-ups at "
-        f"{wanted.rate_hz:g} Hz"
+        f"late by {lateness.p50_us:.3g} µs (median), {duration(lateness.p99_us * 1e-6)} (p99), "
+        f"{duration(lateness.max_us * 1e-6)} (max) over {lateness.wakes:,} wake-ups at "
+        f"{required.rate_hz:g} Hz"
     )
-    allowed = f"the {duration(wanted.allowance_ns * 1e-9)} that {wanted.name}'s certificates allow"
-    if not found.beyond:
-        near = found.max_us * 1e3 > wanted.allowance_ns / 2
+    allowed = f"the {duration(required.allowance_ns * 1e-9)} that {required.name}'s certificates allow"
+    if not lateness.beyond:
+        near = lateness.max_us * 1e3 > required.allowance_ns / 2
         means = f"all within {allowed}" + (", some above half of it" if near else "")
         return GOOD, late, f"{means}; a longer run may exceed the maximum"
-    share = 100 * found.beyond / found.wakes
-    first_s = found.wakes / found.beyond / wanted.rate_hz
+    share = 100 * lateness.beyond / lateness.wakes
+    first_s = lateness.wakes / lateness.beyond / required.rate_hz
     means = (
-        f"{found.beyond:,} of them ({share:.2g} %) beyond {allowed}: about one every "
-        f"{first_s:.2g} s of a run of {wanted.duration_s:g} s; the first makes its claims void"
+        f"{lateness.beyond:,} of them ({share:.2g} %) beyond {allowed}: about one every "
+        f"{first_s:.2g} s of a run of {required.duration_s:g} s; the first makes its claims void"
     )
     if not in_force:
         return GOOD, late, f"{means}. Runs use real-time settings"
@@ -186,70 +184,68 @@ def _wake_ups(found: Lateness | str, wanted: RunRequirements, *, in_force: bool)
 
 @_check("UDP on the loopback")
 def _loopback(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
-    if isinstance(found := machine.round_trips, str):
+    if isinstance(trips := machine.round_trips, str):
         means = "the processes of a run cannot communicate"
         remedy = "`sudo ip link set lo up`; check the firewall's rules for 127.0.0.1"
-        yield BAD, found, means, remedy
+        yield BAD, trips, means, remedy
         return
-    p50, p99 = duration(found.p50_us * 1e-6), duration(found.p99_us * 1e-6)
+    p50, p99 = duration(trips.p50_us * 1e-6), duration(trips.p99_us * 1e-6)
     text = f"round trip {p50} (median), {p99} (p99)"
-    if found.lost:
+    if trips.lost:
         means = "unintended losses break the bound on consecutive losses"
-        lost = f"{text}; {found.lost} of {found.sent} lost"
+        lost = f"{text}; {trips.lost} of {trips.sent} lost"
         yield LIMITED, lost, means, "check the firewall and `tc qdisc show`"
     else:
         yield GOOD, text
 
 
 @_check("receive buffer")
-def _buffer(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
-    if isinstance(found := machine.buffer, str):
-        yield BAD, found, "no process of a run can receive"
+def _buffer(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
+    if isinstance(buffer := machine.buffer, str):
+        yield BAD, buffer, "no process of a run can receive"
         return
-    text = f"{found.datagrams:,} datagrams ({found.granted_bytes // 1024:,} KiB)"
-    if found.most_bytes is not None:
-        text += f"; net.core.rmem_max is {found.most_bytes:,} bytes"
-    stall_s = found.datagrams / wanted.rate_hz
+    text = f"{buffer.datagrams:,} datagrams ({buffer.granted_bytes // 1024:,} KiB)"
+    if buffer.most_bytes is not None:
+        text += f"; net.core.rmem_max is {buffer.most_bytes:,} bytes"
+    stall_s = buffer.datagrams / required.rate_hz
     means = f"the receive buffer covers a {stall_s:.2g} s stall before packets are lost"
-    if found.datagrams >= PLENTY_OF_DATAGRAMS:
+    if buffer.datagrams >= PLENTY_OF_DATAGRAMS:
         yield GOOD, text, means
     else:
         yield LIMITED, text, means, "`sudo sysctl net.core.rmem_max=4194304`"
 
 
 @_check("ports of {}")
-def _ports(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
+def _ports(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
     remedy = "stop the program that uses the port, or `--set ports={}`"
     for line in machine.ports_taken:
-        yield BAD, line, f"{wanted.name} cannot run on its configured ports", remedy
+        yield BAD, line, f"{required.name} cannot run on its configured ports", remedy
     if not machine.ports_taken:
-        numbers = ", ".join(str(port) for port in wanted.ports.values())
+        numbers = ", ".join(str(port) for port in required.ports.values())
         yield GOOD, f"{numbers} free" if numbers else "any free port"
 
 
 @_check("control plane")
 def _control(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
-    if isinstance(found := machine.control, str):
+    if isinstance(query_s := machine.control, str):
         means = "the processes of a run cannot join it"
         remedy = "set XDG_RUNTIME_DIR to a folder of yours that is closed to others"
-        yield BAD, found, means, remedy
+        yield BAD, query_s, means, remedy
         return
-    yield GOOD, f"zenoh over a Unix socket answers in {duration(found)}"
+    yield GOOD, f"zenoh over a Unix socket answers in {duration(query_s)}"
 
 
 @_check("disk")
-def _disk(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
+def _disk(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
     remedy = "choose another folder by --runs"
-    if isinstance(found := machine.disk, str):
-        yield BAD, found, "nothing can be recorded", remedy
+    if isinstance(disk := machine.disk, str):
+        yield BAD, disk, "nothing can be recorded", remedy
         return
-    text = (
-        f"{found.folder}: {byte_size(found.free_bytes)} free, writes {byte_size(found.write_bytes_per_s)}/s"
-    )
-    needs = f"{wanted.name} needs {byte_size(found.needed_bytes)} plus its events"
-    if found.free_bytes < found.needed_bytes:
+    text = f"{disk.folder}: {byte_size(disk.free_bytes)} free, writes {byte_size(disk.write_bytes_per_s)}/s"
+    needs = f"{required.name} needs {byte_size(disk.needed_bytes)} plus its events"
+    if disk.free_bytes < disk.needed_bytes:
         yield BAD, text, needs, f"{remedy}, or shorten horizon_s"
-    elif found.write_bytes_per_s < LEAST_WRITE_BYTES_PER_S:
+    elif disk.write_bytes_per_s < LEAST_WRITE_BYTES_PER_S:
         yield LIMITED, text, f"{needs}; ending a run takes long", remedy
     else:
         yield GOOD, text, needs
@@ -281,38 +277,38 @@ def _viewer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
 @_checks.append
 def _extras(machine: MachineFacts, _: RunRequirements) -> Iterator[MachineFinding]:
     for name, installed in machine.extras.items():
-        what, (_module, use) = f"extra: {name}", EXTRAS[name]
+        title, (_module, use) = f"extra: {name}", EXTRAS[name]
         if installed:
-            yield MachineFinding(what, GOOD, f"installed, for {use}")
+            yield MachineFinding(title, GOOD, f"installed, for {use}")
         else:
             remedy = f"`pip install 'noack[{name}]'`"
-            yield MachineFinding(what, LIMITED, "not installed", f"no {use}", remedy)
+            yield MachineFinding(title, LIMITED, "not installed", f"no {use}", remedy)
 
 
 @_check("versions")
 def _versions(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
-    known = [f"{name} {version}" for name, version in machine.versions.items() if version]
+    installed = [f"{name} {version}" for name, version in machine.versions.items() if version]
     missing = [name for name, version in machine.versions.items() if not version]
     means = f"{', '.join(missing)}: not installed as a package, so runs cannot record the version"
     if missing:
-        yield LIMITED, ", ".join(known), means, "`pip install noack`"
+        yield LIMITED, ", ".join(installed), means, "`pip install noack`"
     else:
-        yield GOOD, ", ".join(known)
+        yield GOOD, ", ".join(installed)
 
 
 def document(
-    machine: MachineFacts, wanted: RunRequirements, findings: Sequence[MachineFinding]
+    machine: MachineFacts, required: RunRequirements, findings: Sequence[MachineFinding]
 ) -> dict[str, object]:
     """Return ``verdict``, ``findings``, and the numbers behind them, for JSON."""
     return {
-        "scenario": asdict(wanted),
+        "scenario": asdict(required),
         "verdict": worst(findings),
         "findings": [finding._asdict() for finding in findings],
         "measured": asdict(machine),
     }
 
 
-def print_findings(console: Console, wanted: RunRequirements, findings: Sequence[MachineFinding]) -> None:
+def print_findings(console: Console, required: RunRequirements, findings: Sequence[MachineFinding]) -> None:
     """Print each finding, its meaning for a run, and a remedy."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
@@ -327,4 +323,4 @@ def print_findings(console: Console, wanted: RunRequirements, findings: Sequence
         table.add_row(Text(finding.verdict, _VERDICTS[finding.verdict][0]), Text(finding.what), text)
     console.print(table)
     colour, verdict = _VERDICTS[worst(findings)]
-    console.print(Text.assemble("this machine, for ", wanted.name, ": ", (verdict, colour)))
+    console.print(Text.assemble("this machine, for ", required.name, ": ", (verdict, colour)))

@@ -176,19 +176,19 @@ class MachineFacts:
     """Versions of Python and of the libraries that a run depends on."""
 
 
-def measure(resolved: Scenario, wanted: RunRequirements, runs: Path, duration_s: float) -> MachineFacts:
+def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_s: float) -> MachineFacts:
     """Measure this machine for a scenario.
 
     Args:
         resolved: the resolved scenario.
-        wanted: its requirements.
+        required: its requirements.
         runs: folder of the run directories; it need not exist.
         duration_s: length of each of the two measurements of wake-ups.
     """
-    plain, realtime, granted = _wake_ups(wanted, duration_s)
-    about = environment("live")
+    plain, realtime, granted = _wake_ups(required, duration_s)
+    recorded = environment("live")
     return MachineFacts(
-        cores=about["cores"],
+        cores=recorded["cores"],
         cores_online=os.cpu_count() or 1,
         load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         governor=_read(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")),
@@ -199,14 +199,14 @@ def measure(resolved: Scenario, wanted: RunRequirements, runs: Path, duration_s:
         realtime=realtime,
         round_trips=_or_why(_round_trips),
         buffer=_or_why(_buffer),
-        ports_taken=list(_ports_taken(wanted)),
+        ports_taken=list(_ports_taken(required)),
         control=_or_why(_control),
         disk=_or_why(lambda: _disk(runs, needed_bytes(resolved))),
         runtime_folder=_runtime_folder(),
         display=has_display(),
-        viewer=about["packages"].get("rerun-sdk") if is_installed() else None,
+        viewer=recorded["packages"].get("rerun-sdk") if is_installed() else None,
         extras={name: find_spec(module) is not None for name, (module, _) in EXTRAS.items()},
-        versions={"python": about["python"], **about["packages"]},
+        versions={"python": recorded["python"], **recorded["packages"]},
     )
 
 
@@ -234,25 +234,21 @@ class _WakeUps(TypedDict):
 
 
 def _wake_ups(
-    wanted: RunRequirements, duration_s: float
+    required: RunRequirements, duration_s: float
 ) -> tuple[Lateness | str, Lateness | str, dict[str, str]]:
-    command = _probe("wake", wanted.period_ns, duration_s, wanted.fifo_priority, wanted.spin_us)
+    command = _probe("wake", required.period_ns, duration_s, required.fifo_priority, required.spin_us)
     try:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=_PATIENCE_S + 10 * duration_s,
+        probe = subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=_PATIENCE_S + 10 * duration_s
         )
     except (OSError, subprocess.SubprocessError) as error:
         reason = one_line(error)
         return reason, reason, {}
-    found: _WakeUps = json.loads(done.stdout)
+    printed: _WakeUps = json.loads(probe.stdout)
     plain, realtime = (
-        lateness(late_ns, wanted.allowance_ns) for late_ns in (found["plain"], found["realtime"])
+        lateness(late_ns, required.allowance_ns) for late_ns in (printed["plain"], printed["realtime"])
     )
-    return plain, realtime, found["granted"]
+    return plain, realtime, printed["granted"]
 
 
 def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
@@ -263,6 +259,20 @@ def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
     p50, p99 = np.quantile(late, [0.5, 0.99]) / 1e3
     beyond = int((late > allowance_ns).sum())
     return Lateness(len(late), float(p50), float(p99), float(late.max()) / 1e3, beyond)
+
+
+def _round_trips_us(endpoint: socket.socket) -> list[float]:
+    """Return the times of the datagrams that come back; raise MachineError if three do not."""
+    taken_us: list[float] = []
+    for number in range(_ROUND_TRIPS):
+        begun_ns = time.perf_counter_ns()
+        with suppress(TimeoutError):
+            endpoint.send(_DATAGRAM)
+            endpoint.recv(len(_DATAGRAM) + 1)
+            taken_us.append((time.perf_counter_ns() - begun_ns) * 1e-3)
+        if number - len(taken_us) >= 2:
+            raise MachineError("datagrams on the loopback are lost")
+    return taken_us
 
 
 def _round_trips() -> RoundTrips:
@@ -277,46 +287,32 @@ def _round_trips() -> RoundTrips:
             if not port:
                 raise MachineError("a process that echoes datagrams did not start")
             endpoint.connect((LOOPBACK, port))
-            taken_us, lost = [], 0
-            for _ in range(_ROUND_TRIPS):
-                begun_ns = time.perf_counter_ns()
-                try:
-                    endpoint.send(_DATAGRAM)
-                    endpoint.recv(len(_DATAGRAM) + 1)
-                except TimeoutError:
-                    lost += 1
-                    if lost > 2:
-                        raise MachineError("datagrams on the loopback are lost") from None
-                else:
-                    taken_us.append((time.perf_counter_ns() - begun_ns) * 1e-3)
+            taken_us = _round_trips_us(endpoint)
             endpoint.send(b"")
         except BaseException:
             process.kill()
             raise
     p50, p99 = np.quantile(taken_us, [0.5, 0.99])
-    return RoundTrips(_ROUND_TRIPS, lost, float(p50), float(p99))
+    return RoundTrips(_ROUND_TRIPS, _ROUND_TRIPS - len(taken_us), float(p50), float(p99))
 
 
 def _buffer() -> Buffer:
-    with (
-        closing(bind(0, "nothing")) as endpoint,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-    ):
+    with closing(bind(0, "nothing")) as endpoint, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.connect(endpoint.getsockname())
         for _ in range(_FLOOD):
             sender.send(_DATAGRAM)
-        held = 0
+        received = 0
         with suppress(BlockingIOError):
-            while held < _FLOOD:
+            while received < _FLOOD:
                 endpoint.recv(len(_DATAGRAM) + 1)
-                held += 1
+                received += 1
         granted = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-    most = _read(Path("/proc/sys/net/core/rmem_max"))
-    return Buffer(held, granted, int(most) if most else None)
+    limit = _read(Path("/proc/sys/net/core/rmem_max"))
+    return Buffer(received, granted, int(limit) if limit else None)
 
 
-def _ports_taken(wanted: RunRequirements) -> Iterable[str]:
-    for name, port in wanted.ports.items():
+def _ports_taken(required: RunRequirements) -> Iterable[str]:
+    for name, port in required.ports.items():
         try:
             bind(port, f"ports.{name}").close()
         except CallerError as error:
@@ -329,17 +325,17 @@ def _control() -> float:
     with (
         open_session(RUNS, name, listen=True) as centre,
         centre.declare_queryable(key, lambda query: query.reply(key, "here")),
-        open_session(RUNS, name, listen=False) as other,
+        open_session(RUNS, name, listen=False) as client,
     ):
         begun_s = time.perf_counter()
-        answer = answer_to(other, key, "", _ANSWER_S)
+        answer = answer_to(client, key, "", _ANSWER_S)
         taken_s = time.perf_counter() - begun_s
     if answer is None:
         raise MachineError(f"no answer within {_ANSWER_S:g} s")
     return taken_s
 
 
-def _disk(runs: Path, needed: int) -> Disk:
+def _disk(runs: Path, required_bytes: int) -> Disk:
     folder = next(path for path in (runs, *runs.absolute().parents) if path.is_dir())
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -352,7 +348,7 @@ def _disk(runs: Path, needed: int) -> Disk:
             taken_s = time.perf_counter() - begun_s
     except OSError as error:
         raise MachineError(f"{folder}: cannot be written: {why(error)}") from None
-    return Disk(str(folder), shutil.disk_usage(folder).free, needed, _WRITE_BYTES / taken_s)
+    return Disk(str(folder), shutil.disk_usage(folder).free, required_bytes, _WRITE_BYTES / taken_s)
 
 
 def _runtime_folder() -> str | None:
@@ -367,8 +363,8 @@ def _runtime_folder() -> str | None:
 def _timer_slack_ns() -> int | None:
     if sys.platform != "linux":
         return None
-    found: int = ctypes.CDLL(None).prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
-    return found if found >= 0 else None
+    slack_ns: int = ctypes.CDLL(None).prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+    return slack_ns if slack_ns >= 0 else None
 
 
 def _read(path: Path) -> str | None:

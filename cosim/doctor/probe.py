@@ -30,12 +30,12 @@ def wake(period_ns: int, duration_s: float, priority: int, spin_us: float) -> di
     Returns:
         ``plain`` and ``realtime``: lateness in ns; ``granted``: the settings.
     """
-    found: dict[str, object] = {}
+    measured: dict[str, object] = {}
     # Timer slack and locked memory cannot be undone in a process: measure without them first.
     for name, enabled in (("plain", False), ("realtime", True)):
         with realtime(enabled, priority, place=0) as granted:
-            found |= {name: idle_lateness_ns(period_ns, duration_s, spin_us), "granted": granted}
-    return found
+            measured |= {name: idle_lateness_ns(period_ns, duration_s, spin_us), "granted": granted}
+    return measured
 
 
 def idle_lateness_ns(period_ns: int, duration_s: float, spin_us: float = 0.0) -> Sequence[int]:
@@ -96,5 +96,5 @@ if __name__ == "__main__":
         echo()
     else:
         period_ns, duration_s, priority, spin_us = sys.argv[2:]
-        found = wake(int(period_ns), float(duration_s), int(priority), float(spin_us))
-        print(json.dumps(found))
+        measured = wake(int(period_ns), float(duration_s), int(priority), float(spin_us))
+        print(json.dumps(measured))

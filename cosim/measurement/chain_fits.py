@@ -82,13 +82,13 @@ class ChainRates(NamedTuple):
         """Return ℓ → P(length ≥ ℓ) of loss bursts, or of the deliveries between them."""
         start, delivers, loses = self.matrices()
         before, during = (delivers, loses) if lost else (loses, delivers)
-        first = start @ before @ during
-        total = first.sum()
+        entry = start @ before @ during
+        total = entry.sum()
 
         def at_least(length: Reals) -> Reals:
             log_scale, power = _powers(during, np.asarray(length, float) - 1)
             with np.errstate(under="ignore"):
-                return np.asarray(np.exp(log_scale) * (first @ power).sum(axis=-1) / total)
+                return np.asarray(np.exp(log_scale) * (entry @ power).sum(axis=-1) / total)
 
         return at_least
 
@@ -184,8 +184,8 @@ def length_test(bursts: LossBursts, left_out: Flags, rates: ChainRates, paramete
     lengths = ((bursts.length[bursts.complete & ~left_out], True), (deliveries, False))
     statistic, degrees = 0.0, -parameters
     for observed, lost in lengths:
-        value, classes = _pearson(observed, rates, lost)
-        statistic, degrees = statistic + value, degrees + classes - 1
+        chi_squared, classes = _pearson(observed, rates, lost)
+        statistic, degrees = statistic + chi_squared, degrees + classes - 1
     if degrees < 1:
         return FitTest(None, max(degrees, 0), None)
     return FitTest(statistic, degrees, float(chi2.sf(statistic, degrees)))
@@ -197,8 +197,8 @@ def _pearson(observed: NDArray[np.int64], rates: ChainRates, lost: bool) -> tupl
     edges = _edges(rates, lost, count)
     tails = np.append(rates.survival(lost=lost)(edges.astype(float)), 0.0)
     expected = -np.diff(tails) * count
-    found = np.histogram(observed, np.append(edges, np.iinfo(np.int64).max))[0]
-    return float(((found - expected) ** 2 / np.maximum(expected, 1e-300)).sum()), len(edges)
+    counts = np.histogram(observed, np.append(edges, np.iinfo(np.int64).max))[0]
+    return float(((counts - expected) ** 2 / np.maximum(expected, 1e-300)).sum()), len(edges)
 
 
 def _edges(rates: ChainRates, lost: bool, count: int) -> NDArray[np.int64]:
@@ -286,8 +286,8 @@ class ChainFits:
         share = 0.0 if estimate is None else estimate.value
         rates = ChainRates(0.5, 0.5, _inside(share), _inside(share))
         delivered = self.packets - self.lost
-        value = float(xlogy(self.lost, share) + xlogy(delivered, 1 - share))
-        return ChainFit("bernoulli", rates, {"probability": estimate}, value, 1)
+        log_likelihood = float(xlogy(self.lost, share) + xlogy(delivered, 1 - share))
+        return ChainFit("bernoulli", rates, {"probability": estimate}, log_likelihood, 1)
 
     @cached_property
     def gilbert(self) -> ChainFit:
@@ -311,8 +311,8 @@ class ChainFits:
             starts += [(leave * share / (1 - share), leave, good, bad) for leave in (r / 3, r / 20)]
         inner = [np.asarray(logit(np.clip(start, [1e-7, 1e-7, 1e-5, 1e-5], 1 - 1e-5))) for start in starts]
         likeliest = sorted(inner, key=self._cost)[:_SEARCHES]
-        found = [minimise(self._cost, start, _LIMIT) for start in likeliest]
-        return min(found, key=lambda one: one.value)
+        minima = [minimise(self._cost, start, _LIMIT) for start in likeliest]
+        return min(minima, key=lambda minimum: minimum.value)
 
     def _cost(self, log_odds: Reals) -> float:
         return min(-self._likelihood(ChainRates(*expit(log_odds).tolist())), 1e300)
@@ -329,9 +329,9 @@ class ChainFits:
         if expit(best.at[2]) > expit(best.at[3]):  # the bad state is the one that loses more
             best = Minimum(best.at[[1, 0, 3, 2]], best.value)
         estimates: dict[str, Estimate | None] = {}
-        for place, name in enumerate(ChainRates._fields):
-            ends = profile_interval(self._cost, best, place, _LIMIT)
-            estimates[name] = Estimate(*map(_rounded, (best.at[place], *ends)))
+        for index, name in enumerate(ChainRates._fields):
+            ends = profile_interval(self._cost, best, index, _LIMIT)
+            estimates[name] = Estimate(*map(_rounded, (best.at[index], *ends)))
         rates = _ordered(best.at)
         return ChainFit("gilbert_elliott", rates, estimates, -best.value, 4)
 
@@ -352,7 +352,7 @@ class ChainFits:
             (4, -self._elliott.value, lambda: self.gilbert_elliott),
         )
         penalty = np.log(max(self.packets, 2))
-        return min(models, key=lambda one: one[0] * penalty - 2 * one[1])[2]()
+        return min(models, key=lambda model: model[0] * penalty - 2 * model[1])[2]()
 
 
 def _inside(probability: float) -> float:
@@ -422,16 +422,16 @@ def _geometric(lengths: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return a bound of P(longest ≥ ℓ) for each of descending lengths among those from it on."""
     total = np.cumsum(lengths[::-1])[::-1].astype(float)
     count = np.arange(len(lengths), 0, -1).astype(float)
-    rest = total - lengths - (count - 1)  # C(S − ℓ, b − 1) is 0 below 0
+    spare = total - lengths - (count - 1)  # C(S − ℓ, b − 1) is 0 below 0
     with np.errstate(invalid="ignore"):
         log = (
             np.log(count)
             + gammaln(total - lengths + 1)
-            - gammaln(rest + 1)
+            - gammaln(spare + 1)
             - gammaln(total)
             + gammaln(total - count + 1)
         )
-    return np.where(rest < 0, 0.0, np.exp(np.minimum(log, 0.0)))
+    return np.where(spare < 0, 0.0, np.exp(np.minimum(log, 0.0)))
 
 
 def _elliott(bursts: LossBursts, left_out: Flags, length: int, count: int) -> float:

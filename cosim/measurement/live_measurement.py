@@ -71,8 +71,8 @@ def is_address(source: str) -> bool:
 
 def period_ns_of(rate: str) -> int:
     """Return the period of a rate such as ``50hz`` or ``2khz``."""
-    found = _RATE.fullmatch(rate)
-    per_s = Decimal(found[1]) * (1000 if found[2] else 1) if found else Decimal(0)
+    match = _RATE.fullmatch(rate)
+    per_s = Decimal(match[1]) * (1000 if match[2] else 1) if match else Decimal(0)
     period_ns = int((NS_PER_S / per_s).to_integral_value()) if per_s else 0
     if not SHORTEST_PERIOD_NS <= period_ns <= LONGEST_PERIOD_NS:
         raise CallerError(f"--rate {rate}: expected a rate from 0.001hz to 20khz, e.g. 50hz")
@@ -106,10 +106,10 @@ def send_live(address: str, options: LiveOptions) -> ProbeResult:
         raise CallerError(f"--size {options.size_bytes}: expected {PROBE_BYTES} to {MAX_PROBE_BYTES} bytes")
     wait_ns = max(_SHORTEST_WAIT_NS, round(2 * (options.deadline_s or 0) * NS_PER_S))
     plan = ProbePlan(period_ns, planned, options.size_bytes, options.round_trip, wait_ns)
-    to = parse_destination(address, "address")
-    way = "round trip" if options.round_trip else "one way"
-    _log(f"{planned} datagrams to {address_text(to)}, one every {period_ns / 1e6:g} ms, {way}")
-    return send(to, plan, options.save, _log)
+    destination = parse_destination(address, "address")
+    direction = "round trip" if options.round_trip else "one way"
+    _log(f"{planned} datagrams to {address_text(destination)}, one every {period_ns / 1e6:g} ms, {direction}")
+    return send(destination, plan, options.save, _log)
 
 
 def _log(line: str) -> None:
@@ -133,14 +133,14 @@ def host_number() -> int:
 
 
 class ProbeSocket:
-    """A socket that listens on ``listen``, or is connected to ``to``.
+    """A socket that listens on ``listen``, or is connected to ``peer``.
 
     Raises:
         CallerError: the address cannot be used.
     """
 
-    def __init__(self, *, listen: Address | None = None, to: Address | None = None) -> None:
-        address = listen or to
+    def __init__(self, *, listen: Address | None = None, peer: Address | None = None) -> None:
+        address = listen or peer
         assert address is not None
         self.endpoint = sockets.socket(family_of(address), sockets.SOCK_DGRAM)
         try:
@@ -161,11 +161,11 @@ class ProbeSocket:
         """Number of sends that failed, as the sends or later reads reported."""
         return self._send_errors + self.arrivals.errors
 
-    def receive(self, most: int = _BATCH) -> list[Arrival]:
+    def receive(self, limit: int = _BATCH) -> list[Arrival]:
         """Return the datagrams that wait, with the kernel's times of arrival."""
-        return self.arrivals.receive(most)
+        return self.arrivals.receive(limit)
 
-    def send(self, data: bytes, to: Address | None = None) -> None:
+    def send(self, data: bytes, destination: Address | None = None) -> None:
         """Send a datagram; a failure is counted.
 
         Raises:
@@ -174,10 +174,10 @@ class ProbeSocket:
         """
         for _ in range(2):  # the first error may belong to the datagram before
             try:
-                if to is None:
+                if destination is None:
                     self.endpoint.send(data)
                 else:
-                    self.endpoint.sendto(data, to)
+                    self.endpoint.sendto(data, destination)
                 return
             except OSError as error:
                 if isinstance(error, PermissionError):
@@ -239,7 +239,7 @@ def send(address: Address, plan: ProbePlan, save: Path | None, log: Callable[[st
     Raises:
         NoackError: the address or the file cannot be used, or no process listens there.
     """
-    socket = ProbeSocket(to=address)
+    socket = ProbeSocket(peer=address)
     with socket.endpoint, ProbeRows(save, log) as rows, Signals().handled() as signals:
         sender = ProbeSender(plan, secrets.randbits(64), host_number(), time.monotonic_ns(), rows.add)
         refused = 0

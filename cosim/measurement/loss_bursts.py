@@ -97,9 +97,9 @@ class LossBursts:
         ends = np.append(self.first, self.packets)
         return np.asarray(ends - np.append(0, self.end))
 
-    def only(self, which: Flags) -> "LossBursts":
+    def only(self, chosen: Flags) -> "LossBursts":
         """Return some of the bursts."""
-        return LossBursts(self.packets, self.first[which], self.length[which])
+        return LossBursts(self.packets, self.first[chosen], self.length[chosen])
 
     def times_s(self, trace: PacketTrace) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return when each burst began, and how long it lasted, (b,) each.
@@ -144,8 +144,8 @@ def binomial_estimate(successes: int, trials: int) -> Estimate | None:
     failures, share = trials - successes, successes / trials
 
     def lacking(probability: float) -> float:
-        at = xlogy(successes, probability) + xlogy(failures, 1 - probability)
-        return float(xlogy(successes, share) + xlogy(failures, 1 - share) - at) - _ALLOWED
+        log_likelihood = xlogy(successes, probability) + xlogy(failures, 1 - probability)
+        return float(xlogy(successes, share) + xlogy(failures, 1 - share) - log_likelihood) - _ALLOWED
 
     def end(outer: float, certain: bool) -> float:
         return outer if certain else float(brentq(lacking, share, outer, xtol=1e-15))
@@ -167,7 +167,7 @@ def exponential_estimate(count: int, total: float) -> Estimate | None:
     if not count:
         return None
     tail = (1 - LEVEL) / 2
-    ends = (2 * total / float(chi2.ppf(at, 2 * count)) for at in (1 - tail, tail))
+    ends = (2 * total / float(chi2.ppf(probability, 2 * count)) for probability in (1 - tail, tail))
     return Estimate(total / count, *ends)
 
 
@@ -183,32 +183,32 @@ def minimise(function: Callable[[Reals], float], start: Reals, limit: float) -> 
     """Return a local minimum with all parameters within ± ``limit``."""
     if not len(start):
         return Minimum(start, function(start))
-    found = minimize(
+    result = minimize(
         function,
         start,
         method="L-BFGS-B",
         bounds=[(-limit, limit)] * len(start),
         options={"eps": 1e-5, "ftol": 1e-10, "gtol": 1e-5, "maxiter": 200},
     )
-    return Minimum(np.asarray(found.x), float(found.fun))
+    return Minimum(np.asarray(result.x), float(result.fun))
 
 
 def profile_interval(
-    function: Callable[[Reals], float], best: Minimum, place: int, limit: float
+    function: Callable[[Reals], float], best: Minimum, index: int, limit: float
 ) -> tuple[float, float]:
     """Return the profile-likelihood interval of a parameter, from its minimum outwards.
 
     Args:
         function: minus the log-likelihood of n parameters.
         best: its minimum.
-        place: place of the parameter.
+        index: index of the parameter.
         limit: bound of the parameters' sizes; an interval that reaches it ends there.
     """
-    low, high = (_profile_end(function, best, place, sign * limit) for sign in (-1, 1))
+    low, high = (_profile_end(function, best, index, sign * limit) for sign in (-1, 1))
     return low, high
 
 
-def _profile_end(function: Callable[[Reals], float], best: Minimum, place: int, outer: float) -> float:
+def _profile_end(function: Callable[[Reals], float], best: Minimum, index: int, outer: float) -> float:
     """Return where the profile has lost what an interval allows, or ``outer``.
 
     The profile at a value is searched for from the minimum at the last step inside the interval.
@@ -216,20 +216,20 @@ def _profile_end(function: Callable[[Reals], float], best: Minimum, place: int, 
     minima, and it has the sign that the steps found at both of them.
     """
 
-    def profile(value: float, others: Reals) -> Minimum:
-        return minimise(lambda rest: function(np.insert(rest, place, value)), others, abs(outer))
+    def profile(value: float, start: Reals) -> Minimum:
+        return minimise(lambda free: function(np.insert(free, index, value)), start, abs(outer))
 
-    def lacking(value: float, others: Reals) -> float:
-        return profile(value, others).value - limit
+    def lacking(value: float, start: Reals) -> float:
+        return profile(value, start).value - limit
 
     limit = best.value + _ALLOWED
-    inside, others, step = float(best.at[place]), np.delete(best.at, place), 0.25
+    inside, start, step = float(best.at[index]), np.delete(best.at, index), 0.25
     while inside != outer:
         beyond = inside + float(np.sign(outer)) * min(step, abs(outer - inside))
-        following = profile(beyond, others)
+        following = profile(beyond, start)
         if following.value > limit:
-            return float(brentq(lacking, inside, beyond, args=(others,), xtol=_TOLERANCE))
-        inside, others, step = beyond, following.at, min(2 * step, _LONGEST_STEP)
+            return float(brentq(lacking, inside, beyond, args=(start,), xtol=_TOLERANCE))
+        inside, start, step = beyond, following.at, min(2 * step, _LONGEST_STEP)
     return outer
 
 
@@ -262,15 +262,12 @@ def quantile_m(bursts: LossBursts, share: float) -> QuantileM:
     """Return M for a share; without bursts it is 1."""
     ordered = np.sort(bursts.length)
     count = len(ordered)
-    place = math.ceil(share * count - 1e-9)
+    covered = math.ceil(share * count - 1e-9)
     # P(at most rank − 1 of the bursts are in the share) ≥ 95 % (Wilks, 1941)
     rank = int(binom.ppf(LEVEL, count, share)) + 1
     confident = int(ordered[rank - 1]) + 1 if rank <= count else None
     return QuantileM(
-        share,
-        int(ordered[place - 1]) + 1 if place > 0 else 1,
-        confident,
-        _packet_quantile(bursts, share),
+        share, int(ordered[covered - 1]) + 1 if covered > 0 else 1, confident, _packet_quantile(bursts, share)
     )
 
 
@@ -278,8 +275,8 @@ def _packet_quantile(bursts: LossBursts, share: float) -> int:
     """Return the smallest M with Σ max(length − (M − 1), 0) ≤ (1 − share) packets."""
     allowed = math.floor((1 - share) * bursts.packets + 1e-9)
 
-    def is_enough(most: int) -> bool:
-        return int(np.maximum(bursts.length - most, 0).sum()) <= allowed
+    def is_enough(allowed_burst: int) -> bool:
+        return int(np.maximum(bursts.length - allowed_burst, 0).sum()) <= allowed
 
     return bisect_left(range(bursts.longest), True, key=is_enough) + 1
 
@@ -291,14 +288,16 @@ def most_losses(bursts: LossBursts, windows: Sequence[int], left_out: Flags | No
     """
     lost = _before(bursts)
     skipped = None if left_out is None or not left_out.any() else _before(bursts.only(left_out))
-    found = {}
-    for window in (one for one in windows if one <= bursts.packets):
-        most = lost[window:] - lost[:-window]
+    by_window = {}
+    for window in windows:
+        if window > bursts.packets:
+            continue
+        losses = lost[window:] - lost[:-window]
         if skipped is not None:
-            most = most[skipped[window:] == skipped[:-window]]
-        if len(most):
-            found[window] = int(most.max())
-    return found
+            losses = losses[skipped[window:] == skipped[:-window]]
+        if len(losses):
+            by_window[window] = int(losses.max())
+    return by_window
 
 
 def _before(bursts: LossBursts) -> NDArray[np.int32]:

@@ -71,22 +71,22 @@ class OutputRequest:
             require_suffix(self.network, "--write", ".toml")
 
 
-def report(found: Measurement, request: OutputRequest, console: Console | None) -> dict[str, object]:
+def report(measurement: Measurement, request: OutputRequest, console: Console | None) -> dict[str, object]:
     """Write what is requested, print the tables, and return the document of ``--json``.
 
     Raises:
         NoackError: one line; a file cannot be written, or the scenario cannot be resolved.
     """
     with error_console().status("measuring"):
-        void = None if request.scenario is None else found.certificate_time(request.scenario)
-        document = found.to_json()
+        void = None if request.scenario is None else measurement.certificate_time(request.scenario)
+        document = measurement.to_json()
     if console is not None:
-        print_measurement(console, found, void)
+        print_measurement(console, measurement, void)
     written: list[Path] = []
     if request.page is not None:
-        written += write_page(found, void, request.page, request.figure_files)
+        written += write_page(measurement, void, request.page, request.figure_files)
     if request.network is not None:
-        written += write_network(found, request.network, request.form)
+        written += write_network(measurement, request.network, request.form)
     if console is not None:
         for path in written:
             console.print(f"written: {path}", markup=False, highlight=False, soft_wrap=True)
@@ -96,7 +96,7 @@ def report(found: Measurement, request: OutputRequest, console: Console | None) 
     return document
 
 
-def write_network(found: Measurement, path: Path, form: Form) -> list[Path]:
+def write_network(measurement: Measurement, path: Path, form: Form) -> list[Path]:
     """Write the section, and the trace that it names; return the written files.
 
     Raises:
@@ -107,12 +107,12 @@ def write_network(found: Measurement, path: Path, form: Form) -> list[Path]:
     written = [path]
     if form == "trace":
         trace_path = path.with_suffix(".csv")
-        write_whole(trace_path, trace_csv(found.trace))
-        section, written = _trace_section(found, trace_path.name), [trace_path, path]
+        write_whole(trace_path, trace_csv(measurement.trace))
+        section, written = _trace_section(measurement, trace_path.name), [trace_path, path]
     else:
-        section = _model_section(found)
-    cap = {"mansd": found.longest_loss_burst, "enforce_mansd": False}
-    text = _comment(found, form) + toml_text({"network": {**cap, **section}})
+        section = _model_section(measurement)
+    cap = {"mansd": measurement.longest_loss_burst, "enforce_mansd": False}
+    text = _comment(measurement, form) + toml_text({"network": {**cap, **section}})
     source = f"--write {path}"
     content = toml_file.parsed(text, source)["network"]
     assert isinstance(content, dict)
@@ -132,32 +132,32 @@ def trace_csv(trace: PacketTrace) -> str:
     return "sequence,sent_ns,received_ns\n" + "".join(rows)
 
 
-def _comment(found: Measurement, form: Form) -> str:
-    deadline_s = found.options.deadline_s
+def _comment(measurement: Measurement, form: Form) -> str:
+    deadline_s = measurement.options.deadline_s
     late = "" if deadline_s is None else f", deadline {deadline_s:g} s"
-    lines = [f"Measured: {printable(found.name)}, {len(found.trace)} packets{late}."]
+    lines = [f"Measured: {printable(measurement.name)}, {len(measurement.trace)} packets{late}."]
     if form == "trace":
-        lines += [
-            'Each update gets what was recorded at its time. With by = "packet", update k gets record k.',
-        ]
+        lines.append(
+            'Each update gets what was recorded at its time. With by = "packet", update k gets record k.'
+        )
     else:
-        lines += ["A model, fitted per packet: it assumes updates at the trace's rate."]
-    lines += ["mansd is not enforced, so that the network behaves as measured."]
-    if found.is_outage.any():
-        lines += ["mansd does not cover the outages; no certificate does."]
+        lines.append("A model, fitted per packet: it assumes updates at the trace's rate.")
+    lines.append("mansd is not enforced, so that the network behaves as measured.")
+    if measurement.is_outage.any():
+        lines.append("mansd does not cover the outages; no certificate does.")
     return "".join(f"# {line}\n" for line in lines)
 
 
-def _trace_section(found: Measurement, name: str) -> Mapping[str, object]:
+def _trace_section(measurement: Measurement, name: str) -> Mapping[str, object]:
     # The network would deliver the first packet.
-    known = {} if found.outcomes.effective[0] else {"initial_sync": "known_state"}
+    known = {} if measurement.outcomes.effective[0] else {"initial_sync": "known_state"}
     replay = {"kind": "replay", "file": name, "by": "time"}
     return known | {"loss": {"model": "lossless"}, "impairments": [replay]}
 
 
-def _model_section(found: Measurement) -> Mapping[str, object]:
-    loss = _loss(found.chosen.fit) if found.models else {"model": "lossless"}
-    return {"loss": loss, "impairments": [*_outage_chain(found), *_delay(found)]}
+def _model_section(measurement: Measurement) -> Mapping[str, object]:
+    loss = _loss(measurement.chosen.fit) if measurement.models else {"model": "lossless"}
+    return {"loss": loss, "impairments": [*_outage_chain(measurement), *_delay(measurement)]}
 
 
 def _loss(fit: ChainFit) -> Mapping[str, object]:
@@ -166,12 +166,12 @@ def _loss(fit: ChainFit) -> Mapping[str, object]:
     return {"model": "gilbert_elliott", **fit.rates._asdict()}
 
 
-def _outage_chain(found: Measurement) -> list[Mapping[str, object]]:
+def _outage_chain(measurement: Measurement) -> list[Mapping[str, object]]:
     """Return the outages as a chain of their own, by packets."""
-    lengths = found.bursts.length[found.is_outage]
+    lengths = measurement.bursts.length[measurement.is_outage]
     if not len(lengths):
         return []
-    usual = len(found.trace) - int(lengths.sum())
+    usual = len(measurement.trace) - int(lengths.sum())
     chain = {
         "model": "gilbert_elliott",
         "good_to_bad": min(len(lengths) / max(usual, 1), 1.0),
@@ -180,15 +180,15 @@ def _outage_chain(found: Measurement) -> list[Mapping[str, object]]:
     return [{"kind": "loss", "loss": chain}]
 
 
-def _delay(found: Measurement) -> list[Mapping[str, object]]:
+def _delay(measurement: Measurement) -> list[Mapping[str, object]]:
     """Return the delays of the effective packets; the others are lost in the model."""
-    delays_ns = found.trace.delay_ns[found.outcomes.effective]
+    delays_ns = measurement.trace.delay_ns[measurement.outcomes.effective]
     if not len(delays_ns) or not delays_ns.any():
         return []
     if delays_ns.min() == delays_ns.max():
         return [{"kind": "delay", "delay_s": int(delays_ns[0]) * 1e-9}]
     samples_s = np.quantile(delays_ns, np.linspace(0, 1, _SAMPLES)) * 1e-9
-    correlation = found.delays.correlation[0] if found.delays.correlation else 0.0
+    correlation = measurement.delays.correlation[0] if measurement.delays.correlation else 0.0
     return [
         {
             "kind": "delay",
@@ -199,11 +199,7 @@ def _delay(found: Measurement) -> list[Mapping[str, object]]:
     ]
 
 
-_MODELS = {
-    "bernoulli": "independent losses",
-    "gilbert": "Gilbert",
-    "gilbert_elliott": "Gilbert–Elliott",
-}
+_MODELS = {"bernoulli": "independent losses", "gilbert": "Gilbert", "gilbert_elliott": "Gilbert–Elliott"}
 _PARAMETERS = {
     "probability": "loss probability",
     "good_to_bad": "p, good to bad",
@@ -216,80 +212,84 @@ _MOST_LISTED = 12
 _MOST_OUTAGES = 5
 
 
-def measurement_tables(found: Measurement, void: CertificateTime | None = None) -> Iterator[ResultTable]:
+def measurement_tables(
+    measurement: Measurement, void: CertificateTime | None = None
+) -> Iterator[ResultTable]:
     """Yield the tables of a measurement, and that of a scenario's certificate."""
-    without = ", without the outages" if found.is_outage.any() else ""
+    suffix = ", without the outages" if measurement.is_outage.any() else ""
     estimates = ("estimate", "95 % interval")
     heads: tuple[str, ...]
-    yield ResultTable("numbers", "losses and delays", KEY_VALUE, [*_numbers(found, without)])
+    yield ResultTable("numbers", "losses and delays", KEY_VALUE, [*_numbers(measurement, suffix)])
     rows = [
         (
-            f"{100 * one.share:.6g} %",
-            str(one.bursts),
-            str(one.bursts_confident or "too few bursts"),
-            str(one.packets),
+            f"{100 * quantile.share:.6g} %",
+            str(quantile.bursts),
+            str(quantile.bursts_confident or "too few bursts"),
+            str(quantile.packets),
         )
-        for one in found.quantiles
+        for quantile in measurement.quantiles
     ]
     heads = ("share", "of the bursts", "with 95 % confidence", "of the packets")
-    yield ResultTable("m", f"M: at most M − 1 consecutive losses{without}", heads, rows)
-    if found.windows:
-        columns = 3 if without else 2
+    yield ResultTable("m", f"M: at most M − 1 consecutive losses{suffix}", heads, rows)
+    if measurement.windows:
+        columns = 3 if suffix else 2
         windows = [
-            (str(window), str(every), NONE if usual is None else str(usual))[:columns]
-            for window, (every, usual) in found.windows.items()
+            (str(window), str(in_all), NONE if without_outages is None else str(without_outages))[:columns]
+            for window, (in_all, without_outages) in measurement.windows.items()
         ]
         heads = ("K", "m", "m in windows without an outage")
-        what = "(m, K): most losses m in any K consecutive packets"
-        yield ResultTable("windows", what, heads[:columns], windows)
-    if found.models:
+        caption = "(m, K): most losses m in any K consecutive packets"
+        yield ResultTable("windows", caption, heads[:columns], windows)
+    if measurement.models:
         heads = ("model and parameter", *estimates)
-        yield ResultTable("models", f"loss models{without}", heads, [*_model_rows(found)])
+        yield ResultTable("models", f"loss models{suffix}", heads, [*_model_rows(measurement)])
     heads = ("parameter", *estimates)
-    yield ResultTable("outages", "model of the outages", heads, [*_outage_rows(found)])
+    yield ResultTable("outages", "model of the outages", heads, [*_outage_rows(measurement)])
     if void is not None:
-        what = f"{void.scenario}: when the network violates a condition of its certificates"
+        caption = f"{void.scenario}: when the network violates a condition of its certificates"
         heads = ("condition", "share of the time", "first", "worst")
-        yield ResultTable("certificate", what, heads, [*_void_rows(void)])
+        yield ResultTable("certificate", caption, heads, [*_void_rows(void)])
 
 
-def print_measurement(console: Console, found: Measurement, void: CertificateTime | None = None) -> None:
+def print_measurement(
+    console: Console, measurement: Measurement, void: CertificateTime | None = None
+) -> None:
     """Print the tables and the remarks."""
-    console.print(found.name, markup=False, highlight=False, soft_wrap=True)
-    for table in measurement_tables(found, void):
+    console.print(measurement.name, markup=False, highlight=False, soft_wrap=True)
+    for table in measurement_tables(measurement, void):
         console.print(f"\n[bold]{escape(table.caption)}[/]", highlight=False)
         console.print(terminal_table(table._replace(caption="")))
-    for line in (*found.remarks, *void_remarks(void)):
+    for line in (*measurement.remarks, *void_remarks(void)):
         console.print(line, markup=False, highlight=False)
 
 
-def _numbers(found: Measurement, without: str) -> Iterator[tuple[str, str]]:
-    count, deadline_s = len(found.trace), found.options.deadline_s
-    yield "packets", f"{count} in {found.observed_s:.1f} s"
-    yield "lost", _share(int(found.outcomes.lost.sum()), count)
-    yield "out of order (stale)", _share(int(found.outcomes.out_of_order.sum()), count)
+def _numbers(measurement: Measurement, suffix: str) -> Iterator[tuple[str, str]]:
+    count, deadline_s = len(measurement.trace), measurement.options.deadline_s
+    yield "packets", f"{count} in {measurement.observed_s:.1f} s"
+    yield "lost", _share(int(measurement.outcomes.lost.sum()), count)
+    yield "out of order (stale)", _share(int(measurement.outcomes.out_of_order.sum()), count)
     if deadline_s is not None:
         name = f"later than the deadline of {duration(deadline_s)}"
-        yield name, _share(int(found.outcomes.late.sum()), count)
-    yield "effective losses (all of these)", _share(found.bursts.losses, count)
-    bursts = found.bursts
+        yield name, _share(int(measurement.outcomes.late.sum()), count)
+    yield "effective losses (all of these)", _share(measurement.bursts.losses, count)
+    bursts = measurement.bursts
     if len(bursts.length):
         listed = [f"{count} × {length}" for length, count in histogram(bursts).items()]
         if len(listed) > _MOST_LISTED:
             listed[_MOST_LISTED // 2 : -_MOST_LISTED // 2] = ["…"]
         yield "loss bursts (number × length)", ", ".join(listed)
-        yield "longest loss burst", _burst(found, int(np.argmax(bursts.length)))
-        outages = np.flatnonzero(found.is_outage).tolist()
-        yield "outages", str(len(outages)) if outages else f"none: {found.outage_rule.reason}"
-        for place in outages[:_MOST_OUTAGES]:
-            yield "  outage", _burst(found, place)
+        yield "longest loss burst", _burst(measurement, int(np.argmax(bursts.length)))
+        outages = np.flatnonzero(measurement.is_outage).tolist()
+        yield "outages", str(len(outages)) if outages else f"none: {measurement.outage_rule.reason}"
+        for outage in outages[:_MOST_OUTAGES]:
+            yield "  outage", _burst(measurement, outage)
         if outages:
-            yield "  rule", found.outage_rule.reason
-    longest = found.longest_loss_burst
-    yield f"M{without}", f"{longest + 1} (maximum consecutive losses M − 1: {longest})"
-    if (fewest := found.fewest_deliveries) is not None:
+            yield "  rule", measurement.outage_rule.reason
+    longest = measurement.longest_loss_burst
+    yield f"M{suffix}", f"{longest + 1} (maximum consecutive losses M − 1: {longest})"
+    if (fewest := measurement.fewest_deliveries) is not None:
         yield "fewest deliveries between two bursts", str(fewest)
-    delays = found.delays
+    delays = measurement.delays
     if delays.received:
         values = (duration(delays.quantiles_s[share]) for share in _SHOWN_DELAYS)
         yield f"delay {' / '.join(_SHOWN_DELAYS.values())}", " / ".join(values)
@@ -297,18 +297,18 @@ def _numbers(found: Measurement, without: str) -> Iterator[tuple[str, str]]:
         yield "correlation of successive delays", f"{delays.correlation[0]:.2f}"
 
 
-def _share(part: int, of: int) -> str:
-    return f"{part} ({percent(part / of)})" if part else "0"
+def _share(count: int, total: int) -> str:
+    return f"{count} ({percent(count / total)})" if count else "0"
 
 
-def _burst(found: Measurement, place: int) -> str:
-    one = found.burst_json(place)
-    return f"{one['losses']} packets, {one['duration_s']:.3g} s, from {one['begin_s']:.3f} s"
+def _burst(measurement: Measurement, index: int) -> str:
+    burst = measurement.burst_json(index)
+    return f"{burst['losses']} packets, {burst['duration_s']:.3g} s, from {burst['begin_s']:.3f} s"
 
 
-def _model_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
-    for name, model in found.models.items():
-        chosen = " (preferred)" if name == found.chosen.fit.model else ""
+def _model_rows(measurement: Measurement) -> Iterator[tuple[str, str, str]]:
+    for name, model in measurement.models.items():
+        chosen = " (preferred)" if name == measurement.chosen.fit.model else ""
         yield f"{_MODELS[name]}{chosen}", "", ""
         for parameter, estimate in model.fit.estimates.items():
             yield f"  {_PARAMETERS[parameter]}", *_estimate(estimate)
@@ -322,8 +322,8 @@ def _estimate(estimate: Estimate | None) -> tuple[str, str]:
     return number(estimate.value), f"{number(estimate.low)} to {number(estimate.high)}"
 
 
-def _outage_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
-    fit = found.outage_fit
+def _outage_rows(measurement: Measurement) -> Iterator[tuple[str, str, str]]:
+    fit = measurement.outage_fit
     per_hour = fit.rate_per_s and Estimate(*(3600 * value for value in fit.rate_per_s))
     yield "outages per hour", *_estimate(per_hour)
     if fit.count:
@@ -332,12 +332,12 @@ def _outage_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
 
 
 def _void_rows(void: CertificateTime) -> Iterator[tuple[str, str, str, str]]:
-    for one in void.causes:
-        yield one.cause, percent(one.share), f"{one.first_s:.3f} s", one.text
+    for violation in void.causes:
+        yield violation.cause, percent(violation.share), f"{violation.first_s:.3f} s", violation.text
     for cause, text in void.kept.items():
         yield cause, percent(0.0), NONE, text
-    first = NONE if void.first_s is None else f"{void.first_s:.3f} s"
-    yield "any of them", percent(void.share), first, ""
+    first_violated = NONE if void.first_s is None else f"{void.first_s:.3f} s"
+    yield "any of them", percent(void.share), first_violated, ""
 
 
 def void_remarks(void: CertificateTime | None) -> Iterator[str]:
@@ -354,7 +354,7 @@ def void_remarks(void: CertificateTime | None) -> Iterator[str]:
 
 
 def write_page(
-    found: Measurement,
+    measurement: Measurement,
     void: CertificateTime | None,
     path: Path,
     figure_files: FigureFiles | None = None,
@@ -370,11 +370,11 @@ def write_page(
 
     require_suffix(path, "--out", ".html")
     template = templates(Path(__file__).parent).get_template("measurement.html.jinja")
-    figures = list(measurement_figures(found))
+    figures = list(measurement_figures(measurement))
     html = template.render(
-        found=found,
-        remarks=[*found.remarks, *void_remarks(void)],
-        tables=list(measurement_tables(found, void)),
+        measurement=measurement,
+        remarks=[*measurement.remarks, *void_remarks(void)],
+        tables=list(measurement_tables(measurement, void)),
         figures=figures,
     )
     return [write_whole(path, html), *save_figures(figures, path, figure_files)]
@@ -387,36 +387,37 @@ _WINDOWS = 40
 _LONGEST_WINDOW = 1000
 
 
-def measurement_figures(found: Measurement) -> Iterator[FigureDescription]:
+def measurement_figures(measurement: Measurement) -> Iterator[FigureDescription]:
     """Yield the figures of a measurement."""
-    deadline_s = found.options.deadline_s
+    deadline_s = measurement.options.deadline_s
     limit = "" if deadline_s is None else f" Dashed: the deadline of {duration(deadline_s)}."
-    yield one_panel("bursts", _histogram(found), _HEIGHT_IN).captioned(
+    bursts = measurement.bursts
+    yield one_panel("bursts", _histogram(measurement), _HEIGHT_IN).captioned(
         "Number of loss bursts by length. A burst is a number of consecutive effective "
         "losses: packets that were lost, out of order, or later than the deadline.",
-        f"Bars: {len(found.bursts.length)} loss bursts, the longest of {found.bursts.longest} packets.",
+        f"Bars: {len(bursts.length)} loss bursts, the longest of {bursts.longest} packets.",
     )
-    yield one_panel("delays", _delays(found), _HEIGHT_IN).captioned(
+    yield one_panel("delays", _delays(measurement), _HEIGHT_IN).captioned(
         "Delay of each received packet, at its sending time; crosses at the top: lost "
         f"packets. Shaded: outages.{limit}",
-        f"Points: the delays of {found.delays.received} packets over {found.observed_s:.1f} s.",
+        f"Points: the delays of {measurement.delays.received} packets over {measurement.observed_s:.1f} s.",
     )
-    yield one_panel("correlation", _correlation(found), _HEIGHT_IN).captioned(
+    yield one_panel("correlation", _correlation(measurement), _HEIGHT_IN).captioned(
         "Correlation of the delays (of their normal scores) and of the effective losses of "
         f"two packets, by their distance. Within the dashed lines: {100 * LEVEL:.0f} % of the "
         "correlations of independent delays.",
         "Curves: correlation of delays and of losses over the distance in packets.",
     )
-    yield one_panel("windows", _windows(found), _HEIGHT_IN).captioned(
+    yield one_panel("windows", _windows(measurement), _HEIGHT_IN).captioned(
         "(m, K): the largest number m of effective losses in any K consecutive packets. "
         "Dashed: all K packets lost.",
         "Curve: most losses over the length of the window.",
     )
 
 
-def _histogram(found: Measurement) -> Panel:
-    outages = found.is_outage
-    longest = found.bursts.longest
+def _histogram(measurement: Measurement) -> Panel:
+    outages = measurement.is_outage
+    longest = measurement.bursts.longest
     # Bins of one length, or, if the lengths differ much, of a constant ratio.
     wide = longest > _WINDOWS
     edges = np.arange(1.0, longest + 2)
@@ -424,8 +425,8 @@ def _histogram(found: Measurement) -> Panel:
         edges = np.unique(np.geomspace(1, longest + 1, _WINDOWS).round())
     items = []
     for label, bursts, colour in (
-        ("loss bursts", found.bursts.only(~outages), _BURSTS),
-        ("outages", found.bursts.only(outages), _OUTAGES),
+        ("loss bursts", measurement.bursts.only(~outages), _BURSTS),
+        ("outages", measurement.bursts.only(outages), _OUTAGES),
     ):
         counts = np.histogram(bursts.length, edges)[0].astype(np.float64)
         items.append(Bars(edges=edges - 0.5, heights=counts, label=label, colour=colour, opacity=0.85))
@@ -438,11 +439,11 @@ def _histogram(found: Measurement) -> Panel:
     )
 
 
-def _delays(found: Measurement) -> Panel:
-    trace = found.trace
+def _delays(measurement: Measurement) -> Panel:
+    trace = measurement.trace
     sent_s, lost = np.asarray(trace.sent_ns * 1e-9), trace.lost
     values = np.asarray(np.where(lost, np.nan, np.maximum(trace.delay_ns, 1)) * 1e-9)
-    begin_s, duration_s = found.bursts.only(found.is_outage).times_s(trace)
+    begin_s, duration_s = measurement.bursts.only(measurement.is_outage).times_s(trace)
     items: list[Item] = [
         Line(x=sent_s, y=values, colour=_DELAYS, width=0.8, marker=".", size=2.5),
         Spans(begin=begin_s, end=begin_s + duration_s, colour=_OUTAGES),
@@ -456,8 +457,8 @@ def _delays(found: Measurement) -> Panel:
             reduced=False,
         ),
     ]
-    if found.options.deadline_s is not None:
-        items.append(Rule(at=found.options.deadline_s, colour=_LIMIT))
+    if measurement.options.deadline_s is not None:
+        items.append(Rule(at=measurement.options.deadline_s, colour=_LIMIT))
     return Panel(
         title="Delay over time",
         items=items,
@@ -466,8 +467,8 @@ def _delays(found: Measurement) -> Panel:
     )
 
 
-def _correlation(found: Measurement) -> Panel:
-    delays, (lags, losses) = found.delays, found.loss_correlation
+def _correlation(measurement: Measurement) -> Panel:
+    delays, (lags, losses) = measurement.delays, measurement.loss_correlation
     items = [
         _curve(x, y, label, colour)
         for x, y, label, colour in (
@@ -476,7 +477,7 @@ def _correlation(found: Measurement) -> Panel:
         )
         if x
     ]
-    limits = [Rule(at=at, colour=_LIMIT, width=1.0) for at in (delays.white, -delays.white)]
+    limits = [Rule(at=level, colour=_LIMIT, width=1.0) for level in (delays.white, -delays.white)]
     return Panel(
         title="Correlation",
         items=[*items, *limits],
@@ -485,23 +486,23 @@ def _correlation(found: Measurement) -> Panel:
     )
 
 
-def _windows(found: Measurement) -> Panel:
-    longest = max(min(_LONGEST_WINDOW, len(found.trace)), 1)
+def _windows(measurement: Measurement) -> Panel:
+    longest = max(min(_LONGEST_WINDOW, len(measurement.trace)), 1)
     windows = np.unique(np.geomspace(1, longest, _WINDOWS).round().astype(int)).tolist()
-    every = most_losses(found.bursts, windows)
-    items = [_curve([*every], [*every.values()], "all packets", _OUTAGES)]
-    if found.is_outage.any():
-        usual = most_losses(found.bursts, windows, found.is_outage)
-        items.append(_curve([*usual], [*usual.values()], "without outages", _BURSTS))
+    in_all = most_losses(measurement.bursts, windows)
+    items = [_curve([*in_all], [*in_all.values()], "all packets", _OUTAGES)]
+    if measurement.is_outage.any():
+        without_outages = most_losses(measurement.bursts, windows, measurement.is_outage)
+        items.append(_curve([*without_outages], [*without_outages.values()], "without outages", _BURSTS))
     all_lost = np.array(windows, np.float64)
-    most = max(every.values())
-    ends = (0.8, 1.4 * most) if most else (None, None)
+    largest = max(in_all.values())
+    ends = (0.8, 1.4 * largest) if largest else (None, None)
     return Panel(
         title="Most losses in a window",
         items=[*items, Line(x=all_lost, y=all_lost, colour=_LIMIT, dash=(6, 2.5))],
         x=Axis(label="window K in packets", logarithmic=True),
-        y=Axis(label="losses m", logarithmic=most > 0, ends=ends),
-        legend=None if found.is_outage.any() else (),
+        y=Axis(label="losses m", logarithmic=largest > 0, ends=ends),
+        legend=None if measurement.is_outage.any() else (),
     )
 
 

@@ -106,9 +106,9 @@ def delay_statistics(trace: PacketTrace) -> DelayStatistics:
 
 def normal_scores(values: NDArray[np.int64]) -> Reals:
     """Return Φ⁻¹ of the middle ranks of values, equal ones with the same rank, scaled, (k,)."""
-    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
     last = np.cumsum(counts)
-    scores = ndtri((last - counts / 2) / len(values))[place]
+    scores = ndtri((last - counts / 2) / len(values))[inverse]
     deviation = scores.std()
     return np.asarray((scores - scores.mean()) / deviation if deviation > 0 else 0.0 * scores)
 
@@ -125,13 +125,13 @@ def autocorrelation(
     if not scores.any():
         return (), ()
     furthest = max(min(_LARGEST_LAG, len(known) // 4), 1)
-    lags, found = [], []
+    lags, correlations = [], []
     for lag in np.unique(np.geomspace(1, furthest, _MOST_LAGS).round()).astype(int).tolist():
         pairs = int(np.count_nonzero(known[lag:] & known[:-lag]))
         if pairs >= _FEWEST_PAIRS:
             lags.append(lag)
-            found.append(float(scores[lag:] @ scores[:-lag] / pairs))
-    return tuple(lags), tuple(found)
+            correlations.append(float(scores[lag:] @ scores[:-lag] / pairs))
+    return tuple(lags), tuple(correlations)
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class FittedModel(NamedTuple):
         """Return the fit for JSON."""
         return {
             "model": self.fit.model,
-            "estimates": {name: _interval(one) for name, one in self.fit.estimates.items()},
+            "estimates": {name: _interval(estimate) for name, estimate in self.fit.estimates.items()},
             "loss_rate": self.fit.rates.loss_rate,
             "log_likelihood": self.fit.log_likelihood,
             "test": asdict(self.test) | {"verdict": self.test.verdict},
@@ -219,9 +219,9 @@ class Measurement:
     @cached_property
     def windows(self) -> dict[int, tuple[int, int | None]]:
         """By K: most losses in K consecutive packets, in all and in windows without an outage."""
-        every = most_losses(self.bursts, self.options.windows)
-        usual = most_losses(self.bursts, self.options.windows, self.is_outage)
-        return {window: (most, usual.get(window)) for window, most in every.items()}
+        in_all = most_losses(self.bursts, self.options.windows)
+        without_outages = most_losses(self.bursts, self.options.windows, self.is_outage)
+        return {window: (most, without_outages.get(window)) for window, most in in_all.items()}
 
     @cached_property
     def delays(self) -> DelayStatistics:
@@ -231,8 +231,8 @@ class Measurement:
     @cached_property
     def loss_correlation(self) -> tuple[tuple[int, ...], tuple[float, ...]]:
         """Lags, and the correlation of the effective losses of two packets."""
-        every = np.ones(len(self.trace), bool)
-        return autocorrelation(self.outcomes.effective.astype(np.int64), every)
+        all_known = np.ones(len(self.trace), bool)
+        return autocorrelation(self.outcomes.effective.astype(np.int64), all_known)
 
     @cached_property
     def _fits(self) -> ChainFits:
@@ -251,9 +251,8 @@ class Measurement:
     @cached_property
     def outage_fit(self) -> OutageFit:
         """The model of the outages."""
-        which = self.is_outage
-        durations_s = self.bursts.times_s(self.trace)[1][which]
-        return fit_outages(durations_s, self.bursts.complete[which], self.observed_s)
+        durations_s = self.bursts.times_s(self.trace)[1][self.is_outage]
+        return fit_outages(durations_s, self.bursts.complete[self.is_outage], self.observed_s)
 
     def certificate_time(self, scenario: Scenario) -> "CertificateTime":
         """Return for which share of the time a scenario's certificates would have been void."""
@@ -262,23 +261,23 @@ class Measurement:
     @cached_property
     def remarks(self) -> list[str]:
         """What the reader of the numbers must know, in plain words."""
-        found = list(self.notes)
+        remarks = list(self.notes)
         count = int((~self.is_outage).sum())
         if 0 < count < _FEW_BURSTS:
-            found.append(f"loss bursts: only {count}; the fits and quantiles have a weak basis")
+            remarks.append(f"loss bursts: only {count}; the fits and quantiles have a weak basis")
         if len(self.bursts.length) > MOST_FITTED:
-            found.append(f"chains are fitted to the first {MOST_FITTED} loss bursts")
+            remarks.append(f"chains are fitted to the first {MOST_FITTED} loss bursts")
         cut = ~self.bursts.complete
         if cut.any():
-            found.append("a loss burst is cut by the beginning or end of the trace")
+            remarks.append("a loss burst is cut by the beginning or end of the trace")
         if self.is_outage.any():
-            found.append("outages are reported as such: M and the loss models do not include them")
+            remarks.append("outages are reported as such: M and the loss models do not include them")
             if self.options.outage_s is None and self.models["gilbert_elliott"].test.verdict == "rejected":
-                found.append(
+                remarks.append(
                     "the fitted chain is itself rejected by its test: what counts as an outage "
                     "depends on it; --outage TIME sets the limit by hand"
                 )
-        return found
+        return remarks
 
     def to_json(self) -> dict[str, object]:
         """Return all results for JSON."""
@@ -297,7 +296,7 @@ class Measurement:
             "outages": [*map(self.burst_json, np.flatnonzero(self.is_outage).tolist())],
             "outage_rule": self.outage_rule.reason,
             "M": self.longest_loss_burst + 1,
-            "quantiles": [asdict(one) for one in self.quantiles],
+            "quantiles": [asdict(quantile) for quantile in self.quantiles],
             "fewest_deliveries_between_bursts": self.fewest_deliveries,
             "windows": {
                 str(window): {"most_losses": every, "without_outages": usual}
@@ -306,7 +305,7 @@ class Measurement:
             "delay_s": {str(share): value for share, value in self.delays.quantiles_s.items()},
             "delay_correlation": dict(zip(map(str, self.delays.lags), self.delays.correlation, strict=True)),
             "interval_level": LEVEL,
-            "models": {name: one.to_json() for name, one in self.models.items()},
+            "models": {name: model.to_json() for name, model in self.models.items()},
             "chosen_model": self.chosen.fit.model if self.models else None,
             "outage_fit": {
                 **vars(outages),
@@ -320,16 +319,16 @@ class Measurement:
     @property
     def fewest_deliveries(self) -> int | None:
         """Smallest number of consecutive deliveries between two bursts; None with fewer bursts."""
-        between = self.bursts.deliveries()[1:-1]
-        return int(between.min()) if len(between) else None
+        deliveries = self.bursts.deliveries()[1:-1]
+        return int(deliveries.min()) if len(deliveries) else None
 
-    def burst_json(self, place: int) -> Mapping[str, float]:
+    def burst_json(self, index: int) -> Mapping[str, float]:
         """Return a burst for JSON: losses, begin and duration."""
         begin_s, duration_s = self.bursts.times_s(self.trace)
         return {
-            "losses": int(self.bursts.length[place]),
-            "begin_s": float(begin_s[place]),
-            "duration_s": float(duration_s[place]),
+            "losses": int(self.bursts.length[index]),
+            "begin_s": float(begin_s[index]),
+            "duration_s": float(duration_s[index]),
         }
 
 
@@ -379,7 +378,7 @@ class CertificateTime:
     @property
     def first_s(self) -> float | None:
         """When a condition was first violated, None if never: a claim is void from then on."""
-        return min((one.first_s for one in self.causes), default=None)
+        return min((violated.first_s for violated in self.causes), default=None)
 
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
@@ -389,41 +388,42 @@ class CertificateTime:
 def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     """Return for which share of the time the certificates of a scenario would have been void."""
     resolved = resolve(scenario)
-    found: dict[str, str | None] = {}
+    certificates: dict[str, str | None] = {}
     if not causes_of(resolved):
-        found["any plant"] = "a loop with acknowledgements cannot have one"
-    for one in scheduled_certificates(resolved):
-        found[one.scope] = one.void if one.constants is None else None
+        certificates["any plant"] = "a loop with acknowledgements cannot have one"
+    for certificate in scheduled_certificates(resolved):
+        certificates[certificate.scope] = certificate.void if certificate.constants is None else None
     allowed = allowed_conditions(resolved)
     delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)
     end_ns = int(max(trace.sent_ns[-1], trace.received_ns.max()))
-    every = list(_violations(trace, allowed, delay_ns, end_ns))
-    spans, whole = [one for one in every if len(one.begin_ns)], max(end_ns, 1)
+    conditions = list(_violations(trace, allowed, delay_ns, end_ns))
+    spans = [span for span in conditions if len(span.begin_ns)]
+    total_ns = max(end_ns, 1)
     union = (
         np.concatenate([[], *times])
-        for times in ([one.begin_ns for one in spans], [one.end_ns for one in spans])
+        for times in ([span.begin_ns for span in spans], [span.end_ns for span in spans])
     )
     return CertificateTime(
         scenario=resolved.name,
-        certificates=found or {"any plant": "the scenario cannot have one"},
+        certificates=certificates or {"any plant": "the scenario cannot have one"},
         allowed_losses=allowed.dropouts,
         allowed_delay_s=delay_ns * 1e-9,
         observed_s=end_ns * 1e-9,
-        share=_covered_ns(*union) / whole,
+        share=_covered_ns(*union) / total_ns,
         causes=tuple(
             VoidShare(
-                one.cause,
-                _covered_ns(one.begin_ns, one.end_ns) / whole,
-                float(one.begin_ns.min()) * 1e-9,
-                one.worst,
-                one.text,
+                span.cause,
+                _covered_ns(span.begin_ns, span.end_ns) / total_ns,
+                float(span.begin_ns.min()) * 1e-9,
+                span.worst,
+                span.text,
             )
-            for one in spans
+            for span in spans
         ),
         kept={
-            one.cause: f"kept: {one.text}" if one.worst else "kept"
-            for one in every
-            if not len(one.begin_ns) and not one.cause.endswith(ORDER)
+            span.cause: f"kept: {span.text}" if span.worst else "kept"
+            for span in conditions
+            if not len(span.begin_ns) and not span.cause.endswith(ORDER)
         },
     )
 
@@ -445,26 +445,28 @@ def _violations(
     trace: PacketTrace, allowed: NetworkConditions, delay_ns: int, end_ns: int
 ) -> Iterator[_Spans]:
     """Yield the intervals of each cause."""
-    found, sent_ns, allowed_s = outcomes(trace), trace.sent_ns, delay_ns * 1e-9
-    sent_s, dropped_s = np.asarray(sent_ns * 1e-9), np.where(found.lost, np.inf, 0.0)
-    stale, replaced_s = found.out_of_order, dropped_s.copy()
-    replaced_s[stale] = (found.newer_ns - sent_ns)[stale] * 1e-9
+    groups, sent_ns, allowed_s = outcomes(trace), trace.sent_ns, delay_ns * 1e-9
+    sent_s, dropped_s = np.asarray(sent_ns * 1e-9), np.where(groups.lost, np.inf, 0.0)
+    stale, replaced_s = groups.out_of_order, dropped_s.copy()
+    replaced_s[stale] = (groups.newer_ns - sent_ns)[stale] * 1e-9
     # A violation by a lost packet lasts until a newer one is received; else, to the next packet.
-    until_ns = np.where(replaced_s > 0, found.newer_ns, np.append(sent_ns[1:], end_ns))
+    until_ns = np.where(replaced_s > 0, groups.newer_ns, np.append(sent_ns[1:], end_ns))
     until_ns = np.minimum(until_ns, end_ns)
     for rule in allowed.guarantee.rules:
-        every, dropped = (
+        losses, drops = (
             PacketLosses(sent_s, times_s).values(rule, allowed_s, rule.start)[0].value
             for times_s in (replaced_s, dropped_s)
         )
-        which = dropped > rule.limit
-        for suffix, these in (("", which), (ORDER, (every > rule.limit) & ~which)):
-            values = every if suffix else dropped
-            worst = float((every[these] if these.any() else values).max(initial=0))
-            yield _Spans(rule.name + suffix, sent_ns[these], until_ns[these], worst, rule.violation(worst))
+        by_drops = drops > rule.limit
+        for suffix, violated in (("", by_drops), (ORDER, (losses > rule.limit) & ~by_drops)):
+            values = losses if suffix else drops
+            worst = float((losses[violated] if violated.any() else values).max(initial=0))
+            yield _Spans(
+                rule.name + suffix, sent_ns[violated], until_ns[violated], worst, rule.violation(worst)
+            )
     delays = trace.received_ns - sent_ns
-    beyond = ~found.lost & ~stale & (delays > delay_ns)
-    worst = float(delays[~found.lost & ~stale].max(initial=0)) * 1e-9
+    beyond = ~groups.lost & ~stale & (delays > delay_ns)
+    worst = float(delays[~groups.lost & ~stale].max(initial=0)) * 1e-9
     yield _Spans(
         DELAY,
         sent_ns[beyond] + delay_ns,

@@ -200,18 +200,18 @@ class ProbeSender:
             return ProbeResult(None, tuple(notes), kernel_drops)
         sent_ns, received_ns = np.array(self._sent_ns), np.array(self._received_ns)
         lost = received_ns == LOST_NS
-        ways = self.lost_ways()
-        for sequence, way in ways.items():
-            self._rows(sequence, self._sent_ns[sequence], "", way)
-        notes.append(self._losses_by_way(list(ways.values())))
+        directions = self.lost_directions()
+        for sequence, direction in directions.items():
+            self._rows(sequence, self._sent_ns[sequence], "", direction)
+        notes.append(self._losses_by_direction(list(directions.values())))
         notes += counted(self._ignored)
         return ProbeResult(packet_trace(sent_ns, received_ns, lost), tuple(notes), kernel_drops)
 
-    def lost_ways(self) -> dict[int, str]:
-        """Return on which way each datagram without an answer was lost.
+    def lost_directions(self) -> dict[int, str]:
+        """Return in which direction each datagram without an answer was lost.
 
         Each answer has the newest sequence number that had arrived, and which of the 128 up to it.
-        A number that no answer covers was lost on an unknown way.
+        A number that no answer covers was lost in an unknown direction.
         """
         arrived, covered = self._arrived()
         lost = np.flatnonzero(np.array(self._received_ns) == LOST_NS)
@@ -221,18 +221,18 @@ class ProbeSender:
         """Return which numbers the answers show as arrived, and which they cover."""
         arrived, covered = np.zeros(self.sent, bool), np.zeros(self.sent, bool)
         seen = np.frombuffer(bytes(self._seen), np.uint8).reshape(-1, SEEN_BITS // 8)
-        for at in range(0, len(seen), _ANSWERS_AT_ONCE):
-            part = slice(at, at + _ANSWERS_AT_ONCE)
-            bits = np.unpackbits(seen[part], axis=1, bitorder="little").astype(bool)
-            newest = np.array(self._newest[part]).astype(np.int64)
+        for begin in range(0, len(seen), _ANSWERS_AT_ONCE):
+            batch = slice(begin, begin + _ANSWERS_AT_ONCE)
+            bits = np.unpackbits(seen[batch], axis=1, bitorder="little").astype(bool)
+            newest = np.array(self._newest[batch]).astype(np.int64)
             numbers = newest[:, None] - np.arange(SEEN_BITS)
             inside = (numbers >= 0) & (numbers < self.sent)
             covered[numbers[inside]] = True
             arrived[numbers[inside & bits]] = True
         return arrived, covered
 
-    def _losses_by_way(self, ways: list[str]) -> str:
-        counts = Counter(ways)
+    def _losses_by_direction(self, directions: list[str]) -> str:
+        counts = Counter(directions)
         text = f"lost forward: {counts[_FORWARD]}; lost in reverse: {counts[_REVERSE]}"
         if not counts[_UNKNOWN]:
             return text

@@ -70,19 +70,19 @@ FILE_OPTIONS = {
 """Options of the command line, by field of :class:`SourceOptions`."""
 
 
-def refuse_unused(options: "DataclassInstance", names: Mapping[str, str], what: str, *used: str) -> None:
+def refuse_unused(options: "DataclassInstance", names: Mapping[str, str], source: str, *used: str) -> None:
     """Raise CallerError for an option that differs from its default, but has no effect.
 
     Args:
         options: a dataclass with defaults.
         names: the options of the command line, by field.
-        what: what the options are given for.
+        source: the kind of source that the options are given for.
         used: the fields that have an effect there.
     """
     for field in fields(options):
         is_given = getattr(options, field.name) != field.default
         if is_given and field.name in names and field.name not in used:
-            raise CallerError(f"{names[field.name]}: has no effect on {what}")
+            raise CallerError(f"{names[field.name]}: has no effect on {source}")
 
 
 def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> PacketTrace:
@@ -91,10 +91,10 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
     Raises:
         NoackError: one line; it cannot be read, or is not a trace.
     """
-    options, first = options or SourceOptions(), paths[0]
-    if len(paths) == 1 and first.is_dir():
+    options, first_path = options or SourceOptions(), paths[0]
+    if len(paths) == 1 and first_path.is_dir():
         refuse_unused(options, FILE_OPTIONS, "a run directory")
-        return read_run(first)
+        return read_run(first_path)
     heads = [_head(path) for path in paths]
     if all(map(is_capture, heads)) and len(paths) < 3:
         refuse_unused(options, FILE_OPTIONS, "captures", "clocks_differ", "flow", "sequence_at")
@@ -106,12 +106,12 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
         )
     if is_fate_file(heads[0]):
         refuse_unused(options, FILE_OPTIONS, "a fate file", "flow")
-        return read_fate_file(first, options.flow)
+        return read_fate_file(first_path, options.flow)
     if is_opportunity_file(heads[0]):
         refuse_unused(options, FILE_OPTIONS, "delivery opportunities", "period_ns")
-        return read_opportunities(first, options.period_ns)
+        return read_opportunities(first_path, options.period_ns)
     refuse_unused(options, FILE_OPTIONS, "a packet trace", "clocks_differ")
-    return read_trace(first, clocks_differ=bool(options.clocks_differ), others=_OTHERS)
+    return read_trace(first_path, clocks_differ=bool(options.clocks_differ), others=_OTHERS)
 
 
 def _head(path: Path) -> bytes:
@@ -167,8 +167,8 @@ def read_fate_file(path: Path, number: int) -> PacketTrace:
         if packets > MAX_PACKETS:
             raise CallerError(f"{path}: the flow has more than {MAX_PACKETS} packets")
         is_chosen = reduce(and_, (pc.field(name) == value for name, value in zip(_FLOW, chosen, strict=True)))
-        batches = (pa.Table.from_batches([one]) for one in file.iter_batches(columns=[*_COLUMNS]))
-        table = pa.concat_tables([batch.filter(is_chosen) for batch in batches])
+        tables = (pa.Table.from_batches([batch]) for batch in file.iter_batches(columns=[*_COLUMNS]))
+        table = pa.concat_tables([part.filter(is_chosen) for part in tables])
     rows = {name: np.asarray(table[name].to_numpy()) for name in _COLUMNS[len(_FLOW) :]}
     received_ns, lost = _received(path, rows)
     try:
@@ -176,8 +176,8 @@ def read_fate_file(path: Path, number: int) -> PacketTrace:
     except TraceRecordError as error:
         raise CallerError(f"{path}: packet {rows['packet'][error.row]} {error}") from None
     link, direction, flow = chosen
-    others = f"; --flow chooses another of the {len(counts)} flows" if len(counts) > 1 else ""
-    return trace.noted(f"flow {number}: {link} {direction}, flow {flow}, {packets} packets{others}")
+    hint = f"; --flow chooses another of the {len(counts)} flows" if len(counts) > 1 else ""
+    return trace.noted(f"flow {number}: {link} {direction}, flow {flow}, {packets} packets{hint}")
 
 
 def _received(path: Path, rows: dict[str, NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -216,12 +216,12 @@ def updates_trace(record: RunRecord) -> PacketTrace:
     """
     outcomes = packet_outcomes(record)
     arrived = record.columns(CONTROLLER_DELIVERY, "sequence", "now_ns")
-    numbers, first = np.unique(arrived["sequence"], return_index=True)
+    numbers, first_row = np.unique(arrived["sequence"], return_index=True)
     received_ns = np.full(len(outcomes.sequence), LOST_NS)
     if len(numbers):
-        at = np.minimum(np.searchsorted(numbers, outcomes.sequence), len(numbers) - 1)
-        here = numbers[at] == outcomes.sequence
-        received_ns[here] = arrived["now_ns"][first[at[here]]]
+        row = np.minimum(np.searchsorted(numbers, outcomes.sequence), len(numbers) - 1)
+        has_arrived = numbers[row] == outcomes.sequence
+        received_ns[has_arrived] = arrived["now_ns"][first_row[row[has_arrived]]]
     sent_ns, lost = outcomes.now_ns, received_ns == LOST_NS
     ended = ~(outcomes.in_flight & lost)
     if not ended.any():
@@ -249,15 +249,15 @@ def read_opportunities(path: Path, period_ns: int) -> PacketTrace:
     Raises:
         CallerError: one line; the file cannot be read, or is wrong.
     """
-    read = Opportunities(file=str(path)).read_file(NamedFile(str(path), Path()))
-    times_ms = np.array(read.times_ms)
-    probes = read.length_ns // period_ns
+    opportunities = Opportunities(file=str(path)).read_file(NamedFile(str(path), Path()))
+    times_ms = np.array(opportunities.times_ms)
+    probes = opportunities.length_ns // period_ns
     if not 1 <= probes <= _MOST_PROBES:
         raise CallerError(
-            f"{path}: {read.length_ns / 1e9:g} s are {probes} datagrams of the simulated probe; "
+            f"{path}: {opportunities.length_ns / 1e9:g} s are {probes} datagrams of the simulated probe; "
             f"expected 1 to {_MOST_PROBES}; choose another --rate"
         )
-    link = LinkState(LinkSettings(impairments=(read,), mansd=None), 0, "link", "forward")
+    link = LinkState(LinkSettings(impairments=(opportunities,), mansd=None), 0, "link", "forward")
     link.start_flow(0, 0)
     sent_ns = np.arange(probes) * period_ns
     received_ns = np.full(probes, LOST_NS)
@@ -265,11 +265,11 @@ def read_opportunities(path: Path, period_ns: int) -> PacketTrace:
         release_ns = link.decide(0, _PROBE_BYTES, at_ns).release_ns
         if release_ns != core.NOACK_NEVER_NS:
             received_ns[k] = release_ns
-    rate_bps = len(times_ms) * OPPORTUNITY_BYTES * 8 * NS_PER_S / read.length_ns
+    rate_bps = len(times_ms) * OPPORTUNITY_BYTES * 8 * NS_PER_S / opportunities.length_ns
     gaps_ms = np.diff(times_ms, prepend=0)
     k = int(gaps_ms.argmax())
     return packet_trace(sent_ns, received_ns, received_ns == LOST_NS).noted(
-        f"delivery opportunities of mahimahi: {len(times_ms)} in {read.length_ns / 1e9:g} s, "
+        f"delivery opportunities of mahimahi: {len(times_ms)} in {opportunities.length_ns / 1e9:g} s, "
         f"{rate_bps / 1e6:.4g} Mbit/s; longest time without one: {gaps_ms[k]} ms, "
         f"before {times_ms[k] / 1e3:g} s",
         f"they say nothing about losses: this is a simulated probe, {_PROBE_BYTES} bytes every "

@@ -94,11 +94,7 @@ class MissedEvents:
         self._errors = np.zeros((0, len(H)))
 
     def take(
-        self,
-        t_ns: NDArray[np.int64],
-        e_s: Matrix,
-        events: NDArray[np.int64],
-        received: NDArray[np.int64],
+        self, t_ns: NDArray[np.int64], e_s: Matrix, events: NDArray[np.int64], received: NDArray[np.int64]
     ) -> Iterator[MissedJumps]:
         """Add k measurements; yield the jumps that are missed at them, some at a time.
 
@@ -119,16 +115,16 @@ class MissedEvents:
         self._errors = errors[lasting]
         lengths = ends - begins
         totals = np.cumsum(lengths)
-        first, most = 0, max(_PART_NUMBERS // errors.shape[1], 1)
-        while first < len(lengths):
-            done = totals[first - 1] if first else 0
-            last = max(int(np.searchsorted(totals, done + most, "right")), first + 1)
-            which = np.repeat(np.arange(first, last), lengths[first:last])
-            at = np.arange(len(which)) - (totals - lengths)[which] + done + begins[which]
-            periods = (t_ns[at] - times_ns[which]) // self._period_ns
-            jumps = self._propagate.leaps(errors[which], periods, self._period_ns)
-            yield MissedJumps(at, times_ns[which], periods, jumps)
-            first = last
+        begin, batch = 0, max(_PART_NUMBERS // errors.shape[1], 1)
+        while begin < len(lengths):
+            earlier = totals[begin - 1] if begin else 0
+            last = max(int(np.searchsorted(totals, earlier + batch, "right")), begin + 1)
+            event = np.repeat(np.arange(begin, last), lengths[begin:last])
+            measurement = np.arange(len(event)) - (totals - lengths)[event] + earlier + begins[event]
+            periods = (t_ns[measurement] - times_ns[event]) // self._period_ns
+            jumps = self._propagate.leaps(errors[event], periods, self._period_ns)
+            yield MissedJumps(measurement, times_ns[event], periods, jumps)
+            begin = last
 
 
 class ErrorBounds(NamedTuple):
@@ -156,11 +152,7 @@ class ErrorMonitor:
         self._growths = _growths(matrix_key(H), matrix_key(self._weight), period_ns)
 
     def take(
-        self,
-        t_ns: NDArray[np.int64],
-        e_s: Matrix,
-        events: NDArray[np.int64],
-        received: NDArray[np.int64],
+        self, t_ns: NDArray[np.int64], e_s: Matrix, events: NDArray[np.int64], received: NDArray[np.int64]
     ) -> ErrorBounds:
         """Add k measurements, as :meth:`MissedEvents.take` does."""
         count = len(t_ns)
@@ -284,14 +276,7 @@ def _theorem_2(
     F = max(start, 0.0) / (a_hat + alpha_bar_per_s) + forced / (a_hat + alpha_per_s)
     inter_event_s = math.log1p(beta / F) / (a_hat + alpha_bar_per_s) if F > 0 else math.inf
     return Theorem2(
-        c,
-        alpha_bar_per_s,
-        delta,
-        a_hat,
-        a_tilde,
-        inter_event_s,
-        c * x0,
-        beta * c * delta * BK / gap,
+        c, alpha_bar_per_s, delta, a_hat, a_tilde, inter_event_s, c * x0, beta * c * delta * BK / gap
     )
 
 
@@ -342,6 +327,6 @@ def theorem_1(H: Matrix, alpha_per_s: float, longest_s: Sequence[float]) -> floa
         reach_s = math.fsum(longest_s[k:])
         if not math.isfinite(reach_s) or alpha_per_s * reach_s > 700:
             return math.inf
-        followed = response_until(H, identity, reach_s, _CELLS)
-        delta += math.exp(alpha_per_s * reach_s) * float(followed.through(identity).sup_on_grid())
+        responses = response_until(H, identity, reach_s, _CELLS)
+        delta += math.exp(alpha_per_s * reach_s) * float(responses.through(identity).sup_on_grid())
     return delta

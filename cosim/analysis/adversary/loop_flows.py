@@ -60,9 +60,9 @@ class Objective(StrEnum):
         """The value of a run without segments."""
         return 0.0 if self.additive else -np.inf
 
-    def joined(self, first: Matrix, second: Matrix) -> Matrix:
+    def joined(self, earlier: Matrix, later: Matrix) -> Matrix:
         """Return the value of two successive parts of a run."""
-        return np.asarray(first + second if self.additive else np.maximum(first, second))
+        return np.asarray(earlier + later if self.additive else np.maximum(earlier, later))
 
 
 @dataclass(frozen=True)
@@ -237,18 +237,18 @@ class SegmentFlow:
             CallerError: an event or a supremum cannot be decided.
         """
         loop, measure, n = self.system.loop, self.measure, self.system.loop.n
-        found = self._simulation.segments(loop.A, loop.B, t_s, z.reshape(-1, 3, n))
-        if not np.isin(found.statuses, (OK, DIVERGED)).all():
+        ends = self._simulation.segments(loop.A, loop.B, t_s, z.reshape(-1, 3, n))
+        if not np.isin(ends.statuses, (OK, DIVERGED)).all():
             raise CallerError("trigger: an error stays too close to a level to decide when it passes")
-        diverged, is_event = found.statuses == DIVERGED, found.events == 1
-        z = found.states.reshape(-1, 3 * n)
+        diverged, is_event = ends.statuses == DIVERGED, ends.events == 1
+        z = ends.states.reshape(-1, 3 * n)
         if measure.objective is Objective.INTER_EVENT:
             between_events = is_event & ((t_s > 0) | (not self.known_start))
-            value = np.where(between_events, t_s - found.t_s, -math.inf)
+            value = np.where(between_events, t_s - ends.t_s, -math.inf)
         else:
-            value = found.values / (measure.beta if measure.objective is Objective.ERROR else 1.0)
+            value = ends.values / (measure.beta if measure.objective is Objective.ERROR else 1.0)
         value = np.where(diverged, math.inf, value)
-        return Segments(found.t_s, z, is_event & ~diverged, value, found.at_s)
+        return Segments(ends.t_s, z, is_event & ~diverged, value, ends.at_s)
 
 
 def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
@@ -265,15 +265,15 @@ def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
     if run.diverged_at_s is not None:
         return Valued(math.inf, run.diverged_at_s)
     # With a first packet the run starts at event 0.
-    first = 1 if len(run.event_s) and run.event_s[0] == 0.0 else 0
-    t_s, starts = np.array([0.0, *run.event_s])[first:], run.starts[first:]
+    first_event = 1 if len(run.event_s) and run.event_s[0] == 0.0 else 0
+    t_s, starts = np.array([0.0, *run.event_s])[first_event:], run.starts[first_event:]
     flow = SegmentFlow(run.system, measure, run.horizon_s, known_start=True)
-    found = flow(t_s, starts.reshape(len(starts), -1))
+    segments = flow(t_s, starts.reshape(len(starts), -1))
     if measure.objective is Objective.COST:
-        return Valued(float(found.value.sum()), None)
-    highest = int(found.value.argmax())
-    assert found.at_s is not None
-    return Valued(float(found.value[highest]), float(found.at_s[highest]))
+        return Valued(float(segments.value.sum()), None)
+    highest = int(segments.value.argmax())
+    assert segments.at_s is not None
+    return Valued(float(segments.value[highest]), float(segments.at_s[highest]))
 
 
 def _gramian(system: ContinuousLoop, measure: Measure, window_s: float) -> Matrix:
@@ -368,8 +368,8 @@ class SampledFlow:
         Large errors of the controller lead to early events.
         """
         runs = self._runs(t_s, z)
-        until = np.minimum(runs.step + round(window_s / self.loop.step_s), self.loop.last)
-        self.loop.follow(runs, self._scales, until, tests=False)
+        last_step = np.minimum(runs.step + round(window_s / self.loop.step_s), self.loop.last)
+        self.loop.follow(runs, self._scales, last_step, tests=False)
         return self._value(runs)
 
     def features(self, t_s: Vector, z: Matrix) -> Matrix:
@@ -377,7 +377,7 @@ class SampledFlow:
         runs = self._runs(t_s, z)
         step = np.maximum(runs.step, 0)
         state, error = self._scales.state[step, None], self._scales.error[step, None]
-        parts = [
+        quantities = [
             runs.x * state,
             (runs.x_s - runs.y) * error,
             (runs.x_c - runs.y) * error,
@@ -386,7 +386,7 @@ class SampledFlow:
             runs.sent,
             runs.auxiliary[:, None],
         ]
-        return np.hstack([part / (np.abs(part).max(initial=0.0) or 1.0) for part in parts])
+        return np.hstack([quantity / (np.abs(quantity).max(initial=0.0) or 1.0) for quantity in quantities])
 
     def _time(self, step: Numbers) -> Vector:
         return np.asarray(step * self.loop.step_s, dtype=np.float64)
@@ -410,32 +410,22 @@ class SampledFlow:
         step: Numbers = np.rint(t_s / self.loop.step_s).astype(np.int64)
         runs.step[:] = step
         begin = 0
-        for part in _states(runs):
-            columns = math.prod(part.shape[1:])
-            part[:] = z[:, begin : begin + columns].reshape(part.shape)
+        for array in _states(runs):
+            columns = math.prod(array.shape[1:])
+            array[:] = z[:, begin : begin + columns].reshape(array.shape)
             begin += columns
         return runs
 
 
 def _states(runs: Runs) -> tuple[Matrix, ...]:
     """Return the arrays of which a run's state consists."""
-    return (
-        runs.x,
-        runs.y,
-        runs.x_s,
-        runs.x_c,
-        runs.u,
-        runs.u_next,
-        runs.sent,
-        runs.updates,
-        runs.auxiliary,
-    )
+    return (runs.x, runs.y, runs.x_s, runs.x_c, runs.u, runs.u_next, runs.sent, runs.updates, runs.auxiliary)
 
 
 def _packed(runs: Runs) -> Matrix:
     """Return the states in rows, (N, entries)."""
     count = len(runs.step)
-    return np.hstack([part.reshape(count, math.prod(part.shape[1:])) for part in _states(runs)])
+    return np.hstack([array.reshape(count, math.prod(array.shape[1:])) for array in _states(runs)])
 
 
 class SampledRun(NamedTuple):
@@ -451,20 +441,20 @@ class SampledRun(NamedTuple):
 
 def run_of(flow: SampledFlow, delivered: Callable[[int], bool]) -> SampledRun:
     """Run the loop; ``delivered`` returns the fate of each update."""
-    now = flow.start()
-    value, at_s = float(now.value[0]), 0.0
+    segment = flow.start()
+    value, at_s = float(segment.value[0]), 0.0
     event_s = [] if flow.loop.known_start else [0.0]
     fates = [True] * len(event_s)
     while True:
-        now = flow(now.end_s, now.z)
-        found = float(now.value[0])
-        if now.at_s is not None and found > value:
-            at_s = float(now.at_s[0])
-        value = float(flow.objective.joined(np.array(value), np.array(found)))
-        if not now.is_event[0]:
+        segment = flow(segment.end_s, segment.z)
+        segment_value = float(segment.value[0])
+        if segment.at_s is not None and segment_value > value:
+            at_s = float(segment.at_s[0])
+        value = float(flow.objective.joined(np.array(value), np.array(segment_value)))
+        if not segment.is_event[0]:
             break
         fates.append(delivered(len(event_s)))
-        event_s.append(float(now.end_s[0]))
-        now = now._replace(z=flow.after_events(now.end_s, now.z, np.array(fates[-1:])))
+        event_s.append(float(segment.end_s[0]))
+        segment = segment._replace(z=flow.after_events(segment.end_s, segment.z, np.array(fates[-1:])))
     known = flow.objective is not Objective.COST and value > -np.inf
     return SampledRun(value, at_s if known else None, tuple(fates), tuple(event_s))

@@ -46,9 +46,9 @@ class Nodes(NamedTuple):
     entry: Indices
     """Index of the last decision in the log, (N,)."""
 
-    def take(self, which: Indices | Flags | slice) -> "Nodes":
+    def take(self, selection: Indices | Flags | slice) -> "Nodes":
         """Return a selection of the runs."""
-        return Nodes(self.t_s[which], self.z[which], self.state[which], self.value[which], self.entry[which])
+        return Nodes._make(column[selection] for column in self)
 
 
 def root(flow: PatternFlow) -> Nodes:
@@ -57,9 +57,9 @@ def root(flow: PatternFlow) -> Nodes:
     return Nodes(start.end_s, start.z, zero, start.value, zero + START)
 
 
-def together(parts: Sequence[Nodes]) -> Nodes:
+def together(groups: Sequence[Nodes]) -> Nodes:
     """Return several groups as one."""
-    return Nodes(*map(np.concatenate, zip(*parts, strict=True)))
+    return Nodes(*map(np.concatenate, zip(*groups, strict=True)))
 
 
 class DecisionLog:
@@ -80,13 +80,13 @@ class DecisionLog:
     def decisions(self, entry: int) -> Pattern:
         """Return whether the update of each event up to this entry was delivered."""
         starts = np.cumsum([0, *map(len, self._parents)])
-        found: list[bool] = []
+        decisions: list[bool] = []
         while entry != START:
             block = int(np.searchsorted(starts, entry, side="right")) - 1
             row = entry - int(starts[block])
-            found.append(bool(self._delivered[block][row]))
+            decisions.append(bool(self._delivered[block][row]))
             entry = int(self._parents[block][row])
-        return tuple(reversed(found))
+        return tuple(reversed(decisions))
 
 
 class PatternSearch:
@@ -144,12 +144,12 @@ class PatternSearch:
         self._report(self.step, self.nodes, self.value)
         events = np.flatnonzero(segments.is_event)
         after_loss = self.automaton.after_loss(nodes.state[events])
-        may = after_loss >= 0
-        these = np.concatenate([events[may], events])
-        delivered = np.repeat([False, True], [int(may.sum()), len(events)])
+        can_be_lost = after_loss >= 0
+        continued = np.concatenate([events[can_be_lost], events])
+        delivered = np.repeat([False, True], [int(can_be_lost.sum()), len(events)])
         after_delivery = self.automaton.after_delivery(nodes.state[events])
-        state = np.concatenate([after_loss[may], after_delivery])
-        return after_events(self.flow, nodes, segments, value, these, delivered, state, self._log)
+        state = np.concatenate([after_loss[can_be_lost], after_delivery])
+        return after_events(self.flow, nodes, segments, value, continued, delivered, state, self._log)
 
 
 def after_events(
@@ -157,12 +157,12 @@ def after_events(
     nodes: Nodes,
     segments: Segments,
     value: Vector,
-    these: Indices,
+    continued: Indices,
     delivered: Flags,
     state: Indices,
     log: DecisionLog,
 ) -> Nodes:
-    """Return the runs ``these``, (k,), just after the events at the end of their segments.
+    """Return the runs ``continued``, (k,), just after the events at the end of their segments.
 
     ``delivered``, (k,), tells whether the update of each run arrives; the ``log`` receives that.
     ``state``, (k,), is the automaton's state after it. ``value``, (N,), has the values of the runs
@@ -171,12 +171,12 @@ def after_events(
     Raises:
         TooManyEventsError: two events at the same time.
     """
-    t_s = segments.end_s[these]
-    stuck = t_s <= nodes.t_s[these]
-    if (stuck & (nodes.entry[these] != START)).any():
+    t_s = segments.end_s[continued]
+    stuck = t_s <= nodes.t_s[continued]
+    if (stuck & (nodes.entry[continued] != START)).any():
         raise TooManyEventsError(f"trigger: the events accumulate at {t_s[stuck][0]:.9g} s")
-    z = flow.after_events(t_s, segments.z[these], delivered)
-    return Nodes(t_s, z, state, value[these], log.add(nodes.entry[these], delivered))
+    z = flow.after_events(t_s, segments.z[continued], delivered)
+    return Nodes(t_s, z, state, value[continued], log.add(nodes.entry[continued], delivered))
 
 
 Ceiling = Callable[[Nodes], Vector]
@@ -192,7 +192,7 @@ def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None 
     Raises:
         TooManyEventsError: two events at the same time.
     """
-    search.step, most_nodes, before = "all patterns", most_nodes + search.nodes, search.runs
+    search.step, most_nodes, earlier_runs = "all patterns", most_nodes + search.nodes, search.runs
     pile = [root(search.flow)]
     while pile and search.value < float("inf"):
         nodes = _top(pile)
@@ -202,21 +202,21 @@ def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None 
             return False
         if len(nodes.t_s):
             pile.append(search.successors(nodes))
-    search.runs -= before  # each pattern counts once
+    search.runs -= earlier_runs  # each pattern counts once
     return True
 
 
 def _top(pile: list[Nodes]) -> Nodes:
     """Pop a block of nodes from the stack, the deepest first."""
-    parts, room = [], _BLOCK
+    blocks, room = [], _BLOCK
     while pile and room > 0:
         nodes = pile.pop()
         if len(nodes.t_s) > room:
             pile.append(nodes.take(slice(None, -room)))
             nodes = nodes.take(slice(-room, None))
-        parts.append(nodes)
+        blocks.append(nodes)
         room -= len(nodes.t_s)
-    return together(parts)
+    return together(blocks)
 
 
 _ALIKE = 1e-4
@@ -237,13 +237,13 @@ def search_beam(search: PatternSearch, width: int, window_s: float) -> None:
     waiting, until_s = root(search.flow), 0.0
     while len(waiting.t_s) and search.value < np.inf:
         until_s = max(until_s, float(waiting.t_s.min())) + window_s
-        now = waiting.t_s < until_s
-        active, later = waiting.take(now), [waiting.take(~now)]
+        in_window = waiting.t_s < until_s
+        active, later = waiting.take(in_window), [waiting.take(~in_window)]
         while len(active.t_s):
             following = search.successors(active)
-            now = following.t_s < until_s
-            later.append(following.take(~now))
-            active = choice.thin(following.take(now), _CROWD * width)
+            in_window = following.t_s < until_s
+            later.append(following.take(~in_window))
+            active = choice.thin(following.take(in_window), _CROWD * width)
         waiting = choice.thin(together(later), width)
 
 
@@ -269,8 +269,8 @@ class _Choice:
 
     def _kind(self, nodes: Nodes) -> Indices:
         since_s = nodes.t_s - nodes.t_s.min()
-        part = np.minimum(since_s * _PARTS / self._window_s, _PARTS).astype(int)
-        return np.asarray(nodes.state * (_PARTS + 1) + part)
+        section = np.minimum(since_s * _PARTS / self._window_s, _PARTS).astype(int)
+        return np.asarray(nodes.state * (_PARTS + 1) + section)
 
     def _distinct(self, nodes: Nodes) -> Indices:
         """Return, for each group of nearly equal runs, the one with the largest value."""
@@ -281,14 +281,14 @@ class _Choice:
         return np.asarray(order[np.sort(first)])
 
 
-def _turns(score: Vector, kind: Indices, then: Vector | None = None) -> Indices:
+def _turns(score: Vector, kind: Indices, second_score: Vector | None = None) -> Indices:
     """Return indices in selection order: first the best of each kind, then the second best, etc."""
-    then = score if then is None else then
-    order = np.lexsort((-then, -score, kind))
+    second_score = score if second_score is None else second_score
+    order = np.lexsort((-second_score, -score, kind))
     starts = np.flatnonzero(np.diff(kind[order], prepend=-1))
     rank = np.empty(len(order), int)
     rank[order] = np.arange(len(order)) - np.repeat(starts, np.diff(starts, append=len(order)))
-    return np.asarray(np.lexsort((-then, -score, rank)))
+    return np.asarray(np.lexsort((-second_score, -score, rank)))
 
 
 _RANDOM = 64
@@ -311,8 +311,8 @@ def follow(
     """
     count, log = len(patterns), DecisionLog()
     longest = max(map(len, patterns), default=0)
-    wanted = np.ones((count, longest + 1), dtype=bool)
-    for row, pattern in zip(wanted, patterns, strict=True):
+    planned = np.ones((count, longest + 1), dtype=bool)
+    for row, pattern in zip(planned, patterns, strict=True):
         row[: len(pattern)] = pattern
     nodes = together([root(flow)] * count)
     run, value, last = np.arange(count), nodes.value.copy(), nodes.entry.copy()
@@ -324,20 +324,20 @@ def follow(
         if not len(going):
             return value, [log.decisions(int(entry)) for entry in last]
         after_loss = automaton.after_loss(nodes.state[going])
-        delivered = wanted[run[going], min(event, longest)] | (after_loss < 0)
+        delivered = planned[run[going], min(event, longest)] | (after_loss < 0)
         state = np.where(delivered, automaton.after_delivery(nodes.state[going]), after_loss)
         following = after_events(flow, nodes, segments, value[run], going, delivered, state, log)
         run, nodes = run[going], following
     raise TooManyEventsError(f"trigger: more than {MAX_EVENTS} events: they accumulate")
 
 
-def guess(search: PatternSearch, own: Pattern, rng: np.random.Generator) -> float:
-    """Try the pattern ``own``, regular and random patterns; return an inter-event time in s."""
+def guess(search: PatternSearch, scenario_pattern: Pattern, rng: np.random.Generator) -> float:
+    """Try the scenario's, regular and random patterns; return an inter-event time in s."""
     search.step = "guesses"
     flow, automaton = search.flow, search.automaton
     events = len(follow(flow, automaton, [(False,) * _LONGEST])[1][0])
-    tried = [own, *_candidates(search.guarantee, events, rng)]
-    values, patterns = follow(flow, automaton, tried)
+    candidates = [scenario_pattern, *_candidates(search.guarantee, events, rng)]
+    values, patterns = follow(flow, automaton, candidates)
     search.nodes += events + sum(map(len, patterns))
     search.runs += len(patterns)
     for i in np.argsort(-values, kind="stable")[:_IMPROVED]:
@@ -351,14 +351,17 @@ def _candidates(guarantee: LossGuarantee, events: int, rng: np.random.Generator)
     A regular pattern loses the first updates of each period; with a further constraint, the period
     may be its window.
     """
-    most = events if guarantee.longest_burst is None else guarantee.longest_burst
-    if most == 0:
+    longest = events if guarantee.longest_burst is None else guarantee.longest_burst
+    if longest == 0:
         return [()]
-    others = [window.packets for window in guarantee.windows[1:] if window.packets <= _PERIODS]
+    lengths = [window.packets for window in guarantee.windows[1:] if window.packets <= _PERIODS]
     regular = [
         tuple((i + phase) % period >= lost for i in range(events))
-        for lost in range(1, most + 1)
-        for period in (lost + 1, *(one for one in others if one > lost + 1))
+        for lost in range(1, longest + 1)
+        for period in (
+            lost + 1,
+            *(length for length in lengths if length > lost + 1),
+        )
         for phase in range(period)
     ]
     share = rng.uniform(size=(_RANDOM, 1))
@@ -376,7 +379,7 @@ def improve(search: PatternSearch, pattern: Pattern, value: float, most_nodes: i
     pattern = follow(flow, automaton, [pattern])[1][0]
     visited = len(pattern)
     while pattern and visited + len(pattern) ** 2 <= most_nodes:
-        changed = [(*pattern[:i], not one, *pattern[i + 1 :]) for i, one in enumerate(pattern)]
+        changed = [(*pattern[:i], not delivered, *pattern[i + 1 :]) for i, delivered in enumerate(pattern)]
         values, patterns = follow(flow, automaton, changed)
         visited += sum(map(len, patterns))
         search.runs += len(patterns)

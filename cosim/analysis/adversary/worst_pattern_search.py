@@ -120,18 +120,20 @@ def _find_sampled(
 ) -> Worst:
     began_s = time.monotonic()
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
-    own = run_of(flow, network_fates(resolved))
-    first = 0 if flow.loop.known_start else 1
+    own_run = run_of(flow, network_fates(resolved))
+    first_event = 0 if flow.loop.known_start else 1
     search = PatternSearch(flow, resolved.network.guarantee, report)
-    exact = _search(search, own.delivered[first:], beam, most_nodes)
+    exact = _search(search, own_run.delivered[first_event:], beam, most_nodes)
     worst, lossless = _run(flow, search.pattern), run_of(flow, lambda event: True)
     bounds = bounds_of(resolved) if objective in (Objective.ERROR, Objective.STATE) else None
     if bounds is not None:
-        exact, (pushed, worst) = False, _push(flow, bounds, worst)
-        again = PatternSearch(pushed, resolved.network.guarantee, report)
-        _search(again, worst.delivered[first:], beam, most_nodes)
-        _, worst = _push(pushed, bounds, max(_run(pushed, again.pattern), worst))
-        search.nodes, search.runs = search.nodes + again.nodes, search.runs + again.runs
+        exact = False
+        pushed_flow, worst = _push(flow, bounds, worst)
+        second_search = PatternSearch(pushed_flow, resolved.network.guarantee, report)
+        _search(second_search, worst.delivered[first_event:], beam, most_nodes)
+        _, worst = _push(pushed_flow, bounds, max(_run(pushed_flow, second_search.pattern), worst))
+        search.nodes += second_search.nodes
+        search.runs += second_search.runs
     return Worst(
         objective,
         flow.horizon_s,
@@ -143,7 +145,7 @@ def _find_sampled(
         nodes=search.nodes,
         runs=search.runs,
         lossless=reported(lossless.value, objective),
-        own=reported(own.value, objective),
+        own=reported(own_run.value, objective),
         certified=flow.certified,
         elapsed_s=time.monotonic() - began_s,
     )
@@ -151,8 +153,8 @@ def _find_sampled(
 
 def _run(flow: SampledFlow, pattern: Pattern) -> SampledRun:
     """Run a pattern that was searched; the first packet is not part of it."""
-    first = 0 if flow.loop.known_start else 1
-    return run_of(flow, lambda event: event - first >= len(pattern) or pattern[event - first])
+    first_event = 0 if flow.loop.known_start else 1
+    return run_of(flow, lambda event: event - first_event >= len(pattern) or pattern[event - first_event])
 
 
 def _push(flow: SampledFlow, bounds: Bounds, worst: SampledRun) -> tuple[SampledFlow, SampledRun]:
@@ -160,18 +162,20 @@ def _push(flow: SampledFlow, bounds: Bounds, worst: SampledRun) -> tuple[Sampled
 
     They are made worst for the time of the largest value, some events, and the horizon.
     """
-    first, before = 0 if flow.loop.known_start else 1, -math.inf
+    first_event = 0 if flow.loop.known_start else 1
+    previous_value = -math.inf
     for _ in range(_MOST_PUSHES):
-        if not worst.value > before * _GAIN:
+        if not worst.value > previous_value * _GAIN:
             break
-        before, base, events = worst.value, flow, worst
-        some_s = events.event_s[:: len(events.event_s) // _TIMES + 1]
-        for at_s in (events.at_s or 0.0, *some_s, flow.horizon_s):
-            for loop in worst_causes(base, bounds, events, at_s):
-                pushed = replace(flow, loop=loop)
-                found = _run(pushed, events.delivered[first:])
-                if found.value > worst.value:
-                    flow, worst = pushed, found
+        previous_value = worst.value
+        base_flow, base_run = flow, worst
+        some_s = base_run.event_s[:: len(base_run.event_s) // _TIMES + 1]
+        for at_s in (base_run.at_s or 0.0, *some_s, flow.horizon_s):
+            for loop in worst_causes(base_flow, bounds, base_run, at_s):
+                pushed_flow = replace(flow, loop=loop)
+                candidate = _run(pushed_flow, base_run.delivered[first_event:])
+                if candidate.value > worst.value:
+                    flow, worst = pushed_flow, candidate
     return flow, worst
 
 
@@ -189,16 +193,16 @@ def _find_continuous(
     measure = measure_of(system, objective, None if constants is None else constants.rate_per_s)
     known_start = resolved.network.initial_sync == "known_state"
     # The first packet is always delivered and not part of the search.
-    first: Pattern = () if known_start else (True,)
+    first_packet: Pattern = () if known_start else (True,)
 
     def simulated(delivered: Callable[[int], bool] | Pattern) -> ContinuousRun:
         return simulate_continuous(system, horizon_s=horizon_s, delivered=delivered, known_start=known_start)
 
-    own = simulated(network_fates(resolved))
+    own_run = simulated(network_fates(resolved))
     flow = SegmentFlow(system, measure, horizon_s, known_start=known_start)
     search = PatternSearch(flow, resolved.network.guarantee, report)
-    exact = _search(search, tuple(own.delivered.tolist())[len(first) :], beam, most_nodes)
-    run = simulated((*first, *search.pattern))
+    exact = _search(search, tuple(own_run.delivered.tolist())[len(first_packet) :], beam, most_nodes)
+    run = simulated((*first_packet, *search.pattern))
     valued = evaluate(run, measure)
     return Worst(
         objective,
@@ -211,16 +215,16 @@ def _find_continuous(
         nodes=search.nodes,
         runs=search.runs,
         lossless=reported(evaluate(simulated(()), measure).value, objective),
-        own=reported(evaluate(own, measure).value, objective),
+        own=reported(evaluate(own_run, measure).value, objective),
         certified=certified_value(certificate, measure, horizon_s, valued),
         elapsed_s=time.monotonic() - began_s,
     )
 
 
-def _search(search: PatternSearch, own: Pattern, beam: int, most_nodes: int) -> bool:
+def _search(search: PatternSearch, scenario_pattern: Pattern, beam: int, most_nodes: int) -> bool:
     """Run all search steps; return whether they covered every pattern."""
     flow = search.flow
-    window_s = guess(search, own, stream(0, "adversary"))
+    window_s = guess(search, scenario_pattern, stream(0, "adversary"))
     if beam > 0:
         search_beam(search, beam, window_s)
     if most_nodes > 0:
@@ -264,10 +268,10 @@ def cost_ceiling(system: ContinuousLoop, longest_burst: int | None, horizon_s: f
 
     def ceiling(nodes: Nodes) -> Vector:
         x, rest_s = nodes.z[:, : loop.n], horizon_s - nodes.t_s
-        own = np.einsum("ai,ij,aj->a", x, P, x)
-        faded = -np.expm1(-rate * rest_s) / rate if rate else rest_s
-        level = beta**2 * np.exp(-rate * nodes.t_s) * faded + trigger.floor**2 * rest_s
-        return np.asarray((np.sqrt(own) + gain * np.sqrt(level)) ** 2)
+        state_part = np.einsum("ai,ij,aj->a", x, P, x)
+        integral = -np.expm1(-rate * rest_s) / rate if rate else rest_s
+        level = beta**2 * np.exp(-rate * nodes.t_s) * integral + trigger.floor**2 * rest_s
+        return np.asarray((np.sqrt(state_part) + gain * np.sqrt(level)) ** 2)
 
     return ceiling
 

@@ -43,14 +43,14 @@ def bounds_of(resolved: Scenario) -> Bounds | None:
     """Return the bounds of a scenario; None if nothing has a bound at all times."""
     through, columns = through_of(resolved), []
     m = resolved.model.dimensions[1]
-    for one in resolved.plant.disturbances:
-        if isinstance(one, UniformDisturbance):
-            at = through[:, :m] if one.at == "input" else through[:, m:]
-            columns.append(at @ one.extent())
+    for disturbance in resolved.plant.disturbances:
+        if isinstance(disturbance, UniformDisturbance):
+            entry_matrix = through[:, :m] if disturbance.at == "input" else through[:, m:]
+            columns.append(entry_matrix @ disturbance.extent())
     noise = np.array(resolved.plant.measurement.noise_bound or ())
-    found = np.hstack([np.zeros((len(through), 0)), *columns])
-    found = found[:, found.any(axis=0)]
-    return Bounds(found, noise) if found.size or noise.any() else None
+    changes = np.hstack([np.zeros((len(through), 0)), *columns])
+    changes = changes[:, changes.any(axis=0)]
+    return Bounds(changes, noise) if changes.size or noise.any() else None
 
 
 def worst_causes(flow: SampledFlow, bounds: Bounds, run: SampledRun, at_s: float) -> Iterator[SampledLoop]:
@@ -59,15 +59,15 @@ def worst_causes(flow: SampledFlow, bounds: Bounds, run: SampledRun, at_s: float
     The norm is largest in some direction: each loop maximises one entry of the vector, with either
     sign, or its part in the direction that it has without the change.
     """
-    loop, at = flow.loop, round(at_s / flow.loop.step_s)
+    loop, step = flow.loop, round(at_s / flow.loop.step_s)
     start = loop.start()
-    _follow_events(loop, start, start.step.copy(), run, at, 0 if loop.known_start else 1)
+    _follow_events(loop, start, start.step.copy(), run, step, 0 if loop.known_start else 1)
     fixed, drawn = _fixed_causes(loop), loop.causes
-    n, k, j = loop.matrices.n, at, at // loop.every + 1
+    n, k, j = loop.matrices.n, step, step // loop.every + 1
     linear = loop.with_causes(np.zeros((0, n)), np.zeros((0, drawn[1].shape[1])))
-    pushes = [_responses_to_push(linear, flow, one, run, at) for one in bounds.columns.T]
+    pushes = [_responses_to_push(linear, flow, column, run, step) for column in bounds.columns.T]
     noises = [
-        _responses_to_noise(linear, flow, entry, bound, run, at) for entry, bound in enumerate(bounds.noise)
+        _responses_to_noise(linear, flow, entry, bound, run, step) for entry, bound in enumerate(bounds.noise)
     ]
     axes = np.eye(n)
     for direction in (_vectors(flow, start)[0], *axes, *-axes):
@@ -81,27 +81,27 @@ def worst_causes(flow: SampledFlow, bounds: Bounds, run: SampledRun, at_s: float
 
 
 def _responses_to_push(
-    linear: SampledLoop, flow: SampledFlow, column: Vector, run: SampledRun, at: int
+    linear: SampledLoop, flow: SampledFlow, column: Vector, run: SampledRun, step: int
 ) -> Matrix:
-    """Return what each of the first ``at`` pushes adds to the vector, (at, n)."""
-    steps = _some(np.arange(1, at + 1))
+    """Return what each of the pushes before ``step`` adds to the vector, (step, n)."""
+    steps = _some(np.arange(1, step + 1))
     runs = linear.empty(len(steps))
     runs.x[:], runs.step[:] = column, steps
     linear.measure_at(runs)
-    _follow_events(linear, runs, steps, run, at, 0)
-    return np.repeat(_vectors(flow, runs), np.diff(steps, append=at + 1), axis=0)
+    _follow_events(linear, runs, steps, run, step, 0)
+    return np.repeat(_vectors(flow, runs), np.diff(steps, append=step + 1), axis=0)
 
 
 def _responses_to_noise(
-    linear: SampledLoop, flow: SampledFlow, entry: int, bound: float, run: SampledRun, at: int
+    linear: SampledLoop, flow: SampledFlow, entry: int, bound: float, run: SampledRun, step: int
 ) -> Matrix:
-    """Return what the noise of each measurement up to ``at`` adds to the vector, (k, n)."""
-    last = at // linear.every
+    """Return what the noise of each measurement up to ``step`` adds to the vector, (k, n)."""
+    last = step // linear.every
     numbers = _some(np.arange(last + 1))
     runs = linear.empty(len(numbers))
     runs.step[:] = numbers * linear.every
     runs.y[:] = bound * linear.correction(numbers)[:, :, entry]
-    _follow_events(linear, runs, runs.step.copy(), run, at, 0)
+    _follow_events(linear, runs, runs.step.copy(), run, step, 0)
     return np.repeat(_vectors(flow, runs), np.diff(numbers, append=last + 1), axis=0)
 
 
@@ -109,10 +109,10 @@ def _fixed_causes(loop: SampledLoop) -> tuple[Matrix, Matrix]:
     """Return disturbances and noise without their bounded parts."""
     plant, zeros = loop.resolved.plant, np.zeros_like
     disturbances = tuple(
-        one.model_copy(update={"bound": tuple(zeros(one.bound).tolist())})
-        if isinstance(one, UniformDisturbance)
-        else one
-        for one in plant.disturbances
+        disturbance.model_copy(update={"bound": tuple(zeros(disturbance.bound).tolist())})
+        if isinstance(disturbance, UniformDisturbance)
+        else disturbance
+        for disturbance in plant.disturbances
     )
     measurement = plant.measurement
     if measurement.noise_bound is not None:
@@ -125,21 +125,21 @@ def _fixed_causes(loop: SampledLoop) -> tuple[Matrix, Matrix]:
 
 
 def _follow_events(
-    loop: SampledLoop, runs: Runs, begin: Numbers, run: SampledRun, at: int, first: int
+    loop: SampledLoop, runs: Runs, begin: Numbers, run: SampledRun, last_step: int, first_event: int
 ) -> None:
-    """Advance runs that begin at ascending steps to the step ``at``, with the events of a run."""
-    one = np.ones(loop.last + 1)
-    scales = Scales(loop.weight, one, one)
+    """Advance runs that begin at ascending steps to ``last_step``, with the events of a run."""
+    ones = np.ones(loop.last + 1)
+    scales = Scales(loop.weight, ones, ones)
     steps = np.rint(np.array(run.event_s) / loop.step_s).astype(np.int64)
-    for event, arrives in list(zip(steps.tolist(), run.delivered, strict=True))[first:]:
-        if event >= at:
+    for event, arrives in list(zip(steps.tolist(), run.delivered, strict=True))[first_event:]:
+        if event >= last_step:
             break
         count = int(np.searchsorted(begin, event, side="right"))
         parts: list[Any] = [part[:count] for part in runs]
-        begun = Runs(*parts)
-        loop.follow(begun, scales, np.full(count, event), tests=False)
-        loop.update(begun, np.full(count, arrives))
-    loop.follow(runs, scales, np.full(len(begin), at), tests=False)
+        running = Runs(*parts)
+        loop.follow(running, scales, np.full(count, event), tests=False)
+        loop.update(running, np.full(count, arrives))
+    loop.follow(runs, scales, np.full(len(begin), last_step), tests=False)
 
 
 def _vectors(flow: SampledFlow, runs: Runs) -> Matrix:
@@ -216,7 +216,7 @@ class Worst:
 
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON; an infinite value becomes null."""
-        found = asdict(self) | {
+        document = asdict(self) | {
             "objective": self.objective.value,
             "pattern": self.text,
             "delivered": [event for event, delivered in enumerate(self.pattern) if delivered],
@@ -224,7 +224,7 @@ class Worst:
             "breaches": self.breaches,
             "diverges": self.diverges,
         }
-        return {key: None if value == math.inf else value for key, value in found.items()}
+        return {key: None if value == math.inf else value for key, value in document.items()}
 
 
 def reported(value: float, objective: Objective) -> float | None:
@@ -238,15 +238,15 @@ def certified_value(
     certificate: ScenarioCertificate, measure: Measure, horizon_s: float, valued: Valued
 ) -> float | None:
     """Return the certificate's bound on the same quantity at the same time."""
-    first, late = certificate.constants, certificate.floor_constants
-    if first is None:
+    constants, floor = certificate.constants, certificate.floor_constants
+    if constants is None:
         return None
     if measure.objective is Objective.INTER_EVENT:
         return certificate.inter_event_s
     if measure.objective is Objective.COST:
-        until_s = min(horizon_s, certificate.floor_from_s) if late is not None else horizon_s
-        cost = _square_integral(first, until_s)
-        return cost if late is None else cost + late.state**2 * (horizon_s - until_s)
+        until_s = min(horizon_s, certificate.floor_from_s) if floor is not None else horizon_s
+        cost = _square_integral(constants, until_s)
+        return cost if floor is None else cost + floor.state**2 * (horizon_s - until_s)
     at_s = np.array([valued.at_s or 0.0])
     level = float(measure.level(at_s)[0])
     if measure.objective is Objective.STATE:
@@ -261,7 +261,7 @@ def _square_integral(constants: Constants, until_s: float) -> float:
 
 
 def document(
-    found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate, trigger: str
+    results: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate, trigger: str
 ) -> dict[str, object]:
     """Return the results as JSON."""
     return {
@@ -273,13 +273,13 @@ def document(
         "guarantee": resolved.network.guarantee.meaning,
         "horizon_s": resolved.horizon_s,
         "certificate": certificate.to_json(),
-        "worst": {worst.objective.value: worst.to_json() for worst in found},
+        "worst": {worst.objective.value: worst.to_json() for worst in results},
     }
 
 
 def print_worst(
     console: Console,
-    found: Sequence[Worst],
+    results: Sequence[Worst],
     resolved: Scenario,
     certificate: ScenarioCertificate,
     trigger: str,
@@ -291,7 +291,7 @@ def print_worst(
     )
     for heading in ("", "no loss", "scenario's seed", "worst", "certified", "share of bound used"):
         table.add_column(heading, justify="right" if heading else "left")
-    for worst in found:
+    for worst in results:
         values = (worst.lossless, worst.own, worst.value, worst.certified)
         table.add_row(
             _quantity(worst.objective, certificate, trigger),
@@ -299,13 +299,13 @@ def print_worst(
             "[bold red]exceeded[/]" if worst.breaches else number(worst.tightness, 4),
         )
     console.print(table)
-    for worst in found:
-        at = "" if worst.at_s is None else f"worst at {worst.at_s:.6f} s; "
-        how = "all patterns searched" if worst.exact else "not all patterns searched"
+    for worst in results:
+        time_text = "" if worst.at_s is None else f"worst at {worst.at_s:.6f} s; "
+        coverage = "all patterns searched" if worst.exact else "not all patterns searched"
         speed = (
             f"{worst.runs:,} runs; {worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f} per second"
         )
-        console.print(f"{worst.objective.value}: {at}{how} ({speed})")
+        console.print(f"{worst.objective.value}: {time_text}{coverage} ({speed})")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
     if trigger == "sampled" and _is_shaped(certificate):
         console.print("[dim]Scaled: multiplied by bound(0) / bound(t)[/]")
@@ -334,5 +334,5 @@ def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: s
 
 def _is_shaped(certificate: ScenarioCertificate) -> bool:
     """Return whether the bounds are not c e^{−rt}."""
-    parts = (certificate.persistent_constants, certificate.floor_constants, certificate.other)
-    return any(part is not None for part in parts)
+    others = (certificate.persistent_constants, certificate.floor_constants, certificate.other)
+    return any(other is not None for other in others)

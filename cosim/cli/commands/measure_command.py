@@ -64,13 +64,7 @@ class ProbeOptions:
     def live(self, deadline_s: float | None) -> "live_measurement.LiveOptions":
         """Return the options of a live measurement."""
         return live_measurement.LiveOptions(
-            self.rate,
-            self.duration,
-            self.size,
-            self.round_trip,
-            self.silence,
-            self.save,
-            deadline_s,
+            self.rate, self.duration, self.size, self.round_trip, self.silence, self.save, deadline_s
         )
 
 
@@ -200,8 +194,8 @@ def measure(
         last = "the listener reports what has arrived"
         cli.print_lines(json, {"notes": result.notes}, *result.notes, last)
         return ExitStatus.OK
-    found = network_measurement.Measurement(result.trace, options, name, result.notes)
-    document = measurement_outputs.report(found, request, None if json else cli.console())
+    measurement = network_measurement.Measurement(result.trace, options, name, result.notes)
+    document = measurement_outputs.report(measurement, request, None if json else cli.console())
     if json:
         cli.print_json(document)
     return ExitStatus.UNINTENDED_LOSSES if result.kernel_drops else ExitStatus.OK

@@ -38,7 +38,7 @@ class Invited(StrEnum):
 @cli.command(cli.PROCESSES, 10, on_linux=True)
 def record(
     context: typer.Context,
-    given: opt.ScenarioOptions,
+    source: opt.ScenarioOptions,
     *,
     session: SessionOption = "default",
     listen: Annotated[str | None, Option(metavar="ADDRESS[:PORT]")] = None,
@@ -68,7 +68,7 @@ def record(
         address = remote_access.listen_address(listen)
         listening = remote_access.Listening(address, invitation, role, 60 * valid_minutes)
     return run_processes(
-        given.load(),
+        source.load(),
         options,
         spawn=(topology.RECORDER,),
         session=session,
@@ -91,7 +91,7 @@ class JoinOptions:
     json: opt.JsonOption = False
 
 
-def _join(role: str, place: int, module: str, about: str) -> None:
+def _join(role: str, position: int, module: str, about: str) -> None:
     """Declare the command that joins the open run as a process."""
 
     def join(options: JoinOptions) -> int:
@@ -110,7 +110,7 @@ def _join(role: str, place: int, module: str, about: str) -> None:
         noack {role} --session two --json   in another session; print its report as JSON
         noack {role} --invitation invitation.json   on another host
     """
-    cli.command(cli.PROCESSES, place, on_linux=True, name=role)(join)
+    cli.command(cli.PROCESSES, position, on_linux=True, name=role)(join)
 
 
 _join("plant", 20, "plant_server.__main__", "integrates the state, sends measurements.")
@@ -133,7 +133,7 @@ def netem(context: typer.Context) -> int:
 
 @cli.command(cli.PROCESSES, 60)
 def helics(
-    given: opt.ScenarioOptions,
+    source: opt.ScenarioOptions,
     *,
     endpoint: Annotated[list[str], Option("--endpoint", metavar="NAME")],
     broker: Annotated[str, Option(metavar="ADDRESS")] = "",
@@ -158,7 +158,7 @@ def helics(
     for number in (signal.SIGINT, signal.SIGTERM):  # HELICS waits in C, and so would Ctrl-C
         signal.signal(number, signal.SIG_DFL)
     options = helics_federate.FederateOptions(name, core, broker)
-    routes = helics_federate.run(given.load(), endpoint, options)
+    routes = helics_federate.run(source.load(), endpoint, options)
     cli.print_lines(json, {"endpoints": [route.to_json() for route in routes]}, *routes)
 
 

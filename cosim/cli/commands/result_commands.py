@@ -110,9 +110,9 @@ def report(
     with cli.status("writing the report"):
         path, drawn = finalize.run_report(run.path, run.loop, again=again), []
     if files is not None:
-        opened = run_library.open_run(run.path)
-        shown = opened if run.loop is None else opened.loops[run.loop]
-        drawn = shown.save_figures(files.kind, files.width_in)
+        whole_run = run_library.open_run(run.path)
+        loop_run = whole_run if run.loop is None else whole_run.loops[run.loop]
+        drawn = loop_run.save_figures(files.kind, files.width_in)
     written = {"figures": [str(figure) for figure in drawn]} if drawn else {}
     cli.print_lines(json, {"report": str(path)} | written, path, *drawn)
 
@@ -127,11 +127,11 @@ def replay(run: opt.LoopOptions, *, json: opt.JsonOption = False) -> int:
     """
     path = run.path
     with cli.status("replaying"):
-        found = run_replay.replay_run(run_record.load_run(path), run.loop)
+        result = run_replay.replay_run(run_record.load_run(path), run.loop)
     changed = run_directory.changed_since(path)
-    document = found.document() | {"changed_since": changed}
-    cli.show(json, lambda: document, replay_result.print_replay, found, changed)
-    return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
+    document = result.document() | {"changed_since": changed}
+    cli.show(json, lambda: document, replay_result.print_replay, result, changed)
+    return ExitStatus.OK if result.bit_exact else ExitStatus.FAILED
 
 
 @cli.command(cli.RUNS, 60, takes="about a second")
@@ -153,11 +153,11 @@ def fidelity(
         noack fidelity runs/latest --json   as JSON
     """
     with cli.status("comparing"):
-        found = fidelity_analysis.compute_fidelity(run_record.load_record(run.path, run.loop))
+        result = fidelity_analysis.compute_fidelity(run_record.load_record(run.path, run.loop))
         if out is not None:
-            figure_files.save_figure(run_figures.fidelity_figure(found), out, width)
-    cli.show(json, found.as_json, run_verdict.print_fidelity, found)
-    return ExitStatus.OK if found.explained else ExitStatus.FAILED
+            figure_files.save_figure(run_figures.fidelity_figure(result), out, width)
+    cli.show(json, result.as_json, run_verdict.print_fidelity, result)
+    return ExitStatus.OK if result.explained else ExitStatus.FAILED
 
 
 def _known_format(name: str) -> str:
@@ -219,9 +219,9 @@ def export(
 
 def _scenario_name(run: opt.LoopOptions) -> str:
     """Return the file of a run's scenario, or the scenario that is given instead of a run."""
-    given = run.run_dir
-    if given is not None and not (given / SCENARIO_FILE).is_file():
-        return str(given)
+    run_dir = run.run_dir
+    if run_dir is not None and not (run_dir / SCENARIO_FILE).is_file():
+        return str(run_dir)
     return str(run.path / SCENARIO_FILE)
 
 
@@ -270,9 +270,9 @@ def reproduce(
         noack reproduce result.noack.zip --into again --json   keep both runs; print JSON
     """
     with cli.status("repeating"):
-        found = run_archive.repeat_archive(file, run_code=run_code, long=long, into=into)
-    cli.show(json, found.to_json, run_archive.print_repetition, found)
-    return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
+        repetition = run_archive.repeat_archive(file, run_code=run_code, long=long, into=into)
+    cli.show(json, repetition.to_json, run_archive.print_repetition, repetition)
+    return ExitStatus.OK if repetition.bit_exact else ExitStatus.FAILED
 
 
 @cli.command(cli.RUNS, 55)
@@ -325,19 +325,19 @@ def compare(
         noack compare runs/A runs/B --json   as JSON
     """
     with cli.status("comparing"):
-        found = run_comparison.compare_runs(directories)
-        found.save(out, width)
+        comparison = run_comparison.compare_runs(directories)
+        comparison.save(out, width)
     if json:
-        cli.print_json(found.to_json() | {"overlay": str(out)})
+        cli.print_json(comparison.to_json() | {"overlay": str(out)})
         return
     console = cli.console()
-    for run in found.runs:
+    for run in comparison.runs:
         line = f"{run.label}  {run.title}  {run.directory}"
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    labels = [run.label for run in found.runs]
-    tables = {"key numbers (in brackets: difference to A)": found.rows}
-    if found.settings:
-        tables["settings that differ"] = found.setting_rows
+    labels = [run.label for run in comparison.runs]
+    tables = {"key numbers (in brackets: difference to A)": comparison.rows}
+    if comparison.settings:
+        tables["settings that differ"] = comparison.setting_rows
     for title, rows in tables.items():
         table = result_tables.ResultTable("", title, ("", *labels), rows)
         console.print(result_tables.terminal_table(table))

@@ -1,5 +1,7 @@
-"""``noack run``, ``demo``, ``simulate``, ``set``: make a run, or change one that goes on."""
+"""``noack lab``, ``run``, ``demo``, ``bridge``, ``simulate``: make a run; ``set``: change a live one."""
 
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +17,8 @@ from noack.core.number_format import number
 
 with lazy_modules():
     from cosim.analysis.summary import summary_model
+    from cosim.interactive import draft
+    from cosim.lab import lab_server
     from cosim.live import remote_access, simulated_run
     from cosim.live.monitoring import progress, ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict
@@ -28,10 +32,50 @@ if TYPE_CHECKING:
 _EVENTS_SHOWN = 40
 
 
+@cli.command(cli.RUNS, 5, on_linux=True)
+def lab(
+    source: opt.ExampleOptions,
+    *,
+    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    port: Annotated[int, Option(min=0, max=65535)] = 0,
+    browser: bool = True,
+    json: opt.JsonOption = False,
+) -> None:
+    """Open a page in the browser: drag settings, watch the loop, run it live.
+
+    The page is on 127.0.0.1, at an address with a secret. Ctrl-C ends it.
+
+    Options:
+        port: Port on 127.0.0.1; 0: a free one.
+        browser: Open the page in a browser.
+
+    Examples:
+        noack lab   open the paper's example
+        noack lab mine.toml --set trigger.beta=0.3   open a file with other settings
+        noack lab --no-browser --port 8080   print the address, for a browser elsewhere
+    """
+    if find_spec("nicegui") is None:
+        raise CallerError(
+            "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the repository"
+        )
+    edited = draft.open_draft(source.scenario)
+    for key, value in map(scenario_file.setting_of, source.settings or ()):
+        edited = edited.with_value(key, value)
+    _ = edited.scenario  # report mistakes here
+    query = edited.query() if source.settings else ""
+    options = lab_server.LabOptions(source.scenario, query, Path.cwd(), runs, port, browser)
+
+    def announce(address: str) -> None:
+        cli.print_lines(json, {"address": address}, f"noack lab: {address}  (Ctrl-C ends)")
+        sys.stdout.flush()  # somebody waits for it
+
+    lab_server.serve(options, announce)
+
+
 @cli.command(cli.RUNS, 20, takes="as long as the scenario's horizon, and a few seconds", on_linux=True)
 def run(
     context: typer.Context,
-    given: opt.ScenarioOptions,
+    source: opt.ScenarioOptions,
     *,
     hosts: Annotated[Path | None, Option(metavar="FILE")] = None,
     options: LiveOptions,
@@ -48,7 +92,7 @@ def run(
         noack run lane_following --hosts hosts.toml   some processes on other hosts, over ssh
     """
     listening = None if hosts is None else remote_access.listening_for(hosts)
-    return run_processes(given.load(), options, server=context.obj, listening=listening)
+    return run_processes(source.load(), options, server=context.obj, listening=listening)
 
 
 @cli.command(cli.RUNS, 10, takes="20 s and a few", on_linux=True)
@@ -69,14 +113,14 @@ def demo(
         noack demo --zoh --live   zero-order hold, with the live viewer
         noack demo --set speed=4 --set horizon_s=8   takes 2 s of wall time
     """
-    wanted = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
-    return run_processes(opt.load_scenario("lane_following", wanted), options, server=context.obj)
+    all_settings = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
+    return run_processes(opt.load_scenario("lane_following", all_settings), options, server=context.obj)
 
 
 @cli.command(cli.RUNS, 22, takes="as long as the scenario's horizon, and a few seconds", on_linux=True)
 def bridge(
     context: typer.Context,
-    given: opt.ScenarioOptions,
+    source: opt.ScenarioOptions,
     *,
     router: Annotated[str, Option(metavar="ENDPOINT")] = "tcp/127.0.0.1:7447",
     listen: Annotated[bool, Option("--listen")] = False,
@@ -94,14 +138,14 @@ def bridge(
         noack bridge lane_following --listen   without an installation of ROS
         noack bridge lane_following --router tcp/127.0.0.1:7447 --json   with rmw_zenohd
     """
-    loaded = given.load()
+    loaded = source.load()
     with ros2_bridge.bridge_process(router, domain, listen=listen) as watcher:
         return run_processes(loaded, options, server=context.obj, watcher=watcher)
 
 
 @cli.command(cli.RUNS, 30, takes="about a second; the report, some more")
 def simulate(
-    given: opt.ScenarioOptions,
+    source: opt.ScenarioOptions,
     *,
     trigger: opt.TriggerOption = opt.TriggerMode.SAMPLED,
     runs: opt.RunsOption = cli.DEFAULT_RUNS,
@@ -116,7 +160,7 @@ def simulate(
         noack simulate lane_following --trigger continuous   the paper's loop, exactly
         noack simulate reactor_petc --no-report --json   print the summary as JSON
     """
-    loaded = given.load()
+    loaded = source.load()
     link_load.require_capacity(loaded)
     warn_of_violations(loaded)
     if trigger is opt.TriggerMode.CONTINUOUS:
@@ -130,40 +174,49 @@ def _simulate_continuously(loaded: "scenario.Scenario", *, json: bool) -> int:
     resolved = resolution.resolve(loaded)
     with cli.status("simulating"):
         run = continuous.run_continuous(resolved)
-    found = continuous.summary(run, resolved)
-    cli.show(json, lambda: continuous.document(run, resolved), _print_run, run, found)
-    return found.exit_status
+    summary = continuous.summary(run, resolved)
+    cli.show(json, lambda: continuous.document(run, resolved), _print_run, run, summary)
+    return summary.exit_status
 
 
 def _print_run(
-    console: "Console", run: "continuous.ContinuousRun", found: "continuous.ContinuousSummary"
+    console: "Console", run: "continuous.ContinuousRun", summary: "continuous.ContinuousSummary"
 ) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
-    import numpy as np  # help and completion need neither of the two
-    from rich.text import Text
+    from rich.text import Text  # help and completion need none
 
-    ended = summary_model.ExitPart(status=int(found.exit_status), reason=found.reason)
+    ended = summary_model.ExitPart(status=int(summary.exit_status), reason=summary.reason)
     state = (
         ""
-        if found.diverged_at_s
+        if summary.diverged_at_s
         else run_verdict.state_text(
-            found.initial_state_norm, found.sup_state_norm, found.final_state_norm, None
+            summary.initial_state_norm, summary.sup_state_norm, summary.final_state_norm, None
         )
     )
-    ending = run_verdict.ending_line(ended, found.reached_s, found.horizon_s, state)
-    for line in (ending, run_verdict.transmission_line(found.events, found.deliveries)):
+    ending = run_verdict.ending_line(ended, summary.reached_s, summary.horizon_s, state)
+    for line in (ending, run_verdict.transmission_line(summary.events, summary.deliveries)):
         console.print(Text(line.text, line.style), soft_wrap=True)
     rows = (
-        run_tables.lost_row(found.drops, found.deliveries),
-        run_tables.longest_burst(found.mansd, (), found.longest_loss_burst),
+        run_tables.lost_row(summary.drops, summary.deliveries),
+        run_tables.longest_burst(summary.mansd, (), summary.longest_loss_burst),
         *run_tables.interval_rows(
-            found.inter_event_min_s, found.inter_event_median_s, found.inter_delivery_median_s
+            summary.inter_event_min_s, summary.inter_event_median_s, summary.inter_delivery_median_s
         ),
-        ("‖x‖ at the start", number(found.initial_state_norm)),
-        ("‖x‖ at the end", number(found.final_state_norm)),
+        ("‖x‖ at the start", number(summary.initial_state_norm)),
+        ("‖x‖ at the end", number(summary.final_state_norm)),
     )
-    title = run_tables.title_of(found.scenario, found.mode, found.mansd, (), "continuous")
+    title = run_tables.title_of(summary.scenario, summary.mode, summary.mansd, (), "continuous")
     run_verdict.print_numbers(console, title, rows)
+    table = _event_table(run)
+    console.print(result_tables.terminal_table(table, left=(), styles={"lost": "red"}))
+    if len(run.before) > _EVENTS_SHOWN:
+        console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")
+
+
+def _event_table(run: "continuous.ContinuousRun") -> "result_tables.ResultTable":
+    """Return the table of a run's first 40 events."""
+    import numpy as np  # help and completion need none
+
     since_s = np.diff(run.event_s, prepend=0.0)
     with np.errstate(all="ignore"):  # a run may diverge
         norms = [
@@ -182,10 +235,7 @@ def _print_run(
         for i, (state, (x, e_c)) in enumerate(zip(run.before, norms, strict=False))
     ]
     headings = ("event", "t, s", "inter-event time, s", "‖x‖", "‖e_c‖ before", "fate")
-    table = result_tables.ResultTable("events", "events", headings, events)
-    console.print(result_tables.terminal_table(table, left=(), styles={"lost": "red"}))
-    if len(run.before) > _EVENTS_SHOWN:
-        console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")
+    return result_tables.ResultTable("events", "events", headings, events)
 
 
 @cli.command(
@@ -217,15 +267,15 @@ def set_(
         noack set loss.p 0.9   lose nine in ten packets from now on
         noack set mansd 2 trigger.beta 0.3 --json   change M − 1 and β at once
     """
-    wanted = parsed(settings or ())
-    answer = run_registry.request_change(run_registry.find(session, run), wanted)
+    changes = parsed(settings or ())
+    answer = run_registry.request_change(run_registry.find(session, run), changes)
     if json:
         cli.print_json(answer.fields())
-    elif wanted:
+    elif changes:
         loops, entries = answer.changed_loops, answer.loops
-        which = "" if len(entries) == 1 else f"; changed: {', '.join(loops) or 'no loop'}"
-        text = runtime_parameters.text_of(wanted)
-        print(f"{answer.name}: {text} from {answer.from_s or 0.0:.3f} s on{which}")
+        suffix = "" if len(entries) == 1 else f"; changed: {', '.join(loops) or 'no loop'}"
+        text = runtime_parameters.text_of(changes)
+        print(f"{answer.name}: {text} from {answer.from_s or 0.0:.3f} s on{suffix}")
     else:
         _print_parameters(cli.console(), answer)
 
@@ -235,22 +285,22 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, object]:
 
     Raise CallerError if a value is missing, or a key is given twice.
     """
-    found: dict[str, object] = {}
-    left = list(words)
-    while left:
-        word = left.pop(0)
+    settings: dict[str, object] = {}
+    remaining = list(words)
+    while remaining:
+        word = remaining.pop(0)
         name, equals, text = word.partition("=")
         if not equals:
             if Path(word).is_dir():
                 raise CallerError(f"{word}: a folder, not a key; a run is given by --run {word}")
-            if not left:
+            if not remaining:
                 raise CallerError(f"{word}: needs a value, e.g. `noack set loss.p 0.9`")
-            text = left.pop(0)
+            text = remaining.pop(0)
         key = runtime_parameters.full_key(name.strip())
-        if key in found:
+        if key in settings:
             raise CallerError(f"{key}: is given twice")
-        found[key] = scenario_file.value_of(text, name)
-    return found
+        settings[key] = scenario_file.value_of(text, name)
+    return settings
 
 
 def _print_parameters(console: "Console", answer: "control_messages.ChangeReply") -> None:
@@ -263,8 +313,8 @@ def _print_parameters(console: "Console", answer: "control_messages.ChangeReply"
                 text = runtime_parameters.text_of({"": values[key]}).removeprefix(" = ")
                 names.setdefault(text, []).append(name)
         for value, loops in names.items():
-            which = "all" if len(loops) == len(entries) else ", ".join(loops)
-            rows.append((key, short.get(key, ""), which, value))
+            loop_text = "all" if len(loops) == len(entries) else ", ".join(loops)
+            rows.append((key, short.get(key, ""), loop_text, value))
     title = f"{answer.name}, at {answer.t_s:.1f} s"
     table = result_tables.ResultTable("", title, ("key", "short", "loops", "value"), rows)
     console.print(result_tables.terminal_table(table, left=range(4)))

@@ -1,6 +1,6 @@
-"""``noack scenarios``, ``check``, ``schema``; ``linearise``, ``gain``, ``new``: scenario files.
+"""``noack doctor``: this machine; ``scenarios``, ``check``, ``schema``, ``linearise``, ``gain``, ``new``.
 
-The last three lead from a plant to a scenario.
+The other six are about scenario files. The last three lead from a plant to a scenario.
 """
 
 import json as json_format
@@ -16,12 +16,13 @@ from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, MachineError, why
+from noack.core.errors import CallerError, ExitStatus, MachineError, why
 from noack.core.file_access import new_file
 
 with lazy_modules():
     from controller_node import controller
     from cosim.analysis.summary import run_summary
+    from cosim.doctor import findings, machine_measures
     from cosim.live import launcher
     from cosim.live.processes import child_processes
     from cosim.output import run_verdict
@@ -50,6 +51,45 @@ PlantArgument = Annotated[
 ]
 
 
+@cli.command(cli.FILES, 10, takes="some 10 s", on_linux=True)
+def doctor(
+    source: opt.ExampleOptions,
+    *,
+    seconds: Annotated[float, Option(min=0.1, max=3600)] = 2.0,
+    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    json: opt.JsonOption = False,
+) -> int:
+    """Check this machine: real-time settings, timers, ports, disk.
+
+    Each finding is good, limited or bad, with its meaning for a run and a remedy. The scenario
+    determines rates, ports and the allowed lateness.
+
+    Exit status 1: a finding is bad, so that no run is possible.
+
+    Options:
+        seconds: Seconds of each measurement of wake-ups: without and with real-time settings.
+
+    Examples:
+        noack doctor   for the paper's example
+        noack doctor lane_weighted --set speed=4   for another scenario
+        noack doctor --seconds 10 --json   measure longer; all numbers as JSON
+    """
+    resolved = resolution.resolve(source.load())
+    required = machine_measures.requirements_of(resolved)
+    with cli.status("measuring"):
+        machine = machine_measures.measure(resolved, required, runs, seconds)
+    results = findings.judge(machine, required)
+    cli.show(
+        json,
+        lambda: findings.document(machine, required, results),
+        findings.print_findings,
+        required,
+        results,
+    )
+    is_bad = findings.worst(results) is findings.FindingStatus.BAD
+    return ExitStatus.FAILED if is_bad else ExitStatus.OK
+
+
 @cli.command(cli.FILES, 20)
 def scenarios(
     name: Annotated[str | None, Argument(autocompletion=opt.complete_shipped)] = None,
@@ -74,22 +114,22 @@ def scenarios(
     if json:
         cli.print_json(
             {
-                kind: [file._asdict() | {"path": str(file.path)} for file in some]
-                for kind, some in shipped.items()
+                kind: [file._asdict() | {"path": str(file.path)} for file in files]
+                for kind, files in shipped.items()
             }
         )
         return
     console = cli.console()
-    for kind, some in shipped.items():
+    for kind, files in shipped.items():
         console.print(kind, style="bold", highlight=False)
-        _print_shipped(console, some)
+        _print_shipped(console, files)
 
 
-def _print_shipped(console: "Console", some: Sequence[ShippedFile]) -> None:
+def _print_shipped(console: "Console", files: Sequence[ShippedFile]) -> None:
     """Print one line per file to a pipe, or a wrapped table to a terminal."""
-    width = max(len(file.name) for file in some)
+    width = max(len(file.name) for file in files)
     if not console.is_terminal:
-        for file in some:
+        for file in files:
             print(f"{file.name:{width}}  {file.description}")
         return
     from rich.table import Table  # a pipe needs none
@@ -97,13 +137,13 @@ def _print_shipped(console: "Console", some: Sequence[ShippedFile]) -> None:
     table = Table.grid(padding=(0, 2))
     table.add_column(min_width=width, no_wrap=True, style="cyan")
     table.add_column()
-    for file in some:
+    for file in files:
         table.add_row(file.name, file.description)
     console.print(table)
 
 
 @cli.command(cli.FILES, 30)
-def check(given: opt.ScenarioOptions, *, json: opt.JsonOption = False) -> None:
+def check(source: opt.ScenarioOptions, *, json: opt.JsonOption = False) -> None:
     """Check a scenario and print it with all defaults and random draws filled in.
 
     The output is a scenario file. Comments at its end say which of the paper's assumptions hold.
@@ -114,7 +154,7 @@ def check(given: opt.ScenarioOptions, *, json: opt.JsonOption = False) -> None:
         noack check lane_following   print the scenario and its assumptions
         noack check lane_following --set mode=zoh --json   as JSON
     """
-    loaded = given.load()
+    loaded = source.load()
     if len(scenario.loop_names(loaded)) > 1:
         _check_loops(loaded, json=json)
         return
@@ -188,8 +228,8 @@ def _print_plant(console: "Console", resolved: "scenario.Scenario") -> None:
     if (law := getattr(controller.law_of(resolved), "about", None)) is not None:
         console.print(f"the controller: {law}", highlight=False, markup=False)
     if (near := run_summary.linearisation(resolved)) is not None:
-        for what, value in run_summary.linearisation_rows(near):
-            console.print(f"{what}: {value}", highlight=False, markup=False)
+        for label, value in run_summary.linearisation_rows(near):
+            console.print(f"{label}: {value}", highlight=False, markup=False)
     for line in _dependent_defaults(resolved):
         console.print(line, highlight=False, markup=False)
 
@@ -245,7 +285,7 @@ def linearise(
     settings: opt.SetOption = None,
     *,
     at: str | None = None,
-    held: Annotated[str | None, Option("--input")] = None,
+    operating_input: Annotated[str | None, Option("--input")] = None,
     within: float = 0.1,
     out: opt.OutOption = None,
     json: opt.JsonOption = False,
@@ -257,7 +297,7 @@ def linearise(
 
     Options:
         at: x at the point, e.g. 0,0,0.1,0; by default 0.
-        held: u at the point; by default 0.
+        operating_input: u at the point; by default 0.
         within: Half-width of the neighbourhood in which the error is sampled.
         out: Write the model as JSON, for gain and new.
 
@@ -266,14 +306,14 @@ def linearise(
         noack linearise pole.py:Pole --out pole.json   a class of yours; write the model
         noack linearise four_tank --set plant.system.voltages_v=[4.0,4.0] --json   as JSON
     """
-    found = linear_model.linearise(
+    model = linear_model.linearise(
         plant,
         at=_numbers("--at", at),
-        input=_numbers("--input", held),
+        input=_numbers("--input", operating_input),
         settings=_settings(settings),
         within=within,
     )
-    _show(found, out, json=json)
+    _show(model, out, json=json)
 
 
 @cli.command(cli.FILES, 14, takes="about a second")
@@ -301,14 +341,14 @@ def gain(
         noack gain pole.json --out pole.json   add a gain to a model that linearise wrote
         noack gain cart_pole --poles=-2,-3,-4,-5 --json   given poles, as JSON
     """
-    found = linear_model.gain(
+    result = linear_model.gain(
         plant,
         q=_numbers("--q", q),
         r=_numbers("--r", r),
         poles=_numbers("--poles", poles, complex),
         settings=_settings(settings),
     )
-    _show(found, out, json=json)
+    _show(result, out, json=json)
 
 
 @cli.command(cli.FILES, 16, takes="some 10 s")
@@ -342,43 +382,47 @@ def new(
     if not file.parent.is_dir():
         raise CallerError(f"{file}: there is no folder {file.parent}")
     with cli.status("linearising") as status:
-        found = new_scenario.new(
+        result = new_scenario.new(
             plant,
             file,
             initial_state=_numbers("--x0", x0),
             settings=_settings(settings),
             report=status.update,
         )
-    found.save(file)
+    result.save(file)
     following = f"wrote {file}; now noack check, certify, simulate or run {file}"
-    cli.print_lines(json, found.to_json(), *found.notes, following)
+    cli.print_lines(json, result.to_json(), *result.notes, following)
 
 
-def _settings(given: Sequence[str] | None) -> "Table":
+def _settings(assignments: Sequence[str] | None) -> "Table":
     """Return the values of --set by their keys."""
-    return dict(scenario_file.setting_of(one, "plant.system.cart_kg=1.0") for one in given or ())
+    return dict(
+        scenario_file.setting_of(assignment, "plant.system.cart_kg=1.0") for assignment in assignments or ()
+    )
 
 
 def _numbers(option: str, text: str | None, kind: Callable[[str], Number] = float) -> list[Number] | None:
     if text is None:
         return None
     try:
-        return [kind(one) for one in text.replace(" ", "").strip("[]()").split(",")]
+        return [kind(word) for word in text.replace(" ", "").strip("[]()").split(",")]
     except ValueError:
         raise CallerError(f"{option} {text}: give numbers with commas, e.g. -1,-0.5") from None
 
 
-def _show(found: "linear_model.LinearModel | linear_model.LoopGain", out: Path | None, *, json: bool) -> None:
+def _show(
+    result: "linear_model.LinearModel | linear_model.LoopGain", out: Path | None, *, json: bool
+) -> None:
     """Print a result, and write its document, not over that of another plant."""
     if out is not None:
         if out.suffix != ".json":
             raise CallerError(f"--out {out}: the name of a model ends in .json")
-        label = found.to_json()["plant"]
-        if out.exists() and (other := linear_model.read_document(out)["plant"]) != label:
-            raise CallerError(f"--out {out}: has the model of {other}; give another name")
+        label = result.to_json()["plant"]
+        if out.exists() and (other_plant := linear_model.read_document(out)["plant"]) != label:
+            raise CallerError(f"--out {out}: has the model of {other_plant}; give another name")
         try:
             with new_file(out, make_folder=False) as file:
-                file.write(json_format.dumps(found.to_json(), indent=2).encode())
+                file.write(json_format.dumps(result.to_json(), indent=2).encode())
         except OSError as error:
             raise MachineError(f"--out {out}: cannot be written: {why(error)}") from None
-    cli.print_lines(json, found.to_json(), repr(found))
+    cli.print_lines(json, result.to_json(), repr(result))

@@ -64,10 +64,10 @@ def campaign(
     path = find_shipped(file, "campaigns")
     plan = campaign_file.load(path)
     folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
-    summary, _, _, made, files = execute_campaign(
+    summary, _, _, new_runs, files = execute_campaign(
         plan, path, start, folder=folder, draws=draws, figure_files=figure_files
     )
-    document = summary.document() | {"made": made}
+    document = summary.document() | {"made": new_runs}
     cli.show_with_files(json, document, files, campaign_report.print_summary, summary)
     cli.write_tables(campaign_report.campaign_tables(summary), tables, json=json)
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK
@@ -104,29 +104,29 @@ def paper(
     """
     if list_names:
         names = paper_results.NAMES if name is None else [name]
-        known = {one: paper_results.named(one).about for one in names}
-        cli.print_lines(json, known, *(f"{one:<18} {about}" for one, about in known.items()))
+        known = {result_name: paper_results.named(result_name).about for result_name in names}
+        cli.print_lines(json, known, *(f"{result_name:<18} {about}" for result_name, about in known.items()))
         return ExitStatus.OK
     if name is not None:
         if out is not None or draws is not None:
             raise CallerError("--out, --draws: are for `noack paper` without a name; this has --tables FILE")
         with cli.status("computing"):
-            found = paper_results.reproduce(name)
-        cli.show(json, found.document, published_result.print_rows, found)
-        cli.write_tables([found.table], tables, json=json)
-        return ExitStatus.OK if found.as_expected else ExitStatus.FAILED
+            result = paper_results.reproduce(name)
+        cli.show(json, result.document, published_result.print_rows, result)
+        cli.write_tables([result.table], tables, json=json)
+        return ExitStatus.OK if result.as_expected else ExitStatus.FAILED
     out = out or cli.DEFAULT_RUNS / "paper"
     paper_page.make_folder(out)
     path, folder = find_shipped("paper", "campaigns"), cli.DEFAULT_RUNS / "campaigns" / "paper"
     plan = campaign_file.load(path)
-    done = execute_campaign(plan, path, worker_pool(None), folder=folder, draws=draws)
+    finished = execute_campaign(plan, path, worker_pool(None), folder=folder, draws=draws)
     with cli.status("computing the examples"):
-        numbers, files = paper_page.write_page(done, out)
-    table = campaign_report.claims_table(done.summary)
+        numbers, files = paper_page.write_page(finished, out)
+    table = campaign_report.claims_table(finished.summary)
     if not json:
         cli.console().print(result_tables.terminal_table(table, left=range(3)))
     document = {
-        "draws": done.summary.draws,
+        "draws": finished.summary.draws,
         "representative": numbers["representative"],
         "claims": numbers["summary"]["claims"],
         "files": [str(file) for file in files],
@@ -158,9 +158,9 @@ class LimitOptions:
         """Return the limits; raise CallerError if one is wrong."""
         if self.settling is None:
             raise CallerError("--settling: give the largest settling time, e.g. --settling 14")
-        for option, most in (("settling", math.inf), ("quantile", 1), ("settle", 1)):
-            if not 0 < (value := getattr(self, option)) < most:
-                allowed = "positive" if most == math.inf else "between 0 and 1"
+        for option, upper in (("settling", math.inf), ("quantile", 1), ("settle", 1)):
+            if not 0 < (value := getattr(self, option)) < upper:
+                allowed = "positive" if upper == math.inf else "between 0 and 1"
                 raise CallerError(f"--{option}: must be {allowed}, not {value:g}")
         if self.under not in ("paper", "schedule"):
             raise CallerError(f'--under: paper or schedule, not "{self.under}"')
@@ -170,7 +170,7 @@ class LimitOptions:
 
     def bounds(self) -> "dict[design_search.Bounded, float]":
         """Return the limits of certified bounds; raise CallerError if one is wrong."""
-        found: dict[design_search.Bounded, float] = {}
+        by_quantity: dict[design_search.Bounded, float] = {}
         for text in self.bound or ():
             name, _, value = text.partition("=")
             try:
@@ -180,10 +180,10 @@ class LimitOptions:
             bounded: dict[str, design_search.Bounded] = {"state": "state", "error": "error"}
             if name not in bounded or not 0 < limit < math.inf:
                 raise CallerError(f"--bound {text}: write it as state=X or error=X, X positive")
-            if bounded[name] in found:
+            if bounded[name] in by_quantity:
                 raise CallerError(f"--bound {text}: {name} is given twice")
-            found[bounded[name]] = limit
-        return found
+            by_quantity[bounded[name]] = limit
+        return by_quantity
 
 
 class DesignAim(StrEnum):
@@ -223,9 +223,7 @@ class NetworkOptions:
     effort: Annotated[int, Option(min=0)] = 1500
 
     def wish(
-        self,
-        weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]",
-        bounds: "design_search.Bounds",
+        self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]", bounds: "design_search.Bounds"
     ) -> "network_search.Wish":
         """Return what is asked for; raise CallerError if an option is wrong."""
         modes = [mode.strip() for mode in self.holds.split(",")]
@@ -260,13 +258,13 @@ class GainOptions(opt.CostOptions):
     gain: str = "given"
 
     def regulator(
-        self, given: "scenario.Scenario"
+        self, loaded: "scenario.Scenario"
     ) -> "tuple[linear_systems.Matrix, linear_systems.Matrix] | None":
         """Return the LQR costs, None for the scenario's gain; raise CallerError if one is wrong."""
         if self.gain not in ("given", "lqr"):
             raise CallerError(f'--gain: given or lqr, not "{self.gain}"')
         if self.gain == "lqr":
-            return self.matrices(given)
+            return self.matrices(loaded)
         if self.Q or self.R:
             raise CallerError("--Q, --R: are for --gain lqr only")
         return None
@@ -297,10 +295,10 @@ class DesignFiles:
 
 @cli.command(cli.CAMPAIGNS, 20, takes="up to a minute")
 def design(
-    given: opt.OneLoopOptions,
+    source: opt.OneLoopOptions,
     *,
     network: NetworkOptions,
-    wanted: LimitOptions,
+    requirements: LimitOptions,
     weights: str = "identity,chosen",
     feedback: GainOptions,
     draws: Annotated[int, Option(min=20)] = 2000,
@@ -330,12 +328,12 @@ def design(
         noack design unstable_pendulum --for network --period 0.25 --out mine.toml
         noack design lane_periodic --for transmissions --cost 1   the longest period
     """
-    figure_files, loaded = figures.files, given.load()
+    figure_files, loaded = figures.files, source.load()
     if network.aim is not DesignAim.SETTLING:
-        if wanted.settling is not None or feedback.gain != "given":
+        if requirements.settling is not None or feedback.gain != "given":
             raise CallerError(f"--settling, --gain: are not for --for {network.aim.value}")
         page = files.page_of(f"{loaded.name}-network")
-        wish = network.wish(feedback.matrices(loaded), wanted.bounds())
+        wish = network.wish(feedback.matrices(loaded), requirements.bounds())
         with progress.work_bar("trying gains") as bar:
             outcome = event_design.design_for_network(loaded, wish, seed, bar)
         written = design_page.write_outcome(outcome, page, figure_files)
@@ -343,13 +341,13 @@ def design(
         cli.show_with_files(json, outcome.to_json(), written, design_page.print_design, outcome)
         return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
     page = files.page_of(loaded.name)
-    found = _trigger_of(loaded, wanted.limits(), weights, feedback, draws, seed)
-    written = design_page.write_page(found, page, figure_files)
-    written += files.write(scenario_file.dumps(found.scenario)) if found.feasible else []
-    cli.show_with_files(json, found.document(), written, design_page.print_found, found)
-    if not found.confirmed:
-        print_to_stderr(f"noack: {found.verdict()}")
-    return ExitStatus.OK if found.confirmed else ExitStatus.FAILED
+    result = _trigger_of(loaded, requirements.limits(), weights, feedback, draws, seed)
+    written = design_page.write_page(result, page, figure_files)
+    written += files.write(scenario_file.dumps(result.scenario)) if result.feasible else []
+    cli.show_with_files(json, result.document(), written, design_page.print_found, result)
+    if not result.confirmed:
+        print_to_stderr(f"noack: {result.verdict()}")
+    return ExitStatus.OK if result.confirmed else ExitStatus.FAILED
 
 
 def _trigger_of(
@@ -404,28 +402,25 @@ class StudyOptions(opt.ScenarioOptions):
         """Return what is run; raise CallerError if an option is wrong."""
         depth = self._depth()
         path = opt.find_scenario(self.scenario)
-        given = scenario_file.load(path, self.settings or ())
+        loaded = scenario_file.load(path, self.settings or ())
         settings: dict[str, Any] = dict(map(scenario_file.setting_of, self.settings or ()))
         if self.rate_bps is not None:
-            given = capacity_plan.with_rate(given, self.rate_bps)
+            loaded = capacity_plan.with_rate(loaded, self.rate_bps)
             settings["network.impairments"] = [
                 impairment.model_dump(mode="json", exclude_none=True)
-                for impairment in given.network.impairments
+                for impairment in loaded.network.impairments
             ]
-        capacity_plan.bottleneck(given)
-        for option, seconds in (
-            ("--update-period", self.update_period),
-            ("--late-after", self.late_after),
-        ):
-            if seconds is not None and not 0 < seconds < given.horizon_s:
+        capacity_plan.bottleneck(loaded)
+        for option, seconds in (("--update-period", self.update_period), ("--late-after", self.late_after)):
+            if seconds is not None and not 0 < seconds < loaded.horizon_s:
                 raise CallerError(f"{option} {seconds:g}: between 0 and the horizon of the scenario")
-        kinds = capacity_plan.kinds_of(given, self.update_period)
+        kinds = capacity_plan.kinds_of(loaded, self.update_period)
         shortest_s = min(kind.period_s for kind in kinds)
-        deadline_s = self.late_after or given.certificate.network_delay_s or shortest_s
+        deadline_s = self.late_after or loaded.certificate.network_delay_s or shortest_s
         settings["certificate.network_delay_s"] = deadline_s
         least = capacity_plan.smallest_mixture(kinds)
         if self.loops is None:
-            carried = capacity_plan.periodic_loops(given, kinds)
+            carried = capacity_plan.periodic_loops(loaded, kinds)
             counts = capacity_plan.default_counts(carried, least, depth)
         else:
             try:
@@ -434,7 +429,7 @@ class StudyOptions(opt.ScenarioOptions):
                 raise CallerError(f"--loops {self.loops}: write it as N,N,..., e.g. 5,10,20") from None
             counts = capacity_plan.require_counts(given_counts, least)
         return capacity_plan.CapacityPlan(
-            scenario=given,
+            scenario=loaded,
             kinds=kinds,
             file=path,
             settings=settings,
@@ -459,18 +454,18 @@ class StudyOptions(opt.ScenarioOptions):
     def _policies(self, kinds: "Sequence[capacity_plan.Kind]") -> dict[str, dict[str, Any]]:
         """Return the settings of the policies that are compared, too, by name."""
         known = {capacity_plan.PERIODIC, capacity_plan.ZOH, capacity_plan.MODEL}
-        found: dict[str, dict[str, Any]] = {}
+        by_name: dict[str, dict[str, Any]] = {}
         for text in self.policy or ():
             name, equals, trigger = text.partition("=")
             name = name.strip()
-            is_new = name not in known and name not in found
+            is_new = name not in known and name not in by_name
             if not equals or not re.match(run_sections.NAME_PATTERN, name) or not is_new:
                 raise CallerError(
                     f"--policy {text}: write it as NAME=TRIGGER, with a new name of letters, digits, _ and -"
                 )
             value: Any = scenario_file.value_of(trigger, f"--policy {name}")
-            found[name] = {"loops": [kind.under({"trigger": value}) for kind in kinds]}
-        return found
+            by_name[name] = {"loops": [kind.under({"trigger": value}) for kind in kinds]}
+        return by_name
 
 
 @cli.command(cli.CAMPAIGNS, 30, takes="minutes with its defaults")
@@ -509,17 +504,17 @@ def capacity(
     name = f"{plan.scenario.name}-thorough" if study.thorough else plan.scenario.name
     folder = out or cli.DEFAULT_RUNS / "capacity" / name
     estimated_s = _announce(study, plan, folder, workers or cli.cores(), len(chosen))
-    done = execute_campaign(plan.campaign(), Path("noack capacity"), start, folder=folder)
+    finished = execute_campaign(plan.campaign(), Path("noack capacity"), start, folder=folder)
     points = []
     for policy, count in chosen:
         with cli.status(f"live: {policy}, {count} loops"):
-            found = done.summary.results
-            points.append(capacity_result.live_point((policy, count), found, folder / "live"))
-    capacities = capacity_result.capacities(plan, done.summary, done.store)
-    result = capacity_page.CapacityResult(plan, done.summary, capacities, points)
-    files = [*capacity_page.write(result, folder, figure_files), *done.files]
-    about = {"thorough": study.thorough, "estimated_s": estimated_s, "made": done.made}
-    document = result.document() | about
+            simulated = finished.summary.results
+            points.append(capacity_result.live_point((policy, count), simulated, folder / "live"))
+    capacities = capacity_result.capacities(plan, finished.summary, finished.store)
+    result = capacity_page.CapacityResult(plan, finished.summary, capacities, points)
+    files = [*capacity_page.write(result, folder, figure_files), *finished.files]
+    facts = {"thorough": study.thorough, "estimated_s": estimated_s, "made": finished.made}
+    document = result.document() | facts
     cli.show_with_files(json, document, files, capacity_page.print_result, result)
     agree = all(point.status == ExitStatus.OK and not point.outside for point in points)
     return ExitStatus.OK if agree else ExitStatus.FAILED

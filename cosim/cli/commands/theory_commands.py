@@ -25,7 +25,7 @@ with lazy_modules():
 
 @cli.command(cli.THEORY, 10, takes="about two seconds; half a minute where events are due after many tests")
 def certify(
-    given: opt.OneLoopOptions,
+    source: opt.OneLoopOptions,
     *,
     weight: str = "given",
     late: Annotated[int | None, Option(min=0, max=1000)] = None,
@@ -50,31 +50,31 @@ def certify(
         noack certify lane_following --weight chosen   with a norm that certifies more
         noack certify lane_weighted --late 6 --json   allow 6 steps of lateness
     """
-    loaded, chosen = given.load(), None
+    loaded, chosen = source.load(), None
     if weight == "chosen":
         with progress.work_bar("choosing the weight") as bar:
-            found = certificates.certificates_of(loaded, weight, late, bar, of_model=True)
+            result = certificates.certificates_of(loaded, weight, late, bar, of_model=True)
     else:
-        found = certificates.certificates_of(loaded, weight, late, of_model=True)
-    if weight == "given" and found.schedule.constants is None:
+        result = certificates.certificates_of(loaded, weight, late, of_model=True)
+    if weight == "given" and result.schedule.constants is None:
         with progress.work_bar("no certificate in the given norm; choosing another") as bar:
-            chosen = certificates.in_chosen_norm(loaded, found, bar)
+            chosen = certificates.in_chosen_norm(loaded, result, bar)
 
     def to_json() -> dict[str, object]:
-        return found.to_json() | {"in_chosen_norm": chosen and chosen.to_json()}
+        return result.to_json() | {"in_chosen_norm": chosen and chosen.to_json()}
 
-    cli.show(json, to_json, certificate_report.print_certificates, found, chosen)
-    cli.write_tables(certificate_report.certificate_tables(found), tables, json=json)
+    cli.show(json, to_json, certificate_report.print_certificates, result, chosen)
+    cli.write_tables(certificate_report.certificate_tables(result), tables, json=json)
     if out is not None:
-        mat_export.save_mat(found.to_json(), out)
-    certified = any(certificate.constants for _, certificate in found)
+        mat_export.save_mat(result.to_json(), out)
+    certified = any(certificate.constants for _, certificate in result)
     return ExitStatus.OK if certified else ExitStatus.FAILED
 
 
 @cli.command(cli.THEORY, 30, takes="some seconds")
 def margin(
     context: typer.Context,
-    given: opt.OneLoopOptions,
+    source: opt.OneLoopOptions,
     *,
     most: Annotated[int, Option(min=1, max=1000)] = 16,
     accuracy: float = 2e-4,
@@ -109,9 +109,9 @@ def margin(
     """
     if play and json:
         raise CallerError("--play: has an output of its own; leave out --json")
-    resolved = resolution.resolve(given.load())
+    resolved = resolution.resolve(source.load())
     with cli.status("examining") as status:
-        found = margin_search.find_margin(
+        result = margin_search.find_margin(
             resolved,
             most_m=most,
             accuracy=accuracy,
@@ -120,19 +120,19 @@ def margin(
             effort=effort,
             progress=lambda text: status.update(f"examining {text}"),
         )
-    cli.show(json, found.to_json, certificate_report.print_margin, found)
-    cli.write_tables(certificate_report.margin_tables(found), tables, json=json)
+    cli.show(json, result.to_json, certificate_report.print_margin, result)
+    cli.write_tables(certificate_report.margin_tables(result), tables, json=json)
     if not play:
-        return ExitStatus.OK if found.stable_m else ExitStatus.FAILED
-    if (pattern := found.destabilised) is None:
+        return ExitStatus.OK if result.stable_m else ExitStatus.FAILED
+    if (pattern := result.destabilised) is None:
         raise CallerError(f"--play: no destabilising pattern was found for M up to {most}")
-    played = given.load(*pattern.settings)
+    played = source.load(*pattern.settings)
     return run_processes(played, LiveOptions(runs=runs), server=context.obj)
 
 
 @cli.command(cli.THEORY, 35, takes="a second")
 def cost(
-    given: opt.OneLoopOptions,
+    source: opt.OneLoopOptions,
     *,
     weights: opt.CostOptions,
     tables: opt.TablesOption = None,
@@ -149,12 +149,12 @@ def cost(
         noack cost lane_periodic --R '[0.1, 0.1]' --json   with other weights; as JSON
         noack cost lane_periodic --set mansd=2   with a stricter guarantee
     """
-    resolved = resolution.resolve(given.load())
-    found = mean_cost.find_mean_cost(resolved, *weights.matrices(resolved))
-    cli.show(json, found.to_json, certificate_report.print_mean_cost, found)
-    cli.write_tables(certificate_report.mean_cost_tables(found), tables, json=json)
-    one = found.with_guarantee
-    grows = isinstance(one, str) or one.stationary is None
+    resolved = resolution.resolve(source.load())
+    costs = mean_cost.find_mean_cost(resolved, *weights.matrices(resolved))
+    cli.show(json, costs.to_json, certificate_report.print_mean_cost, costs)
+    cli.write_tables(certificate_report.mean_cost_tables(costs), tables, json=json)
+    guaranteed = costs.with_guarantee
+    grows = isinstance(guaranteed, str) or guaranteed.stationary is None
     return ExitStatus.FAILED if grows else ExitStatus.OK
 
 
@@ -170,7 +170,7 @@ class AdversaryAim(StrEnum):
 
 @cli.command(cli.THEORY, 20, takes="some 20 s")
 def adversary(
-    given: opt.OneLoopOptions,
+    source: opt.OneLoopOptions,
     *,
     objective: AdversaryAim = AdversaryAim.ALL,
     horizon: float | None = None,
@@ -198,13 +198,13 @@ def adversary(
         noack adversary unstable_pendulum --horizon 2 --beam 64   a faster search
         noack adversary lane_following --trigger continuous   the paper's loop, in exact time
     """
-    resolved = resolution.resolve(given.load(*([] if horizon is None else [f"horizon_s={horizon}"])))
+    resolved = resolution.resolve(source.load(*([] if horizon is None else [f"horizon_s={horizon}"])))
     continuous = trigger is opt.TriggerMode.CONTINUOUS
     conditions = adversary_search.conditions_of(resolved, continuous=continuous)
     certificate = scenario_certificates.certify(resolved, conditions)
     kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL
     with progress.search_status() as report:
-        found = [
+        worst_cases = [
             adversary_search.find_worst(
                 resolved,
                 aim,
@@ -216,6 +216,6 @@ def adversary(
             )
             for aim in (kinds if is_all else (kinds(objective.value),))
         ]
-    about = found, resolved, certificate, trigger.value
-    cli.show(json, lambda: worst_run.document(*about), worst_run.print_worst, *about)
-    return ExitStatus.FAILED if any(worst.breaches for worst in found) else ExitStatus.OK
+    results = worst_cases, resolved, certificate, trigger.value
+    cli.show(json, lambda: worst_run.document(*results), worst_run.print_worst, *results)
+    return ExitStatus.FAILED if any(worst.breaches for worst in worst_cases) else ExitStatus.OK

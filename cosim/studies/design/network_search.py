@@ -279,7 +279,7 @@ class NetworkSearch:
         self.judged += 1
         margin = LossMargin(resolve(self.scenario_of(candidate, rung)))
         stability = margin.first_bounds()
-        return margin.is_stable() if stability.verdict == "undecided" else stability
+        return margin.coarse_bounds() if stability.verdict == "undecided" else stability
 
     def reach(self, candidate: Candidate, most: int, least: int = -1) -> tuple[int, Stability | None]:
         """Return the highest certified rung from ``most`` down to above ``least``."""

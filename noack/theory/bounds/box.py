@@ -52,8 +52,7 @@ class BoxGains(PlantGains):
         free, gain = self._free_model_error, self._forced_model_error
         states = {
             output: Coefficients(
-                self._from_start[output] + free @ peaks.from_w,
-                peaks.forced + gain @ peaks.from_w,
+                self._from_start[output] + free @ peaks.from_w, peaks.forced + gain @ peaks.from_w
             )
             for output, peaks in self._peaks.items()
         }
@@ -87,8 +86,8 @@ class BoxGains(PlantGains):
         size = spectral_norm(self.start) + start_s * np.linalg.norm(pushes, axis=0).sum()
         size = size * math.exp(mu * start_s)
         rate = spectral_norm(R @ self.A) + spectral_norm(R) * box
-        first = spectral_norm(R @ self.start) * math.exp(self.alpha_per_s * start_s)
-        error = first + start_s * (rate * size + np.linalg.norm(R @ pushes, axis=0).sum())
+        at_start = spectral_norm(R @ self.start) * math.exp(self.alpha_per_s * start_s)
+        error = at_start + start_s * (rate * size + np.linalg.norm(R @ pushes, axis=0).sum())
         impulse = error * start_s
         peaks_of = np.array([peaks.impulse for peaks in self._coordinates])
         return error, impulse, self._bound_of_w(impulse[..., None] * peaks_of)
@@ -104,8 +103,8 @@ class BoxGains(PlantGains):
         if start_s > 0:
             _, impulse, late = self._started_late(start_s)
             w = w + late
-        for place, peaks in enumerate(self._coordinates):
-            total[place] += peaks.forced * input_error + peaks.impulse * impulse + peaks.from_w @ w
+        for index, peaks in enumerate(self._coordinates):
+            total[index] += peaks.forced * input_error + peaks.impulse * impulse + peaks.from_w @ w
         total[n:] += np.linalg.norm(self.error.split_K[0], axis=1) * input_error
         total[n:] += self._forcing.at_input
         return np.asarray(total)
@@ -146,7 +145,7 @@ class BoxGains(PlantGains):
     def _signals(self) -> Mapping[str, Matrix]:
         """The outputs, and the coordinates of x and of K x."""
         rows = np.concatenate([np.eye(len(self.A)), self.error.K])
-        names = (f"coordinate {place}" for place in range(len(rows)))
+        names = (f"coordinate {index}" for index in range(len(rows)))
         return {**self.outputs, **dict(zip(names, rows[:, None], strict=True))}
 
     @cached_property

@@ -37,8 +37,8 @@ class Decay(NamedTuple):
     @property
     def area_s(self) -> Stack:
         """Upper bound of ∫‖e^{Gs}‖ds over all times, (…); infinite where no L was found."""
-        found = self.rate_per_s > 0
-        return np.where(found, self.stretch / np.where(found, self.rate_per_s, 1.0), np.inf)
+        decays = self.rate_per_s > 0
+        return np.where(decays, self.stretch / np.where(decays, self.rate_per_s, 1.0), np.inf)
 
     def bounds(self, C: Matrix, states: Stack) -> Stack:
         """Return bounds of ‖C e^{Gs} Y‖ over all s ≥ 0, for stacks of Y, (…, k, n, r) → (…, k)."""
@@ -64,14 +64,14 @@ def _find_decay(entries: bytes, shape: tuple[int, ...]) -> Decay | None:
     rounding = EPSILON * shape[-1] * np.linalg.norm(generator, axis=(-2, -1))
     slowest = abscissas(generator)
     candidates = (_lyapunov_factors(generator, slowest), _modal_factors(generator))
-    first, second = (_checked(generator, factor, slowest < -rounding) for factor in candidates)
-    better = second.area_s < first.area_s
-    rates = np.where(better, second.rate_per_s, first.rate_per_s)
+    by_first, by_second = (_checked(generator, factor, slowest < -rounding) for factor in candidates)
+    better = by_second.area_s < by_first.area_s
+    rates = np.where(better, by_second.rate_per_s, by_first.rate_per_s)
     if not (rates > 0).any():
         return None
-    which = better[..., None, None]
-    factor = np.where(which, second.factor, first.factor)
-    return Decay(factor, np.where(which, second.inverse, first.inverse), rates)
+    is_second = better[..., None, None]
+    factor = np.where(is_second, by_second.factor, by_first.factor)
+    return Decay(factor, np.where(is_second, by_second.inverse, by_first.inverse), rates)
 
 
 def _checked(generator: Matrix, factor: Matrix, may_decay: NDArray[np.bool_]) -> Decay:
@@ -87,7 +87,7 @@ def _checked(generator: Matrix, factor: Matrix, may_decay: NDArray[np.bool_]) ->
     usable = may_decay & np.isfinite(rounding)
     eye = np.eye(generator.shape[-1])
     factor, inverse, turned = (
-        np.where(usable[..., None, None], one, eye) for one in (factor, inverse, turned)
+        np.where(usable[..., None, None], matrix, eye) for matrix in (factor, inverse, turned)
     )
     rates = np.where(usable, -logarithmic_norm(turned) - rounding, 0.0)
     return Decay(factor, inverse, rates)
@@ -116,11 +116,11 @@ def _each(function: Callable[..., Any], stack: Matrix) -> Matrix:
     if np.isfinite(stack).all():
         with contextlib.suppress(np.linalg.LinAlgError):
             return np.asarray(function(stack))
-    found = np.full(stack.shape, np.nan)
-    for place in np.ndindex(stack.shape[:-2]):
+    inverses = np.full(stack.shape, np.nan)
+    for index in np.ndindex(stack.shape[:-2]):
         with contextlib.suppress(np.linalg.LinAlgError, ValueError):
-            found[place] = function(stack[place])
-    return found
+            inverses[index] = function(stack[index])
+    return inverses
 
 
 def abscissas(generator: Matrix) -> Stack:

@@ -140,10 +140,10 @@ class EstimationError:
         if observer is None:
             return EstimationBound()
         known = self._resolved.network.initial_sync == "known_state"
-        first = loop.x0 if known else np.zeros(loop.n)
+        initial_estimate = loop.x0 if known else np.zeros(loop.n)
         if observer.initial_estimate is not None:
-            first = np.array(observer.initial_estimate)
-        start = (self._rest[0] @ (first - loop.x0))[None, :, None]
+            initial_estimate = np.array(observer.initial_estimate)
+        start = (self._rest[0] @ (initial_estimate - loop.x0))[None, :, None]
         nothing = np.zeros((len(self._gains), 0, loop.n, 1))
         fixed = self._peak(nothing, alpha_per_s, start)
         for sources, peak in zip(self._persistent_sources, self._settled_peaks, strict=True):
@@ -215,9 +215,9 @@ class EstimationError:
             largest = max(largest, scale * np.sqrt(max(above, 0.0)))
         # From then on P − P_∞ follows F.
         factor, _ = _contraction(growth * F)
-        seen = float(np.linalg.norm(W @ np.linalg.inv(factor), 2))
+        output_gain = float(np.linalg.norm(W @ np.linalg.inv(factor), 2))
         beyond = float(np.linalg.norm(factor @ (P - settled) @ factor.T, 2))
-        return float(max(largest, scale * seen * np.sqrt(beyond)) * _ROUNDING)
+        return float(max(largest, scale * output_gain * np.sqrt(beyond)) * _ROUNDING)
 
     def _growth(self, alpha_per_s: float) -> float:
         """e^{αT}, T the time between two measurements."""
@@ -277,28 +277,28 @@ class EstimationError:
         old = sources[0] if start is None else np.concatenate([start, sources[0]])
         sums, old = _accumulated(W, _last_axis(old), steps[1:-1], sources[1:-1])
         factor, rate = _contraction(steps[-1])
-        seen = spectral_norm(W @ np.linalg.inv(factor))
+        output_gain = spectral_norm(W @ np.linalg.inv(factor))
         last, total, largest = _last_axis(sources[-1]), 0.0, sums.max()
         powers = _powers(steps[-1], min(_ENTRIES // max(old.size, last.size) + 1, 256))
         turned = factor @ powers[1:]
 
-        def rests(which: slice) -> Stack:
-            sums = _sums(turned[which], last) / (1 - rate) + _sums(turned[which], old)
-            return np.asarray(seen * sums)
+        def rests(steps: slice) -> Stack:
+            sums = _sums(turned[steps], last) / (1 - rate) + _sums(turned[steps], old)
+            return np.asarray(output_gain * sums)
 
         for _ in range(_MOST_STEPS // len(turned)):
             # The same for every number of further measurements, (powers,).
             totals = total + np.cumsum(_sums(W @ powers[:-1], last))
             sums = _sums(W @ powers[1:], old) + totals
             largests = np.maximum.accumulate(np.maximum(sums, largest))
-            rest = rests(slice(-1, None))[0]
-            if rest <= _TAIL_SHARE * largests[-1]:  # the rests fall
+            last_rest = rests(slice(-1, None))[0]
+            if last_rest <= _TAIL_SHARE * largests[-1]:  # the rests fall
                 every = rests(slice(None))
                 number = np.argmax(every <= _TAIL_SHARE * largests)
                 return float((largests[number] + every[number]) * _ROUNDING)
             total, largest = totals[-1], largests[-1]
             old, last = times(powers[-1], old), times(powers[-1], last)
-        return float((largest + rest) * _ROUNDING)
+        return float((largest + last_rest) * _ROUNDING)
 
     def _excess(self, sources: Stack, total: float, alpha_per_s: float) -> float:
         """Return sup_k of Σ_j ‖W Φ(k, j) S_j‖ minus the total for settled gains, scaled."""
@@ -311,9 +311,9 @@ class EstimationError:
         scales = growth ** np.arange(len(sums))
         # From then on the effects of these sources, and those with settled gains, follow F.
         factor, _ = _contraction(growth * steps[-1])
-        seen = spectral_norm(W @ np.linalg.inv(factor))
-        rest = scales[-1] * seen * largest_gains(times(factor, old - settled)).sum()
-        return float(max((scales * (sums - total)).max(), rest, 0.0) * _ROUNDING)
+        output_gain = spectral_norm(W @ np.linalg.inv(factor))
+        remainder = scales[-1] * output_gain * largest_gains(times(factor, old - settled)).sum()
+        return float(max((scales * (sums - total)).max(), remainder, 0.0) * _ROUNDING)
 
 
 def _last_axis(sources: Stack) -> Stack:

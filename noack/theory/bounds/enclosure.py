@@ -92,10 +92,10 @@ class KernelBounds:
 
     def sups(self, after_s: Stack) -> Stack:
         """Sup of k(τ) over τ ≥ a for each a, (…, j)."""
-        first = cells_at(self.edges_s, after_s)
+        first_cells = cells_at(self.edges_s, after_s)
         beyond_s = np.maximum(after_s - self.edges_s[..., -1:], 0.0)
         decayed = np.exp(-np.asarray(self.tail_rate_per_s)[..., None] * beyond_s)
-        return np.asarray(take_rows(self._from_cell, first) * decayed)
+        return np.asarray(take_rows(self._from_cell, first_cells) * decayed)
 
     @cached_property
     def _from_cell(self) -> Stack:
@@ -113,9 +113,9 @@ class KernelBounds:
         sums = np.append(0.0, np.cumsum(self.area))
         cell = np.searchsorted(self.edges_s, age_s, side="right") - 1
         inside = np.minimum(cell, len(self.area) - 1)
-        within = self.highest[inside] * (age_s - self.edges_s[inside])
-        part = sums[inside] + np.minimum(within, self.area[inside])
-        return np.asarray(np.where(cell < len(self.area), part, self.integral()))
+        in_cell = self.highest[inside] * (age_s - self.edges_s[inside])
+        until_age = sums[inside] + np.minimum(in_cell, self.area[inside])
+        return np.asarray(np.where(cell < len(self.area), until_age, self.integral()))
 
     def sup_on_grid(self) -> Stack:
         """Sup of k over the grid only, (…)."""
@@ -131,12 +131,12 @@ def cells_at(edges_s: Stack, t_s: Stack) -> NDArray[np.intp]:
     if edges_s.ndim == 1:
         return np.asarray(np.searchsorted(edges_s, t_s, side="right") - 1)
     lead = np.broadcast_shapes(edges_s.shape[:-1], t_s.shape[:-1])
-    found = np.empty((*lead, t_s.shape[-1]), np.intp)
+    cells = np.empty((*lead, t_s.shape[-1]), np.intp)
     edges_s = np.broadcast_to(edges_s, (*lead, edges_s.shape[-1]))
-    t_s = np.broadcast_to(t_s, found.shape)
-    for place in np.ndindex(lead):
-        found[place] = np.searchsorted(edges_s[place], t_s[place], side="right")
-    return found - 1
+    t_s = np.broadcast_to(t_s, cells.shape)
+    for index in np.ndindex(lead):
+        cells[index] = np.searchsorted(edges_s[index], t_s[index], side="right")
+    return cells - 1
 
 
 def take_rows(values: Stack, places: NDArray[np.intp]) -> Stack:
@@ -162,9 +162,9 @@ class Outputs(Generic[Name]):
     def __init__(self, matrices: Mapping[Name, Matrix]) -> None:
         self.names = list(matrices)
         lead = np.broadcast_shapes(*(C.shape[:-2] for C in matrices.values()))
-        each = [np.broadcast_to(C, (*lead, *C.shape[-2:])) for C in matrices.values()]
-        self.stacked = np.concatenate(each, axis=-2)
-        self.rows = _slices(*accumulate((C.shape[-2] for C in each), initial=0))
+        matrices_alike = [np.broadcast_to(C, (*lead, *C.shape[-2:])) for C in matrices.values()]
+        self.stacked = np.concatenate(matrices_alike, axis=-2)
+        self.rows = _slices(*accumulate((C.shape[-2] for C in matrices_alike), initial=0))
         self._alike = _grouped(self.rows)
         self.norms = self.norms_with(None)
 
@@ -178,27 +178,27 @@ class Outputs(Generic[Name]):
 
     def each(self, norm: Callable[[Stack], Stack], values: Stack, columns: Groups) -> Stack:
         """Return a norm of each C Y, (…, rows, r, k) → (…, outputs, groups of columns, k)."""
-        found: Stack | None = None
-        for place, rows in enumerate(self.rows):
+        stack: Stack | None = None
+        for index, rows in enumerate(self.rows):
             for number, group in enumerate(columns):
                 norms = norm(values[..., rows, group, :])
-                if found is None:
+                if stack is None:
                     *lead, cells = norms.shape
-                    found = np.empty((*lead, len(self.rows), len(columns), cells))
-                found[..., place, number, :] = norms
-        assert found is not None
-        return found
+                    stack = np.empty((*lead, len(self.rows), len(columns), cells))
+                stack[..., index, number, :] = norms
+        assert stack is not None
+        return stack
 
 
 def _grouped(groups: Groups) -> list[tuple[list[int], NDArray[np.intp]]]:
     """Return the places of groups of equal length, with the rows of each, (groups, rows)."""
     lengths = [group.stop - group.start for group in groups]
-    found = []
+    stacks = []
     for length in dict.fromkeys(lengths):
-        places = [place for place, other in enumerate(lengths) if other == length]
-        rows = np.array([range(groups[place].start, groups[place].stop) for place in places])
-        found.append((places, rows))
-    return found
+        places = [index for index, other in enumerate(lengths) if other == length]
+        rows = np.array([range(groups[index].start, groups[index].stop) for index in places])
+        stacks.append((places, rows))
+    return stacks
 
 
 @dataclass(frozen=True)
@@ -319,20 +319,20 @@ class _Bends:
         """Return the bounds for output matrices C, (…, outputs, groups, k)."""
         turned = outputs.stacked[..., None, :, :] @ self.powers
         *lead, terms, rows, n = turned.shape
-        found = times(turned.reshape(*lead, terms * rows, n), self.nodes)
-        found = found.reshape(*found.shape[:-3], terms, rows, *found.shape[-2:])
+        images = times(turned.reshape(*lead, terms * rows, n), self.nodes)
+        images = images.reshape(*images.shape[:-3], terms, rows, *images.shape[-2:])
 
         def total(values: Stack) -> Stack:
             norms = np.sqrt(np.einsum("...jirk,...jirk->...jk", values, values))
             return np.asarray((norms * self.scales).sum(axis=-2))
 
-        bound = outputs.each(total, found, self.columns)
-        rest = outputs.norms[..., None, None] * self.rest[..., None, :, :]
+        bound = outputs.each(total, images, self.columns)
+        remainder = outputs.norms[..., None, None] * self.rest[..., None, :, :]
         if self.decay is None:
-            return np.asarray(bound + rest)
-        seen = outputs.norms_with(self.decay.inverse)[..., None, None]
-        bound += np.minimum(rest, seen * self.rest_decaying[..., None, :, :])
-        return np.asarray(np.minimum(seen * self.least[..., None, :, :], bound))
+            return np.asarray(bound + remainder)
+        factor = outputs.norms_with(self.decay.inverse)[..., None, None]
+        bound += np.minimum(remainder, factor * self.rest_decaying[..., None, :, :])
+        return np.asarray(np.minimum(factor * self.least[..., None, :, :], bound))
 
 
 def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Groups) -> _Bends:
@@ -399,8 +399,8 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
         state = states[..., -1, :, :]
         area = area + step_s * frobenius_norms(parts[-1]).sum(axis=-1)
         cells += _CELLS_PER_BLOCK
-        rest = decay.bounds(everything.stacked, state[..., None, :, :])[..., 0] / decay.rate_per_s
-        ends = ends | (rest <= _TAIL_SHARE * area)
+        remainder = decay.bounds(everything.stacked, state[..., None, :, :])[..., 0] / decay.rate_per_s
+        ends = ends | (remainder <= _TAIL_SHARE * area)
         if ends.all() or cells >= most_cells:
             break
         while (bent := (step_s > usual_s) & ~_straight(generator, state, step_s, decay)).any():
@@ -420,17 +420,14 @@ def _straight(generator: Matrix, state: Matrix, step_s: Stack, decay: Decay) -> 
 
 
 def response_until(
-    generator: Matrix,
-    D: Matrix,
-    until_s: float | Stack,
-    cells: int = 64,
-    groups: tuple[int, ...] = (0,),
+    generator: Matrix, D: Matrix, until_s: float | Stack, cells: int = 64, groups: tuple[int, ...] = (0,)
 ) -> ResponseBounds:
     """Compute e^{Gτ} D over 0 ≤ τ ≤ ``until_s``, (…), on a grid of ``cells`` equal cells."""
     step_s = np.asarray(until_s) / cells
-    decay, is_long = None, step_s * np.linalg.norm(generator, axis=(-2, -1)) > 1
-    if is_long.any() and (found := find_decay(generator)) is not None:
-        decay = found._replace(rate_per_s=np.where(is_long, found.rate_per_s, 0.0))
+    is_long = step_s * np.linalg.norm(generator, axis=(-2, -1)) > 1
+    decay = find_decay(generator) if is_long.any() else None
+    if decay is not None:
+        decay = decay._replace(rate_per_s=np.where(is_long, decay.rate_per_s, 0.0))
     return ResponseBounds(
         generator,
         np.linspace(0.0, until_s, cells + 1, axis=-1),
@@ -447,7 +444,7 @@ def factors(matrix: Matrix) -> tuple[Matrix, Matrix]:
     ‖L R v‖ = ‖R v‖, so a signal that acts in few directions is bounded in these directions only.
     """
     U, singular, Vt = np.linalg.svd(matrix, full_matrices=False)
-    (rank,) = {int(one) for one in np.ravel(_ranks(singular, matrix.shape))}
+    (rank,) = {int(value) for value in np.ravel(_ranks(singular, matrix.shape))}
     return U[..., :, :rank], singular[..., :rank, None] * Vt[..., :rank, :]
 
 
@@ -479,11 +476,7 @@ def _propagate(generator: Matrix, state: Matrix, step_s: Stack, cells: int) -> S
 
 @lru_cache(maxsize=8)
 def _powers(
-    entries: bytes,
-    shape: tuple[int, ...],
-    steps: bytes,
-    of_steps: tuple[int, ...],
-    least: int,
+    entries: bytes, shape: tuple[int, ...], steps: bytes, of_steps: tuple[int, ...], least: int
 ) -> tuple[Stack, Matrix]:
     """Return e^{G k s} for k < 2^j, at least so many, and e^{G 2^j s}.
 
@@ -492,8 +485,8 @@ def _powers(
     generator = np.frombuffer(entries).reshape(shape)
     exponents = generator * np.frombuffer(steps).reshape(of_steps)[..., None, None]
     leap = np.empty(exponents.shape)
-    for place in np.ndindex(exponents.shape[:-2]):
-        leap[place] = exponential(exponents[place])
+    for index in np.ndindex(exponents.shape[:-2]):
+        leap[index] = exponential(exponents[index])
     n = shape[-1]
     powers = np.broadcast_to(np.eye(n), (*leap.shape[:-2], 1, n, n))
     while (size := powers.shape[-3]) < least:

@@ -182,8 +182,8 @@ class ErrorGains:
         """
         if not self.scaled_H.any():  # a hold: a missed update's contribution does not decay
             return {output: constant_kernel(self.now(output)) for output in self.outputs}
-        followed = response(self.scaled_H, self.inverse_weight)
-        kernels = followed.through_each(self.stacked)
+        responses = response(self.scaled_H, self.inverse_weight)
+        kernels = responses.through_each(self.stacked)
         if self.contracts:  # ‖·‖_W is a Lyapunov function: no sum of missing events exceeds M
             norm = kernels[Output.WEIGHTED]
             kernels[Output.WEIGHTED] = replace(norm, highest=np.minimum(norm.highest, 1.0))
@@ -219,8 +219,8 @@ class ErrorGains:
         totals = dict.fromkeys(self.outputs, 0.0)
         for number in range(events):
             until_s = (number + 1) * due_s
-            followed = response_until(self.scaled_H, self.inverse_weight, until_s)
-            for output, kernel in followed.through_each(self.stacked).items():
+            responses = response_until(self.scaled_H, self.inverse_weight, until_s)
+            for output, kernel in responses.through_each(self.stacked).items():
                 totals[output] += float(kernel.sup_on_grid())
         return totals
 
@@ -234,9 +234,9 @@ class ErrorGains:
     ) -> dict[Output, Growth]:
         """Return the growth of some outputs C e_s, with what drives e_s through these columns."""
         pair = columns.mismatch, columns.input_error
-        lead = np.broadcast_shapes(*(one.shape[:-2] for one in pair))
-        each = [np.broadcast_to(one, (*lead, *one.shape[-2:])) for one in pair]
-        driven, groups = np.concatenate(each, axis=-1), (0, columns.mismatch.shape[-1])
+        lead = np.broadcast_shapes(*(column.shape[:-2] for column in pair))
+        alike = [np.broadcast_to(column, (*lead, *column.shape[-2:])) for column in pair]
+        driven, groups = np.concatenate(alike, axis=-1), (0, columns.mismatch.shape[-1])
         kernels = response_until(self.scaled_H, driven, until_s, cells, groups)
         areas = dict.fromkeys(outputs.names, np.zeros(cells))
         if columns.disturbed.size:
@@ -256,8 +256,8 @@ class ErrorGains:
         """Return sup‖C e^{(H+αI)τ} W^{−1}‖ over τ ≤ ``until_s`` for every output."""
         if until_s == 0:
             return {output: self.now(output) for output in self.outputs}
-        followed = response_until(self.scaled_H, self.inverse_weight, until_s)
-        kernels = followed.through_each(self.stacked)
+        responses = response_until(self.scaled_H, self.inverse_weight, until_s)
+        kernels = responses.through_each(self.stacked)
         return {output: float(kernel.sup_on_grid()) for output, kernel in kernels.items()}
 
     @cached_method
@@ -331,8 +331,8 @@ class PlantGains:
         """
         if self.forcing is not None:
             return None
-        own = [getattr(self, one.name) for one in fields(self)]
-        shapes = [one.shape for one in own if isinstance(one, np.ndarray)]
+        values = [getattr(self, entry.name) for entry in fields(self)]
+        shapes = [entry.shape for entry in values if isinstance(entry, np.ndarray)]
         outputs = [(name, matrix_key(C)) for name, C in self.further_outputs.items()]
         rank = int(ranks(self.error.weight @ self._mismatch))
         return type(self), id(self.error), self.alpha_per_s, rank, *shapes, *outputs
@@ -340,8 +340,8 @@ class PlantGains:
     @property
     def identity(self) -> Hashable:
         """What equal plants without disturbances have in common."""
-        own = [getattr(self, one.name) for one in fields(self)]
-        return self.likeness, *(matrix_key(one) for one in own if isinstance(one, np.ndarray))
+        values = [getattr(self, value.name) for value in fields(self)]
+        return self.likeness, *(matrix_key(value) for value in values if isinstance(value, np.ndarray))
 
     @classmethod
     def together(cls, plants: Sequence[Self]) -> Self:
@@ -350,7 +350,7 @@ class PlantGains:
         if not others:
             return first
         changed: dict[str, Any] = {}
-        for name in (one.name for one in fields(first)):
+        for name in (entry.name for entry in fields(first)):
             values = [getattr(plant, name) for plant in plants]
             if isinstance(values[0], np.ndarray):
                 stack = np.array(values)

@@ -228,11 +228,7 @@ class TriggerBounds:
         if self.is_homogeneous:
             apart_s = max(apart_s, conditions.spacing_s)
         return bounds[0]._replace(
-            unit=level or 1.0,
-            apart_s=apart_s,
-            due_s=due_s,
-            forced_s=forced_s,
-            also=tuple(bounds[1:]),
+            unit=level or 1.0, apart_s=apart_s, due_s=due_s, forced_s=forced_s, also=tuple(bounds[1:])
         )
 
     def divided(
@@ -248,12 +244,7 @@ class TriggerBounds:
         whole = self.bound(conditions, self.floor, self.floor or None)
         alone = [
             bound._replace(
-                apart_s=apart_s,
-                due_s=whole.due_s,
-                forced_s=whole.forced_s,
-                unit=1.0,
-                reached=None,
-                also=(),
+                apart_s=apart_s, due_s=whole.due_s, forced_s=whole.forced_s, unit=1.0, reached=None, also=()
             )
             for bound in whole.every
         ]
@@ -286,8 +277,8 @@ class TriggerBounds:
         if not self.has_chord or math.isinf(self.largest):
             return {}
         name, S = next(iter(self.outputs.items()))
-        most = self.largest * float(spectral_norm(S @ np.linalg.inv(self.weight))) * _ROUNDING
-        return {name: (math.hypot(level, most) - level) / most * _ROUNDING}
+        largest_norm = self.largest * float(spectral_norm(S @ np.linalg.inv(self.weight))) * _ROUNDING
+        return {name: (math.hypot(level, largest_norm) - level) / largest_norm * _ROUNDING}
 
     def _levels(
         self, conditions: NetworkConditions, level: float, reached: float | None
@@ -356,8 +347,8 @@ class ErrorGrowth:
             share * spectral_norm(outputs[C] @ plant.error.inverse_weight)
             for C, share in after.shares.items()
         )
-        still = np.zeros(())
-        self.driven: tuple[Vector, Vector, Vector] = (still, still, still)
+        zero = np.zeros(())
+        self.driven: tuple[Vector, Vector, Vector] = (zero, zero, zero)
         if longest_s > 0:
             growth = plant.growth(longest_s, COARSE_CELLS)
             self.driven, self.highest = growth.means(self.ages_s), growth.input_error.sup_on_grid()
@@ -393,18 +384,13 @@ def _mean_ages_s(bound: TriggerBound, sampling_s: float) -> Vector | None:
 
 
 def first_passage_s(
-    plant: PlantGains,
-    level: Vector,
-    mismatch: Vector,
-    input_error: Vector,
-    own: Vector,
-    start: Vector,
+    plant: PlantGains, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector, start: Vector
 ) -> Vector:
     """Return times before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
 
     Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
 
-        ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + own · ρ(r−s)) ds
+        ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + k · ρ(r−s)) ds
 
     and further terms from the disturbances and ``start``. This is iterated from ρ = ``level``;
     every iterate is a bound until the level is reached.
@@ -414,12 +400,12 @@ def first_passage_s(
         level: ‖e_s‖_W at an event, (loops,).
         mismatch: sup‖R_E x‖, (loops,).
         input_error: π', the input error without the effect of the present e_s, (loops,).
-        own: ‖K W^{−1}‖, (loops,).
+        error_gain: k = ‖K W^{−1}‖, (loops,).
         start: ‖e_s‖_W at first, (loops,).
     """
     start_of_growth = plant.growth(_SHORTEST_S, 1)
     speed = start_of_growth.mismatch.sup_on_grid() * mismatch
-    speed = speed + start_of_growth.input_error.sup_on_grid() * (input_error + own * level)
+    speed = speed + start_of_growth.input_error.sup_on_grid() * (input_error + error_gain * level)
     speed = speed + start_of_growth.forced.sum(axis=-1) / _SHORTEST_S
     # The first window is twice the time to the level at the initial speed, limited.
     window_s = np.where(speed > 0, 2 * level / np.where(speed > 0, speed, 1.0), LONGEST_S)
@@ -428,17 +414,17 @@ def first_passage_s(
     is_open = level > start
     while is_open.any():
         count = int(cells[is_open].min())
-        which = np.flatnonzero(is_open & (cells == count))
-        columns = Columns(*(one[which] if one.ndim == 3 else one for one in plant.columns))
+        open_loops = np.flatnonzero(is_open & (cells == count))
+        columns = Columns(*(column[open_loops] if column.ndim == 3 else column for column in plant.columns))
         error = plant.error
-        growth = error.growths(columns, window_s[which], count, error.stacked_norm)[Output.WEIGHTED]
-        first = _first_crossed(
-            growth, level[which], mismatch[which], input_error[which], own[which],
-            np.array([one and one * error.stretch(until_s) for one, until_s in zip(
-                start[which].tolist(), window_s[which].tolist(), strict=True
+        growth = error.growths(columns, window_s[open_loops], count, error.stacked_norm)[Output.WEIGHTED]
+        first_cells = _first_crossed(
+            growth, level[open_loops], mismatch[open_loops], input_error[open_loops], error_gain[open_loops],
+            np.array([column and column * error.stretch(until_s) for column, until_s in zip(
+                start[open_loops].tolist(), window_s[open_loops].tolist(), strict=True
             )]),
         )  # fmt: skip
-        for loop, edge_s, cell in zip(which.tolist(), growth.mismatch.edges_s, first, strict=True):
+        for loop, edge_s, cell in zip(open_loops.tolist(), growth.mismatch.edges_s, first_cells, strict=True):
             if cell < count:
                 known_s[loop] = max(known_s[loop], edge_s[cell])
                 is_open[loop] = count != _FINE_CELLS
@@ -451,12 +437,7 @@ def first_passage_s(
 
 
 def _first_crossed(
-    growth: Growth,
-    level: Vector,
-    mismatch: Vector,
-    input_error: Vector,
-    own: Vector,
-    started: Vector,
+    growth: Growth, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector, started: Vector
 ) -> list[int]:
     """Return the first cell of each loop in which the level may be reached, or their number."""
     areas = growth.mismatch.area * mismatch[:, None]
@@ -466,9 +447,9 @@ def _first_crossed(
     echoing = np.broadcast_to(growth.input_error.area, rho.shape)
     for _ in range(_PICARD_ROUNDS):
         echo = [np.convolve(area, r)[: len(r)] for area, r in zip(echoing, rho, strict=True)]
-        before, rho = rho, np.minimum(level[:, None], fixed + own[:, None] * np.array(echo))
+        before, rho = rho, np.minimum(level[:, None], fixed + error_gain[:, None] * np.array(echo))
         if np.array_equal(before, rho):
             break
     crossed = rho >= level[:, None]
-    found: list[int] = np.where(crossed.any(axis=1), crossed.argmax(axis=1), rho.shape[1]).tolist()
-    return found
+    cells: list[int] = np.where(crossed.any(axis=1), crossed.argmax(axis=1), rho.shape[1]).tolist()
+    return cells

@@ -12,9 +12,8 @@ loop"):
    effect of all losses together, if windows limit them.
 2. ``solution.py``. The minimum inter-event time δ is the time that e_s needs from 0 to the
    threshold under these bounds (eq:miet_errdyn; the paper's is eq:tau). N and D_C depend on δ, so
-   the largest consistent δ is used. Under the paper's conditions ``invariant_ellipsoids.py``
-   sharpens the bounds by an ellipsoid that x never leaves: the flow between two deliveries, which
-   ``delivery_flow.py`` computes, leads back into it.
+   the largest consistent δ is used. For one known plant ``deliveries/`` sharpens the bounds by what
+   holds from one delivery to the next.
 3. ``disturbed.py``. With persistent disturbances, noise, an observer or a constant threshold, each
    bound has a decaying part and a persistent part. All inequalities are linear in functions of
    time, so the bounds of the two parts are added.

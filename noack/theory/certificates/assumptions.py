@@ -59,8 +59,8 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
         why = f'controller.kind = "{resolved.controller.kind}": {_NOT_COVERED}'
         checked.append(_violated("the input is u = K x_c", "eq:ModCont", why))
     if resolved.protocol.acknowledges:
-        what = "the sensor resets x_s at every event; nothing is acknowledged"
-        checked.append(_violated(what, "Section II", f'protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'))
+        assumed = "the sensor resets x_s at every event; nothing is acknowledged"
+        checked.append(_violated(assumed, "Section II", f'protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'))
     if linear:
         checked.append(_unstable_and_distinct(loop.A))
     checked += [_mansd(resolved), _continuous_time(resolved)]
@@ -72,13 +72,13 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     return checked + _estimated(loop, resolved)
 
 
-def _violated(what: str, source: str, why: str) -> Assumption:
-    return Assumption(what, source, AssumptionStatus.VIOLATED, why)
+def _violated(assumed: str, source: str, why: str) -> Assumption:
+    return Assumption(assumed, source, AssumptionStatus.VIOLATED, why)
 
 
-def _checked(what: str, source: str, holds: bool, why: str) -> Assumption:
+def _checked(assumed: str, source: str, holds: bool, why: str) -> Assumption:
     status = AssumptionStatus.HOLDS if holds else AssumptionStatus.VIOLATED
-    return Assumption(what, source, status, why)
+    return Assumption(assumed, source, status, why)
 
 
 def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
@@ -157,15 +157,15 @@ def _closed_loop(loop: LoopMatrices) -> Assumption:
 
 def _other_sign(loop: LoopMatrices) -> str:
     """Return a hint if K seems to be the gain of u = −Kx, the convention of most programs."""
-    given, other = (spectral_abscissa(loop.A_model + sign * loop.B_model @ loop.K) for sign in (1.0, -1.0))
-    return "; the loop's u is +Kx, and −K would stabilise it" if other < 0 <= given else ""
+    plus, minus = (spectral_abscissa(loop.A_model + sign * loop.B_model @ loop.K) for sign in (1.0, -1.0))
+    return "; the loop's u is +Kx, and −K would stabilise it" if minus < 0 <= plus else ""
 
 
 def _decay_rate(loop: LoopMatrices, alpha_per_s: float) -> Assumption:
     rate = -spectral_abscissa(loop.A + loop.B @ loop.K)
-    what = "0 < α < ᾱ: the threshold decays more slowly than the closed loop"
+    assumed = "0 < α < ᾱ: the threshold decays more slowly than the closed loop"
     why = f"α = {alpha_per_s:g} /s; A + BK: {_decays(rate)}"
-    return _checked(what, "Theorem 2", alpha_per_s < rate, why)
+    return _checked(assumed, "Theorem 2", alpha_per_s < rate, why)
 
 
 def _decays(rate_per_s: float) -> str:
@@ -242,30 +242,30 @@ def certificate_assumptions(
     void: str | None,
     loop_gain: float,
     promise: str,
-    kept: float | None,
+    probability: float | None,
 ) -> list[Assumption]:
     """Return the assumptions of a certificate, with verdicts.
 
     ``decay`` has the decay rates per second of "the models" (infinite if they hold) and "A + BK".
     Without a certificate, ``constants`` is None and ``void`` is the reason. ``promise`` is what the
-    trigger's rule says about e_s, or empty. ``kept`` is the probability that a run keeps a
+    trigger's rule says about e_s, or empty. ``probability`` is that of a run that keeps a
     guarantee that nothing enforces, if it is known.
     """
     alpha = policy_of(resolved).fading_per_s
     slower = 0.0 if constants is None else constants.rate_per_s
     why = promise or "not where it does not transmit"
     checked = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(promise), why)]
-    for of, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
-        holds = below(alpha, decay[of])
-        why = f"α = {alpha:g} /s, {_decays(decay[of])}"
+    for matrix, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
+        holds = below(alpha, decay[matrix])
+        why = f"α = {alpha:g} /s, {_decays(decay[matrix])}"
         if slower and not holds:
             why += f"; certified instead: bounds with decay rate {slower:.3g} /s"
         elif constants is not None and not holds:
             why += "; certified instead: constant bounds"
-        if math.isinf(decay[of]):
+        if math.isinf(decay[matrix]):
             holds, why = False, "a hold does not decay: the certified bounds are constant"
-        checked.append(_checked(f"α is below the decay rate of {of}", source, holds, why))
-    checked += _conditions(conditions, resolved, kept)
+        checked.append(_checked(f"α is below the decay rate of {matrix}", source, holds, why))
+    checked += _conditions(conditions, resolved, probability)
     checked += _bounded_causes(resolved)
     if constants is None:
         checked.append(_violated("there is a certificate", "certificate", void or ""))
@@ -273,31 +273,37 @@ def certificate_assumptions(
         why = f"the loop gain of the errors is {loop_gain:.3g}, below 1"
         checked.append(_checked("small-gain condition", "certificate", True, why))
     why = "the bounds rest on (I1), which holds for every plant"
-    what, source = "A is unstable with distinct eigenvalues", "Proposition 1"
-    return [*checked, Assumption(what, source, AssumptionStatus.NOT_NEEDED, why)]
+    assumed, source = "A is unstable with distinct eigenvalues", "Proposition 1"
+    return [*checked, Assumption(assumed, source, AssumptionStatus.NOT_NEEDED, why)]
 
 
 def _bounded_causes(resolved: Scenario) -> list[Assumption]:
     """Return that disturbances and noise stay within their bounds."""
     if resolved.coverage.is_undisturbed:
         return []
-    what, source = "disturbances and noise stay within their bounds", "certificate"
+    assumed, source = "disturbances and noise stay within their bounds", "certificate"
     if (normal := normal_bounds(resolved)) is None:
-        return [Assumption(what, source, AssumptionStatus.HOLDS, "by their settings")]
+        return [Assumption(assumed, source, AssumptionStatus.HOLDS, "by their settings")]
     why = (
         f"normal values have no bound; {normal.limit:.3g} standard deviations are assumed, and "
         "the like for their sums; a run exceeds one of these with a probability of at most "
         f"{resolved.certificate.exceedance_probability:g}"
     )
-    return [Assumption(what, source, AssumptionStatus.ASSUMED, why)]
+    return [Assumption(assumed, source, AssumptionStatus.ASSUMED, why)]
 
 
-def _conditions(conditions: NetworkConditions, resolved: Scenario, kept: float | None) -> list[Assumption]:
+def _conditions(
+    conditions: NetworkConditions, resolved: Scenario, probability: float | None
+) -> list[Assumption]:
     enforced = resolved.network.enforce_mansd
     why = "enforced by the network" if enforced else "not enforced"
-    if kept is not None:
+    if probability is not None:
         horizon_s = resolved.timing.horizon_ns / NS_PER_S
-        known = f"with probability {kept:.4g} or more" if kept > 0 else "with a probability that may be 0"
+        known = (
+            f"with probability {probability:.4g} or more"
+            if probability > 0
+            else "with a probability that may be 0"
+        )
         why += f"; a run of {horizon_s:g} s keeps it {known}"
     losses = Assumption(
         f"{conditions.guarantee.meaning} after a first delivery at t_0",
@@ -317,7 +323,10 @@ def _conditions(conditions: NetworkConditions, resolved: Scenario, kept: float |
     status = AssumptionStatus.ASSUMED
     return [
         losses,
-        *(Assumption(what, "certificate", status, f"checked in each run{why}") for what, why in schedule),
+        *(
+            Assumption(assumed, "certificate", status, f"checked in each run{why}")
+            for assumed, why in schedule
+        ),
     ]
 
 

@@ -139,14 +139,14 @@ class ScenarioCertificate:
 
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
-        constants, late, rest = self.constants, self.floor_constants, self.persistent_constants
+        constants, floor, persistent = self.constants, self.floor_constants, self.persistent_constants
         return asdict(self) | {
             "conditions": self.conditions._asdict()
             | {"constraints": [rule.name for rule in self.conditions.constraints]},
             "assumptions": [assumption._asdict() for assumption in self.assumptions],
             "constants": None if constants is None else constants._asdict(),
-            "floor_constants": None if late is None else late._asdict(),
-            "persistent_constants": None if rest is None else rest._asdict(),
+            "floor_constants": None if floor is None else floor._asdict(),
+            "persistent_constants": None if persistent is None else persistent._asdict(),
             "other": None if self.other is None else self.other.to_json(),
             "inter_event_s": self.inter_event_s,
             "floor_from_s": None if self.floor == 0 else self.floor_from_s,
@@ -192,8 +192,8 @@ def envelope_formula(
         if (late := present.floor_constants) is not None:
             unit = " ε" if in_levels else ""
             formula += f", from {present.floor_from_s:.4g} s on ≤ {getattr(late, constant):.4g}{unit}"
-        if (rest := present.persistent_constants) is not None:
-            formula += f" + {getattr(rest, constant):.4g}"
+        if (persistent := present.persistent_constants) is not None:
+            formula += f" + {getattr(persistent, constant):.4g}"
         parts.append(formula)
         present = present.other
     return f"{quantity} ≤ {' and ≤ '.join(parts)}"
@@ -216,8 +216,8 @@ class KnownStatePart:
 
     @cached_property
     def _estimated(self) -> KernelBounds:
-        followed = response(self.plant.closed_loop, self.plant.error.inverse_weight)
-        return followed.through(np.eye(len(self.plant.A)))
+        responses = response(self.plant.closed_loop, self.plant.error.inverse_weight)
+        return responses.through(np.eye(len(self.plant.A)))
 
     def level(self, t_s: Vector) -> Vector:
         """Return what the scaled bounds are multiplied with, (k,)."""
@@ -242,14 +242,14 @@ class KnownStatePart:
         """β̃ + η, the largest x_s − x̂ at an event, scaled."""
         return self.constants.overshoot * self.unit
 
-    def _by_missing(self, output: Output, none: float) -> Vector:
+    def _by_missing(self, output: Output, by_received: float) -> Vector:
         """Return none + Σ_{i<j} sup_{τ≥iδ} ‖C e^{(H+αI)τ} W^{−1}‖ (β̃ + η) for each j."""
-        error, most = self.plant.error, self.constants.missing_events
+        error, missing_events = self.plant.error, self.constants.missing_events
         if not error.decays:
-            return np.array([none])
-        ages_s = (self.constants.inter_event_s or 0.0) * np.arange(most, dtype=np.float64)
+            return np.array([by_received])
+        ages_s = (self.constants.inter_event_s or 0.0) * np.arange(missing_events, dtype=np.float64)
         sums = np.append(0.0, np.cumsum(error.kernels[output].sups(ages_s)))
-        return np.asarray(none + sums * self._event_error)
+        return np.asarray(by_received + sums * self._event_error)
 
     def deviation(self, input_errors: Vector, age_s: Vector, missing: Counts, delay_s: float) -> Vector:
         """Return the scaled bound of the deviation from the prediction, (k,)."""
@@ -283,22 +283,22 @@ class KnownStateBounds:
             age_s: t − t_k, the time since the newest event, (k,).
             missing: number of events after the newest one that the controller has received, (k,).
         """
-        each = [
+        sizes = [
             part.level(t_s) * part.deviation(errors, age_s, missing, self.delay_s)
             for part, errors in zip(self.parts, self._input_errors, strict=True)
         ]
-        bound = np.asarray(sum(each) + self._disturbed(age_s))
+        bound = np.asarray(sum(sizes) + self._disturbed(age_s))
         if self.other is None:
             return bound
         return np.asarray(np.minimum(bound, self.other.state_deviation(t_s, age_s, missing)))
 
     def controller_error(self, t_s: Vector, missing: Counts) -> Vector:
         """Bound ‖e_c‖_W at times t, (k,), given the numbers of missing events."""
-        each = [
+        sizes = [
             part.level(t_s) * _entries(errors, missing)
             for part, errors in zip(self.parts, self._controller_errors, strict=True)
         ]
-        bound = np.asarray(sum(each))
+        bound = np.asarray(sum(sizes))
         if self.other is None:
             return bound
         return np.asarray(np.minimum(bound, self.other.controller_error(t_s, missing)))
@@ -322,12 +322,12 @@ class KnownStateBounds:
         """Nodes, and Σ_i ∫‖e^{Ms} D_i‖ds up to each node and over all times."""
         plant, total = self.parts[-1].plant, 0.0
         unscaled = plant.closed_loop - plant.alpha_per_s * np.eye(len(plant.A))
-        followed = response(unscaled, self.disturbances)
+        responses = response(unscaled, self.disturbances)
         identity = np.eye(len(plant.A))
         for column in self.disturbances.T:
             total += float(response(unscaled, column[:, None]).through(identity).integral())
-        sums = np.append(0.0, np.cumsum(followed.areas_of_columns(identity)))
-        return followed.edges_s, np.append(sums, max(total, float(sums[-1])))
+        sums = np.append(0.0, np.cumsum(responses.areas_of_columns(identity)))
+        return responses.edges_s, np.append(sums, max(total, float(sums[-1])))
 
 
 def _together(parts: Sequence[tuple[Vector, float]]) -> list[Vector]:
@@ -337,8 +337,11 @@ def _together(parts: Sequence[tuple[Vector, float]]) -> list[Vector]:
     bounds of parts may be added only if they bound the signal in the same way.
     """
     count = min(len(by_missing) for by_missing, _ in parts)
-    is_smaller = np.all([by_missing[:count] <= most for by_missing, most in parts], axis=0)
-    return [np.append(np.where(is_smaller, by_missing[:count], most), most) for by_missing, most in parts]
+    is_smaller = np.all([by_missing[:count] <= persisting for by_missing, persisting in parts], axis=0)
+    return [
+        np.append(np.where(is_smaller, by_missing[:count], persisting), persisting)
+        for by_missing, persisting in parts
+    ]
 
 
 def _entries(table: Vector, missing: Counts) -> Vector:
@@ -347,12 +350,12 @@ def _entries(table: Vector, missing: Counts) -> Vector:
 
 def known_state_bounds(resolved: Scenario, certificate: ScenarioCertificate) -> KnownStateBounds | None:
     """Return the bounds from the newest event; None without a certificate, or for a box."""
-    first, late, rest = (
+    decaying, floor, persistent = (
         certificate.constants,
         certificate.floor_constants,
         certificate.persistent_constants,
     )
-    if first is None or certificate.scope != OWN_PLANT:
+    if decaying is None or certificate.scope != OWN_PLANT:
         return None
     loop = loop_of(resolved)
 
@@ -362,9 +365,9 @@ def known_state_bounds(resolved: Scenario, certificate: ScenarioCertificate) -> 
         plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], rate)
         return KnownStatePart(plant, constants, unit, floor_share)
 
-    level = max(certificate.beta, certificate.floor if first.rate_per_s == 0 else 0.0)
-    parts = [part(first, level or 1.0, 0.0 if late is None else certificate.floor / level)]
-    parts += [] if rest is None else [part(rest, 1.0)]
+    level = max(certificate.beta, certificate.floor if decaying.rate_per_s == 0 else 0.0)
+    parts = [part(decaying, level or 1.0, 0.0 if floor is None else certificate.floor / level)]
+    parts += [] if persistent is None else [part(persistent, 1.0)]
     forcing = bound_forcing(resolved, loop.B)
     pushes = np.zeros((loop.n, 0)) if forcing is None else forcing.limited
     return KnownStateBounds(

@@ -40,10 +40,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     applies the one whose time has come.
     """
     step_ns, tick_ns = resolved.timing.plant_period_ns, resolved.timing.controller_period_ns
-    phase_ns, sample_ns = (
-        resolved.timing.controller_phase_ns,
-        step_ns * resolved.plant.measure_every,
-    )
+    phase_ns, sample_ns = resolved.timing.controller_phase_ns, step_ns * resolved.plant.measure_every
     # Age of the newest tick at a step: 0 < age ≤ tick and age ≡ −phase modulo the gcd; all these
     # values occur. Time from a measurement to the next tick: 0 ≤ wait < tick.
     newest_ns = tick_ns - phase_ns % math.gcd(step_ns, tick_ns)
@@ -92,19 +89,21 @@ def network_delay_texts(resolved: Scenario) -> list[str]:
     A proof needs settings, which the certificates know, and what is said here.
     """
     certificate, link, proven = resolved.certificate, resolved.network.link, resolved.certificate.proven_delay
-    certified_ms, longest_ms = (1e3 * one for one in (certified_delay_s(resolved), link.longest_delay_s))
+    certified_ms, longest_ms = (
+        1e3 * delay_s for delay_s in (certified_delay_s(resolved), link.longest_delay_s)
+    )
     delays = f"the network delays updates by up to {longest_ms:g} ms" if link.delay_is_bounded else ""
     if certificate.network_delay_s is not None and certified_ms != longest_ms:
-        given = f"certificate.network_delay_s allows for a delay of {certified_ms:g} ms"
-        return [f"{delays}; {given}" if delays and longest_ms else given]
+        allowance = f"certificate.network_delay_s allows for a delay of {certified_ms:g} ms"
+        return [f"{delays}; {allowance}" if delays and longest_ms else allowance]
     if link.delay_is_bounded:
         return [delays] if longest_ms else []
     if proven is None or math.isinf(proven.delay_s):
         return [f"no bound of the network's delay is known; the certificates allow for {certified_ms:g} ms"]
-    whose = "its loop" if proven.loops == 1 else f"each of the {proven.loops} loops"
+    owner = "its loop" if proven.loops == 1 else f"each of the {proven.loops} loops"
     return [
         f"the network delays updates by up to {certified_ms:g} ms in virtual time",
-        f", if {whose} keeps the least time between transmissions that its trigger and rate give, no "
+        f", if {owner} keeps the least time between transmissions that its trigger and rate give, no "
         "sensor is restarted, and settings change only as in [[changes]]",
     ]
 

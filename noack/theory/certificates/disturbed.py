@@ -73,7 +73,7 @@ class DisturbedCertificate:
         structured = self.start_error == 0.0
         if decays and self.resolved.coverage.is_decaying:
             try:
-                two = yield from solve_two_parts(
+                parts = yield from solve_two_parts(
                     self._decaying,
                     self._persistent,
                     conditions,
@@ -81,18 +81,22 @@ class DisturbedCertificate:
                     structured=structured,
                     shares=SHARES if longest else (),
                 )
-                return [two]
+                return [parts]
             except NotDecayingError:
                 pass
-        found = yield from self._of_other_thresholds(conditions, decays=decays, longest=longest)
+        pairs = yield from self._of_other_thresholds(conditions, decays=decays, longest=longest)
         for _ in range(_CHORDS if longest and self.trigger.has_chord else 0):
             sizes = [
-                sum(one.state_weighted + one.estimation_error for one in pair if one is not None)
-                for pair in found
+                sum(
+                    constants.state_weighted + constants.estimation_error
+                    for constants in pair
+                    if constants is not None
+                )
+                for pair in pairs
             ]
             known = replace(self, trigger=replace(self.trigger, largest=min(sizes)))
-            found = yield from known._of_other_thresholds(conditions, decays=decays, longest=longest)
-        return found
+            pairs = yield from known._of_other_thresholds(conditions, decays=decays, longest=longest)
+        return pairs
 
     def _of_other_thresholds(
         self, conditions: NetworkConditions, *, decays: bool, longest: bool
@@ -114,13 +118,15 @@ class DisturbedCertificate:
             divided = yield from self._of_constant_threshold(conditions, apart_s)
         return [*divided, (constants, None)]
 
-    def with_plants(self, first: Constants, rest: Constants | None) -> Sequence[tuple[PlantGains, Constants]]:
+    def with_plants(
+        self, decaying: Constants, persistent: Constants | None
+    ) -> Sequence[tuple[PlantGains, Constants]]:
         """Return constants of :meth:`constants` with the plants of their parts."""
-        if rest is None:
-            decays = first.rate_per_s > 0
-            plant = self._plant(first.rate_per_s) if decays else self._together.plant
-            return [(plant, first)]
-        return [(self._plant(first.rate_per_s), first), (self._persistent.plant, rest)]
+        if persistent is None:
+            decays = decaying.rate_per_s > 0
+            plant = self._plant(decaying.rate_per_s) if decays else self._together.plant
+            return [(plant, decaying)]
+        return [(self._plant(decaying.rate_per_s), decaying), (self._persistent.plant, persistent)]
 
     def _of_constant_threshold(self, conditions: NetworkConditions, apart_s: float) -> Search[list[Added]]:
         """Search for the constants of what follows from the start, and of what persists, if any.
@@ -142,16 +148,16 @@ class DisturbedCertificate:
 
         Raises: as :func:`choose_rate`.
         """
-        rest = self._persistent._replace(bound=of_rest)
-        persists = of_rest.beta or rest.plant.forcing is not None or rest.estimation.fixed
-        others = [rest] if persists else []
+        persistent = self._persistent._replace(bound=of_rest)
+        persists = of_rest.beta or persistent.plant.forcing is not None or persistent.estimation.fixed
+        persistent_parts = [persistent] if persists else []
 
         def solved(rate_per_s: float) -> Search[list[Constants]]:
-            return (yield Problem((self._at_rate(rate_per_s, of_start), *others), conditions))
+            return (yield Problem((self._at_rate(rate_per_s, of_start), *persistent_parts), conditions))
 
         x0 = loop_of(self.resolved).x0
-        first, *added = yield from choose_rate(solved, self.slowest_per_s, x0)
-        return first, added[0] if added else None
+        decaying, *added = yield from choose_rate(solved, self.slowest_per_s, x0)
+        return decaying, added[0] if added else None
 
     @cached_property
     def _decaying(self) -> Part:
@@ -174,8 +180,8 @@ class DisturbedCertificate:
         """Everything without decay; the trigger's bound depends on the conditions."""
         plant = self._plant(0.0)
         pushed = replace(plant, forcing=self._forcing(plant))
-        first, rest = self._estimation.decaying(0.0), self._estimation.persistent()
-        estimation = rest._replace(fixed=rest.fixed + first.fixed)
+        decaying, persistent = self._estimation.decaying(0.0), self._estimation.persistent()
+        estimation = persistent._replace(fixed=persistent.fixed + decaying.fixed)
         return Part(plant.error, pushed, TriggerBound(0.0, None), estimation)
 
     def _plant(self, alpha_per_s: float) -> PlantGains:
@@ -227,8 +233,8 @@ def solve_two_parts(
             part._replace(bound=part.bound._replace(reached=level))
             for part, level in zip((decaying, persistent), reached, strict=True)
         ]
-        first, second = yield Problem(tuple(parts), conditions, earlier_error, structured)
-        return first, second
+        first_constants, second_constants = yield Problem(tuple(parts), conditions, earlier_error, structured)
+        return first_constants, second_constants
 
     if floor == 0:
         return (yield from solved(None))

@@ -43,7 +43,7 @@ from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_
 from noack.theory.certificates.loss_accumulation import LossAccumulation
 
 _SIGNALS = 6
-_HELD, _INPUT, _ONE = (np.eye(_SIGNALS)[place] for place in (0, 3, 5))
+_HELD, _INPUT, _ONE = (np.eye(_SIGNALS)[index] for index in (0, 3, 5))
 MOST_STAGES = 16
 """With more missing events π is used for all of them."""
 _EPSILON = float(np.finfo(float).eps)
@@ -143,9 +143,9 @@ class LoopConstants(NamedTuple):
 
     def of_loop(self, loop: int, rate_per_s: float, inter_event_s: float | None) -> Constants:
         """Return the constants of one loop."""
-        own = {name: values[loop].item() for name, values in self._asdict().items()}
-        del own["exists"], own["earlier_input_error"]
-        return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **own)
+        fields = {name: values[loop].item() for name, values in self._asdict().items()}
+        del fields["exists"], fields["earlier_input_error"]
+        return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **fields)
 
 
 class ErrorInequalities:
@@ -194,12 +194,12 @@ class ErrorInequalities:
         solved = self._solutions(method, events, spacing_s)
         smallest = np.min([bound for _, _, bound in solved], axis=0)
         gain = np.where(is_counted, np.min([gain for _, gain, _ in solved], axis=0), np.inf)
-        found = []
+        by_bound = []
         for signals, _, bound in solved:  # each b is another one
             bound = np.where(np.arange(_SIGNALS) == 1, bound, smallest)
-            found.append(self._found(signals, events, gain, bound, is_counted))
-        exists = np.any([one.exists for one in found], axis=0)
-        return LoopConstants(*map(np.fmin.reduce, zip(*found, strict=True)))._replace(exists=exists)
+            by_bound.append(self._found(signals, events, gain, bound, is_counted))
+        exists = np.any([constants.exists for constants in by_bound], axis=0)
+        return LoopConstants(*map(np.fmin.reduce, zip(*by_bound, strict=True)))._replace(exists=exists)
 
     def _solutions(
         self, method: BoundMethod, events: Counts, spacing_s: Vector
@@ -207,11 +207,11 @@ class ErrorInequalities:
         """Return the signals, the loop gains and the bounds of all signals for each bound of e_s."""
         solved = []
         for growths in self._growths:  # all bounds of e_s hold; of each, one growth applies
-            own = growths[0] if len(growths) == 1 and self._error.decays else None
-            signals = self._signals(method, events, spacing_s, own)
-            each = [self._solved(signals, growth, own) for growth in growths]
-            gain = np.max([one.loop_gain for one in each], axis=0)
-            solved.append((signals, gain, np.max([one.bound for one in each], axis=0)))
+            own_growth = growths[0] if len(growths) == 1 and self._error.decays else None
+            signals = self._signals(method, events, spacing_s, own_growth)
+            solutions = [self._solved(signals, growth, own_growth) for growth in growths]
+            gain = np.max([solution.loop_gain for solution in solutions], axis=0)
+            solved.append((signals, gain, np.max([solution.bound for solution in solutions], axis=0)))
         return solved
 
     def _found(
@@ -225,22 +225,22 @@ class ErrorInequalities:
         """Return what follows from bounds of the signals, (loops, 6)."""
         states = signals.free + _applied(signals.states, solved)
         state = dict(zip(self._states, np.moveaxis(states, -1, 0), strict=True))
-        held, estimation = solved[..., 0], solved[..., 2]
-        found = (
+        age_input, estimation = solved[..., 0], solved[..., 2]
+        fields = (
             (_product(signals.errors[Output.WEIGHTED], solved) + estimation) / self.unit,
             (_product(signals.sensor, solved) + estimation) / self.unit,
-            _product(signals.errors[Output.GAIN], solved) + held,
+            _product(signals.errors[Output.GAIN], solved) + age_input,
             self._start_error,
             state[Output.STATE],
             state[Output.WEIGHTED],
             state[Output.MISMATCH],
             loop_gain,
             estimation,
-            _product(signals.received, solved) + held,
-            _product(signals.earlier, solved) + held,
+            _product(signals.received, solved) + age_input,
+            _product(signals.earlier, solved) + age_input,
             np.isfinite(solved).all(axis=-1) & is_counted,
         )
-        return LoopConstants(events, *(np.broadcast_to(values, events.shape) for values in found))
+        return LoopConstants(events, *(np.broadcast_to(values, events.shape) for values in fields))
 
     @property
     def unit(self) -> float:
@@ -248,64 +248,64 @@ class ErrorInequalities:
         return self._bound.beta if self._bound.unit is None else self._bound.unit
 
     def _signals(
-        self,
-        method: BoundMethod,
-        events: Counts,
-        spacing_s: Vector,
-        own: ErrorGrowth | None,
+        self, method: BoundMethod, events: Counts, spacing_s: Vector, own_growth: ErrorGrowth | None
     ) -> "_Signals":
         """Return how all outputs depend on (q, b, η, π, sup‖R_E x‖, 1).
 
-        Every ‖e_s‖_W has grown by ``own`` from at most b at the last test; without it b is β̃. An
+        Every ‖e_s‖_W has grown by ``own_growth`` from at most b at the last test; without it b is β̃. An
         event's x_s − x̂ is at most this plus η, the present x_s − x is at most this.
         """
-        held, test, estimated, *_ = np.eye(_SIGNALS)
-        sensor = test
-        if own is not None:
-            sensor = self._begun(_columns(0.0, own.stretch, 0.0, *own.driven), own.highest)
+        held_unit, test_unit, estimate_unit, *_ = np.eye(_SIGNALS)
+        sensor = test_unit
+        if own_growth is not None:
+            sensor = self._begun(
+                _columns(0.0, own_growth.stretch, 0.0, *own_growth.driven), own_growth.highest
+            )
         counted, flying = events, events - self._conditions.dropouts
-        now = present = {output: self._present(output, own) for output in self._error.outputs}
+        at_present = present = {output: self._present(output, own_growth) for output in self._error.outputs}
         if drifts := method is BoundMethod.DRIFTING:
             # d ago, e_c consisted of e_s and of the errors of events that are lost.
             counted, flying = events - flying, 0 * events
-            present = {output: self._present(output, own, self._conditions.delay_s) for output in now}
+            present = {
+                output: self._present(output, own_growth, self._conditions.delay_s) for output in at_present
+            }
 
         def with_missing(
             output: Output, present: Matrix, count: Counts, stages: _Stages | None = None
         ) -> Matrix:
-            return self._with_missing(output, present, count, spacing_s, own, stages)
+            return self._with_missing(output, present, count, spacing_s, own_growth, stages)
 
-        stages = self._stages(present[Output.GAIN], counted, spacing_s, own)
+        stages = self._stages(present[Output.GAIN], counted, spacing_s, own_growth)
         errors = {output: with_missing(output, row, counted, stages) for output, row in present.items()}
-        whole = errors[Output.GAIN]
-        earlier = whole if drifts else with_missing(Output.GAIN, 0 * _ONE, counted, stages)
-        received = with_missing(Output.GAIN, now[Output.GAIN], 0 * events)
-        near = with_missing(Output.GAIN, present[Output.GAIN], flying)
+        input_error = errors[Output.GAIN]
+        earlier = input_error if drifts else with_missing(Output.GAIN, 0 * _ONE, counted, stages)
+        received = with_missing(Output.GAIN, at_present[Output.GAIN], 0 * events)
+        in_flight = with_missing(Output.GAIN, present[Output.GAIN], flying)
         lost = self._missing_gain(Output.GAIN, counted, spacing_s)
         lost = lost - self._missing_gain(Output.GAIN, flying, spacing_s)
         alone = self._alone(lost, spacing_s)
         states = []
         for name, (_, gain) in self._states.items():
             gain = np.asarray(gain)[..., None]
-            row = gain * (held + whole)
+            row = gain * (held_unit + input_error)
             if name in alone:
-                in_windows = gain * (held + near) + alone[name][:, None] * (sensor + estimated)
+                in_windows = gain * (held_unit + in_flight) + alone[name][:, None] * (sensor + estimate_unit)
                 row = np.where((alone[name] < gain[..., 0] * lost)[:, None], in_windows, row)
             states.append(row)
         free = _columns(*(state.free for state in self._states.values()))
         rows = _rows(*states)
         return _Signals([*self._states], free, rows, errors, sensor, received, earlier)
 
-    def _present(self, output: Output, own: ErrorGrowth | None, later_s: float = 0.0) -> Matrix:
+    def _present(self, output: Output, own_growth: ErrorGrowth | None, later_s: float = 0.0) -> Matrix:
         """Return the bound of sup‖C e_s‖ as a row of the signals.
 
         It is that of what e_s becomes, if nothing resets it, up to ``later_s`` after.
         """
-        until_s, still = later_s + (0.0 if own is None else own.longest_s), np.zeros(())
-        driven: tuple[Vector, Vector, Vector] = (still, still, still)
+        until_s, zero = later_s + (0.0 if own_growth is None else own_growth.longest_s), np.zeros(())
+        driven: tuple[Vector, Vector, Vector] = (zero, zero, zero)
         if until_s > 0:
             growth = self._plant.growths(until_s, COARSE_CELLS)[output]
-            driven = growth.totals if own is None else growth.means(own.ages_s + later_s)
+            driven = growth.totals if own_growth is None else growth.means(own_growth.ages_s + later_s)
         return _columns(0.0, self._error.now_until(until_s)[output], 0.0, *driven)
 
     def _with_missing(
@@ -314,7 +314,7 @@ class ErrorInequalities:
         present: Matrix,
         events: Counts,
         spacing_s: Vector,
-        own: ErrorGrowth | None,
+        own_growth: ErrorGrowth | None,
         stages: "_Stages | None" = None,
     ) -> Matrix:
         """Return the bound of sup‖C e_c‖ as a row of the signals, given that of e_s, ``present``.
@@ -322,16 +322,18 @@ class ErrorInequalities:
         The part of e_s that has grown since the last test is followed from where it entered.
         """
         gain = self._missing_gain(output, events, spacing_s)
-        driven: list[Vector | float] = [0.0] * 3 if own is None else [gain * size for size in own.driven]
-        if own is not None and own.longest_s > 0:
-            for place, kernel in enumerate(self._plant.driven[output]):
-                followed = own.mean_s * sum_of_sups(kernel, events, spacing_s)
-                driven[place] = np.minimum(driven[place], followed)
+        driven: list[Vector | float] = (
+            [0.0] * 3 if own_growth is None else [gain * size for size in own_growth.driven]
+        )
+        if own_growth is not None and own_growth.longest_s > 0:
+            for index, kernel in enumerate(self._plant.driven[output]):
+                followed = own_growth.mean_s * sum_of_sups(kernel, events, spacing_s)
+                driven[index] = np.minimum(driven[index], followed)
         highest = self._plant.driven[output][0].sup() if self._error.decays else 0.0
         row = self._begun(present + _columns(0.0, gain, gain, *driven), highest)
-        if stages is not None and own is not None:
+        if stages is not None and own_growth is not None:
             row[..., 3] = present[..., 3]
-            row += stages.entered(*self._entered(output, len(stages.inputs), spacing_s, own), events)
+            row += stages.entered(*self._entered(output, len(stages.inputs), spacing_s, own_growth), events)
         return row
 
     def _begun(self, row: Matrix, highest: Vector | float) -> Matrix:
@@ -343,7 +345,7 @@ class ErrorInequalities:
         return np.asarray(row + (self._beyond * begun)[..., None] * _ONE)
 
     def _entered(
-        self, output: Output, count: int, spacing_s: Vector, own: ErrorGrowth
+        self, output: Output, count: int, spacing_s: Vector, own_growth: ErrorGrowth
     ) -> tuple[Matrix, Matrix]:
         """Bound how inputs before missing events move C e_c, from the newest event on.
 
@@ -354,10 +356,10 @@ class ErrorInequalities:
         ages_s = spacing_s[:, None] * np.arange(count)
         sups = np.broadcast_to(self._plant.driven[output][0].sups(ages_s), ages_s.shape).T
         gains = self._error.kernels[output].sups(ages_s).T
-        return np.minimum(gains * own.driven[0], own.mean_s * sups), sups
+        return np.minimum(gains * own_growth.driven[0], own_growth.mean_s * sups), sups
 
     def _stages(
-        self, present: Matrix, events: Counts, spacing_s: Vector, own: ErrorGrowth | None
+        self, present: Matrix, events: Counts, spacing_s: Vector, own_growth: ErrorGrowth | None
     ) -> "_Stages | None":
         """Bound ‖p‖ while at most 0, 1, … events are missing; None where π is used instead.
 
@@ -366,25 +368,30 @@ class ErrorInequalities:
         from missing events.
         """
         count, delay_s = int(events.max(initial=0)), self._conditions.delay_s
-        if own is None or own.longest_s == 0 or not 0 < count <= MOST_STAGES or not spacing_s.all():
+        if (
+            own_growth is None
+            or own_growth.longest_s == 0
+            or not 0 < count <= MOST_STAGES
+            or not spacing_s.all()
+        ):
             return None
-        sizes, sups = self._entered(Output.GAIN, count, spacing_s, own)
+        sizes, sups = self._entered(Output.GAIN, count, spacing_s, own_growth)
         shape = len(spacing_s), _SIGNALS
-        late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own.longest_s)
+        late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own_growth.longest_s)
         highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
         stages = _Stages(np.zeros((0, *shape)), late_s)
         for number in range(count):
             counts = np.full_like(events, number)
-            row = _HELD + self._with_missing(Output.GAIN, present, counts, spacing_s, own)
+            row = _HELD + self._with_missing(Output.GAIN, present, counts, spacing_s, own_growth)
             late = np.minimum(present[..., 3], highest * (delay_s - number * spacing_s).clip(min=0.0))
             row[..., 3] = late
             row = row + stages.entered(sizes, sups, counts)
-            left = 1 - (present[..., 3] - late)[..., None]
-            row = np.where(left > 0, row / np.where(left > 0, left, 1.0), _INPUT)
+            share_left = 1 - (present[..., 3] - late)[..., None]
+            row = np.where(share_left > 0, row / np.where(share_left > 0, share_left, 1.0), _INPUT)
             stages = stages._replace(inputs=np.concatenate([stages.inputs, row[None]]))
         return stages
 
-    def _solved(self, signals: "_Signals", growing: ErrorGrowth, own: ErrorGrowth | None) -> Solution:
+    def _solved(self, signals: "_Signals", growing: ErrorGrowth, own_growth: ErrorGrowth | None) -> Solution:
         """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
         errors, beyond, held = signals.errors, self._beyond, self.age_gains
         held_input, _, estimated, *_ = np.eye(_SIGNALS)
@@ -402,13 +409,13 @@ class ErrorInequalities:
         of_mismatch = signals.through({Output.MISMATCH: 1.0})
         through, free = signals.through(growing.shares)
         of_test = (through + growing.estimation * estimated, growing.fixed + free)
-        if own is None:
+        if own_growth is None:
             driven = self._begun(_columns(0.0, 0.0, 0.0, *growing.driven), growing.highest)
             of_test = growing.stretch * of_test[0] + driven, growing.stretch * of_test[1]
-        others = ((input_error, 0.0), of_mismatch, (0.0 * input_error, 1.0))
-        each = (of_age, of_test, of_estimate, *others)
-        rows = _rows(*(row for row, _ in each))
-        right = _columns(*(right for _, right in each))
+        other_rows = ((input_error, 0.0), of_mismatch, (0.0 * input_error, 1.0))
+        all_rows = (of_age, of_test, of_estimate, *other_rows)
+        rows = _rows(*(row for row, _ in all_rows))
+        right = _columns(*(right for _, right in all_rows))
         return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
 
     @property
@@ -437,20 +444,17 @@ class ErrorInequalities:
         windows = self._conditions.guarantee.windows
         density = min(window.losses / window.packets for window in windows)
         lasting = density * self._error.kernels[Output.GAIN].integral()
-        which = np.flatnonzero(lasting < lost * spacing_s).tolist()
-        found: dict[str, Vector] = {}
-        for output in self._states if which else ():
-            found[output] = np.full(len(spacing_s), np.inf)
-            for loop in which:
+        loops = np.flatnonzero(lasting < lost * spacing_s).tolist()
+        bounds: dict[str, Vector] = {}
+        for output in self._states if loops else ():
+            bounds[output] = np.full(len(spacing_s), np.inf)
+            for loop in loops:
                 total = self._lost.total(output, float(spacing_s[loop]), windows, loop)
-                found[output][loop] = total
-        return found
+                bounds[output][loop] = total
+        return bounds
 
     def inter_event_s(
-        self,
-        constants: LoopConstants,
-        drifts: NDArray[np.bool_],
-        searched: NDArray[np.bool_],
+        self, constants: LoopConstants, drifts: NDArray[np.bool_], searched: NDArray[np.bool_]
     ) -> Vector:
         """Return the times that ‖e_s‖_W needs to the next event, given the constants until then.
 
@@ -460,8 +464,8 @@ class ErrorInequalities:
             searched: the loops whose times are needed, (loops,); the others are of no use.
         """
         # The part of D_K that is the e_s of now.
-        own = np.where(drifts, 0.0, self._error.now(Output.GAIN))
-        others = constants.earlier_input_error
+        error_gain = np.where(drifts, 0.0, self._error.now(Output.GAIN))
+        other_input_error = constants.earlier_input_error
         estimation = np.where(searched, constants.estimation_error, 0.0)
         # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
         times_s = [
@@ -470,8 +474,8 @@ class ErrorInequalities:
                     self._plant,
                     np.where(searched, bound.reached - estimation, 0.0),
                     np.where(searched, constants.mismatch, 0.0),
-                    np.where(searched, np.maximum(others, self._beyond), 0.0),
-                    own,
+                    np.where(searched, np.maximum(other_input_error, self._beyond), 0.0),
+                    error_gain,
                     estimation,
                 ),
                 bound.ago_s or math.inf,
@@ -542,16 +546,16 @@ def _product(row: Vector, column: Vector) -> Vector:
 
 def _columns(*values: Vector | float) -> Matrix:
     """Return values of loops, (…), side by side, (…, k)."""
-    found = np.empty((*np.broadcast(*values).shape, len(values)))
-    for place, value in enumerate(values):
-        found[..., place] = value
-    return found
+    columns = np.empty((*np.broadcast(*values).shape, len(values)))
+    for index, value in enumerate(values):
+        columns[..., index] = value
+    return columns
 
 
 def _rows(*values: Vector) -> Matrix:
     """Return vectors of loops, (…, j), one below the other, (…, k, j)."""
     *lead, size = np.broadcast(*values).shape
-    found = np.empty((*lead, len(values), size))
-    for place, value in enumerate(values):
-        found[..., place, :] = value
-    return found
+    rows = np.empty((*lead, len(values), size))
+    for index, value in enumerate(values):
+        rows[..., index, :] = value
+    return rows

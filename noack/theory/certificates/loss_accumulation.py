@@ -53,8 +53,8 @@ class LossAccumulation:
         return min(self._total(output, highest, spacing_s, window, loop) for window in windows)
 
     def _total(self, output: str, highest: Vector, spacing_s: float, window: LossWindow, loop: int) -> float:
-        most, packets = window
-        if most == 0:
+        losses, packets = window
+        if losses == 0:
             return 0.0
         blocks = -(-len(highest) // packets)
         padded = np.zeros(blocks * packets)
@@ -62,8 +62,8 @@ class LossAccumulation:
         ranked = np.sort(padded.reshape(blocks, packets), axis=1)[:, ::-1]
         falling = self._beyond[output][self._place(self._beyond[output], loop)]
         # The blocks that begin beyond the grid.
-        beyond = sum(most * f * (1 + 2 / (rate * packets * spacing_s)) for f, rate in falling)
-        return float(ranked[:, :most].sum()) * _ROUNDING + float(beyond)
+        beyond = sum(losses * f * (1 + 2 / (rate * packets * spacing_s)) for f, rate in falling)
+        return float(ranked[:, :losses].sum()) * _ROUNDING + float(beyond)
 
     @staticmethod
     def _place(values: NDArray[np.float64], loop: int) -> int:
@@ -90,10 +90,10 @@ class LossAccumulation:
         numbers = np.arange(1, _CELLS + 1)
         g = np.where(numbers * (self._until_s[:, None] / _CELLS) > self.delay_s, g, 0.0)
         ages = np.maximum(g, np.pad(g[:, :-1], ((0, 0), (1, 0))))
-        seen, size = np.fft.rfft(ages, 2 * _CELLS), np.linalg.norm(ages, axis=-1)
+        transform, size = np.fft.rfft(ages, 2 * _CELLS), np.linalg.norm(ages, axis=-1)
         effects = {}
         for output, area in areas.items():
-            convolved = np.fft.irfft(np.fft.rfft(area, 2 * _CELLS) * seen)[..., :_CELLS]
+            convolved = np.fft.irfft(np.fft.rfft(area, 2 * _CELLS) * transform)[..., :_CELLS]
             rounding = _TRANSFORMED * np.linalg.norm(area, axis=-1) * size
             effects[output] = np.maximum(convolved, 0.0) + rounding[:, None]
         return effects
@@ -107,7 +107,7 @@ class LossAccumulation:
         """
         g, forced = self._kernels
         half_s = self._until_s / 2
-        found = {}
+        by_output = {}
         for output, k in forced.items():
             levels = (g, g.tail_highest * k.integral()), (k, k.tail_area * g.sup())
             terms = [
@@ -117,8 +117,8 @@ class LossAccumulation:
                 )
                 for kernel, level in levels
             ]
-            found[output] = np.moveaxis(np.array(terms), -1, 0)
-        return found
+            by_output[output] = np.moveaxis(np.array(terms), -1, 0)
+        return by_output
 
 
 def _over_bins(cells: Vector, per_bin: float, bins: int) -> Vector:

@@ -91,23 +91,23 @@ class _Box(CertificateScope):
         trigger = self._trigger
         level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
         tested, reached = trigger.tested(conditions), trigger.floor or None
-        first = yield from self._solve(tested, 0.0, level, reached, longest=False)
-        return [(*self._checked(first, None), None)]
+        constants = yield from self._solve(tested, 0.0, level, reached, longest=False)
+        return [(*self._checked(constants, None), None)]
 
     def _coordinate_bounds(self, phases: list[Phases], conditions: NetworkConditions) -> Vector:
-        found = list[Vector]()
-        for first, _, rest in phases:
+        bounds = list[Vector]()
+        for decaying, _, persistent in phases:
             parts = (
-                [(self._plants[first.rate_per_s], first)]
+                [(self._plants[decaying.rate_per_s], decaying)]
                 if self.is_simple
-                else (self._disturbed.with_plants(first, rest))
+                else (self._disturbed.with_plants(decaying, persistent))
             )
             total = np.zeros(self._loop.n + self._loop.m)
             for plant, constants in parts:
                 assert isinstance(plant, BoxGains)
                 total += plant.coordinate_bounds(constants.input_error, conditions.start_s)
-            found.append(total)
-        return np.asarray(np.min(found, axis=0))
+            bounds.append(total)
+        return np.asarray(np.min(bounds, axis=0))
 
 
 class RegionScope(_Box):
@@ -121,14 +121,14 @@ class RegionScope(_Box):
 
     def search(self, conditions: NetworkConditions) -> Search[ScenarioCertificate]:
         """Search for the certificate under some conditions, and its region."""
-        found = yield from super().search(conditions)
-        if found.constants is None:
-            return found
+        certificate = yield from super().search(conditions)
+        if certificate.constants is None:
+            return certificate
         region = self._regions[conditions]
         why = "the bounds on the region are inside it, so that there is no first exit"
         stays = "x and u stay in the region over which the equations are enclosed"
         proven = Assumption(stays, "certificate", AssumptionStatus.HOLDS, why)
-        return replace(found, region=region, assumptions=(*found.assumptions, proven))
+        return replace(certificate, region=region, assumptions=(*certificate.assumptions, proven))
 
     def _constants(self, conditions: NetworkConditions, *, longest: bool = True) -> Search[list[Phases]]:
         widths, where = np.zeros(self._loop.n + self._loop.m), "near 0"

@@ -25,8 +25,8 @@ from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
+from noack.theory.certificates.deliveries.due_deliveries import Deliveries
 from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate, tenth_s
-from noack.theory.certificates.due_deliveries import Deliveries
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 MOST_S = 10.0
@@ -83,10 +83,7 @@ def box(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | Non
     loop, plant = loop_of(resolved), resolved.plant
     if plant.uncertainty_A is None and plant.uncertainty_B is None:
         return None
-    half_A, half_B = (
-        _halfwidth(plant.uncertainty_A, loop.A),
-        _halfwidth(plant.uncertainty_B, loop.B),
-    )
+    half_A, half_B = _halfwidth(plant.uncertainty_A, loop.A), _halfwidth(plant.uncertainty_B, loop.B)
 
     def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
         return BoxGains(error, loop.A_model, loop.B_model, start, alpha_per_s, half_A, half_B)
@@ -177,29 +174,29 @@ class CertificateScope:
             void = str(error)
 
         def certificate(
-            phase: tuple[Constants | None, ...], *others: tuple[Constants | None, ...]
+            phase: tuple[Constants | None, ...], *other_phases: tuple[Constants | None, ...]
         ) -> ScenarioCertificate:
-            first, late, rest = phase
+            main, floor, persistent = phase
             return ScenarioCertificate(
                 self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-                self._loop.weight is not None, conditions, (), first, late, void, rest,
-                certificate(*others) if others else None,
+                self._loop.weight is not None, conditions, (), main, floor, void, persistent,
+                certificate(*other_phases) if other_phases else None,
             )  # fmt: skip
 
         unchecked = certificate(*phases)
-        first, rest = unchecked.constants, unchecked.persistent_constants
-        kept = None
+        main, persistent = unchecked.constants, unchecked.persistent_constants
+        probability = None
         if not self._resolved.network.enforce_mansd:
-            kept = kept_probability(self._resolved, conditions.guarantee, unchecked.inter_event_s)
+            probability = kept_probability(self._resolved, conditions.guarantee, unchecked.inter_event_s)
         assumptions = certificate_assumptions(
             self._resolved,
             conditions,
             self._decay,
-            first,
+            main,
             void,
-            max((phase.loop_gain for phase in (first, rest) if phase is not None), default=0.0),
+            max((phase.loop_gain for phase in (main, persistent) if phase is not None), default=0.0),
             trigger.text(),
-            kept,
+            probability,
         )
         return replace(unchecked, assumptions=tuple(assumptions))
 
@@ -216,7 +213,7 @@ class CertificateScope:
         else:
             return max(phase.loop_gain for phase in constants[0] if phase is not None)
         # The slowest rate asks for least.
-        return next((one.gain for one in self._deliveries(conditions, _TIMED_RATES[-1:])), gain)
+        return next((deliveries.gain for deliveries in self._deliveries(conditions, _TIMED_RATES[-1:])), gain)
 
     def _constants(self, conditions: NetworkConditions) -> Search[list[Phases]]:
         """Search for the constants of each bound of the run; all of them hold.
@@ -226,17 +223,17 @@ class CertificateScope:
             NotDecayingError: a mode of the loop decays too slowly.
         """
         try:
-            found = yield from self._solved(conditions, longest=True)
+            solved = yield from self._solved(conditions, longest=True)
         except (NoCertificateError, NotDecayingError) as error:
-            found, void = [], error
-        apart_s = max((first.inter_event_s or 0.0 for first, _, _ in found), default=0.0)
+            solved, void = [], error
+        apart_s = max((main.inter_event_s or 0.0 for main, _, _ in solved), default=0.0)
         timed = self._timed(conditions, apart_s)
         if timed is None:
-            if not found:
+            if not solved:
                 raise void
-            return found
+            return solved
         apart_s = max(apart_s, timed.inter_event_s or 0.0)
-        useful = [phases for phases in found if not _is_within(timed, phases[0])]
+        useful = [phases for phases in solved if not _is_within(timed, phases[0])]
         return [(timed._replace(inter_event_s=apart_s), None, None), *useful]
 
     def _solved(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
@@ -246,10 +243,10 @@ class CertificateScope:
         """
         try:
             if self.is_simple:
-                first, late = yield from self._phases(conditions, longest=longest)
-                return [(first, late, None)]
+                main, floor = yield from self._phases(conditions, longest=longest)
+                return [(main, floor, None)]
             pairs = yield from self._disturbed_phases(conditions, longest=longest)
-            return [(first, None, rest) for first, rest in pairs]
+            return [(main, None, persistent) for main, persistent in pairs]
         except (OverflowError, np.linalg.LinAlgError):
             raise NoCertificateError(_TOO_LARGE) from None
 
@@ -258,14 +255,14 @@ class CertificateScope:
 
         ``apart_s``: events are known to be that far apart.
         """
-        found, soonest_s = None, math.inf
-        for one in self._deliveries(conditions, apart_s=apart_s):
-            if math.log(10) / one.rate_per_s >= soonest_s:
+        soonest, soonest_s = None, math.inf
+        for deliveries in self._deliveries(conditions, apart_s=apart_s):
+            if math.log(10) / deliveries.rate_per_s >= soonest_s:
                 break  # a slower rate needs longer, since no bound of ‖x‖ is below ‖x(0)‖
-            constants = one.constants(self._trigger.beta or 1.0)
+            constants = deliveries.constants(self._trigger.beta or 1.0)
             if (later_s := tenth_s(constants, self._start)) < soonest_s:
-                found, soonest_s = constants, later_s
-        return found
+                soonest, soonest_s = constants, later_s
+        return soonest
 
     def _deliveries(
         self, conditions: NetworkConditions, shares: Sequence[float] = _TIMED_RATES, apart_s: float = 0.0
@@ -290,12 +287,12 @@ class CertificateScope:
         self, conditions: NetworkConditions, *, longest: bool
     ) -> Search[tuple[Constants, Constants | None]]:
         """Search for the constants, and those after the threshold has reached its floor, if any."""
-        trigger, late = self._trigger, None
+        trigger, floor = self._trigger, None
         conditions = trigger.tested(conditions)
-        first = yield from self._first_phase(conditions, longest=longest)
-        if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
-            late = _at_floor(first, trigger.floor / trigger.beta)
-        return self._checked(first, late)
+        main = yield from self._first_phase(conditions, longest=longest)
+        if 0 < trigger.floor < trigger.beta and main.rate_per_s == trigger.alpha_per_s:
+            floor = _at_floor(main, trigger.floor / trigger.beta)
+        return self._checked(main, floor)
 
     def _disturbed_phases(
         self, conditions: NetworkConditions, *, longest: bool
@@ -310,28 +307,24 @@ class CertificateScope:
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
         return DisturbedCertificate(
-            self._resolved,
-            self._plant_at,
-            self._trigger,
-            self._start_error,
-            min(self._decay.values()),
+            self._resolved, self._plant_at, self._trigger, self._start_error, min(self._decay.values())
         )
 
-    def _checked(self, first: Constants, other: Constants | None) -> tuple[Constants, Constants | None]:
+    def _checked(self, main: Constants, added: Constants | None) -> tuple[Constants, Constants | None]:
         """Return the constants.
 
         Raises:
             NoCertificateError: they do not cover the inputs at the start, or are not finite.
         """
-        if first.input_error < self._start_error:
+        if main.input_error < self._start_error:
             raise NoCertificateError(
                 f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
-                f"covers at most {first.input_error:.3g}"
+                f"covers at most {main.input_error:.3g}"
             )
-        for constants in (first, other):
+        for constants in (main, added):
             if constants is not None and not _is_finite(constants):
                 raise NoCertificateError(_TOO_LARGE)
-        return first, other
+        return main, added
 
     def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Search[Constants]:
         trigger, decay = self._trigger, min(self._decay.values())
@@ -421,36 +414,24 @@ def _first_equal(known: _KnownPlant) -> PlantGains:
     return known.plant
 
 
-def _at_floor(first: Constants, share: float) -> Constants:
+_BOUNDS = ("input_error", "state", "state_weighted", "mismatch", "received_input_error")
+"""Constants that bound a signal themselves, not in units of the threshold."""
+
+
+def _at_floor(constants: Constants, share: float) -> Constants:
     """Return the constants from the floor on, ``share`` = ε/β.
 
     With θ(t) = max(βe^{−αt}, ε) in place of βe^{−αt}, all bounds of the first phase hold at all
     times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
     """
-    scaled = (
-        "input_error",
-        "start_error",
-        "state",
-        "state_weighted",
-        "mismatch",
-        "received_input_error",
-    )
-    return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
+    names = ("start_error", *_BOUNDS)
+    return constants._replace(rate_per_s=0.0, **{name: share * getattr(constants, name) for name in names})
 
 
-def _is_within(ours: Constants, others: Constants) -> bool:
-    """Return whether no bound of the others is below ours at any time."""
-    names = (
-        "delta",
-        "overshoot",
-        "input_error",
-        "state",
-        "state_weighted",
-        "mismatch",
-        "received_input_error",
-    )
-    return ours.rate_per_s >= others.rate_per_s and all(
-        getattr(ours, name) <= getattr(others, name) for name in names
+def _is_within(inner: Constants, outer: Constants) -> bool:
+    """Return whether no bound of ``outer`` is below that of ``inner`` at any time."""
+    return inner.rate_per_s >= outer.rate_per_s and all(
+        getattr(inner, name) <= getattr(outer, name) for name in ("delta", "overshoot", *_BOUNDS)
     )
 
 
@@ -470,24 +451,26 @@ class NetworkLimits(NamedTuple):
 
 def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
     """Return the limits for some plants; 0 means that there is no certificate at any time."""
-    return NetworkLimits(*(network_limit(scope, scheduled, what) for what in ("sampling", "delay", "hold")))
+    return NetworkLimits(
+        *(network_limit(scope, scheduled, quantity) for quantity in ("sampling", "delay", "hold"))
+    )
 
 
 _CHANGES: dict[str, Callable[[NetworkConditions, float], NetworkConditions]] = {
-    "sampling": lambda given, s: given._replace(sampling_s=s, spacing_s=s),
-    "delay": lambda given, s: given._replace(delay_s=s, start_s=s),
-    "hold": lambda given, s: given._replace(hold_s=s),
-    "start": lambda given, s: given._replace(start_s=s),
+    "sampling": lambda conditions, s: conditions._replace(sampling_s=s, spacing_s=s),
+    "delay": lambda conditions, s: conditions._replace(delay_s=s, start_s=s),
+    "hold": lambda conditions, s: conditions._replace(hold_s=s),
+    "start": lambda conditions, s: conditions._replace(start_s=s),
 }
 
 
-def network_limit(scope: CertificateScope, scheduled: NetworkConditions, what: str) -> float:
+def network_limit(scope: CertificateScope, scheduled: NetworkConditions, quantity: str) -> float:
     """Return the limit of one of the times ``sampling``, ``delay``, ``hold`` and ``start``, in s.
 
     0 means that there is no certificate at any time.
     """
-    change = _CHANGES[what]
-    usual_s: float = getattr(scheduled, f"{what}_s")
+    change = _CHANGES[quantity]
+    usual_s: float = getattr(scheduled, f"{quantity}_s")
     return largest(lambda value_s: scope.loop_gain(change(scheduled, value_s)), usual_s)
 
 
@@ -526,8 +509,8 @@ def _next_s(low_s: float, high_s: float, known: Points, *, middle: bool) -> floa
     if middle or not low_s < guess_s < high_s:
         return math.sqrt(low_s * high_s)
     # Next to a time that is close to the guess, the next one is on the other side of it.
-    near = 0.9 * _RESOLUTION
-    return min(max(guess_s, low_s * (1 + near)), high_s * (1 - near))
+    margin = 0.9 * _RESOLUTION
+    return min(max(guess_s, low_s * (1 + margin)), high_s * (1 - margin))
 
 
 def _interpolated_s(known: Points) -> float:
@@ -535,6 +518,6 @@ def _interpolated_s(known: Points) -> float:
     nearest = sorted(known, key=lambda point: abs(point[0]))[:3]
     interpolated = 0.0
     for gain, time in nearest:
-        others = [other for other, _ in nearest if other != gain]
-        interpolated += time * math.prod(other / (other - gain) for other in others)
+        other_gains = [other_gain for other_gain, _ in nearest if other_gain != gain]
+        interpolated += time * math.prod(other_gain / (other_gain - gain) for other_gain in other_gains)
     return math.exp(min(interpolated, math.log(MOST_S)))

@@ -4,7 +4,7 @@ The bounds are the solution of the inequalities of :mod:`noack.theory.certificat
 The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
 assumed δ gives a time of at least δ, it holds by induction over the events; the largest such δ is
 used. The constants are sharpened by the flow between two updates
-(:mod:`noack.theory.certificates.scheduled_flow`).
+(:mod:`noack.theory.certificates.deliveries.scheduled_flow`).
 """
 
 import contextlib
@@ -29,8 +29,8 @@ from noack.theory.bounds.terms import (
     TriggerBound,
 )
 from noack.theory.bounds.trigger_bounds import LONGEST_S
+from noack.theory.certificates.deliveries.scheduled_flow import is_scheduled_flow, scheduled_constants
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
-from noack.theory.certificates.scheduled_flow import is_scheduled_flow, scheduled_constants
 
 _SETTLED = 1e-3
 _ATTEMPTS = 200
@@ -102,32 +102,32 @@ def completed(searches: Sequence[Search[Found]]) -> list[Found]:
 
 def completed_alone(search: Search[Found]) -> Found:
     """Return the result of one search; see :func:`completed`."""
-    (found,) = completed([search])
-    return found
+    (answer,) = completed([search])
+    return answer
 
 
 def _answers(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
     """Return the constants of each problem, or its error."""
     alike = defaultdict[Hashable, list[int]](list)
-    for place, problem in enumerate(problems):
+    for index, problem in enumerate(problems):
         likeness = problem.likeness if len(problems) > 1 else None
-        alike[("alone", place) if likeness is None else likeness].append(place)
+        alike[("alone", index) if likeness is None else likeness].append(index)
     groups: list[list[int]] = []
     for places in alike.values():
         states = len(problems[places[0]].parts[0].error.H)
         width = max(_TOGETHER // states**2, 1)
-        groups += (places[first : first + width] for first in range(0, len(places), width))
+        groups += (places[begin : begin + width] for begin in range(0, len(places), width))
     answers: dict[int, list[Constants] | Exception] = {}
     for places in groups:
         try:
-            found = _solved([problems[place] for place in places])
-            answers.update(zip(places, found, strict=True))
+            solved = _solved([problems[index] for index in places])
+            answers.update(zip(places, solved, strict=True))
         except _UNSOLVED as error:
             if len(places) == 1:
                 answers[places[0]] = error
             else:  # of one of them
-                answers.update((place, _answers([problems[place]])[0]) for place in places)
-    return [answers[place] for place in range(len(problems))]
+                answers.update((index, _answers([problems[index]])[0]) for index in places)
+    return [answers[index] for index in range(len(problems))]
 
 
 def solve(
@@ -159,7 +159,7 @@ def sharpened(problem: Problem) -> Search[Constants]:
     (constants,) = yield problem
     (part,), conditions, *_ = problem
     is_plain = problem.structured and problem.earlier_error == 0.0
-    if problem.longest and is_plain and is_scheduled_flow(part, conditions):
+    if problem.longest and is_plain and is_scheduled_flow(part):
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
             return scheduled_constants(constants, part, conditions)
     return constants
@@ -171,25 +171,25 @@ def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
     Raises:
         NotDecayingError: a mode of a loop decays more slowly than the threshold.
     """
-    first = problems[0]
-    conditions, count = first.conditions, len(problems)
+    example = problems[0]
+    conditions, count = example.conditions, len(problems)
     steps = []
-    for place, part in enumerate(first.parts):
-        plants = [problem.parts[place].plant for problem in problems]
+    for index, part in enumerate(example.parts):
+        plants = [problem.parts[index].plant for problem in problems]
         together = part._replace(plant=part.plant.together(plants))
-        earlier = first.earlier_error if place == 0 else 0.0
+        earlier = example.earlier_error if index == 0 else 0.0
         steps.append(ErrorInequalities(together, conditions, earlier))
-        if first.structured and first.parts[0].plant.is_one_plant:
+        if example.structured and example.parts[0].plant.is_one_plant:
             steps[-1].use_windows()
-    apart_s = max(part.bound.apart_s for part in first.parts)
+    apart_s = max(part.bound.apart_s for part in example.parts)
     least_s = max(conditions.spacing_s, apart_s)
-    is_separated = all(any(bound.reached is not None for bound in part.bound.every) for part in first.parts)
+    is_separated = all(any(bound.reached is not None for bound in part.bound.every) for part in example.parts)
     searched = np.full(count, is_separated)
-    if is_separated and not first.longest:
+    if is_separated and not example.longest:
         searched = ~_smallest(steps, np.full(count, least_s)).exists
     spacing_s = _longest_s(steps, searched, least_s)
     smallest = _smallest(steps, spacing_s)
-    rates = [part.error.alpha_per_s for part in first.parts]
+    rates = [part.error.alpha_per_s for part in example.parts]
     shortest_s = least_s if is_separated else apart_s
     between_s = np.where(spacing_s > least_s, spacing_s, shortest_s).tolist()
     return [smallest.of_loop(loop, rates, between_s[loop] or None) for loop in range(count)]
@@ -210,9 +210,9 @@ def _longest_s(steps: Sequence[ErrorInequalities], searched: NDArray[np.bool_], 
         spacing_s = np.where(smallest.exists, spacing_s, least_s)
         for step, constants in zip(reversed(steps), reversed(smallest.parts), strict=True):
             # Often what persists, which is the last part, gives a time of at most the least one.
-            which = is_open & (found_s > least_s)
-            passed_s = step.inter_event_s(constants, smallest.drifts, which)
-            found_s = np.where(which, np.minimum(found_s, passed_s), found_s)
+            loops = is_open & (found_s > least_s)
+            passed_s = step.inter_event_s(constants, smallest.drifts, loops)
+            found_s = np.where(loops, np.minimum(found_s, passed_s), found_s)
         is_open &= found_s < spacing_s
         # Iterate from above.
         shorter = found_s < (1 - _SETTLED) * spacing_s
@@ -251,25 +251,25 @@ class _Smallest(NamedTuple):
 
 def _smallest(steps: Sequence[ErrorInequalities], spacing_s: Vector) -> _Smallest:
     """Return the constants of all parts with the first method for e_c that has a certificate."""
-    none = np.full(len(spacing_s), np.inf)
-    best = _Smallest((), none > 0, none < 0, none, spacing_s > 0)
+    infinite = np.full(len(spacing_s), np.inf)
+    best = _Smallest((), infinite > 0, infinite < 0, infinite, spacing_s > 0)
     for method in steps[0].methods:
         if not all(method in step.methods for step in steps):
             continue
-        parts = [step.constants(spacing_s, method) for step in steps]
-        exists, gain = np.ones(len(none), dtype=bool), none
-        for part in parts:
+        by_step = [step.constants(spacing_s, method) for step in steps]
+        exists, gain = np.ones(len(infinite), dtype=bool), infinite
+        for part in by_step:
             gain = np.where(exists & ~part.exists, part.loop_gain, gain)
             exists = exists & part.exists
         is_new = exists & ~best.exists
         drifts = np.where(is_new, method is BoundMethod.DRIFTING, best.drifts)
         if best.parts:
-            parts = [
-                LoopConstants(*(np.where(is_new, *pair) for pair in zip(one, other, strict=True)))
-                for one, other in zip(parts, best.parts, strict=True)
+            by_step = [
+                LoopConstants(*(np.where(is_new, *pair) for pair in zip(new, old, strict=True)))
+                for new, old in zip(by_step, best.parts, strict=True)
             ]
         gain = np.where(is_new | best.exists, best.loop_gain, np.minimum(gain, best.loop_gain))
-        best = best._replace(parts=parts, drifts=drifts, exists=best.exists | exists, loop_gain=gain)
+        best = best._replace(parts=by_step, drifts=drifts, exists=best.exists | exists, loop_gain=gain)
         if best.exists.all():
             break
     return best

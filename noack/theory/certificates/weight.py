@@ -57,7 +57,7 @@ def choose_weight(
     entry_rounds = _ROUNDS + _ROUNDS_PER_ENTRY * len(full[0])
     rounds = 0
 
-    def search(most: int, start: Vector, factor: Callable[[Vector], Matrix]) -> Vector:
+    def search(evaluations: int, start: Vector, factor: Callable[[Vector], Matrix]) -> Vector:
         def merit(entries: Vector) -> float:
             nonlocal rounds
             rounds += 1
@@ -65,7 +65,7 @@ def choose_weight(
             weight = _weight(loop.H, alpha_per_s, factor(entries))
             return 2 * _VOID if weight is None else samples.merit(weight, conditions, bound)
 
-        best = minimize(merit, start, method="Nelder-Mead", options={"maxfev": most, "adaptive": True})
+        best = minimize(merit, start, method="Nelder-Mead", options={"maxfev": evaluations, "adaptive": True})
         return np.asarray(best.x)
 
     def triangular(entries: Vector) -> Matrix:
@@ -144,8 +144,7 @@ class _SampledPlant(PlantGains):
             nodes_s, states = self.samples.plant
             followed = product(C, states)
             coefficients[output] = Coefficients(
-                _sampled(nodes_s, followed[:, :, :1]).sup(),
-                _sampled(nodes_s, followed[:, :, 1:]).integral(),
+                _sampled(nodes_s, followed[:, :, :1]).sup(), _sampled(nodes_s, followed[:, :, 1:]).integral()
             )
         return coefficients
 
@@ -154,10 +153,7 @@ class _SampledPlant(PlantGains):
         nodes_s, states = self.samples.models
         by_input, mismatched = self.columns.input_error, self.columns.mismatch
         return {
-            output: (
-                _sampled(nodes_s, C @ states @ by_input),
-                _sampled(nodes_s, C @ states @ mismatched),
-            )
+            output: (_sampled(nodes_s, C @ states @ by_input), _sampled(nodes_s, C @ states @ mismatched))
             for output, C in self.error.outputs.items()
         }
 
@@ -169,17 +165,17 @@ class _SampledPlant(PlantGains):
 
 def _thinned(generator: Matrix, D: Matrix) -> tuple[Vector, Stack]:
     """Return some of the nodes of a response, and e^{Gτ} D there."""
-    followed = response(generator, D)
-    kept = np.unique(np.linspace(0, len(followed.edges_s) - 1, _NODES).astype(int))
-    return followed.edges_s[kept], followed.states[kept]
+    responses = response(generator, D)
+    nodes = np.unique(np.linspace(0, len(responses.edges_s) - 1, _NODES).astype(int))
+    return responses.edges_s[nodes], responses.states[nodes]
 
 
 def _sampled(nodes_s: Vector, values: Stack) -> KernelBounds:
     """Return the norms of a kernel from its values at nodes; beyond the last node it is 0."""
     norms = spectral_norms(values)
     ends = np.maximum(norms[:-1], norms[1:])
-    areas, none = np.diff(nodes_s) * (norms[:-1] + norms[1:]) / 2, np.zeros(())
-    return KernelBounds(nodes_s, ends, areas, none, none, none)
+    areas, zero = np.diff(nodes_s) * (norms[:-1] + norms[1:]) / 2, np.zeros(())
+    return KernelBounds(nodes_s, ends, areas, zero, zero, zero)
 
 
 def _weight(H: Matrix, alpha_per_s: float, L: Matrix) -> Matrix | None:

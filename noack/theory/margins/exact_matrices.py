@@ -39,9 +39,9 @@ class IntervalMatrix(NamedTuple):
 
     def __matmul__(self, other: "IntervalMatrix") -> "IntervalMatrix":
         """Enclose the products."""
-        size, others = np.abs(self.middle), np.abs(other.middle)
-        terms = size.shape[-1] + 4
-        radius = size @ (other.radius + terms * _UNIT * others) + self.radius @ (others + other.radius)
+        left, right = np.abs(self.middle), np.abs(other.middle)
+        terms = left.shape[-1] + 4
+        radius = left @ (other.radius + terms * _UNIT * right) + self.radius @ (right + other.radius)
         return IntervalMatrix(self.middle @ other.middle, radius * _ENLARGED + terms * _UNDERFLOW)
 
     def __sub__(self, other: "IntervalMatrix") -> "IntervalMatrix":
@@ -105,9 +105,9 @@ class FixedPointMatrix:
         """Return the sum."""
         return FixedPointMatrix(self.entries + other.entries, self.error + other.error)
 
-    def rows(self, which: slice | list[int]) -> "FixedPointMatrix":
+    def rows(self, numbers: slice | list[int]) -> "FixedPointMatrix":
         """Return some of the rows."""
-        return FixedPointMatrix(self.entries[which], self.error)
+        return FixedPointMatrix(self.entries[numbers], self.error)
 
     def interval(self) -> IntervalMatrix:
         """Return the matrix in double precision, with its error."""

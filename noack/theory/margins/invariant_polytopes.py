@@ -70,8 +70,8 @@ class PolytopeNorm:
 
     def combinations(self, points: Matrix, enough: float = 0.0) -> Combinations:
         """Return combinations for points, (k, n), of the smallest norm, or at most ``enough``."""
-        none = np.full(len(points), _NONE)
-        return self._in_chunks(points, enough, none)
+        excluded = np.full(len(points), _NONE)
+        return self._in_chunks(points, enough, excluded)
 
     def redundant(self, first: int, enough: float) -> NDArray[np.bool_]:
         """Return which vertices from number ``first`` on have a norm up to ``enough`` without them.
@@ -84,15 +84,15 @@ class PolytopeNorm:
         redundant[first:] = (norms <= enough) & (numbers >= self.vertices.shape[1])
         return redundant
 
-    def _in_chunks(self, points: Matrix, enough: float, without: NDArray[np.int64]) -> Combinations:
+    def _in_chunks(self, points: Matrix, enough: float, excluded: NDArray[np.int64]) -> Combinations:
         chunk = max(_PRODUCTS // self.vertices.size, 16)
         parts = [
-            self._combinations(points[i : i + chunk], enough, without[i : i + chunk])
+            self._combinations(points[i : i + chunk], enough, excluded[i : i + chunk])
             for i in range(0, len(points), chunk)
         ]
         return Combinations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
-    def _combinations(self, points: Matrix, enough: float, without: NDArray[np.int64]) -> Combinations:
+    def _combinations(self, points: Matrix, enough: float, excluded: NDArray[np.int64]) -> Combinations:
         (k, n), V = points.shape, self.vertices
         chosen = np.tile(np.arange(n), (k, 1))
         signs = np.where(points >= 0, 1.0, -1.0) * np.sign(np.diag(V[:n]))
@@ -109,7 +109,7 @@ class PolytopeNorm:
             # The vertex that violates the dual's inequalities most enters the basis.
             scores = undone.sum(axis=2) @ V.T
             self.work += scores.size * n
-            scores[without[active] != _NONE, without[active][without[active] != _NONE]] = 0.0
+            scores[excluded[active] != _NONE, excluded[active][excluded[active] != _NONE]] = 0.0
             entering = np.abs(scores).argmax(axis=1)
             value = scores[np.arange(len(active)), entering]
             sign = np.sign(value)
@@ -208,17 +208,17 @@ class InvariantPolytopes:
             self._work += norm.work
             order = np.argsort(-norms)
             order = order[norms[order] > _INSIDE]
-            first, points = np.split(points[order], [max(4, len(order) // 4)])
-            self.vertices[node] = np.concatenate([self.vertices[node], first])
+            largest, points = np.split(points[order], [max(4, len(order) // 4)])
+            self.vertices[node] = np.concatenate([self.vertices[node], largest])
         if len(self.vertices[node]) == before:
             return points
         # Without points in its interior it is the same polytope.
         everywhere = len(self.vertices[node]) > _MUCH_LARGER * self._examined.get(node, 0)
         norm = PolytopeNorm(self.vertices[node])
-        kept = ~norm.redundant(0 if everywhere else before, _INSIDE)
+        is_new = ~norm.redundant(0 if everywhere else before, _INSIDE)
         self._work += norm.work
-        added = self.vertices[node][before:][kept[before:]]
-        self.vertices[node] = self.vertices[node][kept]
+        added = self.vertices[node][before:][is_new[before:]]
+        self.vertices[node] = self.vertices[node][is_new]
         if everywhere:
             self._examined[node] = len(self.vertices[node])
         return added

@@ -81,7 +81,7 @@ class JointSpectralRadius(NamedTuple):
     """Numbers of the edges of the cycle that attains the lower bound, in their order of time."""
     vertices: int
     """Number of vertices of the polytopes that prove the upper bound; 0: it has another proof."""
-    needed: float = 0.0
+    needed_effort: float = 0.0
     """If the threshold is between the bounds: an estimate of the effort that would prove the radius
     to be below, if it is the lower bound; infinity if the two hardly differ."""
 
@@ -105,20 +105,20 @@ def joint_spectral_radius(
         effort: factor of the limits of the work for this comparison.
     """
     numbers = {id(edge): number for number, edge in enumerate(edges)}
-    lower, upper, vertices, needed = 0.0, 0.0, 0, 0.0
+    lower, upper, vertices, needed_effort = 0.0, 0.0, 0, 0.0
     path: tuple[int, ...] = ()
     for part in strongly_connected(edges):
         enclosure = _Enclosure(part, most_vertices)
         if threshold is not None and not enclosure.is_decided(threshold):
-            needed = max(needed, enclosure.compare(threshold, effort))
+            needed_effort = max(needed_effort, enclosure.compare(threshold, effort))
         enclosure.sharpen(accuracy)
         if enclosure.cycle.growth > lower:
             lower = enclosure.cycle.growth
             path = tuple(numbers[id(part.edges[i])] for i in enclosure.cycle.path)
         upper, vertices = max(upper, enclosure.upper), vertices + enclosure.vertices
     if threshold is not None and not lower <= threshold <= upper:
-        needed = 0.0
-    return JointSpectralRadius(lower, upper, path, vertices, needed)
+        needed_effort = 0.0
+    return JointSpectralRadius(lower, upper, path, vertices, needed_effort)
 
 
 class _Enclosure:
@@ -168,10 +168,10 @@ class _Enclosure:
 
     def _search(self, remembers: bool = False) -> NormSearch:
         if remembers not in self._searches:
-            system, most = self._system, FEW_ENTRIES
+            system, entries = self._system, FEW_ENTRIES
             if remembers:
-                system, most = self._remembering, MOST_ENTRIES
-            self._searches[remembers] = NormSearch(system, most)
+                system, entries = self._remembering, MOST_ENTRIES
+            self._searches[remembers] = NormSearch(system, entries)
         return self._searches[remembers]
 
     def _improve(self, upper: float, vertices: int = 0) -> None:
@@ -183,7 +183,7 @@ class _Enclosure:
 
     def compare(self, threshold: float, effort: float) -> float:
         """Try to decide whether the radius is below a threshold; return the effort if it failed."""
-        needed = math.inf
+        needed_effort = math.inf
         attempts: tuple[Callable[[float], float], ...] = (
             lambda growth: self._prove_by_polytopes(growth, int(_FEW_VERTICES * effort)),
             self._search_longer,
@@ -192,10 +192,10 @@ class _Enclosure:
             lambda growth: self._prove_by_norms(growth, int(_MORE_PRODUCTS * effort), True),
         )
         for attempt in attempts:
-            needed = attempt(threshold - _WITHIN * (threshold - self.cycle.growth))
+            needed_effort = attempt(threshold - _WITHIN * (threshold - self.cycle.growth))
             if self.is_decided(threshold):
                 return 0.0
-        return needed * effort
+        return needed_effort * effort
 
     def sharpen(self, accuracy: float) -> None:
         """Bring the bounds together as far as the limits of the work allow."""
@@ -219,7 +219,7 @@ class _Enclosure:
 
     def _search_longer(self, growth: float) -> float:
         if not self._is_large:
-            self.cycle = max(self.cycle, self._longest_cycle, key=lambda one: one.growth)
+            self.cycle = max(self.cycle, self._longest_cycle, key=lambda cycle: cycle.growth)
         return math.inf
 
     def _prove_by_polytopes(self, growth: float, most_vertices: int) -> float:
@@ -231,7 +231,7 @@ class _Enclosure:
                 self._improve(polytopes.bound(), polytopes.count)
         return math.inf
 
-    def _prove_by_norms(self, growth: float, most: int, remembers: bool = False) -> float:
+    def _prove_by_norms(self, growth: float, entries: int, remembers: bool = False) -> float:
         """Try to prove a growth; return the effort that this is estimated to need, 1: the limit."""
         norms = self._search(remembers).improve(growth)
         self._improve(norms.upper)
@@ -242,11 +242,11 @@ class _Enclosure:
         if turned is None:
             return math.inf
         try:
-            found = bound_by_products(turned, growth, most, slowest=self.cycle.growth)
+            bound = bound_by_products(turned, growth, entries, slowest=self.cycle.growth)
         except FloatingPointError:  # an overflow, where the caller has asked for it
             return math.inf
-        self._improve(found.upper)
-        return found.needed / most
+        self._improve(bound.upper)
+        return bound.needed_products / entries
 
 
 def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _CycleSearch) -> Cycle:
@@ -272,7 +272,7 @@ class ProductBound(NamedTuple):
     """Upper bound of the joint spectral radius."""
     products: int
     """Number of products that were examined."""
-    needed: float
+    needed_products: float
     """Number of products that would prove γ; an estimate if the work was limited."""
 
 

@@ -55,10 +55,10 @@ class Burst(NamedTuple):
 
     def intervals(self, times: EventTimes) -> list[int]:
         """Return times between the transmissions, (losses + 1,), in steps; the longest first."""
-        intervals, left = [], self.steps
+        intervals, remaining = [], self.steps
         for further in range(self.losses, -1, -1):
-            intervals.append(min(times.longest, left - further * times.shortest))
-            left -= intervals[-1]
+            intervals.append(min(times.longest, remaining - further * times.shortest))
+            remaining -= intervals[-1]
         return intervals
 
 
@@ -110,12 +110,12 @@ def _merged(bursts: list[Burst]) -> list[Burst]:
     classes, count = dict.fromkeys(leaving, 0), 0
     while len(set(classes.values())) > count:
         count = len(set(classes.values()))
-        seen = {
+        merged = {
             node: frozenset((*burst[2:], classes[burst.target]) for burst in ones)
             for node, ones in leaving.items()
         }
-        numbers = {future: number for number, future in enumerate(dict.fromkeys(seen.values()))}
-        classes = {node: numbers[future] for node, future in seen.items()}
+        numbers = {future: number for number, future in enumerate(dict.fromkeys(merged.values()))}
+        classes = {node: numbers[future] for node, future in merged.items()}
     lowest: dict[int, int] = {}
     for node in sorted(classes):
         lowest.setdefault(classes[node], node)
@@ -209,8 +209,8 @@ class LossMargin:
         self.guarantee = resolved.network.guarantee
         self.shortest_ns, self.longest_ns = intervals_ns(resolved)
         if longest_ns is not None:
-            same = self.shortest_ns == self.longest_ns
-            self.shortest_ns = longest_ns if same else min(self.shortest_ns, longest_ns)
+            is_regular = self.shortest_ns == self.longest_ns
+            self.shortest_ns = longest_ns if is_regular else min(self.shortest_ns, longest_ns)
             self.longest_ns = longest_ns
         is_periodic = self.shortest_ns == self.longest_ns
         self._unit_ns = unit_ns = self.longest_ns if is_periodic else resolved.timing.measurement_period_ns
@@ -246,12 +246,12 @@ class LossMargin:
         begun_s = time.process_time()
         try:
             with np.errstate(over="raise"):
-                found = self._bounded(bursts, accuracy, decide=decide, effort=effort)
+                stability = self._bounded(bursts, accuracy, decide=decide, effort=effort)
         except (OverflowError, FloatingPointError):
             raise CallerError(
                 "the loop grows beyond 1e308 within some deliveries; reduce mansd or the period"
             ) from None
-        return found._replace(took_s=time.process_time() - begun_s)
+        return stability._replace(took_s=time.process_time() - begun_s)
 
     def _bounded(self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float) -> Stability:
         edges = [
@@ -270,12 +270,12 @@ class LossMargin:
         path = [bursts[number] for number in radius.cycle]
         # In another slot than the first update's the pattern may grow less.
         slots = [burst.slot for burst in path]
-        first = slots.index(self._first_slot) if self._first_slot in slots else 0
-        path = path[first:] + path[:first]
+        begin = slots.index(self._first_slot) if self._first_slot in slots else 0
+        path = path[begin:] + path[:begin]
         pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
         if path and self._times == EVERY_STEP:
-            first = (self._first_slot - path[0].slot) % self.loop.times.slots
-            pattern = pattern[first:] + pattern[:first]
+            begin = (self._first_slot - path[0].slot) % self.loop.times.slots
+            pattern = pattern[begin:] + pattern[:begin]
         intervals_s = (
             steps * self._unit_ns / NS_PER_S for burst in path for steps in burst.intervals(self._times)
         )
@@ -285,10 +285,10 @@ class LossMargin:
             tuple(pattern),
             tuple(intervals_s),
             radius.vertices,
-            radius.needed,
+            radius.needed_effort,
         )
 
-    def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
+    def coarse_bounds(self, guarantee: LossGuarantee | None = None) -> Stability:
         """Return coarser bounds, which decide whether all patterns are stable."""
         return self.stability(guarantee, _FIRST_ACCURACY)
 
@@ -343,17 +343,13 @@ def loop_times(resolved: Scenario, unit_ns: int) -> LoopTimes:
     timing, delay_ns = resolved.timing, update_delay_ns(resolved)
     if delay_ns >= unit_ns:
         is_every = unit_ns != timing.measurement_period_ns
-        what = "two updates" if is_every else "two measurements"
+        pair = "two updates" if is_every else "two measurements"
         raise CallerError(
             f"network.impairments: a delay of {delay_ns / NS_PER_S:g} s; expected less "
-            f"than the period between {what}, {unit_ns / NS_PER_S:g} s"
+            f"than the period between {pair}, {unit_ns / NS_PER_S:g} s"
         )
     return LoopTimes(
-        timing.plant_period_ns,
-        timing.controller_period_ns,
-        timing.controller_phase_ns,
-        unit_ns,
-        delay_ns,
+        timing.plant_period_ns, timing.controller_period_ns, timing.controller_phase_ns, unit_ns, delay_ns
     )
 
 

@@ -80,9 +80,9 @@ class NormSearch:
         self._coordinates = {v: coordinates[0 if is_common else v] for v in dimensions}
         n = max(dimensions.values())
         self._matrices = np.zeros((len(self._edges), n, n))
-        for place, edge in zip(self._matrices, balanced.edges, strict=True):
+        for padded, edge in zip(self._matrices, balanced.edges, strict=True):
             rows, columns = edge.matrix.middle.shape
-            place[:rows, :columns] = edge.matrix.middle
+            padded[:rows, :columns] = edge.matrix.middle
         self._sources = np.array([self._nodes[edge.source] for edge in self._edges])
         self._targets = np.array([self._nodes[edge.target] for edge in self._edges])
         self._durations = np.array([float(edge.duration) for edge in self._edges])
@@ -90,9 +90,9 @@ class NormSearch:
         self._squares: _Stack = np.tile(np.eye(n) * len(self._edges) / count, (count, 1, 1))
         """P_v in balanced coordinates; they are enlarged to the largest dimension."""
 
-    def improve(self, wanted: float) -> QuadraticNorms:
+    def improve(self, target: float) -> QuadraticNorms:
         """Improve the norms until they prove a growth, or hardly become better."""
-        goal, settled = math.log(max(wanted, _SMALLEST)), _SETTLED / self._durations.max()
+        goal, settled = math.log(max(target, _SMALLEST)), _SETTLED / self._durations.max()
         firsts = np.unique(self._sources, return_index=True)[1]
         spread = np.unique(np.linspace(0, len(self._edges) - 1, _FIRST_EDGES).astype(np.int64))
         numbers = np.union1d(firsts, spread)
@@ -258,17 +258,13 @@ def _symmetric_basis(n: int) -> Matrix:
     """Return the map from lower triangles to symmetric matrices, (n², n(n+1)/2)."""
     rows, columns = np.tril_indices(n)
     basis = np.zeros((n * n, len(rows)))
-    for place in (rows * n + columns, columns * n + rows):
-        basis[place, np.arange(len(rows))] = 1.0
+    for position in (rows * n + columns, columns * n + rows):
+        basis[position, np.arange(len(rows))] = 1.0
     return basis
 
 
 def _log_growths(
-    P: _Stack,
-    matrices: _Stack,
-    sources: NDArray[np.int64],
-    targets: NDArray[np.int64],
-    durations: Vector,
+    P: _Stack, matrices: _Stack, sources: NDArray[np.int64], targets: NDArray[np.int64], durations: Vector
 ) -> Vector:
     """Return log γ of every edge, (k,)."""
     forms = np.linalg.cholesky(P).swapaxes(1, 2)

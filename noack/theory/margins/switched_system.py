@@ -52,10 +52,10 @@ class SwitchedSystem:
 
     def product(self, path: Sequence[int]) -> IntervalMatrix:
         """Enclose the product of the matrices of edges, given by number in their order of time."""
-        first, *others = (self.edges[number].matrix for number in path)
-        for matrix in others:
-            first = matrix @ first
-        return first
+        product, *matrices = (self.edges[number].matrix for number in path)
+        for matrix in matrices:
+            product = matrix @ product
+        return product
 
     def duration(self, path: Sequence[int]) -> int:
         """Return the length of a path in units of time."""

@@ -100,8 +100,8 @@ class TimeTriggeredLoop:
         else:
             self._kept = [*range(2 * n if follows else 2 * n + m)]  # x, x_c and perhaps u
         self.dimension = len(self._kept)
-        kept = np.vstack([of_x, of_x, of_u, of_u])[self._kept]
-        self._given_units = kept.T - kept
+        rows = np.vstack([of_x, of_x, of_u, of_u])[self._kept]
+        self._given_units = rows.T - rows
 
     def map(self, slot: int, losses: int) -> IntervalMatrix:
         """Return the map of z from a delivered update to the next one.
@@ -151,10 +151,10 @@ class TimeTriggeredLoop:
 
     def _advance_from_cycle(self, from_ns: int, duration_ns: int) -> FixedPointMatrix:
         cycles, rest_ns = divmod(duration_ns, self._cycle_ns)
-        rest = self._occurrences(from_ns, from_ns + rest_ns)
+        last_part = self._occurrences(from_ns, from_ns + rest_ns)
         if not cycles:
-            return rest
-        return rest @ power(self._occurrences(from_ns, from_ns + self._cycle_ns), cycles)
+            return last_part
+        return last_part @ power(self._occurrences(from_ns, from_ns + self._cycle_ns), cycles)
 
     def _occurrences(self, from_ns: int, until_ns: int) -> FixedPointMatrix:
         result, now_ns = fixed(np.eye(len(self._latch.entries))), from_ns

@@ -84,8 +84,8 @@ class MomentStep(NamedTuple):
 
     def of_first(self, states: int) -> "MomentStep":
         """Leave out all but the first states, of which nothing after the interval depends."""
-        kept = slice(states)
-        M, W, C = self.matrix[kept, kept], self.noise[kept, kept], self.costs[:, kept, kept]
+        rows = slice(states)
+        M, W, C = self.matrix[rows, rows], self.noise[rows, rows], self.costs[:, rows, rows]
         return MomentStep(M, W, C, self.constants)
 
 
@@ -157,8 +157,8 @@ class LoopPeriods:
         self._latch = jump(np.vstack([x, x_c, w, w, nothing, s]), count, fresh)
         self._tick = jump(np.vstack([x, x_c, u, loop.K @ x_c, d, s]), count)
         self._send = jump(np.vstack([x, x_c, u, w, d, x]), count, s.T @ noise @ s)
-        held = flow(loop.H, 0 * loop.H, np.zeros((0, n, n)), times.delay_ns / NS_PER_S).matrix
-        self._receive = jump(np.vstack([x, held @ s, u, w, d, s]), count)
+        during_delay = flow(loop.H, 0 * loop.H, np.zeros((0, n, n)), times.delay_ns / NS_PER_S).matrix
+        self._receive = jump(np.vstack([x, during_delay @ s, u, w, d, s]), count)
         self._flows: dict[int, MomentStep] = {}
 
     def step(self, slot: int, delivered: bool, duration_ns: int | None = None) -> MomentStep:
@@ -181,11 +181,11 @@ class LoopPeriods:
         """Return an interval; a tick at its end is excluded, a step at its start."""
         cycle_ns = np.lcm(self.times.step_ns, self.times.tick_ns)
         cycles, rest_ns = divmod(until_ns - from_ns, int(cycle_ns))
-        rest = self._interval(from_ns, from_ns + rest_ns)
+        last_part = self._interval(from_ns, from_ns + rest_ns)
         if not cycles:
-            return rest
+            return last_part
         cycle = self._interval(from_ns + rest_ns, from_ns + rest_ns + int(cycle_ns))
-        return rest.then(cycle.repeated(cycles))
+        return last_part.then(cycle.repeated(cycles))
 
     def _interval(self, from_ns: int, until_ns: int) -> MomentStep:
         parts, now_ns = [], from_ns
@@ -266,26 +266,26 @@ class LoopMoments:
         number, rest_ns = divmod(horizon_ns, self._periods.times.period_ns)
         if number > _MOST_PERIODS:
             raise NotPredictableError("there are too many periods until the horizon")
-        now, costs = start, np.zeros_like(self._slots[0][0].constants)
+        current, costs = start, np.zeros_like(self._slots[0][0].constants)
         for k in range(number):
-            now, more = self._advance(now, self._slots[k % len(self._slots)])
-            costs = costs + more
+            current, added = self._advance(current, self._slots[k % len(self._slots)])
+            costs = costs + added
         if rest_ns:
             slot = number % len(self._slots)
-            last = tuple(self._periods.step(slot, way, rest_ns) for way in (True, False))
-            now, more = self._advance(now, last)
-            costs = costs + more
-        return now, costs
+            last = tuple(self._periods.step(slot, is_delivered, rest_ns) for is_delivered in (True, False))
+            current, added = self._advance(current, last)
+            costs = costs + added
+        return current, costs
 
-    def _cycle(self, now: SecondMoments) -> tuple[SecondMoments, Vector]:
-        return self.until(now, len(self._slots) * self._periods.times.period_ns)
+    def _cycle(self, current: SecondMoments) -> tuple[SecondMoments, Vector]:
+        return self.until(current, len(self._slots) * self._periods.times.period_ns)
 
-    def _advance(self, now: SecondMoments, slot: tuple[MomentStep, ...]) -> tuple[SecondMoments, Vector]:
+    def _advance(self, current: SecondMoments, slot: tuple[MomentStep, ...]) -> tuple[SecondMoments, Vector]:
         """Return the moments after a period, and its mean costs."""
-        moments, shares = np.zeros_like(now.moments), np.zeros_like(now.shares)
+        moments, shares = np.zeros_like(current.moments), np.zeros_like(current.shares)
         costs = np.zeros_like(slot[0].constants)
         for step, moves in zip(slot, (self._outcomes.delivered, self._outcomes.lost), strict=True):
-            before, weights = np.einsum("ij,iab->jab", moves, now.moments), now.shares @ moves
+            before, weights = np.einsum("ij,iab->jab", moves, current.moments), current.shares @ moves
             moments += step.matrix @ before @ step.matrix.T + weights[:, None, None] * step.noise
             shares += weights
             costs += np.einsum("kab,jab->k", step.costs, before) + weights.sum() * step.constants
@@ -301,10 +301,10 @@ def require_predictable(resolved: Scenario) -> None:
         raise CallerError(f"{why}; the mean cost needs a linear plant with u = K x_c")
     if scenario.observer is not None:
         raise CallerError(f'observer.kind = "{scenario.observer.kind}": the mean cost needs none')
-    for number, one in enumerate(scenario.plant.disturbances):
-        if any(one.entries) and not one.variance.any():
+    for number, disturbance in enumerate(scenario.plant.disturbances):
+        if any(disturbance.entries) and not disturbance.variance.any():
             raise CallerError(
-                f"plant.disturbances.{number}: {one.kind} is not random; the mean cost needs "
+                f"plant.disturbances.{number}: {disturbance.kind} is not random; the mean cost needs "
                 "disturbances of kind gaussian or uniform"
             )
     if any(scenario.controller.safe_input or ()):

@@ -72,7 +72,7 @@ def balanced_maps(maps: Sequence[tuple[Matrix, Matrix]]) -> list[tuple[Matrix, M
     U, singular, _ = np.linalg.svd(stack.transpose(2, 0, 1, 3).reshape(size, -1))
     rank = max(int((singular > 10 * size * EPSILON * singular[0]).sum()), 1)
     stack = U[:, :rank].T @ stack @ U[:, :rank]
-    edges = tuple(Edge(0, 0, exactly(one)) for slot in stack for one in slot)
+    edges = tuple(Edge(0, 0, exactly(matrix)) for slot in stack for matrix in slot)
     T = SwitchedSystem(edges).balancing()[0]
     stack = T @ stack @ np.linalg.inv(T)
     return [(delivered, lost) for delivered, lost in stack]

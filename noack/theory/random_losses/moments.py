@@ -128,14 +128,14 @@ def moments(
         NoCertificateError: the spectral radius of the inequalities is not below 1.
         NotDecayingError: α is not below the decay rate of the models, or of A + BK.
     """
-    found = [
-        _Inequalities(error, plant, conditions, beta, largest_probability, one).solve()
-        for one in ORDERS[order - 1 :]  # a mean is at most the root mean square
+    candidates = [
+        _Inequalities(error, plant, conditions, beta, largest_probability, higher_order).solve()
+        for higher_order in ORDERS[order - 1 :]  # a mean is at most the root mean square
     ]
-    if not any(np.isfinite(one.state) for one in found):
-        loop_gain = min(one.loop_gain for one in found)
+    if not any(np.isfinite(candidate.state) for candidate in candidates):
+        loop_gain = min(candidate.loop_gain for candidate in candidates)
         raise NoCertificateError(f"the loop gain of the moments is {loop_gain:.3g}, not below 1")
-    return Moments(order, *map(min, zip(*(one[1:] for one in found), strict=True)))
+    return Moments(order, *map(min, zip(*(candidate[1:] for candidate in candidates), strict=True)))
 
 
 class _Inequalities:
@@ -179,10 +179,10 @@ class _Inequalities:
                 return best._replace(loop_gain=min(best.loop_gain, loop_gain))
             signals = (_A, controller[Output.WEIGHTED], _PI, state)
             a, e_c, pi, x = (float(row @ values) for row in signals)
-            found = Moments(self._order, rate_per_s, a, e_c, pi, x, loop_gain)
-            if found.state > _SETTLED * best.state:
+            refined = Moments(self._order, rate_per_s, a, e_c, pi, x, loop_gain)
+            if refined.state > _SETTLED * best.state:
                 break
-            best = found
+            best = refined
         return best
 
     def _rows(self, controller: Mapping[Output, Vector]) -> Matrix:
@@ -338,19 +338,19 @@ def _bursts(
     resolved: Scenario, scope: CertificateScope, losses: LossProcess, conditions: NetworkConditions
 ) -> list[BurstCertificate]:
     certificates: list[BurstCertificate] = []
-    for most in range(_MOST_BURST + 1):
-        certificate = scope.certificate(conditions._replace(dropouts=most, constraints=()))
+    for longest in range(_MOST_BURST + 1):
+        certificate = scope.certificate(conditions._replace(dropouts=longest, constraints=()))
         constants, spacing_s = certificate.constants, certificate.inter_event_s
         if constants is None or not spacing_s:
             break
         events = most_events(resolved, spacing_s)
         try:
-            kept = losses.keeps(LossGuarantee((LongestBurst(most),)), events)
+            probability = losses.keeps(LossGuarantee((LongestBurst(longest),)), events)
         except NotPredictableError:
             break
         state = float(certificate.state(np.zeros(1))[0])
-        certificates.append(BurstCertificate(most, kept, events, constants.delta, state))
-        if kept > _CERTAIN:
+        certificates.append(BurstCertificate(longest, probability, events, constants.delta, state))
+        if probability > _CERTAIN:
             break
     return certificates
 
@@ -370,21 +370,21 @@ def _moments(
     bounds: list[Moments] = []
     level = max(trigger.beta, trigger.floor)
     for order in ORDERS:
-        found: list[Moments] = []
+        solutions: list[Moments] = []
         reason = None
         for share in _RATES:
             error = error_gains(loop, share * alpha)
             plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], share * alpha)
             p = losses.largest_probability
             try:
-                found.append(moments(error, plant, conditions, level, p, order))
+                solutions.append(moments(error, plant, conditions, level, p, order))
             except (NoCertificateError, NotDecayingError) as error_found:
                 reason = str(error_found)
-            if found and (share == 1 or found[-1].loop_gain < _CLEARLY):
+            if solutions and (share == 1 or solutions[-1].loop_gain < _CLEARLY):
                 break
-        if not found:
+        if not solutions:
             return bounds, reason
-        bounds.append(found[-1])
+        bounds.append(solutions[-1])
     return bounds, None
 
 

@@ -70,7 +70,7 @@ def random_growth(resolved: Scenario, losses: LossProcess) -> RandomGrowth:
     outcomes = losses.outcomes(LossGuarantee())
     mean_square = almost_sure = LoopMoments(periods, outcomes).growth
     if times.slots == 1:
-        delivered, lost = (periods.step(0, way).matrix for way in (True, False))
+        delivered, lost = (periods.step(0, is_delivered).matrix for is_delivered in (True, False))
         almost_sure = min(mean_square, sure_growth(delivered, lost, outcomes))
     return RandomGrowth(mean_square, almost_sure)
 
@@ -105,10 +105,10 @@ def _remembering(chain: OutcomeChain, present: int, before: int) -> OutcomeChain
     """Return the chain whose states know the lengths of two bursts up to these numbers."""
     count = (present + 1) * (before + 1)
     places = np.arange(count)
-    now, last = np.divmod(places, before + 1)
+    current, last = np.divmod(places, before + 1)
     after_loss, after_delivery = np.zeros((count, count)), np.zeros((count, count))
-    after_loss[places, np.minimum(now + 1, present) * (before + 1) + last] = 1.0
-    after_delivery[places, np.minimum(now, before)] = 1.0
+    after_loss[places, np.minimum(current + 1, present) * (before + 1) + last] = 1.0
+    after_delivery[places, np.minimum(current, before)] = 1.0
     lost, delivered = np.kron(after_loss, chain.lost), np.kron(after_delivery, chain.delivered)
     return OutcomeChain(np.asarray(lost, np.float64), np.asarray(delivered, np.float64)).recurrent()
 
@@ -154,8 +154,8 @@ class _Tilts:
                 break
             before = radius
         self._forward, self._backward = X, Y
-        way, source, target = self._steps
-        M = self._maps[way]
+        is_delivered, source, target = self._steps
+        M = self._maps[is_delivered]
         weights = chances[self._steps] * np.einsum(
             "eab,eab->e", Y[target], M @ X[source] @ M.transpose(0, 2, 1)
         )

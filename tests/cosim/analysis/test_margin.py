@@ -45,91 +45,91 @@ def test_longest_period_is_that_of_the_sampled_loop() -> None:
         held = np.block([[A @ A1 + B @ loop.K, A @ B1], [loop.K, np.zeros((1, 1))]])
         return float(np.abs(np.linalg.eigvals(held)).max())
 
-    found = find_longest_period(resolved)
-    assert found.stable_s is not None
-    assert found.unstable_s == pytest.approx(found.stable_s + 0.02)
-    assert radius(round(found.stable_s * 50)) < 1 < radius(round(found.unstable_s * 50))
-    assert found.stability is not None
-    assert found.stability.lower == pytest.approx(radius(round(found.unstable_s * 50)), rel=1e-9)
+    limit = find_longest_period(resolved)
+    assert limit.stable_s is not None
+    assert limit.unstable_s == pytest.approx(limit.stable_s + 0.02)
+    assert radius(round(limit.stable_s * 50)) < 1 < radius(round(limit.unstable_s * 50))
+    assert limit.stability is not None
+    assert limit.stability.lower == pytest.approx(radius(round(limit.unstable_s * 50)), rel=1e-9)
 
 
 def test_verdicts_agree_with_the_bounds() -> None:
     trigger = {"policy": "periodic", "period_s": 0.5}
-    found = find_margin(resolve(held_integrator(trigger=trigger)), with_period=False)
-    assert [cap.m for cap in found.caps] == list(range(1, len(found.caps) + 1))
-    assert [cap.stability.verdict for cap in found.caps[:-1]] == ["stable"] * (len(found.caps) - 1)
-    assert all(cap.stability.upper < 1 for cap in found.caps[:-1])
-    growth = [cap.stability.lower for cap in found.caps]
+    margin = find_margin(resolve(held_integrator(trigger=trigger)), with_period=False)
+    assert [cap.m for cap in margin.caps] == list(range(1, len(margin.caps) + 1))
+    assert [cap.stability.verdict for cap in margin.caps[:-1]] == ["stable"] * (len(margin.caps) - 1)
+    assert all(cap.stability.upper < 1 for cap in margin.caps[:-1])
+    growth = [cap.stability.lower for cap in margin.caps]
     assert growth == sorted(growth)
-    assert found.destabilised is not None
-    assert found.destabilised.stability.lower > 1
-    assert f"M ≤ {found.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(found)
+    assert margin.destabilised is not None
+    assert margin.destabilised.stability.lower > 1
+    assert f"M ≤ {margin.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(margin)
 
 
 def test_constraints_that_cap_the_losses_themselves() -> None:
     constraints = [{"kind": "at_most", "losses": 1, "window": 4}]
     settings = {"network.constraints": constraints, "network.mansd": 5}
-    found = noack.margin(held_integrator(**settings), period=False)
-    assert found.every_m
-    assert found.stable_m == 2
-    assert "every M ≥ 2" in found.verdict
-    assert found.to_json()["period"] is None
+    margin = noack.margin(held_integrator(**settings), period=False)
+    assert margin.every_m
+    assert margin.stable_m == 2
+    assert "every M ≥ 2" in margin.verdict
+    assert margin.to_json()["period"] is None
     with pytest.raises(noack.NoackError, match="most_m 0: expected"):
         noack.margin("lane_periodic", most_m=0)
 
 
 def test_events_at_unknown_times() -> None:
-    done = invoke("margin", "double_integrator", *DEADLINE, "--json")
-    assert done.exit_code == 0, done.output
-    document = json.loads(done.stdout)
+    result = invoke("margin", "double_integrator", *DEADLINE, "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
     assert (document["shortest_s"], document["period_s"]) == (0.2, 0.8)
     last = document["caps"][-1]
     assert last["verdict"] == "destabilised"
     assert len(last["intervals_s"]) == len(last["pattern"].replace("L", "D").split("D")) - 1
-    shown = invoke("margin", "double_integrator", *DEADLINE, "--no-period")
-    assert "with updates 0.2 to 0.8 s apart" in " ".join(shown.output.split())
+    printed = invoke("margin", "double_integrator", *DEADLINE, "--no-period")
+    assert "with updates 0.2 to 0.8 s apart" in " ".join(printed.output.split())
     words = ["margin", "lane_periodic", "--no-period", "--most", "2"]
     assert "stable for every pattern with M ≤ 2" in invoke(*words).output
 
 
 def test_a_loop_that_no_m_keeps_stable_and_a_pattern_without_times() -> None:
-    done = invoke("margin", "lane_periodic", "--set", "trigger.period_s=9", "--no-period")
-    assert (done.exit_code, "destabilises M = 1" in done.output) == (1, True), done.output
-    done = invoke("margin", "double_integrator", *DEADLINE, "--play", "--no-period")
-    assert (done.exit_code, "--play: the times between" in done.stderr) == (2, True), done.output
+    result = invoke("margin", "lane_periodic", "--set", "trigger.period_s=9", "--no-period")
+    assert (result.exit_code, "destabilises M = 1" in result.output) == (1, True), result.output
+    result = invoke("margin", "double_integrator", *DEADLINE, "--play", "--no-period")
+    assert (result.exit_code, "--play: the times between" in result.stderr) == (2, True), result.output
 
 
 def test_the_played_settings_are_the_pattern() -> None:
-    found = noack.margin("lane_periodic", period=False).destabilised
-    assert found is not None
-    played = load_scenario("lane_periodic", found.settings)
-    assert played.network.mansd == found.m - 1
+    cap = noack.margin("lane_periodic", period=False).destabilised
+    assert cap is not None
+    played = load_scenario("lane_periodic", cap.settings)
+    assert played.network.mansd == cap.m - 1
     run = noack.simulate(played)
     received = run.events()["received"].to_pylist()
-    pattern = found.stability.pattern
+    pattern = cap.stability.pattern
     expected = [pattern[i % len(pattern)] for i in range(len(received))]
     assert received[:-1] == expected[:-1]
 
 
 def test_guarantees_are_compared() -> None:
     words = ["atmost 6 in 7", "mansd 4 recover 2"]
-    found = noack.margin("lane_periodic", most_m=1, period=False, guarantees=words)
-    own, weaker, stronger = found.compared.guarantees
+    margin = noack.margin("lane_periodic", most_m=1, period=False, guarantees=words)
+    own, weaker, stronger = margin.compared.guarantees
     assert (own.stability.verdict, stronger.stability.verdict) == ("stable", "stable")
     assert weaker.stability.verdict == "destabilised"
     assert stronger.stability.upper <= own.stability.upper <= weaker.stability.upper
-    first, second, third = found.compared.relations
+    first, second, third = margin.compared.relations
     cap, window = "at most M − 1 = 4 consecutive losses", "at most 6 losses in 7"
     assert first.startswith(f"“{cap}” implies “{window}")
     assert first.endswith("which also allows LLLLL")
     assert second.endswith(f"implies “{cap}”, which also allows LDL")
     assert f"implies “{window}" in third
-    assert [one["verdict"] for one in found.to_json()["compared"]] == [
+    assert [compared["verdict"] for compared in margin.to_json()["compared"]] == [
         "stable", "destabilised", "stable"
     ]  # fmt: skip
     options = ["--no-period", "--most", "1", "--guarantee", "atmost 6 in 7"]
-    shown = " ".join(invoke("margin", "lane_periodic", *options).output.split())
-    assert first in shown
+    printed = " ".join(invoke("margin", "lane_periodic", *options).output.split())
+    assert first in printed
 
 
 def test_an_undecided_m_states_the_gap_and_the_effort() -> None:

@@ -14,9 +14,9 @@ def test_results_are_those_of_the_library() -> None:
     explorer = noack.explore("lane_following")
     certificate = noack.certify("lane_following").schedule
     assert certificate.constants is not None
-    found = explorer.certificate
-    assert found.verdict == "certified"
-    np.testing.assert_array_equal(found.e_c, certificate.controller_error(found.t_s))
+    guarantee = explorer.certificate
+    assert guarantee.verdict == "certified"
+    np.testing.assert_array_equal(guarantee.e_c, certificate.controller_error(guarantee.t_s))
     assert explorer.ensemble is not None
     assert explorer.ensemble.draws == 200
     assert not explorer.margin.defined  # an event trigger has no longest time between events
@@ -60,7 +60,7 @@ def test_sliders_change_the_explorer_and_the_other_way_round() -> None:
     explorer = noack.explore("lane_following", {"horizon_s": 4.0})
     controls, figure = explorer.widget().children
     rows = controls.children[0].children
-    sliders = {label.value: one for label, one in pairwise(rows)
+    sliders = {label.value: slider for label, slider in pairwise(rows)
                if isinstance(label, ipywidgets.Label)}  # fmt: skip
     message, image, facts, margin = figure.children
     first = bytes(image.value)
@@ -74,12 +74,12 @@ def test_sliders_change_the_explorer_and_the_other_way_round() -> None:
     sliders["model error, as a multiple of the scenario's uncertainty"].value = 18.0
     assert "no certificate" in facts.value
     assert "grows" in message.value
-    (choice,) = [one.children[1] for one in rows if isinstance(one, ipywidgets.VBox)
-                 and one.children[0].value == "loss model"]  # fmt: skip
+    (choice,) = [row.children[1] for row in rows if isinstance(row, ipywidgets.VBox)
+                 and row.children[0].value == "loss model"]  # fmt: skip
     choice.value = "lossless"
     assert explorer.scenario.network.loss.model == "lossless"
-    labels = [one.value for one in controls.children[0].children
-              if isinstance(one, ipywidgets.Label)]  # fmt: skip
+    labels = [row.value for row in controls.children[0].children
+              if isinstance(row, ipywidgets.Label)]  # fmt: skip
     assert "loss probability" not in labels
     margin.click()
     assert ">margin</th>" in facts.value

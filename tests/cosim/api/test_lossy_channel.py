@@ -68,8 +68,8 @@ def test_the_losses_are_those_of_a_run_packet_by_packet() -> None:
 
 def test_without_loss_and_delay_nothing_changes() -> None:
     env = noack.LossyChannel(Clock(), {**LOSSLESS, "actuation": LOSSLESS})
-    seen, infos = episode(env, 5)
-    np.testing.assert_array_equal(seen, [[k, k] for k in range(6)])
+    observations, infos = episode(env, 5)
+    np.testing.assert_array_equal(observations, [[k, k] for k in range(6)])
     assert all(info["network"]["observation"]["arrived"] and info["own"] for info in infos)
 
 
@@ -79,51 +79,51 @@ def test_without_loss_and_delay_nothing_changes() -> None:
 def test_a_delay_takes_the_next_whole_number_of_steps(delay_s: float, late: int) -> None:
     delayed = {**LOSSLESS, "impairments": [{"kind": "delay", "delay_s": delay_s}]}
     env = noack.LossyChannel(Clock(), {**delayed, "actuation": delayed})
-    seen, infos = episode(env, 10)
+    observations, infos = episode(env, 10)
     k = np.arange(11)
-    np.testing.assert_array_equal(seen[:, 0], np.maximum(k - late, 0))
+    np.testing.assert_array_equal(observations[:, 0], np.maximum(k - late, 0))
     # Step j, counted from 1, gets action j − late, which was sent as j − late.
     applied = np.maximum(np.maximum(k - late, 0) - late, 0)
-    np.testing.assert_array_equal(seen[:, 1], applied)
+    np.testing.assert_array_equal(observations[:, 1], applied)
     last = infos[-1]["network"]
     assert last["observation"]["age_steps"] == last["action"]["age_steps"] == late
     assert last["action"]["arrived"]
 
 
-@pytest.mark.parametrize("more", [
+@pytest.mark.parametrize("settings", [
     {},
     {"impairments": [{"kind": "delay", "delay_s": 0.03, "jitter_s": 0.03}]},
     {"impairments": [{"kind": "corrupt", "probability": 0.3},
                      {"kind": "duplicate", "probability": 0.3}]},
 ])  # fmt: skip
-def test_a_packet_of_m_successive_ones_arrives_in_each_direction(more: dict[str, Any]) -> None:
+def test_a_packet_of_m_successive_ones_arrives_in_each_direction(settings: dict[str, Any]) -> None:
     """Over long runs; the newest packet that has arrived is in force, an older one never again."""
-    lossy = {**MOST, **more}
-    late = 3 if more.get("impairments", [{}])[0].get("kind") == "delay" else 0
+    lossy = {**MOST, **settings}
+    late = 3 if settings.get("impairments", [{}])[0].get("kind") == "delay" else 0
     env = noack.LossyChannel(Clock(), {**lossy, "actuation": lossy})
     longest = {"observation": 0, "action": 0}
     for seed in range(5):
-        seen, infos = episode(env, 4000, seed=seed)
+        observations, infos = episode(env, 4000, seed=seed)
         for direction in longest:
             longest[direction] = max(longest[direction], *losses(infos, direction))
             ages = [info["network"][direction]["age_steps"] for info in infos[1:]]
             assert max(ages[late + 4 :]) <= 3 + late
-        steps = seen[:, 0]
+        steps = observations[:, 0]
         assert all(after >= before for before, after in pairwise(steps))
-        assert all(after >= before for before, after in pairwise(seen[:, 1]))
+        assert all(after >= before for before, after in pairwise(observations[:, 1]))
     assert longest == {"observation": 3, "action": 3}
 
 
 def test_a_seed_gives_the_same_bits_and_each_episode_has_other_losses() -> None:
     lossy = {**HALF, "impairments": [{"kind": "delay", "delay_s": 0.03, "jitter_s": 0.03}]}
-    env, other = (noack.LossyChannel(Clock(), {**lossy, "actuation": HALF}) for _ in range(2))
+    env, second_env = (noack.LossyChannel(Clock(), {**lossy, "actuation": HALF}) for _ in range(2))
     first, infos = episode(env, 300, seed=4)
     second, more = episode(env, 300, seed=None)
-    again, same = episode(other, 300, seed=4)
+    again, same = episode(second_env, 300, seed=4)
     assert first.tobytes() == again.tobytes()
     assert infos == same
     assert first.tobytes() != second.tobytes()
-    assert episode(other, 300, seed=None)[0].tobytes() == second.tobytes()
+    assert episode(second_env, 300, seed=None)[0].tobytes() == second.tobytes()
     assert losses(infos, "observation") != losses(more, "observation")
     assert losses(infos, "observation") != losses(infos, "action")
 
@@ -133,14 +133,14 @@ def test_a_seed_gives_the_same_bits_and_each_episode_has_other_losses() -> None:
 def test_it_passes_the_check_of_gymnasium(name: str) -> None:
     env = noack.LossyChannel(gymnasium.make(name), {**HALF, "actuation": HALF}, step_s=STEP_S)
     check_env(env, skip_render_check=True)
-    again = gymnasium.make(env.spec)  # it records how it was made
-    assert isinstance(again, noack.LossyChannel)
+    made_again = gymnasium.make(env.spec)  # it records how it was made
+    assert isinstance(made_again, noack.LossyChannel)
 
 
 def test_actions_cross_the_network_only_if_it_says_so() -> None:
-    seen, infos = episode(noack.LossyChannel(Clock(), MOST), 50)
-    held = seen[np.array([info["network"]["observation"]["arrived"] for info in infos])]
-    np.testing.assert_array_equal(held[:, 0], held[:, 1])
+    observations, infos = episode(noack.LossyChannel(Clock(), MOST), 50)
+    arrived = observations[np.array([info["network"]["observation"]["arrived"] for info in infos])]
+    np.testing.assert_array_equal(arrived[:, 0], arrived[:, 1])
     assert "action" not in infos[-1]["network"]
 
 

@@ -20,8 +20,8 @@ HEAVY = ("cosim", "matplotlib", "numba", "numpy", "pyarrow", "pydantic", "rerun"
 
 def loaded_by(program: str) -> set[str]:
     code = f"{program}\nimport json, sys\nprint(json.dumps(sorted(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return {name.partition(".")[0] for name in json.loads(done.stdout.splitlines()[-1])}
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return {name.partition(".")[0] for name in json.loads(process.stdout.splitlines()[-1])}
 
 
 def documented(heading: str) -> set[str]:
@@ -49,16 +49,16 @@ def test_the_members_of_results_are_the_documented_ones() -> None:
 
 @pytest.mark.parametrize("name", sorted(set(noack.__all__) - {"__version__"}))
 def test_every_public_name_has_a_docstring(name: str) -> None:
-    found = getattr(noack, name)
-    text = inspect.getdoc(found)
+    public = getattr(noack, name)
+    text = inspect.getdoc(public)
     assert text
-    assert f"{name} in module noack" in pydoc.render_doc(found, renderer=pydoc.plaintext)
-    if inspect.isfunction(found):
+    assert f"{name} in module noack" in pydoc.render_doc(public, renderer=pydoc.plaintext)
+    if inspect.isfunction(public):
         assert {"Args:", "Raises:"} <= set(text.split())
-        for parameter in inspect.signature(found).parameters:
+        for parameter in inspect.signature(public).parameters:
             assert f"    {parameter}: " in text, parameter
-    if found in (noack.CampaignResult, noack.Run, noack.Certificates, noack.Explorer):
-        for member in vars(found).values():
+    if public in (noack.CampaignResult, noack.Run, noack.Certificates, noack.Explorer):
+        for member in vars(public).values():
             target = member.fget if isinstance(member, property) else member
             if inspect.isfunction(target) and not target.__name__.startswith("_"):
                 assert inspect.getdoc(target)
@@ -86,6 +86,6 @@ EXAMPLES = [name for name in noack.__all__ if ">>>" in (getattr(noack, name).__d
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_the_examples_of_the_docstrings_run(name: str) -> None:
     (example,) = doctest.DocTestFinder(recurse=False).find(getattr(noack, name), name, module=False, globs={})
-    found = doctest.DocTestRunner().run(example)
-    assert found.attempted > 1
-    assert found.failed == 0
+    outcome = doctest.DocTestRunner().run(example)
+    assert outcome.attempted > 1
+    assert outcome.failed == 0

@@ -24,60 +24,60 @@ PLAN: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def found() -> noack.CampaignResult:
+def result() -> noack.CampaignResult:
     return noack.campaign(PLAN, workers=1)
 
 
-def test_the_estimates_are_those_of_the_draws(found: noack.CampaignResult) -> None:
-    rows = found.estimates().to_pylist()
+def test_the_estimates_are_those_of_the_draws(result: noack.CampaignResult) -> None:
+    rows = result.estimates().to_pylist()
     (row,) = (
-        one for one in rows
-        if (one["mode"], one["loss"], one["metric"]) == ("hold", "0.8", "transmissions")
+        row for row in rows
+        if (row["mode"], row["loss"], row["metric"]) == ("hold", "0.8", "transmissions")
     )  # fmt: skip
-    values = found.draws(mode="hold", loss=0.8)["transmissions"].to_numpy()
+    values = result.draws(mode="hold", loss=0.8)["transmissions"].to_numpy()
     assert (row["draws"], row["finite"]) == (30, 30)
     assert row["mean"] == pytest.approx(values.mean())
     assert row["largest"] == values.max()
-    others = found.draws(mode="model", loss=0.8)["transmissions"].to_numpy()
+    others = result.draws(mode="model", loss=0.8)["transmissions"].to_numpy()
     (compared,) = (
-        one for one in found.differences().to_pylist()
-        if (one["mode"], one["loss"], one["metric"]) == ("model", "0.8", "transmissions")
+        row for row in result.differences().to_pylist()
+        if (row["mode"], row["loss"], row["metric"]) == ("model", "0.8", "transmissions")
     )  # fmt: skip
     assert compared["mean"] == pytest.approx(np.mean(others - values))
-    assert found.breaches == 0
+    assert result.breaches == 0
 
 
-def test_the_page_the_summary_and_the_figures_are_there(found: noack.CampaignResult) -> None:
-    assert found.report().is_file()
-    written = json.loads((found.folder / "summary.json").read_text())
-    assert [one["axes"] for one in written["points"]] == [one["axes"] for one in found.summary["points"]]
-    assert found.plot().axes
-    assert "0.8" in repr(found)
-    assert "<table>" in found._repr_html_()
+def test_the_page_the_summary_and_the_figures_are_there(result: noack.CampaignResult) -> None:
+    assert result.report().is_file()
+    written = json.loads((result.folder / "summary.json").read_text())
+    assert [row["axes"] for row in written["points"]] == [row["axes"] for row in result.summary["points"]]
+    assert result.plot().axes
+    assert "0.8" in repr(result)
+    assert "<table>" in result._repr_html_()
 
 
-def test_what_is_not_there_is_named(found: noack.CampaignResult) -> None:
+def test_what_is_not_there_is_named(result: noack.CampaignResult) -> None:
     with pytest.raises(noack.NoackError, match=r"loss is one of 0\.2, 0\.8"):
-        found.draws(mode="model", loss=0.3)
+        result.draws(mode="model", loss=0.3)
     with pytest.raises(noack.NoackError, match="it has curve-1"):
-        found.plot("curve-2")
+        result.plot("curve-2")
     with pytest.raises(noack.NoackError, match="campaign: axes"):
         noack.campaign({**PLAN, "axes": []})
 
 
 def test_a_system_is_certified(scenario: noack.Scenario) -> None:
-    found = noack.certify(scenario)
-    assert pickle.loads(pickle.dumps(found)).to_json() == found.to_json()
-    assert found.schedule.constants is not None
-    assert json.loads(json.dumps(found.to_json()))["scenario"] == "own_system"
+    certificates = noack.certify(scenario)
+    assert pickle.loads(pickle.dumps(certificates)).to_json() == certificates.to_json()
+    assert certificates.schedule.constants is not None
+    assert json.loads(json.dumps(certificates.to_json()))["scenario"] == "own_system"
 
 
 def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:
     box = {"plant.uncertainty_A": [[0.0, 0.0], [0.3, 0.1]]}
-    found = noack.certify(noack.with_settings(scenario, box), late=0)
-    assert found.paper_box is not None
-    assert found.schedule_box is not None
-    assert found.paper_box.constants is not None
-    for shown in (repr(found), found._repr_html_()):
-        assert "schedule, box" in shown
-        assert f"{found.paper_box.constants.delta:.4g}" in shown
+    certificates = noack.certify(noack.with_settings(scenario, box), late=0)
+    assert certificates.paper_box is not None
+    assert certificates.schedule_box is not None
+    assert certificates.paper_box.constants is not None
+    for text in (repr(certificates), certificates._repr_html_()):
+        assert "schedule, box" in text
+        assert f"{certificates.paper_box.constants.delta:.4g}" in text

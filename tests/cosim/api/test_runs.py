@@ -28,9 +28,9 @@ def test_a_run_gives_its_results(simulated: noack.Run) -> None:
     (loop,) = simulated.summary.loops
     assert simulated.claims == loop.claims != []
     assert simulated.scenario.plant.draw == "given"
-    for shown in (repr(simulated), simulated._repr_html_()):
-        assert "own_system" in shown
-        assert str(loop.events) in shown
+    for text in (repr(simulated), simulated._repr_html_()):
+        assert "own_system" in text
+        assert str(loop.events) in text
     assert len(repr(simulated).splitlines()) < 10
 
 
@@ -41,10 +41,10 @@ def test_a_run_of_several_loops_has_each_loop_as_a_run() -> None:
     assert run.ok
     assert "3 loops" in repr(run)
     assert list(run.loops) == ["fast-1", "fast-2", "held"]
-    events = {name: one.summary.loops[0].events for name, one in run.loops.items()}
-    assert events == {one.name: one.events for one in run.summary.loops}
+    events = {name: loop.summary.loops[0].events for name, loop in run.loops.items()}
+    assert events == {loop.name: loop.events for loop in run.summary.loops}
     assert sum(events.values()) == len(run.table("netem_packet"))
-    assert run.claims == [claim for one in run.loops.values() for claim in one.claims]
+    assert run.claims == [claim for loop in run.loops.values() for claim in loop.claims]
     steps = run.table("plant_step")["loop"].to_pylist()
     assert set(steps) == {0, 1, 2}
     assert run.loops["fast-2"].table("plant_step").num_rows == steps.count(1)
@@ -86,10 +86,10 @@ def test_a_run_of_the_api_has_an_ordinary_run_directory(
     run = noack.simulate(scenario, runs=tmp_path / "runs")
     assert (run.directory / "recording.rrd").is_file()
     monkeypatch.chdir(tmp_path)
-    again = noack.open_run()
-    assert again.directory.samefile(run.directory)
-    assert again.summary == run.summary
-    assert again.report() == again.directory / "report.html"
+    opened = noack.open_run()
+    assert opened.directory.samefile(run.directory)
+    assert opened.summary == run.summary
+    assert opened.report() == opened.directory / "report.html"
 
 
 def test_an_interrupted_live_run_is_returned() -> None:

@@ -20,11 +20,11 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(tmp_path: Path, con
 
     def message() -> str:
         path.write_text(tomli_w.dumps(content))
-        done = invoke("check", path)
-        assert done.exit_code == 0, done.stderr
-        assert done.stderr == ""
-        assert tomllib.loads(done.stdout)["name"] == content["name"]
-        return " ".join(done.stdout.replace("\n# ", "\n").split())
+        result = invoke("check", path)
+        assert result.exit_code == 0, result.stderr
+        assert result.stderr == ""
+        assert tomllib.loads(result.stdout)["name"] == content["name"]
+        return " ".join(result.stdout.replace("\n# ", "\n").split())
 
     silent = message()
     assert "watchdog: policy hold" in silent
@@ -49,10 +49,10 @@ def test_ctrl_c_during_any_command_gives_one_line(line: str, monkeypatch: pytest
         raise KeyboardInterrupt
 
     monkeypatch.setattr(options, "load_scenario", interrupted)
-    done = invoke(*line.split())
-    assert (done.exit_code, done.stdout, done.stderr) == (130, "", INTERRUPTED)
-    done = invoke(*line.split(), "--json")
-    assert json.loads(done.stdout)["exit"]["status"] == 130
+    result = invoke(*line.split())
+    assert (result.exit_code, result.stdout, result.stderr) == (130, "", INTERRUPTED)
+    result = invoke(*line.split(), "--json")
+    assert json.loads(result.stdout)["exit"]["status"] == 130
 
 
 SHORT = ("double_integrator", "--no-report", "--set", "horizon_s=0.1")
@@ -74,10 +74,10 @@ def test_a_signal_while_a_run_is_finalised_names_the_command_that_completes_it(
 
     with monkeypatch.context() as patch:
         patch.setattr(finalize, "summarise", signalled)
-        done = invoke("simulate", *SHORT, "--runs", tmp_path)
-    assert done.exit_code == status
+        result = invoke("simulate", *SHORT, "--runs", tmp_path)
+    assert result.exit_code == status
     (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
-    assert done.stderr.splitlines()[-1] == (f"noack: {why}; `noack summary {run_dir}` completes its record")
+    assert result.stderr.splitlines()[-1] == (f"noack: {why}; `noack summary {run_dir}` completes its record")
     assert not (run_dir / SUMMARY_FILE).exists()
     assert invoke("summary", run_dir).exit_code == 0
     assert (run_dir / SUMMARY_FILE).is_file()

@@ -22,9 +22,9 @@ OURS = sorted(COMMANDS.keys() - {"netem"})
 
 
 def help_of(*command: str) -> str:
-    done = invoke(*command, "--help")
-    assert done.exit_code == 0
-    return done.stdout
+    result = invoke(*command, "--help")
+    assert result.exit_code == 0
+    return result.stdout
 
 
 def examples() -> list[tuple[str, str]]:
@@ -43,12 +43,12 @@ def test_help_fits_a_terminal_and_has_examples(command: str) -> None:
     wrapped = [" ".join(line.split()) for line in text.splitlines()]
     if not command:
         return
-    shown = examples_of(COMMANDS[command])
-    assert len(shown) >= 2
-    for example in shown:
+    examples = examples_of(COMMANDS[command])
+    assert len(examples) >= 2
+    for example in examples:
         assert words_of(example)[0] == command
         assert any(line.startswith(example) for line in wrapped), example
-    assert "--json" in {name for one in COMMANDS[command].params for name in one.opts}
+    assert "--json" in {name for option in COMMANDS[command].params for name in option.opts}
 
 
 @pytest.mark.parametrize("command", ["", *EMULATOR_COMMANDS])
@@ -68,11 +68,11 @@ def test_every_example_has_valid_arguments(
 
 def completed(line: str) -> list[str]:
     """The completions that bash offers for the last word of a line."""
-    place = str(len(line.split(" ")) - 1)
-    asked = {"_NOACK_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": place}
-    done = CliRunner().invoke(app, env=asked, prog_name="noack")
-    assert done.stderr == ""
-    return done.stdout.split()
+    position = str(len(line.split(" ")) - 1)
+    environment = {"_NOACK_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": position}
+    result = CliRunner().invoke(app, env=environment, prog_name="noack")
+    assert result.stderr == ""
+    return result.stdout.split()
 
 
 def test_words_are_completed_as_approved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

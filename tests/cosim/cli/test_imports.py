@@ -33,8 +33,8 @@ show()
 def imported(*words: str, program: str = _PROGRAM) -> set[str]:
     """The modules that a program loads."""
     command = [sys.executable, "-c", f"{_SHOW}{program}", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=150)
-    return set(json.loads(done.stderr.splitlines()[-1]))
+    process = subprocess.run(command, capture_output=True, text=True, check=True, timeout=150)
+    return set(json.loads(process.stderr.splitlines()[-1]))
 
 
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["certify", "--help"]])
@@ -65,7 +65,7 @@ def test_a_run_begins_without_large_libraries(program: str, tmp_path: Path) -> N
     modules = imported("run", "lane_following", "--runs", str(tmp_path), program=program)
     assert "numpy" in modules
     assert not modules & _LARGE
-    assert [one for one in modules if re.match(r"noack\.theory\.\w+\.", one)] == []
+    assert [module for module in modules if re.match(r"noack\.theory\.\w+\.", module)] == []
     assert not modules & {"cosim.live.finalize", "cosim.live.monitoring.progress"}
     assert program is _BEFORE_THE_START or "typer" not in modules
 

@@ -23,10 +23,10 @@ def test_a_mistake_gives_the_approved_line(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.chdir(Path(__file__).parents[3])
 
     def mistake(line: str) -> list[str]:
-        done = noack(line.replace("FOLDER", str(tmp_path)))
-        assert done.exit_code in (1, 2)
-        assert done.stderr.count("\n") == 1
-        return [done.stderr.strip().replace(str(tmp_path), "FOLDER")]
+        result = noack(line.replace("FOLDER", str(tmp_path)))
+        assert result.exit_code in (1, 2)
+        assert result.stderr.count("\n") == 1
+        return [result.stderr.strip().replace(str(tmp_path), "FOLDER")]
 
     compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
     assert not [*tmp_path.iterdir()]
@@ -35,10 +35,10 @@ def test_a_mistake_gives_the_approved_line(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize("line", ["certfy lane_following", "check nothing", "demo --set", "netem --session"])
 def test_with_json_a_mistake_is_a_document_too(line: str) -> None:
     expected = noack(line).stderr
-    done = noack(f"{line} --json" if line != "demo --set" else "demo --json --set")
-    assert done.stderr == expected
+    result = noack(f"{line} --json" if line != "demo --set" else "demo --json --set")
+    assert result.stderr == expected
     _, _, message = expected.strip().partition(": ")
-    assert json.loads(done.stdout) == {"error": message, "exit": {"status": 2, "reason": message}}
+    assert json.loads(result.stdout) == {"error": message, "exit": {"status": 2, "reason": message}}
 
 
 def test_every_command_names_what_it_does_not_find() -> None:
@@ -49,11 +49,11 @@ def test_every_command_names_what_it_does_not_find() -> None:
 
 def test_a_process_that_fails_is_named_once(tmp_path: Path) -> None:
     """Both the process's log and the launcher name the process; the message contains it once."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
-        port = other.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
+        endpoint.bind(("127.0.0.1", 0))
+        port = endpoint.getsockname()[1]
         settings = ("ports={}", f"ports.sensor={port}", "horizon_s=1")
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-m", "cosim.cli", "run", "double_integrator",
              "--runs", tmp_path / "runs",
              *(word for setting in settings for word in ("--set", setting))],
@@ -65,8 +65,8 @@ def test_a_process_that_fails_is_named_once(tmp_path: Path) -> None:
         f"sensor: UDP port 127.0.0.1:{port} is already taken by another program; "
         "set ports.sensor to another port, or to 0 for any"
     )
-    assert done.returncode == 2
-    assert done.stderr == f"noack: {expected} (logs in {run_dir / 'logs'})\n"
+    assert process.returncode == 2
+    assert process.stderr == f"noack: {expected} (logs in {run_dir / 'logs'})\n"
     assert (run_dir / "logs/sensor.log").read_text() == f"noack {expected}\n"
 
 
@@ -74,5 +74,5 @@ def test_a_deleted_current_folder_is_named(tmp_path: Path, monkeypatch: pytest.M
     (folder := tmp_path / "folder").mkdir()
     monkeypatch.chdir(folder)
     folder.rmdir()
-    done = noack("simulate lane_following")
-    assert (done.exit_code, done.stderr) == (1, "noack: the current folder was deleted\n")
+    result = noack("simulate lane_following")
+    assert (result.exit_code, result.stderr) == (1, "noack: the current folder was deleted\n")

@@ -33,11 +33,11 @@ def ticket(content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.fixture
 def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
-    found = Coordinator(ticket)
+    running = Coordinator(ticket)
     try:
-        yield found
+        yield running
     finally:
-        found.close()
+        running.close()
 
 
 VALUES = {
@@ -57,18 +57,18 @@ VALUES = {
 def test_both_names_of_a_parameter_work_in_noack_set_in_the_option_and_in_changes(
     short: str, content: dict[str, Any], tmp_path: Path
 ) -> None:
-    path, text, found = tmp_path / "some.toml", VALUES[short], []
+    path, text, values = tmp_path / "some.toml", VALUES[short], []
     assert VALUES.keys() == SHORT.keys()
     path.write_text(tomli_w.dumps(content))
     for name in (short, SHORT[short]):
         settings = parsed([name, text])
-        found.append(changed(load(path), settings))
-        found.append(load(path, [f"{name}={text}"]))
+        values.append(changed(load(path), settings))
+        values.append(load(path, [f"{name}={text}"]))
         change = {"at_s": 0.5, "set": {name: settings[SHORT[short]]}}
         scheduled = validate(content | {"changes": [change]}, "here")
-        found.append(changed(load(path), scheduled.changes[0].set))
-    assert found[0] != load(path)
-    assert found[1:] == found[:-1]
+        values.append(changed(load(path), scheduled.changes[0].set))
+    assert values[0] != load(path)
+    assert values[1:] == values[:-1]
 
 
 def test_a_mistake_in_the_words_gives_the_approved_line(ticket: Ticket) -> None:
@@ -81,12 +81,12 @@ def test_a_mistake_in_the_words_gives_the_approved_line(ticket: Ticket) -> None:
 def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
     ticket: Ticket, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = new_ticket(ticket.scenario, Path("elsewhere"), launched=True)
-    with run_registry.registered_run(other, "lab"):
+    second_ticket = new_ticket(ticket.scenario, Path("elsewhere"), launched=True)
+    with run_registry.registered_run(second_ticket, "lab"):
         assert run_registry.find().run_dir == "elsewhere"
         warn_of_other_runs()
         assert "elsewhere is active, too" in capsys.readouterr().err
-    with run_registry.registered_run(other, "lab"), run_registry.registered_run(ticket, None) as path:
+    with run_registry.registered_run(second_ticket, "lab"), run_registry.registered_run(ticket, None) as path:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
         assert ticket.key.hex() not in path.read_text()
@@ -102,9 +102,9 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
 
 
 def test_only_active_runs_can_be_changed(coordinator: Coordinator) -> None:
-    done = invoke("set", "loss.p", "0.5")
-    assert done.exit_code == 2
-    assert "no run is active" in done.stderr
+    result = invoke("set", "loss.p", "0.5")
+    assert result.exit_code == 2
+    assert "no run is active" in result.stderr
     change = Query("", b'{"settings": {"network.mansd": 1}}')
     question = Query("", b"{}")
     coordinator._answer_change(change)  # type: ignore[arg-type]

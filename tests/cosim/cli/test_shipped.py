@@ -47,38 +47,38 @@ def test_each_command_runs_a_trigger_of_ones_own_or_says_why_not(
 ) -> None:
     """``lane_python_trigger``: its trigger is a class, so it has no rule, bound or exact run."""
     monkeypatch.chdir(tmp_path)
-    own, last = "lane_python_trigger", "runs/latest"
+    own_trigger, last = "lane_python_trigger", "runs/latest"
     Path("own.toml").write_text(
-        f'name = "own"\nscenario = "{own}"\ndraws = 2\n'
+        f'name = "own"\nscenario = "{own_trigger}"\ndraws = 2\n'
         'axes = [{ name = "loss", key = "network.loss.probability", values = [0.2, 0.8] }]\n'
         'figures = [{ kind = "curve", x = "loss", metric = "transmissions" }]\n'
     )
     works = (
-        f"simulate {own} --set horizon_s=1",
+        f"simulate {own_trigger} --set horizon_s=1",
         f"summary {last} --verbose", f"replay {last}", f"report {last}", f"compare {last} {last}",
         f"export {last} --format csv",
     )  # fmt: skip
     for line in works:
-        done = invoke(*line.split())
-        assert done.exit_code == 0, done.output
+        result = invoke(*line.split())
+        assert result.exit_code == 0, result.output
     refuses = (  # the others are in mistakes.txt
         (f"fidelity {last}", "trigger.policy: needs a policy that is a rule"),
         ("campaign own.toml", 'time = "sampled" runs it as `noack simulate` does'),
     )
     for line, reason in refuses:
-        done = invoke(*line.split())
-        assert done.exit_code == 2, done.output
-        assert reason in done.stderr
-        assert done.stderr.count("\n") == 1
+        result = invoke(*line.split())
+        assert result.exit_code == 2, result.output
+        assert reason in result.stderr
+        assert result.stderr.count("\n") == 1
 
 
 def test_all_shipped_scenarios_are_listed_with_their_description() -> None:
     document = json.loads(invoke("scenarios", "--json").stdout)
-    assert [one["name"] for one in document["scenarios"]] == SCENARIOS
-    assert [one["name"] for one in document["campaigns"]] == CAMPAIGNS
-    done = invoke("scenarios")
-    assert done.exit_code == 0
-    listed = [" ".join(line.split()) for line in done.stdout.splitlines()]  # one line each
+    assert [entry["name"] for entry in document["scenarios"]] == SCENARIOS
+    assert [entry["name"] for entry in document["campaigns"]] == CAMPAIGNS
+    result = invoke("scenarios")
+    assert result.exit_code == 0
+    listed = [" ".join(line.split()) for line in result.stdout.splitlines()]  # one line each
     for folder, names in (("scenarios", SCENARIOS), ("campaigns", CAMPAIGNS)):
         for name in names:
             content = tomllib.loads((ROOT / folder / f"{name}.toml").read_text("utf-8"))
@@ -87,9 +87,9 @@ def test_all_shipped_scenarios_are_listed_with_their_description() -> None:
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_printed_scenario_loads_from_any_folder(name: str, tmp_path: Path) -> None:
-    done = invoke("scenarios", name)
-    assert done.exit_code == 0
+    result = invoke("scenarios", name)
+    assert result.exit_code == 0
     copy = tmp_path / "mine.toml"
-    copy.write_text(done.stdout, encoding="utf-8")
+    copy.write_text(result.stdout, encoding="utf-8")
     assert load(copy) == load(ROOT / "scenarios" / f"{name}.toml")
-    assert "schema" not in done.stdout  # which is in another folder
+    assert "schema" not in result.stdout  # which is in another folder

@@ -15,12 +15,12 @@ ROOT = Path(__file__).parents[3]
 SIMULATE = ("simulate", "double_integrator", "--set", "horizon_s=1", "--no-report")
 
 
-def environment(**more: str) -> dict[str, str]:
+def environment(**variables: str) -> dict[str, str]:
     """The tests' environment without variables that concern terminals and colours."""
     concerned = ("NO_COLOR", "FORCE_COLOR", "PY_COLORS", "TTY_COMPATIBLE", "TTY_INTERACTIVE",
                  "GITHUB_ACTIONS", "COLUMNS", "TERM", "COLORTERM")  # fmt: skip
-    others = {name: value for name, value in os.environ.items() if name not in concerned}
-    return others | {"TERM": "xterm-256color", "PYTHONPATH": str(ROOT)} | more
+    kept_variables = {name: value for name, value in os.environ.items() if name not in concerned}
+    return kept_variables | {"TERM": "xterm-256color", "PYTHONPATH": str(ROOT)} | variables
 
 
 @pytest.mark.parametrize(
@@ -32,13 +32,13 @@ def test_a_closed_pipe_does_not_change_the_exit_status(
 ) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    done = subprocess.run(
+    process = subprocess.run(
         [*NOACK, *command], cwd=tmp_path, env=environment(), stdout=writing,
         stderr=subprocess.PIPE, check=False,
     )  # fmt: skip
     os.close(writing)
-    assert done.returncode == status
-    assert status or done.stderr == b""
+    assert process.returncode == status
+    assert status or process.stderr == b""
 
 
 @pytest.mark.parametrize(("line_buffering", "write_through"), [(True, False), (False, True)])
@@ -59,10 +59,10 @@ def test_a_line_is_written_at_once(line_buffering: bool, write_through: bool) ->
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
 def test_a_full_disk_gives_one_line(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
+        process = subprocess.run(
             [*NOACK, "scenarios"], cwd=tmp_path, env=environment(),
             stdout=full, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
-    assert done.returncode == 1
-    assert done.stderr.startswith("noack: cannot write: ")
-    assert done.stderr.count("\n") == 1
+    assert process.returncode == 1
+    assert process.stderr.startswith("noack: cannot write: ")
+    assert process.stderr.count("\n") == 1

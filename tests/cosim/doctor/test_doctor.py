@@ -39,16 +39,17 @@ IDEAL = MachineFacts(
 )  # fmt: skip
 
 
-def about(what: str, wanted: RunRequirements = WANTED, **changed: Any) -> MachineFinding:
+def about(title: str, required: RunRequirements = WANTED, **changed: Any) -> MachineFinding:
     """The first finding of a kind that is not good, or the first one if all are good."""
-    found = [one for one in judge(replace(IDEAL, **changed), wanted) if one.what.startswith(what)]
-    return next((one for one in found if one.verdict is not FindingStatus.GOOD), found[0])
+    findings = judge(replace(IDEAL, **changed), required)
+    of_kind = [finding for finding in findings if finding.what.startswith(title)]
+    return next((finding for finding in of_kind if finding.verdict is not FindingStatus.GOOD), of_kind[0])
 
 
 def test_a_machine_without_limits_is_good() -> None:
     findings = judge(IDEAL, WANTED)
     assert worst(findings) is FindingStatus.GOOD
-    assert not [one for one in findings if one.remedy]
+    assert not [finding for finding in findings if finding.remedy]
 
 
 @pytest.mark.parametrize(("what", "changed", "verdict"), [
@@ -77,41 +78,41 @@ def test_a_machine_without_limits_is_good() -> None:
 def test_each_finding_has_a_verdict_and_a_remedy(
     what: str, changed: dict[str, Any], verdict: FindingStatus
 ) -> None:
-    found = about(what, **changed)
-    assert found.verdict is verdict
+    finding = about(what, **changed)
+    assert finding.verdict is verdict
     if verdict is not FindingStatus.GOOD:
-        assert found.means
-        assert found.remedy or isinstance(next(iter(changed.values())), str)
+        assert finding.means
+        assert finding.remedy or isinstance(next(iter(changed.values())), str)
         assert worst(judge(replace(IDEAL, **changed), WANTED)) is verdict
 
 
 def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
     late = Lateness(1000, 50.0, 3000.0, 9000.0, 4)
-    found = about("wake-ups with the real-time settings applied", realtime=late)
-    assert found.verdict is FindingStatus.LIMITED
-    without = replace(WANTED, realtime=False)  # what is not used does not matter
+    finding = about("wake-ups with the real-time settings applied", realtime=late)
+    assert finding.verdict is FindingStatus.LIMITED
+    not_realtime = replace(WANTED, realtime=False)  # what is not used does not matter
     assert about("wake-ups", plain=late).verdict is FindingStatus.GOOD
-    assert about("wake-ups", without, plain=late).verdict is FindingStatus.LIMITED
+    assert about("wake-ups", not_realtime, plain=late).verdict is FindingStatus.LIMITED
     refused = {"sched_fifo": "not permitted: Operation not permitted"}
-    assert about("real-time", without, granted=refused).verdict is FindingStatus.GOOD
+    assert about("real-time", not_realtime, granted=refused).verdict is FindingStatus.GOOD
     # 4 of 1000 at 500 Hz: one every 250 steps of 2 ms
-    assert "4 of them (0.4 %) beyond the 4 ms that loop's certificates allow" in found.means
-    assert "one every 0.5 s of a run of 20 s" in found.means
-    assert "certificate.late_periods" in found.remedy
+    assert "4 of them (0.4 %) beyond the 4 ms that loop's certificates allow" in finding.means
+    assert "one every 0.5 s of a run of 20 s" in finding.means
+    assert "certificate.late_periods" in finding.remedy
 
 
 def test_every_finding_is_documented() -> None:
     text = (Path(__file__).parents[3] / "docs/command-line.md").read_text()
     rows = re.findall(r"^\| `([^`]+)` \|", text.partition("| finding |")[2], re.MULTILINE)
     named = [row.removesuffix(" ...").removesuffix(" of").removesuffix(":") for row in rows]
-    found = {one.what for one in judge(IDEAL, WANTED)}
-    assert all(any(what.startswith(name) for name in named) for what in found)
-    assert all(any(what.startswith(name) for what in found) for name in named)
+    titles = {finding.what for finding in judge(IDEAL, WANTED)}
+    assert all(any(title.startswith(name) for name in named) for title in titles)
+    assert all(any(title.startswith(name) for title in titles) for name in named)
 
 
 def test_lateness_statistics_are_those_of_the_sample() -> None:
-    found = lateness(range(0, 101_000, 1000), 98_500)  # 0 to 100 µs
-    assert found == Lateness(101, 50.0, 99.0, 100.0, 2)
+    statistics = lateness(range(0, 101_000, 1000), 98_500)  # 0 to 100 µs
+    assert statistics == Lateness(101, 50.0, 99.0, 100.0, 2)
     assert isinstance(lateness([], 1), str)
 
 
@@ -122,14 +123,14 @@ def doctor(*arguments: str) -> Result:
 def test_every_check_gives_a_finding_and_a_taken_port_makes_a_run_impossible(
     tmp_path: Path,
 ) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
+        endpoint.bind(("127.0.0.1", 0))
+        port = endpoint.getsockname()[1]
         ports = ("--set", f"ports={{plant={port}}}")
-        done = doctor("--seconds", "0.1", *ports, "--json", "--runs", str(tmp_path))
-    document = json.loads(done.stdout)
-    assert (done.exit_code, document["verdict"]) == (1, "bad")
-    (finding,) = [one for one in document["findings"] if one["what"].startswith("ports of")]
+        result = doctor("--seconds", "0.1", *ports, "--json", "--runs", str(tmp_path))
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["verdict"]) == (1, "bad")
+    (finding,) = [entry for entry in document["findings"] if entry["what"].startswith("ports of")]
     assert finding["verdict"] == "bad"
     assert str(port) in finding["found"]
     assert "already taken" in finding["found"]
@@ -142,5 +143,5 @@ def test_every_check_gives_a_finding_and_a_taken_port_makes_a_run_impossible(
     assert measured["control"] > 0
     assert measured["disk"]["write_bytes_per_s"] > 0
     assert set(measured["granted"]) >= {"sched_fifo", "memory_lock"}
-    assert {one["verdict"] for one in document["findings"]} <= {"good", "limited", "bad"}
+    assert {entry["verdict"] for entry in document["findings"]} <= {"good", "limited", "bad"}
     assert not list(tmp_path.iterdir())

@@ -33,9 +33,9 @@ chances = st.floats(0.01, 0.99)
 rates = st.builds(ChainRates, chances, chances, chances, chances)
 
 
-def forward(lost: list[bool], one: ChainRates) -> float:
+def forward(lost: list[bool], rates: ChainRates) -> float:
     """The likelihood by the forward algorithm, packet by packet."""
-    start, delivers, loses = one.matrices()
+    start, delivers, loses = rates.matrices()
     for flag in lost:
         start = start @ (loses if flag else delivers)
     return math.log(start.sum())
@@ -76,8 +76,8 @@ def test_intervals_of_gilberts_chain_cover_its_parameters() -> None:
     for seed in range(200):
         fit = ChainFits(loss_bursts(~chain_losses(1500, GILBERT, seed))).gilbert
         covered += [
-            one is not None and one.low <= truth <= one.high
-            for one, truth in zip(fit.estimates.values(), GILBERT, strict=False)
+            estimate is not None and estimate.low <= truth <= estimate.high
+            for estimate, truth in zip(fit.estimates.values(), GILBERT, strict=False)
         ]
     assert (abs(covered / 200 - 0.95) < 4 * math.sqrt(0.95 * 0.05 / 200)).all()
 
@@ -88,9 +88,9 @@ def test_intervals_of_the_hidden_chain_cover_its_parameters() -> None:
     for seed in range(4):
         fit = ChainFits(loss_bursts(~chain_losses(4000, ELLIOTT, seed))).gilbert_elliott
         for name, truth in ELLIOTT._asdict().items():
-            one = fit.estimates[name]
-            assert one is not None
-            covered += one.low <= truth <= one.high
+            estimate = fit.estimates[name]
+            assert estimate is not None
+            covered += estimate.low <= truth <= estimate.high
         biases.append(np.log(np.array(fit.rates) / np.array(ELLIOTT)))
     assert covered >= 13
     assert (abs(np.mean(biases, axis=0)) < 0.2).all()
@@ -107,11 +107,11 @@ def test_the_preferred_model_is_the_true_one() -> None:
 
 
 def test_the_test_of_lengths_rejects_at_its_level_and_wrong_models() -> None:
-    found = []
+    tests = []
     for seed in range(100):
         fits = ChainFits(loss_bursts(~chain_losses(3000, GILBERT, seed)))
-        found.append(fits.tested(fits.gilbert).p_value)
-    p_values = np.array(found, float)
+        tests.append(fits.tested(fits.gilbert).p_value)
+    p_values = np.array(tests, float)
     assert 0.01 < (p_values < 0.05).mean() < 0.12
     fits = ChainFits(loss_bursts(~chain_losses(8000, ELLIOTT, seed=2)))
     assert fits.tested(fits.gilbert).verdict == "rejected"
@@ -122,24 +122,24 @@ def test_the_test_of_lengths_rejects_at_its_level_and_wrong_models() -> None:
 @pytest.mark.parametrize(("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39)])
 def test_poisson_intervals_are_garwoods(count: int, low: float, high: float) -> None:
     """Garwood, Biometrika 28, 1936, and every table since."""
-    found = poisson_estimate(count, 2.0)
-    np.testing.assert_allclose(found, [count / 2, low / 2, high / 2], rtol=2e-3)
+    estimate = poisson_estimate(count, 2.0)
+    np.testing.assert_allclose(estimate, [count / 2, low / 2, high / 2], rtol=2e-3)
 
 
 def test_binomial_and_exponential_intervals_at_their_edges() -> None:
     assert binomial_estimate(0, 0) is None
     assert exponential_estimate(0, 3.0) is None
-    none, every = binomial_estimate(0, 50), binomial_estimate(50, 50)
-    assert none is not None
-    assert every is not None
+    never, always = binomial_estimate(0, 50), binomial_estimate(50, 50)
+    assert never is not None
+    assert always is not None
     limit = 1 - math.exp(-1.920729 / 50)  # (1 − p)^50 = e^(−χ²/2)
-    assert (none.low, every.high) == (0.0, 1.0)
-    assert (none.high, every.low) == pytest.approx((limit, 1 - limit))
+    assert (never.low, always.high) == (0.0, 1.0)
+    assert (never.high, always.low) == pytest.approx((limit, 1 - limit))
     rng = np.random.default_rng(3)
     inside = []
     for _ in range(1000):
-        one = exponential_estimate(4, rng.exponential(2.0, 4).sum())
-        inside.append(one is not None and one.low <= 2.0 <= one.high)
+        estimate = exponential_estimate(4, rng.exponential(2.0, 4).sum())
+        inside.append(estimate is not None and estimate.low <= 2.0 <= estimate.high)
     assert abs(np.mean(inside) - 0.95) < 0.03
 
 
@@ -148,11 +148,11 @@ TRACES = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
 
 def test_the_rural_run_has_one_outage_of_ten_seconds_and_an_m_without_it() -> None:
     trace = read_trace(TRACES / "rural_n8_10kmh.csv")
-    found = Measurement(trace, MeasurementOptions(deadline_s=0.1))
-    (outage,) = found.to_json()["outages"]
+    measurement = Measurement(trace, MeasurementOptions(deadline_s=0.1))
+    (outage,) = measurement.to_json()["outages"]
     assert outage["losses"] == 175
     assert 10 < outage["duration_s"] < 11.5
-    assert found.longest_loss_burst + 1 == found.quantiles[-1].bursts == 49
+    assert measurement.longest_loss_burst + 1 == measurement.quantiles[-1].bursts == 49
     by_hand = Measurement(trace, MeasurementOptions(deadline_s=0.1, outage_s=2.0))
     durations_s = by_hand.bursts.times_s(trace)[1]
     assert by_hand.is_outage.tolist() == (durations_s >= 2.0).tolist()
@@ -171,16 +171,16 @@ def test_networks_without_outages_have_none_and_added_ones_are_found(truth: Chai
         for start in starts[::-1]:
             lost = np.insert(lost, start, np.ones(rng.integers(220, 260), bool))
         bursts = loss_bursts(~lost)
-        found = find_outages(bursts).flags
-        assert found.sum() == outages
-        assert bursts.length[found].min() >= 220
+        flags = find_outages(bursts).flags
+        assert flags.sum() == outages
+        assert bursts.length[flags].min() >= 220
 
 
 def test_the_bound_for_geometric_bursts_counts_the_ways_to_divide_the_losses() -> None:
     lengths = np.array([7, 2, 1, 1])
-    total, parts = lengths.sum(), len(lengths)
-    divisions = [np.diff([0, *cuts, total]) for cuts in combinations(range(1, total), parts - 1)]
-    exact = np.mean([np.max(one) >= lengths[0] for one in divisions])
+    total, count = lengths.sum(), len(lengths)
+    divisions = [np.diff([0, *cuts, total]) for cuts in combinations(range(1, total), count - 1)]
+    exact = np.mean([np.max(division) >= lengths[0] for division in divisions])
     bound = rule._geometric(lengths)[0]
     assert exact == pytest.approx(bound)  # two parts of 7 or more do not fit into 11
 
@@ -193,16 +193,16 @@ def test_the_outage_fit_covers_rate_and_duration() -> None:
         durations_s = rng.exponential(3.0, count)
         every = np.ones(count, bool)
         fit = fit_outages(durations_s, every, 100 + durations_s.sum())
-        for place, (one, truth) in enumerate(((fit.rate_per_s, 1 / 20), (fit.duration_s, 3.0))):
-            covered[place] += one is not None and one.low <= truth <= one.high
+        for index, (estimate, truth) in enumerate(((fit.rate_per_s, 1 / 20), (fit.duration_s, 3.0))):
+            covered[index] += estimate is not None and estimate.low <= truth <= estimate.high
     assert (covered / 200 > 0.92).all()  # exact intervals cover at least 95 %
-    many = np.full(40, 2.0) + 0.01 * np.arange(40)
-    assert "rejected" in fit_outages(many, np.ones(40, bool), 500.0).text
+    forty_s = np.full(40, 2.0) + 0.01 * np.arange(40)
+    assert "rejected" in fit_outages(forty_s, np.ones(40, bool), 500.0).text
     assert "not rejected" in fit_outages(rng.exponential(2.0, 40), np.ones(40, bool), 500.0).text
-    none = fit_outages(np.zeros(0), np.zeros(0, bool), 100.0)
-    assert none.rate_per_s is not None
-    assert none.duration_s is None
-    assert none.rate_per_s.high == pytest.approx(0.0369, rel=1e-3)
+    no_outages = fit_outages(np.zeros(0), np.zeros(0, bool), 100.0)
+    assert no_outages.rate_per_s is not None
+    assert no_outages.duration_s is None
+    assert no_outages.rate_per_s.high == pytest.approx(0.0369, rel=1e-3)
 
 
 flags = st.lists(st.booleans(), min_size=1, max_size=60)
@@ -215,16 +215,16 @@ def test_a_packet_is_effective_if_it_arrives_in_time_before_every_later_one(
     """The definition of docs/mansd.md, by a receiver that keeps only what is newer."""
     sent = 2 * np.arange(len(delays))
     arrivals = [(2 * k + d, k) for k, d in enumerate(delays) if d is not None]
-    kept, newest = set(), -1
-    for at, k in sorted(arrivals):
-        if at - 2 * k <= deadline and k > newest:
-            kept.add(k)
+    effective, newest = set(), -1
+    for arrival, k in sorted(arrivals):
+        if arrival - 2 * k <= deadline and k > newest:
+            effective.add(k)
             newest = k
     lost = np.array([d is None for d in delays])
     received = sent + np.array([d or 0 for d in delays])
-    found = outcomes(packet_trace(sent, received, lost), deadline)
-    assert set(np.flatnonzero(found.effective).tolist()) == kept
-    groups = np.array([found.lost, found.out_of_order, found.late, found.effective])
+    packets = outcomes(packet_trace(sent, received, lost), deadline)
+    assert set(np.flatnonzero(packets.effective).tolist()) == effective
+    groups = np.array([packets.lost, packets.out_of_order, packets.late, packets.effective])
     assert (groups.sum(axis=0) == 1).all()
 
 
@@ -247,9 +247,9 @@ def test_m_of_a_share_is_the_smallest_that_covers_it(effective: list[bool], shar
     for ok in effective:
         count = 0 if ok else count + 1
         counts.append(count)
-    found = quantile_m(bursts, share)
-    of = {found.packets: counts, found.bursts: bursts.length.tolist()}
-    for m, values in of.items():
+    quantile = quantile_m(bursts, share)
+    values_of = {quantile.packets: counts, quantile.bursts: bursts.length.tolist()}
+    for m, values in values_of.items():
         for smaller, covered in ((m, True), (m - 1, False)):
             within = sum(value <= smaller - 1 for value in values)
             assert (smaller < 1) or (within >= share * len(values) - 1e-9) is (covered or not values)
@@ -279,8 +279,8 @@ def test_confidence_needs_as_many_bursts_as_wilks_says(share: float, fewest: int
     assert fewest == math.ceil(math.log(0.05) / math.log(share))
     for count in (fewest - 1, fewest):
         effective = np.tile([True, False], count)
-        found = quantile_m(loss_bursts(effective), share).bursts_confident
-        assert (found is None) == (count < fewest)
+        confident = quantile_m(loss_bursts(effective), share).bursts_confident
+        assert (confident is None) == (count < fewest)
     rng = np.random.default_rng(1)
     covered = [
         quantile_m(loss_bursts(_bursts(rng.geometric(0.3, 400))), share).bursts_confident for _ in range(400)

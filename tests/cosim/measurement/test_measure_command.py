@@ -63,19 +63,19 @@ def chain_csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_json_tables_and_page_have_the_same_numbers(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     words = (RURAL, "--deadline", "100ms", "--for-scenario", "lane_following", "--window", 20)
-    found = json.loads(measure(*words, "--json", "--out", page).stdout)
-    assert (found["packets"], found["late"], found["M"]) == (2178, 616, 49)
-    assert found["windows"] == {"20": {"most_losses": 20, "without_outages": 20}}
-    assert sum(int(n) * count for n, count in found["histogram"].items()) == 616
-    assert found["certificate"]["share"] == pytest.approx(0.57, abs=0.01)
-    assert found["written"] == [str(page)]
+    document = json.loads(measure(*words, "--json", "--out", page).stdout)
+    assert (document["packets"], document["late"], document["M"]) == (2178, 616, 49)
+    assert document["windows"] == {"20": {"most_losses": 20, "without_outages": 20}}
+    assert sum(int(n) * count for n, count in document["histogram"].items()) == 616
+    assert document["certificate"]["share"] == pytest.approx(0.57, abs=0.01)
+    assert document["written"] == [str(page)]
     html = page.read_text()
     assert html.count("<svg") + html.count("<img") == 4
-    shown = measure(*words)
-    assert shown.exit_code == 0
+    printed = measure(*words)
+    assert printed.exit_code == 0
     for text in ("616 (28.3 %)", "175 packets, 10.9 s, from 81.312 s"):
         assert text in html
-        assert text in " ".join(shown.output.split())
+        assert text in " ".join(printed.output.split())
 
 
 def test_the_written_model_is_a_network_with_the_fitted_parameters(chain_csv: Path, tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_the_written_model_is_a_network_with_the_fitted_parameters(chain_csv: Pa
     assert not network.enforce_mansd
     assert measure(RURAL, "--deadline", "100ms", "--write", path, "--as", "model").exit_code == 0
     network = section(path)
-    assert [one.kind for one in network.impairments] == ["loss", "delay"]
+    assert [impairment.kind for impairment in network.impairments] == ["loss", "delay"]
     assert "outages" in path.read_text()
     scenario = noack.load("lane_following", {"network": network.model_dump(exclude_none=True)})
     assert noack.simulate(noack.with_settings(scenario, {"horizon_s": 1.0})).summary
@@ -97,12 +97,12 @@ def test_a_network_without_losses_is_measured(tmp_path: Path) -> None:
     path = tmp_path / "all.csv"
     path.write_text("sent_ms,received_ms\n0,1\n")
     for words in ((), ("--out", tmp_path / "a.html"), ("--write", tmp_path / "a.toml")):
-        found = measure(path, "--for-scenario", "lane_following", "--json", *words)
-        assert json.loads(found.stdout)["M"] == 1
+        document = measure(path, "--for-scenario", "lane_following", "--json", *words)
+        assert json.loads(document.stdout)["M"] == 1
     path.write_text("sent_ms,received_ms\n0,\n5,\n")
     for words in ((), ("--out", tmp_path / "a.html")):
-        found = json.loads(measure(path, "--json", *words).stdout)
-        assert (found["lost"], found["M"], found["delay_s"]) == (2, 3, {})
+        document = json.loads(measure(path, "--json", *words).stdout)
+        assert (document["lost"], document["M"], document["delay_s"]) == (2, 3, {})
 
 
 def test_correlation_is_that_of_an_autoregressive_delay() -> None:
@@ -111,9 +111,9 @@ def test_correlation_is_that_of_an_autoregressive_delay() -> None:
         z[k] = 0.8 * z[k - 1] + 0.6 * rng.normal()
     delay_ns = np.exp(15 + z).astype(np.int64)
     known = rng.random(len(z)) > 0.2
-    lags, found = autocorrelation(delay_ns, known)
-    for lag, one in list(zip(lags, found, strict=True))[:5]:
-        assert one == pytest.approx(0.8**lag, abs=0.04)
+    lags, correlations = autocorrelation(delay_ns, known)
+    for lag, correlation in list(zip(lags, correlations, strict=True))[:5]:
+        assert correlation == pytest.approx(0.8**lag, abs=0.04)
     scores = normal_scores(np.array([5, 1, 1, 9]))
     assert scores[1] == scores[2] < scores[0] < scores[3]
     sent = 10**8 * np.arange(len(z))
@@ -137,15 +137,15 @@ def test_any_trace_is_measured(records: list[tuple[int, int | None]], deadline_s
     lost = np.array([delay is None for _, delay in records])
     received = sent + np.array([delay or 0 for _, delay in records])
     trace = packet_trace(sent, received, lost)
-    found = Measurement(trace, MeasurementOptions(deadline_s=deadline_s))
+    measurement = Measurement(trace, MeasurementOptions(deadline_s=deadline_s))
     with np.errstate(all="raise", under="ignore"):
-        document = found.to_json()
+        document = measurement.to_json()
     assert document["effective_losses"] >= int(lost.sum())
-    void = found.certificate_time(noack.load("lane_following"))
+    void = measurement.certificate_time(noack.load("lane_following"))
     assert 0 <= void.share <= 1
-    assert all(one.share <= void.share for one in void.causes)
-    assert [*measurement_tables(found, void)]
-    assert len([*measurement_figures(found)]) == 4
+    assert all(cause.share <= void.share for cause in void.causes)
+    assert [*measurement_tables(measurement, void)]
+    assert len([*measurement_figures(measurement)]) == 4
 
 
 def through(path: Path, sent_ns: np.ndarray) -> PacketTrace:
@@ -162,9 +162,9 @@ def measured_again(source: Path | str, path: Path, form: str) -> tuple[noack.Mea
     sent_ns = first.trace.sent_ns
     if form == "model":
         sent_ns = PERIOD_NS * np.arange(25_000)
-    again = through(path, sent_ns)
+    second_trace = through(path, sent_ns)
     csv = path.with_suffix(".again.csv")
-    csv.write_text(trace_csv(again))
+    csv.write_text(trace_csv(second_trace))
     return first, noack.measure(csv)
 
 
@@ -177,9 +177,9 @@ def test_a_written_trace_repeats_each_packet(tmp_path: Path, first_lost: bool) -
     late_ns = np.where(lost, 0, rng.integers(0, 3 * PERIOD_NS, len(lost)))  # overtakes
     csv = tmp_path / "trace.csv"
     csv.write_text(trace_csv(packet_trace(trace.sent_ns, trace.sent_ns + late_ns, lost)))
-    first, again = measured_again(csv, tmp_path / "network.toml", "trace")
-    assert (first.trace.received_ns == again.trace.received_ns).all()
-    assert histogram(first.bursts) == histogram(again.bursts)
+    first, second = measured_again(csv, tmp_path / "network.toml", "trace")
+    assert (first.trace.received_ns == second.trace.received_ns).all()
+    assert histogram(first.bursts) == histogram(second.bursts)
     assert bool(first.trace.received_ns[0] == LOST_NS) is first_lost
 
 
@@ -193,12 +193,12 @@ def test_a_written_model_has_the_parameters_and_delays(tmp_path: Path) -> None:
     delay_ns = (PERIOD_NS * (0.3 + 0.2 * np.tanh(z))).astype(np.int64)
     csv = tmp_path / "trace.csv"
     csv.write_text(trace_csv(packet_trace(sent_ns, sent_ns + delay_ns, lost)))
-    first, again = measured_again(csv, tmp_path / "network.toml", "model")
-    fits = [one.models["gilbert"].fit.rates for one in (first, again)]
+    first, second = measured_again(csv, tmp_path / "network.toml", "model")
+    fits = [measurement.models["gilbert"].fit.rates for measurement in (first, second)]
     assert fits[0] == pytest.approx(fits[1], rel=0.1)
     for share, delay_s in first.delays.quantiles_s.items():
-        assert again.delays.quantiles_s[share] == pytest.approx(delay_s, abs=2e-4)
-    correlations = [one.delays.correlation[0] for one in (first, again)]
+        assert second.delays.quantiles_s[share] == pytest.approx(delay_s, abs=2e-4)
+    correlations = [measurement.delays.correlation[0] for measurement in (first, second)]
     assert correlations[0] == pytest.approx(correlations[1], abs=0.03)
 
 
@@ -242,8 +242,8 @@ def test_opportunities_delay_a_probe_until_the_next_one(tmp_path: Path) -> None:
     path.write_text("".join(f"{t}\n" for t in times_ms))
     trace = read_source([path], SourceOptions(period_ns=20_000_000))
     # An opportunity at the very time of an arrival is lost, as in mahimahi.
-    expected = [min(t for t in times_ms if t > at) - at for at in range(0, 200, 20)]
-    assert trace.delay_ns.tolist() == [one * 10**6 for one in expected]
+    expected = [min(t for t in times_ms if t > sent_ms) - sent_ms for sent_ms in range(0, 200, 20)]
+    assert trace.delay_ns.tolist() == [delay_ms * 10**6 for delay_ms in expected]
     assert "5 in 0.2 s, 0.3008 Mbit/s; longest time without one: 100 ms, before 0.2 s" in trace.notes[0]
 
 
@@ -272,8 +272,8 @@ def lane(**network: object) -> Scenario:
 LANE = lane(mansd=2)  # allows 4 ms in the network
 
 
-def share(found: object, cause: str) -> float:
-    return next((one.share for one in found.causes if one.cause == cause), 0.0)  # type: ignore[attr-defined]
+def share(certificate_time: object, cause: str) -> float:
+    return next((violation.share for violation in certificate_time.causes if violation.cause == cause), 0.0)  # type: ignore[attr-defined]
 
 
 @settings(max_examples=25, deadline=None)
@@ -284,30 +284,30 @@ def test_shares_are_those_of_a_step_through_the_time(delays: list[int | None]) -
     received = [None if d is None else 10 * k + d for k, d in enumerate(delays)]
     lost = np.array([d is None for d in delays])
     trace = packet_trace(sent * MS, (sent + np.array([d or 0 for d in delays])) * MS, lost)
-    end = max(sent[-1], *(at for at in received if at is not None), 0)
+    end = max(sent[-1], *(t_ms for t_ms in received if t_ms is not None), 0)
 
     def replaced(k: int) -> float:
-        return min((at for at in received[k + 1 :] if at is not None), default=np.inf)
+        return min((t_ms for t_ms in received[k + 1 :] if t_ms is not None), default=np.inf)
 
-    stale = [at is not None and replaced(k) < at for k, at in enumerate(received)]
-    gone = [at is None or (stale[k] and replaced(k) - 10 * k > 4) for k, at in enumerate(received)]
+    stale = [t_ms is not None and replaced(k) < t_ms for k, t_ms in enumerate(received)]
+    is_lost = [t_ms is None or (stale[k] and replaced(k) - 10 * k > 4) for k, t_ms in enumerate(received)]
     late = void = 0
     for ms in range(end):
         overdue = any(
-            at is not None and not stale[k] and 10 * k + 4 <= ms < at for k, at in enumerate(received)
+            t_ms is not None and not stale[k] and 10 * k + 4 <= ms < t_ms for k, t_ms in enumerate(received)
         )
         missing = False
         for k in range(2, len(delays)):
-            if all(gone[k - 2 : k + 1]) and 10 * k <= ms < replaced(k):
+            if all(is_lost[k - 2 : k + 1]) and 10 * k <= ms < replaced(k):
                 missing = True
         late += overdue
         void += overdue or missing
-    found = certificate_time(trace, LANE)
-    assert found.allowed_delay_s == 0.004
-    assert found.allowed_losses == 2
+    times = certificate_time(trace, LANE)
+    assert times.allowed_delay_s == 0.004
+    assert times.allowed_losses == 2
     if end:
-        assert found.share == pytest.approx(void / end)
-        assert share(found, DELAY) == pytest.approx(late / end)
+        assert times.share == pytest.approx(void / end)
+        assert share(times, DELAY) == pytest.approx(late / end)
 
 
 def test_every_rule_of_the_guarantee_counts() -> None:
@@ -315,23 +315,23 @@ def test_every_rule_of_the_guarantee_counts() -> None:
     scenario = lane(mansd=2, constraints=[{"kind": "at_most", "losses": 2, "window": 5}])
     sent, lost = 10 * np.arange(15), np.zeros(15, bool)
     lost[[2, 4, 6]] = True
-    found = certificate_time(packet_trace(sent * MS, (sent + 1) * MS, lost), scenario)
-    (one,) = found.causes
-    assert (one.cause, one.worst, one.first_s) == ("atmost 2 in 5", 3, pytest.approx(0.06))
-    assert found.kept["dropouts"] == "kept: 1 consecutive updates lost, 2 allowed"
-    assert one.share == pytest.approx(11 / 141)
+    void = certificate_time(packet_trace(sent * MS, (sent + 1) * MS, lost), scenario)
+    (cause,) = void.causes
+    assert (cause.cause, cause.worst, cause.first_s) == ("atmost 2 in 5", 3, pytest.approx(0.06))
+    assert void.kept["dropouts"] == "kept: 1 consecutive updates lost, 2 allowed"
+    assert cause.share == pytest.approx(11 / 141)
 
 
 def test_the_certificates_of_the_scenario_are_named() -> None:
     trace = read_trace(TRACES / "rural_n8_10kmh.csv")
-    found = certificate_time(trace, lane())
-    assert None in found.certificates.values()
-    assert [one.cause for one in found.causes] == [DELAY]
-    assert found.causes[0].worst == pytest.approx(9.744)
+    void = certificate_time(trace, lane())
+    assert None in void.certificates.values()
+    assert [cause.cause for cause in void.causes] == [DELAY]
+    assert void.causes[0].worst == pytest.approx(9.744)
     slow = lane(impairments=[{"kind": "delay", "delay_s": 9.8}])
-    kept = certificate_time(trace, slow)
-    assert kept.share == 0.0
-    assert kept.kept["dropouts"] == "kept"  # nothing was lost
-    assert kept.kept[DELAY].startswith("kept: an update was in the network for 9.744 s, 9.8")
+    slow_void = certificate_time(trace, slow)
+    assert slow_void.share == 0.0
+    assert slow_void.kept["dropouts"] == "kept"  # nothing was lost
+    assert slow_void.kept[DELAY].startswith("kept: an update was in the network for 9.744 s, 9.8")
     acknowledged = certificate_time(trace, noack.load("lane_acknowledged"))
     assert all(reason is not None for reason in acknowledged.certificates.values())

@@ -72,18 +72,18 @@ def exchange(
 @given(st.sets(st.integers(0, 59)), st.sampled_from([0, FAR_NS, -FAR_NS]))
 def test_the_trace_has_exactly_the_losses(lost: set[int], offset_ns: int) -> None:
     host = HOST if offset_ns == 0 else 6
-    found = exchange(60, lost.__contains__, host=host, offset_ns=offset_ns)
+    probe = exchange(60, lost.__contains__, host=host, offset_ns=offset_ns)
     if len(lost) == 60:
-        assert found.result is None
+        assert probe.result is None
         return
-    assert found.result is not None
-    trace = found.result.trace
+    assert probe.result is not None
+    trace = probe.result.trace
     assert trace is not None
     assert np.flatnonzero(trace.lost).tolist() == sorted(lost)
     assert trace.sent_ns.tolist() == [k * PERIOD_NS for k in range(60)]
     assert set(trace.delay_ns[~trace.lost].tolist()) == {DELAY_NS if offset_ns == 0 else 0}
     # The saved rows are the same trace: what is missing between two rows is lost.
-    header, *rows = found.rows
+    header, *rows = probe.rows
     assert header[2] == ("received_ns" if offset_ns == 0 else "received_other_clock_ns")
     assert {row[0] for row in rows if row[2] != ""} == set(range(60)) - lost
     assert {row[0] for row in rows} >= {0, 59}
@@ -91,18 +91,18 @@ def test_the_trace_has_exactly_the_losses(lost: set[int], offset_ns: int) -> Non
 
 @given(st.sets(st.integers(0, 99)), st.sets(st.integers(0, 99)))
 def test_a_round_trip_tells_on_which_way_each_datagram_was_lost(forward: set[int], reverse: set[int]) -> None:
-    found = exchange(100, forward.__contains__, reverse.__contains__, round_trip=True)
-    result = found.sender.finish(0)
+    probe = exchange(100, forward.__contains__, reverse.__contains__, round_trip=True)
+    result = probe.sender.finish(0)
     assert result.trace is not None
     arrived = [k for k in range(100) if k not in forward]
-    back = {k for number, k in enumerate(arrived) if number in reverse}
-    truth = dict.fromkeys(forward, "forward") | dict.fromkeys(back, "reverse")
+    lost_in_reverse = {k for number, k in enumerate(arrived) if number in reverse}
+    truth = dict.fromkeys(forward, "forward") | dict.fromkeys(lost_in_reverse, "reverse")
     assert set(np.flatnonzero(result.trace.lost)) == truth.keys()
     # Fewer than 128 are lost in a row, so that each answer covers what was lost before it.
-    answered = [k for k in arrived if k not in back]
-    known = {k: way for k, way in truth.items() if answered and k < answered[-1]}
-    assert {k: way for k, way in found.sender.lost_ways().items() if k in known} == known
-    after = {way for k, way in found.sender.lost_ways().items() if k not in known}
+    answered = [k for k in arrived if k not in lost_in_reverse]
+    known = {k: direction for k, direction in truth.items() if answered and k < answered[-1]}
+    assert {k: direction for k, direction in probe.sender.lost_directions().items() if k in known} == known
+    after = {direction for k, direction in probe.sender.lost_directions().items() if k not in known}
     assert after <= {"unknown"}
 
 
@@ -169,7 +169,7 @@ WAIT_S = 0.05
 @on_linux
 def test_an_arrival_has_the_time_at_which_it_came_not_that_of_reading() -> None:
     receiver = ProbeSocket(listen=("127.0.0.1", 0))
-    sender = ProbeSocket(to=receiver.endpoint.getsockname())
+    sender = ProbeSocket(peer=receiver.endpoint.getsockname())
     with receiver.endpoint, sender.endpoint:
         for _ in range(20):  # a process that is stalled meanwhile cannot compare its clocks
             before_ns = time.monotonic_ns()
@@ -203,7 +203,7 @@ def test_a_send_that_nobody_receives_is_counted() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
         closed.bind(("127.0.0.1", 0))
         address = closed.getsockname()
-    sender = ProbeSocket(to=address)
+    sender = ProbeSocket(peer=address)
     with sender.endpoint:
         for _ in range(3):
             sender.send(b"datagram")

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
-from noack.theory.certificates.delivery_flow import ROUNDING, DeliveryFlow
+from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, DeliveryFlow
 from noack.theory.margins.exact_matrices import exponential
 from tests.oracles.lossy_loops import SEARCH, System, systems
 

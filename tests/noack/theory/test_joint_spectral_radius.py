@@ -118,7 +118,7 @@ def test_a_growth_near_the_threshold_is_decided(seed: int) -> None:
         found = joint_spectral_radius(scaled(edges, wanted / sharp), accuracy=0.1, threshold=1.0)
         assert (found.upper < 1) == (wanted < 1)
         assert (found.lower > 1) == (wanted > 1)
-        assert found.needed == 0
+        assert found.needed_effort == 0
         assert fastest_cycle(scaled(edges, wanted / sharp), 4) <= found.upper
 
 
@@ -130,9 +130,9 @@ def test_the_estimate_of_the_work_is_mostly_that_of_a_complete_search() -> None:
         balanced, growth = system.balanced(), 1.05 * slowest
         complete = bound_by_products(balanced, growth, 60_000, slowest=slowest)
         assert complete.upper <= growth
-        assert complete.needed == complete.products
+        assert complete.needed_products == complete.products
         part = bound_by_products(balanced, growth, complete.products // 4, slowest=slowest)
-        ratios.append(part.needed / complete.products)
+        ratios.append(part.needed_products / complete.products)
     assert min(ratios) > 0.2
     assert 0.5 < np.median(ratios) < 2
 
@@ -141,7 +141,7 @@ def test_a_growth_that_is_the_threshold_is_undecided() -> None:
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
     found = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, turn.T)], threshold=1.0)
     assert found.lower <= 1 <= found.upper < 1 + 1e-3
-    assert found.needed == np.inf
+    assert found.needed_effort == np.inf
 
 
 @pytest.mark.parametrize("seed", range(10))

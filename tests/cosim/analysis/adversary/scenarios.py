@@ -47,12 +47,12 @@ def scenario_of(system: System, horizon_s: float, mode: str, floor: float) -> Sc
 
 def constraints_of(system: System) -> list[dict[str, Any]]:
     """The constraints of a random loop's guarantee, as in a scenario."""
-    (losses, window), found = system.window, []
+    (losses, window), constraints = system.window, []
     if losses < window:
-        found.append({"kind": "at_most", "losses": losses, "window": window})
+        constraints.append({"kind": "at_most", "losses": losses, "window": window})
     if system.recovery:
-        found.append({"kind": "recovery", "deliveries": system.recovery})
-    return found
+        constraints.append({"kind": "recovery", "deliveries": system.recovery})
+    return constraints
 
 
 @st.composite
@@ -73,7 +73,7 @@ def scenarios(draw: st.DrawFn, most_events: int, **fixed: Any) -> Scenario:
     return resolved.model_copy(update={"horizon_s": float(event_s[most_events]) * 0.999})
 
 
-def simulate(resolved: Scenario, wanted: Pattern) -> ContinuousRun:
+def simulate(resolved: Scenario, pattern: Pattern) -> ContinuousRun:
     """Simulate one pattern with the reference simulator; the guarantee forces deliveries."""
     known_start = resolved.network.initial_sync == "known_state"
     so_far = ""  # one letter per event: D delivered, L lost
@@ -81,7 +81,7 @@ def simulate(resolved: Scenario, wanted: Pattern) -> ContinuousRun:
     def delivered(event: int) -> bool:
         nonlocal so_far
         arrives = (event == 0 and not known_start) or not may_be_lost(resolved, so_far)
-        arrives = arrives or event >= len(wanted) or wanted[event]
+        arrives = arrives or event >= len(pattern) or pattern[event]
         so_far += "D" if arrives else "L"
         return arrives
 
@@ -99,13 +99,13 @@ def may_be_lost(resolved: Scenario, so_far: str) -> bool:
     bursts = [len(burst) for burst in so_far.split("D")]
     if bursts[-1] >= network.mansd:
         return False
-    for one in network.constraints:
-        if one.kind == "at_most":
-            recent = (so_far + "L")[-one.window :]
-            allowed = recent.count("L") <= one.losses
+    for constraint in network.constraints:
+        if constraint.kind == "at_most":
+            recent = (so_far + "L")[-constraint.window :]
+            allowed = recent.count("L") <= constraint.losses
         else:
-            since = len(so_far) - len(so_far.rstrip("D"))
-            allowed = since == 0 or "L" not in so_far or since >= one.deliveries
+            deliveries = len(so_far) - len(so_far.rstrip("D"))
+            allowed = deliveries == 0 or "L" not in so_far or deliveries >= constraint.deliveries
         if not allowed:
             return False
     return True

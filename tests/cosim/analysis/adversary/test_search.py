@@ -75,8 +75,8 @@ def test_the_pattern_is_admissible_and_has_the_reported_value(
     assert run.event_s.tolist() == list(worst.event_s)
     measure = flow_of(resolved, objective, rate_of(resolved)).measure
     assert evaluate(run, measure).value == signed(worst)
-    for other in (worst.lossless, worst.own):
-        best = signed(replace(worst, value=other))
+    for milder in (worst.lossless, worst.own):
+        best = signed(replace(worst, value=milder))
         assert best <= signed(worst) or best == pytest.approx(signed(worst), rel=1e-9)
 
 
@@ -125,11 +125,11 @@ def test_a_supremum_is_just_above_all_samples(resolved: Scenario) -> None:
         (Objective.STATE, np.linalg.norm(samples.x, axis=1)),
     ):
         measure = measure_of(run.system, objective)
-        found, scaled = evaluate(run, measure), norms / measure.level(t_s)
-        assert found.value >= scaled.max() * (1 - 1e-9)
-        assert found.value == pytest.approx(scaled.max(), rel=1e-3)
-        assert found.at_s is not None
-        assert scaled[np.abs(t_s - found.at_s).argmin()] == pytest.approx(scaled.max(), rel=1e-2)
+        valued, scaled = evaluate(run, measure), norms / measure.level(t_s)
+        assert valued.value >= scaled.max() * (1 - 1e-9)
+        assert valued.value == pytest.approx(scaled.max(), rel=1e-3)
+        assert valued.at_s is not None
+        assert scaled[np.abs(t_s - valued.at_s).argmin()] == pytest.approx(scaled.max(), rel=1e-2)
 
 
 @given(resolved=scenarios(8))
@@ -142,12 +142,12 @@ def test_cost_and_inter_event_time_are_those_of_the_run(resolved: Scenario) -> N
 
     stops = [0.0, *run.event_s[run.event_s > 0].tolist(), run.horizon_s]
     expected = sum(quad(square, a, b, epsabs=1e-13, epsrel=1e-12)[0] for a, b in pairwise(stops))
-    found = evaluate(run, measure_of(run.system, Objective.COST))
-    assert found.value == pytest.approx(expected, rel=1e-10)
-    found = evaluate(run, measure_of(run.system, Objective.INTER_EVENT))
+    valued = evaluate(run, measure_of(run.system, Objective.COST))
+    assert valued.value == pytest.approx(expected, rel=1e-10)
+    valued = evaluate(run, measure_of(run.system, Objective.INTER_EVENT))
     between_s = [b - a for a, b in pairwise(run.event_s)]
-    assert -found.value == min(between_s, default=math.inf)
-    assert (found.at_s is None) == (not between_s)
+    assert -valued.value == min(between_s, default=math.inf)
+    assert (valued.at_s is None) == (not between_s)
 
 
 # --- noack adversary ------------------------------------------------------------------------------
@@ -185,9 +185,9 @@ def test_a_bound_of_zero_is_searched(start: str) -> None:
         "plant.draw=nominal", "plant.uncertainty_A=", "plant.uncertainty_B=",
         'trigger={policy="periodic", period_s=0.1}', f"plant.initial_state={start}",
     ]  # fmt: skip
-    words = [word for one in settings if not one.endswith("=") for word in ("--set", one)]
+    words = [word for setting in settings if not setting.endswith("=") for word in ("--set", setting)]
     arguments = ["adversary", "double_integrator", "--horizon", "0.5", "--nodes", "100"]
-    done = invoke(*arguments, *words, "--json")
-    assert done.exit_code == ExitStatus.OK, done.output
-    for worst in json.loads(done.stdout)["worst"].values():
+    result = invoke(*arguments, *words, "--json")
+    assert result.exit_code == ExitStatus.OK, result.output
+    for worst in json.loads(result.stdout)["worst"].values():
         assert worst["tightness"] is None or worst["tightness"] <= 1 + 1e-9

@@ -111,23 +111,23 @@ def value_of(
 
 @pytest.mark.parametrize(
     ("policy", "mode"),
-    [*((one, "model") for one in EXAMPLES), ("decaying", "zoh"), ("mixed", "zoh")],
+    [*((followed, "model") for followed in EXAMPLES), ("decaying", "zoh"), ("mixed", "zoh")],
 )
 def test_the_search_finds_the_worst_of_all_patterns(policy: str, mode: str) -> None:
     trigger = EXAMPLES[policy] | OWN.get(policy, {})
     resolved = scenario_of(trigger, mode=mode)
-    most = max((event_steps(run(resolved, lost)[0]) for lost in ((), (True,) * 100)), key=len)
-    if len(most) > MOST_EVENTS:
-        resolved = scenario_of(trigger, mode=mode, horizon_s=most[MOST_EVENTS] * STEP_S)
+    events = max((event_steps(run(resolved, lost)[0]) for lost in ((), (True,) * 100)), key=len)
+    if len(events) > MOST_EVENTS:
+        resolved = scenario_of(trigger, mode=mode, horizon_s=events[MOST_EVENTS] * STEP_S)
     certificate = certify(resolved, conditions_of(resolved, continuous=False))
     runs = list(every_run(resolved))
     assert len(runs) > 4
     for objective in Objective:
-        expected = max(value_of(*one, objective, certificate) for one in runs)
+        expected = max(value_of(*followed, objective, certificate) for followed in runs)
         worst = find_worst(resolved, objective, beam=0)
-        found = worst.value if objective is not Objective.INTER_EVENT else -(worst.value or np.inf)
+        worst_value = worst.value if objective is not Objective.INTER_EVENT else -(worst.value or np.inf)
         assert worst.exact
-        assert found == pytest.approx(expected, rel=SURE)
+        assert worst_value == pytest.approx(expected, rel=SURE)
         assert not worst.breaches, worst
         record, delivered = run(resolved, tuple(not arrives for arrives in worst.pattern))
         assert delivered == worst.pattern, "the guarantee would have forced a delivery"
@@ -164,14 +164,14 @@ def test_a_pattern_makes_the_run_of_the_machines(sections: dict[str, Any]) -> No
     lost = tuple((np.random.default_rng(1).uniform(size=100) < 0.5).tolist())
     record, delivered = run(resolved, lost, loop.delay_ns)
     flow = SampledFlow(loop, Objective.STATE, certificate)
-    found = run_of(flow, lambda event: event >= len(delivered) or delivered[event])
+    sampled = run_of(flow, lambda event: event >= len(delivered) or delivered[event])
     rows = record["sensor_measurement"]
     expected_s = rows["t_ns"][rows["event"] >= 0] * 1e-9
     assert len(expected_s) > 4
-    assert found.event_s == pytest.approx(expected_s.tolist())
-    assert found.delivered == delivered
+    assert sampled.event_s == pytest.approx(expected_s.tolist())
+    assert sampled.delivered == delivered
     x = record["plant_step"]["x"]
-    assert found.value == pytest.approx(value_of(record, delivered, Objective.STATE, certificate))
+    assert sampled.value == pytest.approx(value_of(record, delivered, Objective.STATE, certificate))
     assert len(x) == loop.last + 1
 
 
@@ -209,15 +209,15 @@ def test_no_signs_are_worse_than_those_found(sections: dict[str, Any], objective
         causes = (push, sign * bounds.noise) if len(noise) else (sign * bounds.columns.T, noise)
         run = run_of(replace(flow, loop=flow.loop.with_causes(*causes)), lambda event: True)
         worst = max(worst, run.value)
-    found = find_worst(resolved, objective)
-    assert found.value == pytest.approx(worst, rel=1e-9)
-    assert not found.exact
+    search_result = find_worst(resolved, objective)
+    assert search_result.value == pytest.approx(worst, rel=1e-9)
+    assert not search_result.exact
 
 
 def test_causes_that_end_too_early_are_refused() -> None:
     """The core checks what Python hands to it."""
     loop = SampledLoop(scenario_of(EXAMPLES["mixed"]))
-    runs, one = loop.start(), np.ones(loop.last + 1)
+    runs, ones = loop.start(), np.ones(loop.last + 1)
     short = loop.with_causes(np.zeros((0, 2)), np.zeros((3, 2)))
     with pytest.raises(ValueError, match="do not reach"):
-        short.follow(runs, Scales(loop.weight, one, one), np.array([loop.last]))
+        short.follow(runs, Scales(loop.weight, ones, ones), np.array([loop.last]))

@@ -153,7 +153,7 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
     assert best.cost <= found.search.limit or best == given
     if best.rung >= 0:
         assert best.stability is not None
-        assert LossMargin(resolve(found.shown.scenario)).is_stable().upper < 1
+        assert LossMargin(resolve(found.shown.scenario)).coarse_bounds().upper < 1
         slower = growths(found.shown.scenario, found.shown.scenario.network.guarantee, 6)
         assert max(slower.values()) < 1
     if name != "double_integrator":
@@ -179,7 +179,7 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         maps = np.array([exact.maps(one.slot, one.losses).middle for one in bursts])
         if not more:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
-        stability = exact.is_stable(search.ladder[4].guarantee)
+        stability = exact.coarse_bounds(search.ladder[4].guarantee)
         lower = np.exp(PatternGraph(bursts).growth(quick).logarithm)
         assert lower <= stability.upper
         assert lower == pytest.approx(stability.lower, rel=2e-2)

@@ -17,10 +17,12 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
-from noack.theory.certificates import scheduled_flow
-from noack.theory.certificates.delivery_flow import UNDISTURBED, DeliveryFlow, Reach
-from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
-from noack.theory.certificates.scheduled_flow import _OpenLoopErrors, _ScheduledFlow
+from noack.theory.certificates.deliveries import scheduled_flow
+from noack.theory.certificates.deliveries.delivery_flow import NO_EFFECTS, DeliveryFlow
+from noack.theory.certificates.deliveries.delivery_reach import Reach
+from noack.theory.certificates.deliveries.inserted_bounds import _OpenLoopErrors
+from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
+from noack.theory.certificates.deliveries.scheduled_flow import _ScheduledFlow
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import bounds_of, certified_by, dominated_by_errors, search
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time
@@ -31,14 +33,14 @@ def only_the_start() -> AbstractContextManager[Any]:
     """The ellipsoid need not contain what errors drive x to."""
 
     def within(
-        ellipsoids: InvariantEllipsoids, limit: float, disturbed: Any = None, _: float = 0.0
+        ellipsoids: InvariantEllipsoids, limit: float, effects_of: Any = None, _: float = 0.0
     ) -> Reach | None:
         starts = ellipsoids._starts
         if starts is None:
             return None
         size = float(np.linalg.norm(starts.shape @ ellipsoids.flow.start))
-        by = UNDISTURBED if disturbed is None else disturbed(starts, size)
-        return Reach(starts, size, limit, by)
+        effects = NO_EFFECTS if effects_of is None else effects_of(starts, size)
+        return Reach(starts, size, limit, effects)
 
     return patch.object(InvariantEllipsoids, "within", within)
 
@@ -61,7 +63,7 @@ def no_mismatch(*, at_nodes: bool) -> AbstractContextManager[Any]:
 
 def no_age_of_inputs() -> AbstractContextManager[Any]:
     """Inputs that are held and late do not change the flow."""
-    return patch.object(_ScheduledFlow, "_disturbed", lambda *_: UNDISTURBED)
+    return patch.object(_ScheduledFlow, "_input_effects", lambda *_: NO_EFFECTS)
 
 
 def no_lost_errors() -> AbstractContextManager[Any]:

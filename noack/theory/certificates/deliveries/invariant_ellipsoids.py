@@ -1,9 +1,9 @@
 """An ellipsoid that x never leaves.
 
 Given ‖e_c‖_W ≤ D at all times, an ellipsoid ‖Λx‖ ≤ 1 is found that x never leaves, by the flow
-between two deliveries (:mod:`noack.theory.certificates.delivery_flow`). It bounds x and E x, and the
-flow from it bounds K e_c. Λ comes from a Lyapunov equation with three parameters. They are chosen by
-samples; what they give is checked with all enclosures.
+between two deliveries (``delivery_reach.py``). It bounds x and E x, and the flow from it bounds K
+e_c. Λ comes from a Lyapunov equation with three parameters. They are chosen by samples; what they
+give is checked with all enclosures.
 """
 
 import contextlib
@@ -19,14 +19,13 @@ from noack.core.linear_systems import Matrix, Vector, solve_lyapunov, spectral_a
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.certificates.delivery_flow import (
+from noack.theory.certificates.deliveries.delivery_flow import (
+    NO_EFFECTS,
     ROUNDING,
-    UNDISTURBED,
     DeliveryFlow,
-    Disturbed,
-    Reach,
-    Starts,
+    InputEffects,
 )
+from noack.theory.certificates.deliveries.delivery_reach import Reach, Starts
 
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 _WIDE_MARGINS = (1.0, 1.15, 1.4, 1.8, 2.5, 3.5)
@@ -59,14 +58,14 @@ class InvariantEllipsoids:
     def within(
         self,
         limit: float,
-        disturbed: Callable[[Starts, float], Disturbed] | None = None,
+        effects_of: Callable[[Starts, float], InputEffects] | None = None,
         start_s: float = 0.0,
     ) -> Reach | None:
         """Return the flow from an ellipsoid for these bounds; None if none is found.
 
         Args:
             limit: D.
-            disturbed: returns by how much delay and hold change the flow as long as ‖ΛWx‖ ≤ c.
+            effects_of: returns how much delay and hold change the flow as long as ‖ΛWx‖ ≤ c.
             start_s: until then the input is 0.
         """
         starts = self._starts
@@ -75,17 +74,17 @@ class InvariantEllipsoids:
         (size,) = self._sizes(starts.inverse[None], limit)
         if start_s > 0:
             drift = self.plant.A + self.plant.alpha_per_s * np.eye(self.flow.n)
-            begun = response_until(drift, self.plant.start, start_s)
-            size = max(size, float(begun.through(starts.shape @ self.flow.weight).sup_on_grid()))
+            responses = response_until(drift, self.plant.start, start_s)
+            size = max(size, float(responses.through(starts.shape @ self.flow.weight).sup_on_grid()))
         if self._first:  # the first delivery
             Y = np.hstack([starts.shape, np.zeros_like(starts.shape)])
             size = max(size, self.flow.from_start(Y, limit, self._first))
         if not 0 < size < math.inf:
             return None
-        for margin in _MARGINS if disturbed is None else _WIDE_MARGINS:
-            by = UNDISTURBED if disturbed is None else disturbed(starts, float(size * margin))
-            for share in (1.0,) if disturbed is None else _FOLLOWED:
-                reach = Reach(starts, float(size * margin), limit, by, share, self._first)
+        for margin in _MARGINS if effects_of is None else _WIDE_MARGINS:
+            effects = NO_EFFECTS if effects_of is None else effects_of(starts, float(size * margin))
+            for share in (1.0,) if effects_of is None else _FOLLOWED:
+                reach = Reach(starts, float(size * margin), limit, effects, share, self._first)
                 if reach.is_invariant():
                     return reach
         return None
@@ -104,14 +103,14 @@ class InvariantEllipsoids:
     def _starts(self) -> Starts | None:
         """Λ for a small bound of ‖x‖: a pattern search over its three parameters."""
         with np.errstate(all="ignore"):
-            tried = np.array(_STARTS)
-            merits = self._merits(tried)
-            best, merit = tried[merits.argmin()], merits.min()
+            candidates = np.array(_STARTS)
+            merits = self._merits(candidates)
+            best, merit = candidates[merits.argmin()], merits.min()
             for width in _WIDTHS:
-                tried = best + width * _DIRECTIONS
-                merits = self._merits(tried)
+                candidates = best + width * _DIRECTIONS
+                merits = self._merits(candidates)
                 if merits.min() < merit:
-                    best, merit = tried[merits.argmin()], merits.min()
+                    best, merit = candidates[merits.argmin()], merits.min()
             (factor,) = self._factors(best[None])
         return Starts(self.flow, np.linalg.inv(factor)) if math.isfinite(merit) else None
 
@@ -194,25 +193,27 @@ class InvariantEllipsoids:
                 self._nodes[:, n:] @ factors[:, None] / limit,
             )
         )
-        first = self.flow.start[:, 0] if not self._first else self.flow.begun[0][self._first, :n]
-        largest = np.linalg.norm(shapes @ first, axis=1) ** 2 * ROUNDING
-        which, nodes = np.nonzero(np.linalg.eigvalsh(image)[..., -1] >= 1)
-        if len(which):
-            image, error = image[which, nodes], error[which, nodes]
-            squares, best = _squares(image, error, np.tile(_COARSE, (len(which), 1)))
-            order = np.lexsort((-squares, which))  # the largest of each candidate first
-            rank = np.arange(len(which)) - np.searchsorted(which[order], which[order])
+        first_state = (
+            self.flow.start[:, 0] if not self._first else self.flow.start_response[0][self._first, :n]
+        )
+        largest = np.linalg.norm(shapes @ first_state, axis=1) ** 2 * ROUNDING
+        candidates, nodes = np.nonzero(np.linalg.eigvalsh(image)[..., -1] >= 1)
+        if len(candidates):
+            image, error = image[candidates, nodes], error[candidates, nodes]
+            squares, best = _squares(image, error, np.tile(_COARSE, (len(candidates), 1)))
+            order = np.lexsort((-squares, candidates))  # the largest of each candidate first
+            rank = np.arange(len(candidates)) - np.searchsorted(candidates[order], candidates[order])
             last = order[rank < _CRITICAL]
             squares, _ = _squares(image[last], error[last], best[last, None] * _FINE)
-            np.maximum.at(largest, which[last], squares)
+            np.maximum.at(largest, candidates[last], squares)
         return np.asarray(np.sqrt(largest))
 
 
 def _squares(image: Stack, error: Stack, multipliers: Matrix) -> tuple[Vector, Vector]:
     """Return the smallest c² over the multipliers, (k, j), and its multiplier, for k nodes."""
     forms = image[:, None] - multipliers[..., None, None] * error[:, None]
-    left = np.linalg.eigvalsh(forms)[..., -1]
-    squares = np.where(left < 1, multipliers / (1 - left.clip(min=0.0)), np.inf)
+    largest_values = np.linalg.eigvalsh(forms)[..., -1]
+    squares = np.where(largest_values < 1, multipliers / (1 - largest_values.clip(min=0.0)), np.inf)
     best = squares.argmin(axis=1)
     rows = np.arange(len(squares))
     return squares[rows, best], multipliers[rows, best]

@@ -1,0 +1,23 @@
+"""From delivery to delivery: bounds that use that all follows from x at the last delivery.
+
+``inequalities.py`` adds the errors of missing events as if each had a direction of its own. But
+from one delivery to the next, x and e_c follow a linear system from one state: x at the delivery.
+Two lines of argument use this. Both are for one known plant without disturbances.
+
+An ellipsoid that x never leaves sharpens the constants of the inequalities:
+
+1. ``delivery_flow.py``. The system, e^{Fτ} at the nodes of a grid, and what delayed and held inputs
+   change of it.
+2. ``delivery_reach.py``. Bounds of x and e_c for all states of an ellipsoid at the delivery. If
+   they lead back into the ellipsoid until the next one, x never leaves it.
+3. ``invariant_ellipsoids.py``. The search for such an ellipsoid that is small.
+4. ``lost_events.py``. Bounds of e_c after 0, 1, … lost events, and the time until the next event.
+5. ``inserted_bounds.py``. The inequalities, into which any bound that holds is inserted.
+6. ``scheduled_flow.py``. All of these in turns, until the bounds have settled. Tests may be
+   sampled, updates delayed, and inputs held.
+
+If events are due at finitely many times, x is followed from one delivery to the next by balls:
+
+7. ``delivery_gaps.py``. What one gap between two deliveries makes of a ball.
+8. ``due_deliveries.py``. The balls from x(0) on, until all later bounds are smaller.
+"""

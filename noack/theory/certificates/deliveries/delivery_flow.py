@@ -1,0 +1,175 @@
+"""The flow between two deliveries: how x and e_c develop until the next one.
+
+From one delivery to the next no update reaches the controller. So z = (x, e_c) follows a linear
+system without an input, from (ξ, 0) with the state ξ at the delivery:
+
+    x' = (A + BK + αI) x + BK e_c,    e_c' = −E x + (H − BK + αI) e_c,    z(τ) = e^{Fτ} (ξ, 0)
+
+:class:`DeliveryFlow` has e^{Fτ} at the nodes of a grid, in coordinates in which W is the identity.
+Between two nodes the bounds are those of :mod:`noack.theory.bounds.enclosure`.
+
+**Delayed and held inputs.** If inputs are delayed or held, z begins with an e_c that is not 0, and
+the age of inputs drives it; :class:`InputEffects` bounds both. What they change is added to the
+bounds.
+
+``delivery_reach.py`` bounds z for all states ξ of an ellipsoid, ``lost_events.py`` bounds e_c after
+lost events.
+"""
+
+import math
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
+from noack.theory.bounds.contraction import Stack, logarithmic_norm, spectral_norms
+from noack.theory.bounds.gains import Output, PlantGains
+
+_CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
+_MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000
+TAYLOR_TERMS = 4
+"""Terms by which a second derivative over a cell is bounded."""
+ROUNDING = 1 + 1e-5
+"""Exceeds the error of e^{Fτ}: measured below 1e-12 of its norm, which is up to 1e6; no proof."""
+
+
+class InputEffects(NamedTuple):
+    """How much inputs that are held and late change the flow from the moment an update acts."""
+
+    held: float = 0.0
+    """Bound of ‖q‖, p = K e_c + q."""
+    late: float = 0.0
+    """Bound of ‖e_c‖_W when an update acts."""
+    late_s: float = 0.0
+    """The largest time from an event until its update acts."""
+
+    @property
+    def is_none(self) -> bool:
+        """Whether they change nothing."""
+        return self.held == 0 and self.late == 0
+
+    def sizes(self, unit_effects: tuple[Vector, Vector]) -> Vector:
+        """Return by how much an output can differ, over each cell, (k,)."""
+        late, pushed = unit_effects
+        return self.late * late + self.held * pushed
+
+
+NO_EFFECTS = InputEffects()
+"""Inputs are neither delayed nor held."""
+
+
+class DeliveryFlow:
+    """e^{Fτ} (ξ, 0) at the nodes of a grid, for a known plant; W is the identity."""
+
+    def __init__(self, plant: PlantGains) -> None:
+        self.error = error = plant.error
+        self.weight, self.inverse = error.weight, error.inverse_weight
+        self.n = len(error.H)
+        self.closed_loop = self.transformed(plant.closed_loop)
+        self.BK = self.transformed(plant.B @ error.K)
+        self.H = self.transformed(error.scaled_H)
+        self.mismatch = E = self.closed_loop - self.H
+        self.generator = np.block([[self.closed_loop, self.BK], [-E, self.H - self.BK]])
+        self.start = self.weight @ plant.start
+        self.stretch = float(error.kernels[Output.WEIGHTED].sup())
+        self.input_error = self.weight @ plant.input_matrix
+        self.gain = error.split_K[1] @ self.inverse
+        self.edges_s, self._propagators = self._grid()
+        self.states = np.ascontiguousarray(self._propagators[:, :, : self.n])
+
+    def _grid(self) -> tuple[Vector, Stack]:
+        """Return the nodes τ, (k + 1,), and e^{Fτ} at them; steps become longer with τ.
+
+        The last node is where the models have decayed, or the flow has grown too much.
+        """
+        fastest = max(float(np.abs(np.linalg.eigvals(self.generator)).max()), 1e-9)
+        slowest, unstable = -spectral_abscissa(self.H), spectral_abscissa(self.generator)
+        step_s, t_s, state = _FIRST_STEP / fastest, 0.0, np.eye(2 * self.n)
+        leap = exponential(self.generator * step_s)
+        edges, states = [t_s], [state]
+        for cell in range(1, _MOST_CELLS):
+            t_s, state = t_s + step_s, leap @ state
+            edges.append(t_s)
+            states.append(state)
+            grown = np.linalg.norm(state[:, : self.n])
+            if grown > _MOST_GROWTH or math.exp(-slowest * t_s) < _SETTLED:
+                break
+            if cell % _CELLS_PER_STEP == 0 and 2 * step_s * unstable < _MOST_STEP:
+                step_s, leap = 2 * step_s, leap @ leap
+        return np.array(edges), np.array(states)
+
+    @cached_property
+    def start_response(self) -> tuple[Matrix, Vector]:
+        """e^{Fτ} (x(0), 0) at the nodes, (k + 1, 2n), and bounds of its second derivative, (k,)."""
+        z, steps_s, F = self.states @ self.start[:, 0], np.diff(self.edges_s), self.generator
+        term, bends = z[:-1] @ (F @ F).T, np.zeros(len(steps_s))
+        for order in range(1, TAYLOR_TERMS + 1):
+            bends += np.linalg.norm(term, axis=1)
+            term = term @ F.T * (steps_s / order)[:, None]
+        with np.errstate(over="ignore"):
+            growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s)
+        return z, bends + growth * np.linalg.norm(term, axis=1)
+
+    def from_start(self, C: Matrix, limit: float, first_cell: int = 0) -> float:
+        """Bound ‖C z‖ from a cell after the start on, until the first delivery, if ‖e_c‖_W ≤ D.
+
+        z is at most as large as that of x(0), and small enough for D at all earlier times.
+        """
+        z, bends = self.start_response
+        errors = np.maximum.accumulate(np.linalg.norm(z[:-1, self.n :], axis=1))
+        shares = limit / np.maximum(errors, limit)
+        sizes = np.linalg.norm(z @ C.T, axis=1)
+        sags = np.diff(self.edges_s) ** 2 / 8 * bends * float(np.linalg.norm(C, 2))
+        cells = shares * (np.maximum(sizes[1:], sizes[:-1]) + sags)
+        return float(cells[first_cell:].max()) * ROUNDING
+
+    def first_event(self, level: float) -> int:
+        """Return the first cell in which ‖e_s‖_W can reach a level after the start."""
+        z, bends = self.start_response
+        sizes = np.linalg.norm(z[:, self.n :], axis=1)
+        highest = np.maximum(sizes[1:], sizes[:-1]) + np.diff(self.edges_s) ** 2 / 8 * bends
+        return int(np.argmax(np.append(highest[:-1] * ROUNDING >= level, True)))
+
+    def cell_at(self, time_s: float) -> int:
+        """Return the cell that contains a time."""
+        return max(int(self.edges_s[1:-1].searchsorted(time_s)), 0)
+
+    @cached_property
+    def _entered(self) -> tuple[Stack, Stack, Vector]:
+        """e^{Fτ} (0, I) and e^{Fτ} (BU, −BU) at the nodes, and step²/8 · ‖F‖² e^{‖F‖ step}."""
+        pushed = self._propagators @ np.vstack([self.input_error, -self.input_error])
+        turns = np.diff(self.edges_s) * float(np.linalg.norm(self.generator, 2))
+        return self._propagators[:, :, self.n :], pushed, turns**2 / 8 * np.exp(turns)
+
+    def unit_effects(self, C: Matrix) -> tuple[Vector, Vector]:
+        """Bound sup ‖C e^{Fτ} (0, I)‖ over each cell, and ∫₀^τ ‖C e^{Fs} (BU, −BU)‖ ds, (k,)."""
+        late, pushed, bends = self._entered
+        size, sizes = float(np.linalg.norm(C, 2)), []
+        for stack in (late, pushed):
+            ends = spectral_norms(C @ stack)
+            sags = bends * size * np.linalg.norm(stack[:-1], axis=(1, 2))
+            sizes.append((np.maximum(ends[1:], ends[:-1]) + sags) * ROUNDING)
+        return sizes[0], np.cumsum(sizes[1] * np.diff(self.edges_s))
+
+    @cached_property
+    def error_effects(self) -> tuple[Vector, Vector]:
+        """The same for C = (0, I)."""
+        return self.unit_effects(np.eye(2 * self.n)[self.n :])
+
+    def transformed(self, matrix: Matrix) -> Matrix:
+        """Return a matrix of the system in the coordinates W x."""
+        return np.asarray(self.weight @ matrix @ self.inverse)
+
+
+def bend_rows(flow: DeliveryFlow) -> Matrix:
+    """Return the matrix of the part of e_s'' that follows from z."""
+    n, F, H = flow.n, flow.generator, flow.H
+    return np.asarray((F @ F)[n:] - np.hstack([np.zeros((n, n)), H @ H]))
+
+
+def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
+    """Return C_r: e_s a time after an event is C_r z."""
+    rows = np.asarray(exponential(flow.generator * time_s)[flow.n :])
+    rows[:, flow.n :] -= exponential(flow.H * time_s)
+    return rows

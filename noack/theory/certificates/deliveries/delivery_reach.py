@@ -1,0 +1,453 @@
+"""What x and e_c can be after a delivery, for all states ξ of an ellipsoid.
+
+All that is uncertain of the flow (``delivery_flow.py``) is ξ, and the time of the next delivery.
+Let ‖Λξ‖ ≤ 1 and ‖e_c‖_W ≤ D at all times. At the time τ, ξ has ‖Λξ‖ ≤ 1 and ‖Nξ‖_W ≤ D, N the rows
+of e_c in e^{Fs} (I, 0) for an s ≤ τ. So ξ is in the ellipsoid λ‖Λξ‖² + (1 − λ)‖Nξ‖²/D² ≤ 1, for
+each λ in [0, 1]. So ‖C z(τ)‖ is at most the norm of C e^{Fτ} on this ellipsoid, and the λ with the
+smallest is used. If no ‖Λx(τ)‖ found in this way exceeds 1, ‖Λx‖ ≤ 1 holds at the next delivery,
+whenever it happens, and by induction at all times: the set ‖Λx‖ ≤ 1 is invariant.
+
+Over a cell of the grid, s is the left node. From the last node T on, x + e_c = e^{Hτ} ξ has
+decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D and ‖Λx‖ ≤ 1. If inputs
+are delayed or held, the flow is followed until what they change is a share of D.
+
+Where bounds are largest, the conditions of several earlier times are used together
+(:func:`largest_outputs`). Up to the first event after the start x is known, so if inputs are
+neither delayed nor held, the ellipsoid need only contain x at the first delivery after it.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.core.linear_systems import Matrix, Vector, exponential
+from noack.theory.bounds.contraction import (
+    Stack,
+    largest_eigenvalues,
+    logarithmic_norm,
+    product,
+    spectral_norm,
+    spectral_norms,
+)
+from noack.theory.bounds.enclosure import response
+from noack.theory.bounds.gains import Output
+from noack.theory.certificates.deliveries.delivery_flow import (
+    NO_EFFECTS,
+    ROUNDING,
+    TAYLOR_TERMS,
+    DeliveryFlow,
+    InputEffects,
+)
+
+_LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), 40.0)
+_ALONE = 40.0
+"""λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
+_NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
+_AT_ONCE, _MOST_JOINT = 16, 3
+_SHARES = np.array(
+    [
+        (first, (1 - first) * (1 - last), (1 - first) * last, 0.0)
+        for first in (0.01, 0.03, 0.1, 0.3)
+        for last in (0.1, 0.3, 0.5, 0.7, 0.9)
+    ]
+    + [
+        (0.0, (1 - of_x) * (1 - last), (1 - of_x) * last, of_x)
+        for of_x in (0.5, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.985)
+        for last in (0.4, 0.55, 0.7)
+    ]
+)
+"""Of ‖x_c‖, of ‖e_c‖ at both ends, and of ‖Λx‖, after the last node: the first to be tried."""
+_WINDOWS = (1 / 6, 1 / 3, 2 / 3, 0.9, 1.0)
+"""T' as shares of the last node."""
+_EARLIER = 8
+"""Earlier times whose conditions are used together."""
+_FOUR = [0, 1, 2 * _EARLIER + 1, 2]
+_OTHERS = 0.1
+"""Their share at first, beside the best two."""
+_HALVINGS = 12
+_ROUNDS, _POWER, _LEAST_WEIGHT, _NEARLY = 40, 0.3, 1e-9, 0.97
+_CONDITION = 1e-10
+"""Smallest over largest eigenvalue of a sum of forms that is used."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """The states ξ at a delivery with ‖Λ W ξ‖ ≤ 1."""
+
+    flow: DeliveryFlow
+    shape: Matrix
+    """Λ, (n, n), invertible."""
+
+    @cached_property
+    def inverse(self) -> Matrix:
+        """Λ⁻¹."""
+        return np.asarray(np.linalg.inv(self.shape))
+
+    @cached_property
+    def axes(self) -> tuple[Vector, Stack]:
+        """The singular values of N Λ⁻¹ at the left nodes, and Λ⁻¹ V."""
+        _, singular, Vt = np.linalg.svd(self.flow.states[:-1, self.flow.n :] @ self.inverse)
+        return singular, self.inverse @ Vt.transpose(0, 2, 1)
+
+    @cached_property
+    def cell_terms(self) -> tuple[Matrix, Matrix, Vector]:
+        """What bounds of z over the cells need, on the axes of their ellipsoids.
+
+        e^{Fτ} at both nodes of each cell, Taylor's terms of F² e^{Fτ}, both as columns; and bounds
+        of the terms' remainder.
+        """
+        flow, axes = self.flow, self.axes[1]
+        F, steps_s = flow.generator, np.diff(flow.edges_s)
+        ends = [flow.states[:-1] @ axes, flow.states[1:] @ axes]
+        terms = [product(F @ F, ends[0])]
+        for order in range(1, TAYLOR_TERMS + 1):
+            terms.append(product(F, terms[-1]) * (steps_s / order)[:, None, None])
+        with np.errstate(over="ignore"):
+            growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s)
+        remainder = growth[:, None] * np.linalg.norm(terms[-1], axis=1)
+        return _columns(ends), _columns(terms[:-1]), remainder
+
+    @cached_property
+    def state_bounds(self) -> "_CellBounds":
+        """Bounds of Λx."""
+        return _CellBounds(self, np.hstack([self.shape, np.zeros_like(self.shape)]))
+
+    @cached_property
+    def model_sups(self) -> Mapping[Output, float]:
+        """The largest ‖C e^{(H+αI)τ} ξ‖ for all τ and all these ξ, of every output C of e_c."""
+        error = self.flow.error
+        responses = response(error.scaled_H, error.inverse_weight @ self.inverse)
+        return {C: float(k.sup()) for C, k in responses.through_each(error.stacked).items()}
+
+    @cached_property
+    def drive_limit(self) -> tuple[float, Vector, "_CellBounds"]:
+        """The largest ‖p‖ that does not drive ‖Λx‖ beyond 1, ‖K e_c‖ over the cells, its bounds.
+
+        On ‖y‖ = 1, y = Λx, d‖y‖/dt ≤ yᵀSy + yᵀΛBU p, and yᵀΛBU p ≤ ‖p‖ (γ/2 + ‖(ΛBU)ᵀy‖²/2γ).
+        """
+        flow = self.flow
+        S = self.shape @ flow.closed_loop @ self.inverse
+        pushed = self.shape @ flow.input_error
+        squares, largest = pushed @ pushed.T / 2, 0.0
+        size = float(np.linalg.norm(pushed, 2))
+        for gamma in size * np.exp(np.linspace(-4.0, 0.0, 17)) if size else ():
+            low, high = 0.0, -2 * float(logarithmic_norm(S)) / gamma
+            for _ in range(_HALVINGS if high > 0 else 0):
+                middle = (low + high) / 2
+                grown = float(logarithmic_norm(S + middle / gamma * squares)) + middle * gamma / 2
+                low, high = (middle, high) if grown < 0 else (low, middle)
+            largest = max(largest, low)
+        bounds = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
+        return largest, bounds.loose(np.ones(1), np.array([_ALONE]))[:, 0], bounds
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What z can be at some time after a delivery: ‖ΛWξ‖ ≤ c at the delivery, ‖e_c‖_W ≤ D since."""
+
+    starts: Starts
+    size: float
+    """c."""
+    limit: float
+    """D."""
+    effects: InputEffects = NO_EFFECTS
+    followed_share: float = 1.0
+    """e_c is followed until delay and hold may have changed it by this share of D."""
+    first_cell: int = 0
+    """‖ΛWξ‖ ≤ c from this cell after the start on; before, x is that of the start."""
+
+    def sup(self, C: Matrix) -> float:
+        """Bound ‖C z‖ at all times, for C of shape (q, 2n)."""
+        return max(self._sup(_CellBounds(self.starts, C), 0), self._from_start(C))
+
+    def sup_state(self, C: Matrix) -> float:
+        """Bound ‖C W x‖ at all times, for C of shape (q, n)."""
+        size = self.size * float(spectral_norm(C @ self.starts.inverse)) * ROUNDING
+        return max(size, self._from_start(np.hstack([C, np.zeros_like(C)])))
+
+    def _from_start(self, C: Matrix) -> float:
+        return self.starts.flow.from_start(C, self.limit) if self.first_cell else 0.0
+
+    def largest(self, since_s: float = 0.0) -> float:
+        """Bound ‖ΛWx‖ from a time after the start on."""
+        if not self.first_cell:
+            return self.size
+        flow, C = self.starts.flow, self.starts.state_bounds.C
+        return max(self.size, flow.from_start(C, self.limit, flow.cell_at(since_s)))
+
+    def is_invariant(self) -> bool:
+        """Return whether ‖Λx‖ ≤ c at a delivery implies the same at all times until the next.
+
+        It cannot be left while ‖K e_c + q‖ is below :attr:`Starts.drive_limit`.
+        """
+        largest, driven, bounds = self.starts.drive_limit
+        driven = driven + (self._changes(bounds) + self.effects.held) / self.size
+        first_cell = int(np.argmax(np.append(driven, np.inf) * ROUNDING >= largest))
+        return self._sup(self.starts.state_bounds, first_cell) <= self.size
+
+    def _changes(self, bounds: "_CellBounds") -> Vector:
+        """Bound what delay and hold change of C z over the cells, (k,)."""
+        return self.effects.sizes(bounds.unit_effects) if not self.effects.is_none else np.zeros(bounds.cells)
+
+    @cached_property
+    def _errors(self) -> Vector:
+        """The same of e_c."""
+        flow = self.starts.flow
+        return (
+            self.effects.sizes(flow.error_effects)
+            if not self.effects.is_none
+            else np.zeros(len(flow.edges_s) - 1)
+        )
+
+    @cached_property
+    def _levels(self) -> Vector:
+        """Bounds of ‖ΛWx‖ over the cells, for c = 1."""
+        return 1 + self._changes(self.starts.state_bounds) / self.size
+
+    @cached_property
+    def _cells(self) -> int:
+        """The cells that are followed."""
+        return int(np.argmax(np.append(self._errors, np.inf) > self.followed_share * self.limit))
+
+    def _sup(self, bounds: "_CellBounds", first_cell: int) -> float:
+        # All is in proportion to c, for D/c.
+        limits, changes = self.limit + self._errors, self._changes(bounds)
+        cells = slice(first_cell, self._cells)
+        after = self._afterwards(bounds)
+        followed = bounds.sup(limits / self.size, self._levels, changes / self.size, cells, after)
+        return float(self.size * max(followed, after))
+
+    def _afterwards(self, bounds: "_CellBounds") -> float:
+        """Bound ‖C z‖ after the last node that is followed, for c = 1."""
+        changes = np.zeros(bounds.cells)
+        if not self.effects.is_none:
+            held = self.effects._replace(late=0.0)
+            changes = held.sizes(bounds.unit_effects)
+        by_window = []
+        for cell, moved, forms, roots in self._windows:
+            sizes = spectral_norms(bounds.C @ moved @ roots)
+            first_weights = np.full((1, len(forms)), _OTHERS / len(forms))
+            first_weights[0, _FOUR] += (1 - _OTHERS) * _SHARES[int(sizes.argmin())]
+            largest, _ = largest_outputs(forms[None], (bounds.C @ moved)[None], 0.0, first_weights)
+            size = min(float(sizes.min()) * ROUNDING, float(largest[0]))
+            by_window.append(size + float(changes[cell]) / self.size)
+        return min(by_window)
+
+    @cached_property
+    def _windows(self) -> list[tuple[int, Matrix, Stack, Stack]]:
+        """What holds of z a time T' ago, after the last node that is followed, for each T'.
+
+        T' as a cell, the flow in it, forms that are at most 1, all for c = 1 and in (x_c, e_c):
+        ‖x_c‖ ≤ h, and ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1 at several times; semi-axes for some of their sums.
+        """
+        flow, n, shape, windows = self.starts.flow, self.starts.flow.n, self.starts.shape, []
+        last_s, limit, identity = float(flow.edges_s[self._cells]), self.limit / self.size, np.eye(n)
+        # By how much held inputs change ‖e_c‖, and the bound of ‖Λx‖, over each cell.
+        errors = np.zeros(len(flow.edges_s) - 1)
+        levels = np.ones(len(errors))
+        if not self.effects.is_none:
+            held = self.effects._replace(late=0.0)
+            errors = held.sizes(flow.error_effects) / self.size
+            levels = levels + held.sizes(self.starts.state_bounds.unit_effects) / self.size
+        for share in _WINDOWS:
+            # h bounds x_c = x + e_c, which follows the model, at the node T' ago.
+            node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
+            since_s = last_s - float(flow.edges_s[node])
+            x_c = flow.states[node, :n] + flow.states[node, n:]
+            h = float(np.linalg.norm(x_c @ self.starts.inverse, 2))
+            h = h + float(np.linalg.norm(x_c, 2)) * self.effects.late / self.size
+            if self.first_cell:
+                h = max(h, float(np.linalg.norm(x_c @ flow.start)) / self.size)
+            # The conditions at times from T' ago until now, as rows for (x_c, e_c) T' ago.
+            level = 1.0 if node >= self.first_cell else self.largest() / self.size
+            rows = [np.hstack([identity, np.zeros((n, n))]) / (flow.stretch * h)]
+            moved = np.block([[identity, -identity], [np.zeros((n, n)), identity]])
+            step = exponential(flow.generator * (since_s / _EARLIER))
+            for number in range(_EARLIER + 1):
+                cell = flow.cell_at(number * since_s / _EARLIER) if number else 0
+                added = (errors[cell], levels[cell] - 1) if number else (0.0, 0.0)
+                rows.append(moved[n:] / (limit + added[0]))
+                if number < _EARLIER:
+                    rows.append(shape @ moved[:n] / (level + added[1]))
+                    moved = step @ moved
+            # Semi-axes of the ellipsoids of the first weights, in balanced coordinates.
+            turn = _balancing_coordinates(np.array(rows)[None])[0]
+            balanced = np.array(rows) @ turn
+            forms = balanced.swapaxes(-1, -2) @ balanced
+            values, V = np.linalg.eigh(np.tensordot(_SHARES, forms[_FOUR], axes=1))
+            usable = values[:, :1] > _CONDITION * values[:, -1:]  # others are too flat
+            roots = V / np.sqrt(np.where(usable, values, _CONDITION))[:, None]
+            windows.append((flow.cell_at(since_s), moved @ turn, forms, roots))
+        return windows
+
+
+class _CellBounds:
+    """Bounds of ‖C z‖ over each cell, for ‖Λξ‖ ≤ 1."""
+
+    def __init__(self, starts: Starts, C: Matrix) -> None:
+        self.C, self._singular, self._flow, self._starts = C, starts.axes[0], starts.flow, starts
+        self.cells, n = self._singular.shape
+        cells = self.cells
+        ends, terms, remainder = starts.cell_terms
+        self._ends = (C @ ends).reshape(len(C), 2, cells, n)
+        bend_terms = (C @ terms).reshape(len(C), TAYLOR_TERMS, cells, n)
+        self._squares = np.concatenate(
+            [
+                np.einsum("qokj->kjo", self._ends**2),
+                np.einsum("qokj->kjo", bend_terms**2),
+                (np.linalg.norm(C, 2) * remainder)[..., None] ** 2,
+            ],
+            axis=2,
+        )
+        """(k, n, 7): of both ends, and of the terms that bound ‖C F² e^{Fτ}‖, for each axis."""
+        self._sags_s2 = np.diff(starts.flow.edges_s) ** 2 / 8
+
+    @cached_property
+    def unit_effects(self) -> tuple[Vector, Vector]:
+        """See :meth:`DeliveryFlow.unit_effects`."""
+        return self._flow.unit_effects(self.C)
+
+    def sup(
+        self, limits: Vector, levels: Vector, added: Vector, followed_cells: slice, enough: float
+    ) -> float:
+        """Bound ‖C z‖ over some cells, given D and ‖Λx‖ for each, with what is added to each, (k,).
+
+        A bound below ``enough`` is not improved.
+        """
+        loose = self.loose(limits, _LOGITS)
+        if not np.isfinite(loose).all():
+            return math.inf
+        highest, logits = loose.min(axis=1) + added, _LOGITS[loose.argmin(axis=1)]
+        highest[: followed_cells.start] = 0.0
+        highest[followed_cells.stop :] = 0.0
+        rounds, joint = np.zeros(len(highest), dtype=np.int64), 0
+        while True:  # the highest bounds become better, until that of the highest is settled
+            cells = np.argsort(highest)[-_AT_ONCE:]
+            is_last = rounds[cells[-1]] > len(_WIDTHS) or joint == _MOST_JOINT
+            if is_last or highest[cells[-1]] * ROUNDING <= enough:
+                return float(highest[cells[-1]]) * ROUNDING
+            settled = cells[rounds[cells] == len(_WIDTHS)]
+            if len(settled):
+                values = self._joint(limits, levels, settled, logits[settled, None])
+                highest[settled] = np.minimum(highest[settled], values + added[settled])
+                rounds[settled], joint = rounds[settled] + 1, joint + 1
+                continue
+            cells = cells[rounds[cells] < len(_WIDTHS)]
+            candidates = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
+            values = self._tight(limits, cells, candidates)
+            index = values.argmin(axis=1)
+            logits[cells] = candidates[np.arange(len(cells)), index]
+            highest[cells] = np.minimum(highest[cells], values.min(axis=1) + added[cells])
+            rounds[cells] += 1
+
+    def loose(self, limits: Vector, logits: Vector) -> Stack:
+        """Return bounds in the Frobenius norm, for every λ, (k, j)."""
+        singular = self._singular / limits[:, None]
+        sizes = np.sqrt(_semi_axes(singular, logits) ** 2 @ self._squares)
+        return np.asarray(sizes[..., :2].max(axis=2) + self._sags_s2[:, None] * sizes[..., 2:].sum(axis=2))
+
+    def _tight(self, limits: Vector, cells: NDArray[np.int64], logits: Stack) -> Stack:
+        """Return bounds in the spectral norm for some cells, each with its own λ, (k, j)."""
+        ends = self._ends[:, :, cells]
+        d = _semi_axes(self._singular[cells] / limits[cells, None], logits)
+        grams = np.einsum("qoki,qokj->koij", ends, ends)[:, None]
+        scaled = grams * d[:, :, None, :, None] * d[:, :, None, None, :]
+        sizes = largest_eigenvalues(scaled.reshape(-1, *scaled.shape[-2:])).clip(min=0.0)
+        bends = np.sqrt(d**2 @ self._squares[cells, :, 2:]).sum(axis=2)
+        ends = np.sqrt(sizes.reshape(scaled.shape[:-2])).max(axis=2)
+        return np.asarray(ends + self._sags_s2[cells, None] * bends)
+
+    def _joint(self, limits: Vector, levels: Vector, cells: NDArray[np.int64], logits: Stack) -> Vector:
+        """Return bounds by all conditions at several earlier nodes, (k,); the bends are as above."""
+        flow, n = self._flow, self._flow.n
+        times_s = flow.edges_s[cells, None] * (np.arange(1, _EARLIER + 1) / _EARLIER)
+        nodes = np.minimum(flow.edges_s.searchsorted(times_s, side="right") - 1, cells[:, None])
+        states, shape = flow.states[nodes], self._starts.shape
+        rows = np.concatenate(
+            [
+                np.broadcast_to(shape, (len(cells), 1, n, n)),
+                states[:, :, n:] / limits[nodes][..., None, None],
+                shape @ states[:, :, :n] / levels[nodes][..., None, None],
+            ],
+            axis=1,
+        )
+        share = 1 / (1 + np.exp(-logits[:, 0]))
+        first_weights = np.full(rows.shape[:2], _OTHERS / rows.shape[1])
+        first_weights[:, 0] += (1 - _OTHERS) * share
+        first_weights[:, _EARLIER] += (1 - _OTHERS) * (1 - share)
+        turn = _balancing_coordinates(rows * np.sqrt(first_weights)[..., None, None])
+        rows = rows @ turn[:, None]
+        forms = rows.swapaxes(-1, -2) @ rows
+        ends = self.C @ np.array([flow.states[cells], flow.states[cells + 1]]) @ turn
+        bounds, weights = largest_outputs(forms, ends[1], 0.0, first_weights, improve_all=True)
+        inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
+        sizes = np.linalg.eigvalsh(ends @ inverse @ ends.swapaxes(-1, -2))[..., -1].max(axis=0)
+        sizes = np.where(np.isfinite(bounds), sizes.clip(min=0.0), np.inf)
+        d = _semi_axes(self._singular[cells] / limits[cells, None], logits)
+        bends = np.sqrt(d**2 @ self._squares[cells, :, 2:]).sum(axis=2)[:, 0]
+        return np.asarray(np.sqrt(sizes) + self._sags_s2[cells] * bends)
+
+
+def _semi_axes(singular: Vector, logits: Vector) -> Stack:
+    """Return those of the ellipsoids of cells with λ = 1/(1 + e^{−logit}), (k, j, n)."""
+    share = 1 / (1 + np.exp(-logits))[..., None]
+    return np.asarray(1 / np.sqrt(share + (1 - share) * singular[:, None] ** 2))
+
+
+def _columns(stacks: list[Stack]) -> Matrix:
+    """Return stacks of the same shape (k, 2n, n) side by side."""
+    return np.asarray(np.concatenate(stacks).transpose(1, 0, 2).reshape(stacks[0].shape[1], -1))
+
+
+def _balancing_coordinates(rows: Stack) -> Stack:
+    """Return coordinates in which the sum of the squares of rows is the identity, (j, m, m).
+
+    ``rows`` is (j, i, q, m). The squares themselves may be too different for their rounding.
+    """
+    together = rows.reshape(len(rows), -1, rows.shape[-1])
+    return np.asarray(np.linalg.inv(np.linalg.qr(together, mode="r")))
+
+
+def largest_outputs(
+    forms: Stack,
+    Y: Stack,
+    enough: float,
+    first_weights: Stack | None = None,
+    *,
+    improve_all: bool = False,
+    cap: Vector | float = math.inf,
+) -> tuple[Vector, Stack]:
+    """Bound ‖Y z‖ for all z with forms of at most 1, (j,), by weights, (j, i), from some on.
+
+    None below ``enough`` is improved, and only the largest ones unless all of them are wanted.
+    Bounds above ``cap`` count as that.
+    """
+    bounds = np.full(len(forms), np.inf)
+    weights = np.full(forms.shape[:2], 1 / forms.shape[1]) if first_weights is None else first_weights
+    active, best = np.arange(len(forms)), weights.copy()
+    for _ in range(_ROUNDS):
+        chosen = forms[active]
+        Z = np.linalg.solve(np.einsum("ji,jiab->jab", weights[active], chosen), Y[active].swapaxes(1, 2))
+        values, vectors = np.linalg.eigh(Y[active] @ Z)
+        sizes = np.sqrt(values[:, -1].clip(min=0.0)) * ROUNDING
+        better = sizes < bounds[active]
+        best[active[better]] = weights[active[better]]
+        bounds[active] = np.minimum(bounds[active], sizes)
+        # The forms of the z with the largest ‖Y z‖: those above the mean need more weight.
+        z = (Z @ vectors[:, :, -1:])[..., 0]
+        sizes = np.einsum("ja,jiab,jb->ji", z, chosen, z).clip(min=0.0)
+        weights[active] *= (sizes / sizes.max(axis=1, keepdims=True).clip(min=1e-300)) ** _POWER
+        weights = weights.clip(min=_LEAST_WEIGHT)
+        weights /= weights.sum(axis=1, keepdims=True)
+        sizes = np.minimum(bounds, cap)
+        least = enough if improve_all else max(enough, _NEARLY * float(sizes.max()))
+        active = np.flatnonzero(sizes > least)
+        if not len(active):
+            break
+    sums = np.linalg.eigvalsh(np.einsum("ji,jiab->jab", best, forms))
+    bounds[~(sums[:, 0] > _CONDITION * sums[:, -1])] = np.inf
+    return bounds, best

@@ -1,0 +1,367 @@
+"""The inequalities of one loop, into which bounds that hold are inserted to make them smaller.
+
+The inequalities (:mod:`noack.theory.certificates.inequalities`) have one bound of e_s in each row,
+so that they stay linear. Inserted bounds need not: for each error and output the smallest of all
+bounds of e_s counts, and where e_s may have grown in two ways, from a test or from an event, the
+larger one of them. Besides, e_c is followed in open loop.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from noack.core.cached_method import cached_method
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.contraction import Stack
+from noack.theory.bounds.enclosure import response_until
+from noack.theory.bounds.gains import Growth, Output, PlantGains
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth
+from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
+
+Growths = Sequence[Sequence[ErrorGrowth]]
+"""How e_s may grow under each bound of it. All bounds hold, and of each one growth applies."""
+
+
+def _smallest(values: Matrix, growths: Growths) -> Matrix:
+    """Return the smallest over all bounds of e_s of the largest over its growths, (o, g, …) → (o, …)."""
+    ends = np.cumsum([0, *map(len, growths)])
+    rows = [values[:, a:b].max(axis=1) for a, b in pairwise(ends)]
+    return np.asarray(np.min(rows, axis=0))
+
+
+class _SumOfErrors:
+    """The gains of the errors of one loop, of events ``spacing_s`` apart, of which ``count`` are missing.
+
+    The present e_s is followed for ``later_s``, as if nothing reset it. Axes are named o, output; g,
+    growth; i, the present error and those of the missing events, from the newest one on.
+    """
+
+    def __init__(
+        self,
+        plant: PlantGains,
+        growths: Growths,
+        begin_s: float,
+        spacing_s: float,
+        count: int,
+        later_s: float,
+    ) -> None:
+        error, all_growths = plant.error, [growth for row in growths for growth in row]
+        self._growths, ages_s = growths, spacing_s * np.arange(count, dtype=np.float64)
+        # Gains of the errors of missing events, and of what had entered before them.
+        missing = np.array([error.kernels[C].sups(ages_s) for C in error.outputs])[:, None]
+        kernels = [plant.driven[C] for C in error.outputs]
+        sups = [np.array([kernel_pair[k].sups(ages_s) for kernel_pair in kernels])[:, None] for k in (0, 1)]
+        grown = np.array([growth.driven[:2] for growth in all_growths])
+        means_s = np.array([growth.mean_s for growth in all_growths])[:, None]
+        # The same of the present error.
+        present_gains = [error.now_until(later_s + growth.longest_s) for growth in all_growths]
+        present = np.array([[gains[C] for gains in present_gains] for C in error.outputs])
+        driven = np.zeros((2, len(kernels), len(all_growths)))
+        for index, growth in enumerate(all_growths):
+            if (until_s := later_s + growth.longest_s) > 0:
+                followed = plant.growths(until_s, COARSE_CELLS)
+                means = [followed[C].means(growth.ages_s + later_s)[:2] for C in error.outputs]
+                driven[:, :, index] = np.array(means).T
+        self._entered, self._mismatched = (
+            np.dstack([driven[k], np.minimum(missing * grown[:, k, None], means_s * sups[k])]) for k in (0, 1)
+        )
+        self._gains = np.dstack([present, np.broadcast_to(missing, (*present.shape, count))])
+        """(o, g, i), like those of what has entered."""
+        highest = np.array([kernel.sup() for kernel, _ in kernels])
+        self._highest, self._begin_s = highest[:, None], begin_s
+
+    def bound(
+        self, b: Vector, input_error: float, mismatch: float, start_error: float
+    ) -> tuple[Matrix, Matrix]:
+        """Bound each error's part of ‖C e_c‖, and what the first i of them had entered at first, (o, i).
+
+        Given are bounds of ‖e_s‖_W after a test for each growth, of π and sup‖R_E x‖.
+        """
+        parts = self._parts(b, mismatch, np.array([input_error]))[..., 0]
+        return parts, self._entered_at_start(self._begin_s) * max(start_error - input_error, 0.0)
+
+    def after_losses(self, b: Vector, inputs: Vector, mismatch: float, late_s: float, late: float) -> Matrix:
+        """Bound ‖C e_c‖ after 0, 1, … lost events, which are at least ``late_s`` apart, (o, j).
+
+        ``inputs``: bounds of ‖p‖ meanwhile, and ``late`` until an update acts, for ``late_s``.
+        """
+        parts, lost = self._parts(b, mismatch, inputs), np.arange(len(inputs))
+        sums = [parts[:, 0, j] + parts[:, lost[1 : j + 1], lost[:j][::-1]].sum(axis=1) for j in lost.tolist()]
+        return np.array(sums).T + self._entered_at_start(late_s)[:, lost] * max(late - float(inputs[0]), 0.0)
+
+    def _parts(self, b: Vector, mismatch: float, inputs: Vector) -> Stack:
+        """Bound each error's part of ‖C e_c‖ for each bound of ‖p‖, (o, i, j)."""
+        known = self._gains * b[:, None] + self._mismatched * mismatch
+        return _smallest(known[..., None] + self._entered[..., None] * inputs, self._growths)
+
+    def _entered_at_start(self, late_s: float) -> Matrix:
+        """Bound what enters within a time at first, into the first i errors together, by a p of 1, (o, i)."""
+        return np.asarray(np.fmin(late_s * self._highest, self._entered.max(axis=1).cumsum(axis=1)))
+
+
+class _OpenLoopErrors:
+    """The gains of e_c, followed from the last test before each lost event in open loop.
+
+    The input is computed from x_c, so e_c follows G − BK = H + αI − BK while no update acts. At
+    the last test before an event it is e_s, at most b, and what is left of the lost errors. Axes
+    are those of :class:`_SumOfErrors`.
+    """
+
+    def __init__(
+        self, plant: PlantGains, growths: Growths, conditions: NetworkConditions, spacing_s: float
+    ) -> None:
+        error, all_growths = plant.error, [growth for row in growths for growth in row]
+        self._growths, self._lost = growths, conditions.dropouts
+        generator = error.scaled_H - plant.B @ error.K
+        driven = np.hstack([plant.columns.input_error, plant.columns.mismatch])
+        groups, any_age = (0, plant.columns.input_error.shape[1]), np.ones(1)
+
+        def gains(later_s: float, apart_s: float) -> Stack:
+            """Return those of b, of a lost error, and of q and R_E x, then without means, (6, o, g)."""
+            gains_by_growth = []
+            for growth in all_growths:
+                ages_s = growth.ages_s + later_s
+                until_s = float(ages_s.max())
+                alone = response_until(generator, error.inverse_weight, until_s, COARSE_CELLS)
+                pairs = response_until(generator, driven, until_s, COARSE_CELLS, groups=groups)
+                kept_by_output = alone.through_each(error.stacked)
+                entered = pairs.through_groups(error.stacked)
+                rows = []
+                for C in error.outputs:
+                    by_input, mismatched = entered[C]
+                    growth_sizes = Growth(mismatched, by_input, np.zeros(COARSE_CELLS))
+                    means = growth_sizes.means(ages_s if until_s else any_age)
+                    rows.append((kept_by_output[C].sup_on_grid(), *means[:2], *growth_sizes.totals[:2]))
+                gains_by_growth.append(rows)
+            stay, *entered_by = np.array(gains_by_growth).transpose(2, 1, 0)
+            # A lost error has been followed by its model since, and by the open loop from then on.
+            remaining_s = np.array([max(apart_s - growth.longest_s, 0.0) for growth in all_growths])
+            remaining = {C: error.kernels[C].sups(remaining_s) for C in error.outputs}
+            redirected = np.array([*remaining.values()]) + entered_by[2] * remaining[Output.GAIN]
+            return np.array([stay, np.minimum(stay * remaining[Output.WEIGHTED], redirected), *entered_by])
+
+        self._step, self._between = gains(0.0, spacing_s)[:, :1], gains(0.0, 0.0)[:, :1]
+        self._whole = gains(conditions.delay_s, 0.0)
+        until_s = max(conditions.delay_s, conditions.start_s)
+        self._late = plant.growth(until_s, COARSE_CELLS).totals[:2] if until_s else (0.0, 0.0)
+
+    def bound(self, b: Vector, held: float, input_error: float, mismatch: float) -> tuple[Vector, Matrix]:
+        """Bound ‖e_c‖_W after at most 0, 1, … lost events until the next event, (j,).
+
+        The other result is sup‖C e_c‖ without a lost event, and after as many as there may be, (o, 2).
+        ``input_error`` bounds π before the first input, too.
+        """
+        late = float(self._late[0] * input_error + self._late[1] * mismatch)
+
+        def followed(gains: Stack, lost: float) -> Vector:
+            kept, remaining, by_input, mismatched, *totals = gains
+            tested = kept * b + remaining * lost + by_input * held + mismatched * mismatch
+            values = np.maximum(tested, kept * late + totals[0] * held + totals[1] * mismatch)
+            return _smallest(values, self._growths)
+
+        lost = [0.0]
+        for _ in range(self._lost):
+            lost.append(max(float(followed(self._step, lost[-1])[0]), lost[-1]))
+        between = np.array([followed(self._between, error)[0] for error in lost])
+        return between, np.array([followed(self._whole, error) for error in (0.0, lost[-1])]).T
+
+
+@dataclass
+class KnownBounds:
+    """Bounds of one loop that hold, each of which may be replaced by a smaller one."""
+
+    signals: Vector
+    """Of (q, b, η, π, sup‖R_E x‖, 1), or β̃ for b."""
+    states: dict[str, float]
+    """Of sup‖C x‖."""
+    errors: dict[Output, float]
+    """Of sup‖C e_c‖."""
+    sensor: float = math.inf
+    """Of β̃ = sup‖e_s‖_W."""
+    earlier: float = math.inf
+    """Of the part of ‖u − Kx‖ that does not come from the present e_s."""
+    received: float = math.inf
+    """Of ‖u − Kx‖ while no event is missing."""
+    lost: Vector = field(default_factory=lambda: np.array(math.inf))
+    """Of ‖e_c‖_W after at most 0, 1, … lost events, from when an update acts until the next event."""
+    present: Vector = field(default_factory=lambda: np.array(math.inf))
+    """Of ‖e_s‖_W meanwhile, if the update acts before the first lost event."""
+    inputs: Vector = field(default_factory=lambda: np.array(math.inf))
+    """Of ‖p‖ likewise."""
+    tested: float = math.inf
+    """Of ‖e_s‖_W after a test."""
+
+    def reduce_errors(self, sizes: Vector) -> None:
+        """Take smaller bounds of sup‖C e_c‖, (o,)."""
+        for output, size in zip(self.errors, sizes.tolist(), strict=True):
+            self.errors[output] = min(self.errors[output], size)
+
+    @property
+    def input_error(self) -> float:
+        """π."""
+        return self.errors[Output.GAIN] + float(self.signals[0])
+
+
+class InsertedInequalities(ErrorInequalities):
+    """The inequalities of one loop without disturbances, into which bounds are inserted."""
+
+    def known(self, spacing_s: float) -> KnownBounds:
+        """Return the bounds of one loop; infinite without a certificate."""
+        spacing, events = np.array([spacing_s]), np.array([self._missing_events(spacing_s)])
+        solved = [
+            bound[0] for method in self.methods for _, _, bound in self._solutions(method, events, spacing)
+        ]
+        infinite = dict.fromkeys(self._states, math.inf), dict.fromkeys(self._error.outputs, math.inf)
+        return KnownBounds(np.min(solved, axis=0), *infinite)
+
+    def insert(self, known: KnownBounds, spacing_s: float) -> None:
+        """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
+        v, states, errors = known.signals, known.states, known.errors
+        # x from the start on.
+        for name, (free, forced) in self._timed_states.items():
+            states[name] = min(states[name], float((free + forced * known.signals[3]).max()))
+        # e_s after a test, for each way in which it may grow from there.
+        growths = [growth for row in self._growths for growth in row]
+        b = np.array([growth.after_test(states) for growth in growths])
+        is_last = [growth.longest_s == self._conditions.sampling_s for growth in growths]
+        known.tested = min([known.tested, *b[is_last].tolist()])
+        self._insert_errors(known, b, spacing_s)
+        if spacing_s >= self.late_s:
+            self._insert_lost(known, b, spacing_s)
+        self._insert_sensor(known, b)
+        age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
+        new_signals = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
+        known.signals = np.minimum(v, np.array(new_signals, dtype=np.float64))
+
+    def _insert_errors(self, known: KnownBounds, b: Vector, spacing_s: float) -> None:
+        """Insert bounds of e_c, given those of e_s after a test: as a sum, and in open loop."""
+        age_input, input_error, mismatch = known.signals[[0, 3, 4]].tolist()
+        weighted, gain = self._rows
+        for method, sums in self._sums(spacing_s).items():
+            parts, at_start = sums.bound(b, input_error, mismatch, self.start_error)
+            whole = parts.cumsum(axis=1) + at_start
+            if method is BoundMethod.MISSING:
+                known.earlier = min(known.earlier, float(whole[gain, -1] - parts[gain, 0]) + age_input)
+                known.received = min(known.received, float(whole[gain, 0]) + age_input)
+                known.lost = np.minimum(known.lost, whole[weighted, : self._conditions.dropouts + 1])
+            known.reduce_errors(whole[:, -1])
+        start_error = max(input_error, self.start_error)
+        between_events, whole = self._followed(spacing_s).bound(b, age_input, start_error, mismatch)
+        known.reduce_errors(whole[:, -1])
+        known.received = min(known.received, float(whole[gain, 0]) + age_input)
+        known.lost = np.minimum(known.lost, between_events)
+
+    def _insert_lost(self, known: KnownBounds, b: Vector, spacing_s: float) -> None:
+        """Insert bounds of e_c after 0, 1, … lost events, if an update acts before the next event."""
+        age_input, input_error, mismatch = known.signals[[0, 3, 4]].tolist()
+        weighted, gain = self._rows
+        inputs = np.minimum(known.inputs, self._error.now(Output.GAIN) * known.lost + age_input)
+        inputs[0] = min(inputs[0], known.received)
+        # While one more event is in flight, π bounds the input that drives the present error.
+        stages = np.append(inputs, input_error)[: self._missing_events(spacing_s) + 1]
+        start_error = max(input_error, self.start_error)
+        sums = self._sums(spacing_s)[BoundMethod.MISSING]
+        summed = sums.after_losses(b, stages, mismatch, self.late_s, start_error)
+        known.reduce_errors(summed[:, -1])
+        known.lost = np.minimum(known.lost, summed[weighted, : len(inputs)])
+        known.inputs = np.minimum(inputs, summed[gain, : len(inputs)] + age_input)
+
+    @property
+    def _rows(self) -> tuple[int, int]:
+        """The rows of ‖e_c‖_W and of ‖K e_c‖ among the outputs of e_c."""
+        outputs = [*self._error.outputs]
+        return outputs.index(Output.WEIGHTED), outputs.index(Output.GAIN)
+
+    def _insert_sensor(self, known: KnownBounds, b: Vector) -> None:
+        """Insert bounds of e_s, given those after a test."""
+        input_error, mismatch = known.signals[3:5].tolist()
+        inputs = np.minimum(known.inputs + np.zeros_like(known.lost), input_error)
+        received = inputs[0] = min(float(inputs[0]), known.received)
+        inputs = np.append(input_error, inputs)
+        late = self.entered(self.late_s, max(input_error, self.start_error), mismatch)
+        ends, by_bound = iter(b.tolist()), []
+        for row in self._growths:
+            sizes = np.max([self._grown(growth, next(ends), inputs, mismatch) for growth in row], axis=0)
+            until_s = max(growth.longest_s for growth in row)
+            # In this time after an update acts, e_s is what was there and what has entered since.
+            after_update = self._error.stretch(until_s) * late + self.entered(until_s, received, mismatch)
+            by_bound.append([sizes[0], max(float(sizes[1]), after_update), *sizes[2:]])
+        smallest = np.min(by_bound, axis=0)
+        known.sensor = min(known.sensor, float(smallest[0]))
+        known.present = np.minimum(known.present, np.minimum(smallest[1:], known.sensor))
+        known.lost[0] = min(known.lost[0], known.present[0])
+
+    def entered(self, until_s: float, input_error: float, mismatch: float) -> float:
+        """Bound the e_s that enters within some time."""
+        if until_s == 0:
+            return 0.0
+        by_input, mismatched, _ = self._plant.growth(until_s, COARSE_CELLS).totals
+        return float(by_input * input_error + mismatched * mismatch)
+
+    @property
+    def late_s(self) -> float:
+        """An update acts at most so long after its event, the first one after the start."""
+        return max(self._conditions.delay_s, self._conditions.start_s)
+
+    @cached_property
+    def _timed_states(self) -> Mapping[str, tuple[Vector, Vector]]:
+        """Bounds of ‖C x‖ from the start, and of what a p of 1 has added, up to some times, (k,)."""
+        plant, (_, at_start) = self._plant, self._plant.start_up(self._conditions.start_s)
+        return {
+            name: (
+                np.append(free.highest, free.tail_highest) + at_start[name],
+                forced.integral_until(np.append(free.edges_s[1:], forced.edges_s[-1] + 1.0)),
+            )
+            for (name, free), forced in zip(plant.free.items(), plant.forced.values(), strict=True)
+        }
+
+    def _grown(self, growth: ErrorGrowth, b: float, inputs: Vector, mismatch: float) -> Vector:
+        """Return how large e_s may become under one bound, given those of ‖p‖; the start is in the first."""
+        by_input, mismatched, _ = growth.driven
+        at_start = np.fmin(by_input, self._begin_s * growth.highest)
+        sizes = growth.stretch * b + by_input * inputs + mismatched * mismatch
+        sizes[0] += at_start * max(self.start_error - float(inputs[0]), 0.0)
+        return np.asarray(sizes)
+
+    @cached_method
+    def _sums(self, spacing_s: float) -> Mapping[BoundMethod, _SumOfErrors]:
+        conditions = self._conditions
+        numbers = {
+            BoundMethod.DRIFTING: (conditions.dropouts, conditions.delay_s),
+            BoundMethod.MISSING: (self._missing_events(spacing_s), 0.0),
+        }
+        return {
+            method: _SumOfErrors(self._plant, self._growths, self._begin_s, spacing_s, *numbers[method])
+            for method in self.methods
+        }
+
+    @cached_method
+    def _followed(self, spacing_s: float) -> _OpenLoopErrors:
+        return _OpenLoopErrors(self._plant, self._growths, self._conditions, spacing_s)
+
+    def _missing_events(self, spacing_s: float) -> int:
+        """Return how many events may be missing: lost, or in flight."""
+        conditions = self._conditions
+        flying = math.ceil(conditions.delay_s / spacing_s) if conditions.delay_s > 0 else 0
+        return conditions.dropouts + flying
+
+    @property
+    def start_error(self) -> float:
+        """sup‖u − Kx‖ of one loop before the first input."""
+        return float(self._beyond)
+
+    def next_event_s(self, known: KnownBounds) -> float:
+        """Return the time between two events that follows from bounds; 0 if there is none."""
+        if all(bound.reached is None for bound in self._bound.every):
+            return 0.0
+        zero, never = np.zeros(1), np.zeros(1, dtype=bool)
+        events = np.zeros(1, dtype=np.int64)
+        mismatch, earlier = known.signals[4:5], zero + known.earlier
+        before, after = (zero,) * 6, (zero,) * 3
+        constants = LoopConstants(events, *before, mismatch, *after, earlier, ~never)
+        return float(self.inter_event_s(constants, never, ~never)[0])

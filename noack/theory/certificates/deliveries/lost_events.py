@@ -1,0 +1,220 @@
+"""Bounds of e_c after lost events, by the flow from the last delivery.
+
+Without the flow, each missing event adds its ‖e_s‖_W in full, as if all had one direction. But
+until the next delivery everything follows from z at one time (``delivery_flow.py``). Let an event
+be lost at least w after the delivery, and ‖e_c‖_W ≤ D up to it. z is the value w before it, z' =
+e^{Fw} z:
+
+    ‖Λx‖ ≤ c and ‖e_c‖ ≤ D at z and z',  ‖e_s‖ = ‖C_r z'‖ ≤ β for r until the next event
+
+With positive weights of sum 1, z is in the ellipsoid of the sum of these forms, which bounds e_c =
+(0, I) e^{Fr} z' after r (``largest_outputs`` in ``delivery_reach.py``).
+
+After an event e_s begins at 0, so the same forms bound the time until the next event, too.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.linear_systems import Matrix, Vector, exponential
+from noack.theory.bounds.contraction import Stack, logarithmic_norm
+from noack.theory.bounds.enclosure import KernelBounds, response_until
+from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, bend_rows
+from noack.theory.certificates.deliveries.delivery_reach import Reach, largest_outputs
+
+_NEAR, _RATIO, _MOST_NODES = np.linspace(0.0, 1.0, 20).tolist(), 1.03, 300
+"""First nodes of r in units of δ; then the ratio from node to node."""
+_LATEST = 6.0
+"""Largest r in units of δ at which events are looked for."""
+_SOUGHT = 0.6
+"""‖e^{(H+αI)r}‖_W at the last r, if possible."""
+_NEARLY_PLAIN = 0.999
+"""Share of the bound without the flow from which on nothing is gained."""
+_NOTHING = 1e-3
+"""Bound of ‖e_c‖ at a delivery, where it is 0, in β."""
+_LATE_TERMS = 8
+
+
+class SensorErrors(NamedTuple):
+    """What is known of ‖e_s‖_W between two events."""
+
+    sizes: Vector
+    """Its bounds, while 0, 1, … events have been lost since the delivery."""
+    tested: float
+    """Its bound after a test; infinite if there is none."""
+    begin_s: float
+    """The first test is that long after an event."""
+    grid_s: float
+    """Tests are multiples of this after an event; 0 if the trigger is tested at all times."""
+    level: float
+    """At an event it, or what is compared, is at least this large; 0 if nothing is known."""
+    integrates: bool
+    """Whether its integral since the event is compared."""
+    forced_s: float
+    """So long after an event the next one may be due without any of this."""
+
+
+def errors_after_losses(
+    reach: Reach,
+    without_flow: Vector,
+    sensor: SensorErrors,
+    outputs: Sequence[Matrix],
+    spacing_s: float,
+    kernel: KernelBounds,
+    bend: float,
+) -> tuple[Vector, float]:
+    """Bound ‖e_c‖_W while at most 0, 1, … events have been lost since the delivery.
+
+    Args:
+        reach: the flow from a delivery; it is invariant.
+        without_flow: bounds without the flow, for 0, 1, … events.
+        sensor: bounds of e_s.
+        outputs: matrices Y with ‖Y z‖ ≤ 1 at all times.
+        spacing_s: the least time between events.
+        kernel: of ‖e^{(H+αI)τ}‖_W.
+        bend: that of e_s, see :func:`bend_of_error`.
+
+    Returns:
+        The bounds, and a time between events that is at least ``spacing_s``.
+    """
+    flow, errors = reach.starts.flow, without_flow.copy()
+    most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
+    if spacing_s >= most_s or len(without_flow) == 1:
+        return errors, spacing_s
+    # The nodes r after an event, e^{Fr}, and ‖e_s‖_W at them after a test.
+    r_s = _nodes_s(spacing_s, kernel, 2 * most_s, sensor.grid_s)
+    flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
+    tested = np.where(r_s * ROUNDING >= sensor.begin_s, sensor.tested, math.inf)
+    first_s = float(flow.edges_s[reach.first_cell]) if reach.first_cell else math.inf
+    since_s, apart_s, size_of_x = -reach.effects.late_s, math.inf, reach.size
+    for lost, size in enumerate(sensor.sizes.tolist()):
+        earlier = float(errors[lost - 1]) if lost else max(_NOTHING * size, reach.effects.late)
+        window_s = min(max(since_s, 0.0), most_s)
+        stage = _Stage(reach, window_s, earlier, size_of_x, outputs, r_s, flows)
+        # e_c until the next delivery, if at most so many events are lost.
+        if lost:
+            added = size + kernel.sups(r_s) * earlier
+            largest = stage.largest_error(np.minimum(tested, size), added)
+            errors[lost] = min(without_flow[lost], max(largest, float(added[-1]), earlier))
+            if lost > 1 and errors[lost] > _NEARLY_PLAIN * float(added[0]):
+                return errors, spacing_s  # later stages gain nothing, either
+        # The time until the next event. After a delivery e_s is at most ‖e^{(H+αI)r}‖ · late larger
+        # than C_r z.
+        late_part = 0.0 if lost else flow.stretch * reach.effects.late
+        later_s = stage.next_event_s(sensor, late_part, bend, min(_LATEST * spacing_s, sensor.forced_s))
+        since_s += max(spacing_s, later_s)
+        if not lost:  # x(0) itself may be outside the ellipsoid
+            since_s, later_s = min(since_s, first_s), min(later_s, first_s)
+            size_of_x = reach.largest(first_s - since_s)
+        apart_s = min(apart_s, max(spacing_s, later_s))
+    return errors, apart_s
+
+
+def bend_of_error(reach: Reach, level: float) -> float:
+    """Bound the second derivative of e_s while ‖e_s‖_W is below a level."""
+    flow = reach.starts.flow
+    return reach.sup(bend_rows(flow)) + float(np.linalg.norm(flow.H @ flow.H, 2)) * level
+
+
+def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float, grid_s: float) -> Vector:
+    """Return times r, if possible up to one at which ‖e^{(H+αI)r}‖_W has fallen below a value."""
+    nodes_s = [spacing_s * share for share in _NEAR]
+    while len(nodes_s) < _MOST_NODES and kernel.sup(nodes_s[-1]) > _SOUGHT:
+        nodes_s.append(nodes_s[-1] * _RATIO)
+    r_s = np.array([time_s for time_s in nodes_s if time_s <= most_s])
+    return grid_s * np.unique(np.rint(r_s / grid_s)) if grid_s else r_s
+
+
+class _Stage:
+    """What follows an event, a time w or more after the delivery, for times r since it.
+
+    z is e^{Fw} ζ at the event. What q has changed since some time before is bounded with e^{−Fs} (BU, −BU).
+    """
+
+    def __init__(
+        self,
+        reach: Reach,
+        window_s: float,
+        earlier: float,
+        size_of_x: float,
+        outputs: Sequence[Matrix],
+        r_s: Vector,
+        flows: Stack,
+    ) -> None:
+        self._flow, self._r_s, self._earlier = reach.starts.flow, r_s, earlier
+        self._held, self._late_s = reach.effects.held, reach.effects.late_s
+        n, shape, identity = self._flow.n, reach.starts.shape, np.eye(2 * self._flow.n)
+        event = exponential(self._flow.generator * window_s)
+        pushed = self._flow.error_effects[1][[self._flow.cell_at(time_s) for time_s in r_s.tolist()]]
+        self._later = self._held * pushed if self._held else np.zeros(len(r_s))
+        error_change, state_change = (
+            self._held * self._pushed_back(C, window_s) for C in (identity[n:, n:], shape)
+        )
+        rows = [
+            identity[n:] / (earlier + error_change),
+            shape @ identity[:n] / (size_of_x + state_change),
+            event[n:] / earlier,
+            shape @ event[:n] / size_of_x,
+            *(Y @ event for Y in outputs),
+        ]
+        forms = np.array([row.T @ row for row in rows])
+        self._forms = np.broadcast_to(forms, (len(r_s), *forms.shape))
+        self._z = flows @ event
+        # x + e_c follows the models: e^{Hr} is the sum of both rows of e^{Fr} (I, 0).
+        models = flows[:, :n, :n] + flows[:, n:, :n]
+        self._e_s = self._z[:, n:] - models @ event[n:]
+
+    def _pushed_back(self, C: Matrix, ago_s: float) -> float:
+        """Bound ∫ ‖C e^{−As} BU‖ ds over some time; (I, 0) e^{−Fs} (BU, −BU) = e^{−As} BU."""
+        if not (self._held and ago_s):
+            return 0.0
+        flow = self._flow
+        responses = response_until(flow.BK - flow.closed_loop, flow.input_error, ago_s)
+        return float(responses.through(C).integral_on_grid())
+
+    def largest_error(self, sizes: Vector, added: Vector) -> float:
+        """Bound ‖e_c‖_W up to the last r, given those of e_s, and bounds without the flow."""
+        n, sizes = self._flow.n, (sizes + self._later)[:-1, None, None] ** 2
+        events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1] / sizes
+        forms = np.concatenate([self._forms[:-1], events[:, None]], axis=1)
+        cap = added[:-1] - self._later[1:]
+        ends, weights = largest_outputs(forms, self._z[1:, n:], float(added[-1]), cap=cap)
+        cells = np.maximum(ends, np.append(self._earlier, ends[:-1])) + self._sags(forms, weights)
+        return float(np.minimum(cells + self._later[1:], added[:-1]).max())
+
+    def _sags(self, forms: Stack, weights: Stack) -> Vector:
+        """Bound how much e_c differs from its chord in each cell of r."""
+        F, steps_s = self._flow.generator, np.diff(self._r_s)[:, None, None]
+        inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
+        terms, bends = F @ F @ self._z[:-1], np.zeros(len(steps_s))
+        for order in range(1, _LATE_TERMS + 1):
+            error_terms = terms[:, self._flow.n :]
+            bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", error_terms, inverse, error_terms)))
+            terms = F @ terms * (steps_s / order)
+        with np.errstate(over="ignore"):
+            growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s[:, 0, 0])
+        bends += growth * np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", terms, inverse, terms)))
+        return np.asarray(steps_s[:, 0, 0] ** 2 / 8 * bends * ROUNDING)
+
+    def next_event_s(self, sensor: SensorErrors, late_part: float, bend: float, most_s: float) -> float:
+        """Return a time before which there is no event; e_s may be larger than C_r z by ``late_part``."""
+        is_near, flow, level = self._r_s <= most_s, self._flow, sensor.level
+        level -= late_part * self._late_s if sensor.integrates else late_part
+        if level <= 0:
+            return 0.0
+        if self._held:  # what is followed differs from e_s
+            pushed = flow.unit_effects(bend_rows(flow))[1][flow.cell_at(most_s)]
+            difference = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._later.max())
+            bend = bend + self._held * float(pushed) + difference
+        enough = 0.0 if sensor.integrates else 0.9 * level
+        ends, _ = largest_outputs(self._forms[is_near], self._e_s[is_near], enough, improve_all=True)
+        steps_s = np.diff(self._r_s[is_near])
+        cells = np.maximum(ends[1:], ends[:-1]) + steps_s**2 / 8 * bend + self._later[1:][is_near[1:]]
+        if sensor.integrates:
+            cells = np.cumsum(steps_s * (np.maximum.accumulate(cells) + late_part))
+        found_s = float(self._r_s[np.append(cells >= level, True).argmax()])
+        # Tests may lie beside the nodes if times are not those since an event.
+        return max(found_s - sensor.grid_s, 0.0) if late_part and sensor.integrates else found_s
