@@ -97,10 +97,10 @@ class Program(TyperGroup):
         except typer.TyperException as error:
             status = ExitStatus.CALLER
             if message := self._line(error, words):
-                failed(message, status, who=NAME, as_json="--json" in words)
+                failed(message, status, source=NAME, as_json="--json" in words)
         except OSError as error:  # help is written to a full disk
             text, as_json = f"cannot write: {why(error)}", "--json" in words
-            status = failed(text, ExitStatus.FAILED, who=NAME, as_json=as_json)
+            status = failed(text, ExitStatus.FAILED, source=NAME, as_json=as_json)
         if standalone_mode:
             sys.exit(int(status or 0))
         return status
@@ -296,13 +296,13 @@ def command(
             except KeyboardInterrupt as error:
                 stop = error if isinstance(error, StopRequestError) else StopRequestError()
                 what = "; ".join([str(stop), *getattr(error, "__notes__", ())])
-                status = failed(what, stop.exit_status, who=NAME, as_json=as_json)
+                status = failed(what, stop.exit_status, source=NAME, as_json=as_json)
             except NoackError as error:
-                status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
+                status = failed(str(error), error.exit_status, source=NAME, as_json=as_json)
             except Exception as error:
                 if (line := exhausted_limit(error) or _why_not_written(error)) is None:
                     raise
-                status = failed(line, ExitStatus.FAILED, who=NAME, as_json=as_json)
+                status = failed(line, ExitStatus.FAILED, source=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 
         reported.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

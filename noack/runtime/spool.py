@@ -137,14 +137,14 @@ def batches_in(data: memoryview) -> tuple[list[tuple[int, memoryview]], int]:
 
     Of each batch: the number of its first row, and the rows.
     """
-    found, begin, rows = [], 0, _CHUNK.size
+    batches, begin, rows = [], 0, _CHUNK.size
     while rows <= len(data):
         first, length = _CHUNK.unpack_from(data, begin)
         if (end := rows + length) > len(data):
             break
-        found.append((first, data[rows:end]))
+        batches.append((first, data[rows:end]))
         begin, rows = end, end + _CHUNK.size
-    return found, begin
+    return batches, begin
 
 
 def batch_bytes(data: memoryview) -> int | None:
