@@ -142,8 +142,8 @@ class RunComparison:
             save_figure(overlay_figure(self.runs), path, width)
             return
         if path.suffix != ".html":
-            known = ", ".join(FIGURE_SUFFIXES)
-            raise CallerError(f"{path}: a comparison is written as .html, {known}")
+            suffixes = ", ".join(FIGURE_SUFFIXES)
+            raise CallerError(f"{path}: a comparison is written as .html, {suffixes}")
         if width is not None:
             raise CallerError(f"{path}: a page has its own width; --width is that of a figure")
         template = templates(Path(__file__).parent).get_template("overlay.html.jinja")
@@ -201,15 +201,15 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
     return RunComparison(runs)
 
 
-def _compared(label: str, given: Path) -> ComparedRun:
+def _compared(label: str, named_path: Path) -> ComparedRun:
     """Open a run of one loop, or a loop of a run: ``RUN:NAME``."""
-    folder, colon, name = given.name.partition(":")
-    loop = name if colon and not given.exists() else None
-    path = given if loop is None else given.with_name(folder)
+    folder, colon, name = named_path.name.partition(":")
+    loop = name if colon and not named_path.exists() else None
+    path = named_path if loop is None else named_path.with_name(folder)
     path = chosen_run(path, path.parent)
     outcome, record = reopen(path), load_record(path, loop)
-    shown = path if loop is None else given
-    return ComparedRun(label, shown, outcome.summary.of_loop(record.scenario.name), record)
+    shown_path = path if loop is None else named_path
+    return ComparedRun(label, shown_path, outcome.summary.of_loop(record.scenario.name), record)
 
 
 def _claims(verdict: str) -> Callable[[LoopSummary], int]:
@@ -250,11 +250,11 @@ _NUMBERS: dict[str, Callable[[LoopSummary], float | None]] = {
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def _distance(first: RunRecord, other: RunRecord) -> tuple[float | None, float | None]:
+def _distance(first: RunRecord, second: RunRecord) -> tuple[float | None, float | None]:
     """RMS and maximum of ‖x − x'‖ over the common times of two records; None if not finite."""
-    a, b = first[PLANT_STEP], other[PLANT_STEP]
+    a, b = first[PLANT_STEP], second[PLANT_STEP]
     _, at_a, at_b = np.intersect1d(a["t_ns"], b["t_ns"], return_indices=True)
-    if first is other or not len(at_a):
+    if first is second or not len(at_a):
         return None, None
     apart = np.linalg.norm(b["x"][at_b] - a["x"][at_a], axis=1)
     if not np.isfinite(apart).all():
@@ -286,13 +286,13 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
         aligned = [align_tables(run.record) for run in runs]
     times = [np.asarray(samples.t_ns / NS_PER_S, dtype=np.float64) for samples in aligned]
     longest = time_axis(max(times, key=lambda t_s: t_s.max(initial=0.0)), numbers=False)
-    every = list(enumerate(zip(runs, times, aligned, strict=True)))
+    numbered = list(enumerate(zip(runs, times, aligned, strict=True)))
     panels = [
         # Each run's line is thinner than the line below it.
         Panel(x=longest, y=Axis(label=plain(name)), legend=() if i else None, items=[
             Line(x=t_s, y=samples.x[:, i], label=f"{run.label}: {plain(run.title, 60)}",
                  colour=series_colour(k), width=max(_WIDEST * _NARROWER**k, 0.8))
-            for k, (run, t_s, samples) in every
+            for k, (run, t_s, samples) in numbered
         ])
         for i, name in enumerate(runs[0].record.loop.state_names[:_MOST_STATES])
     ]  # fmt: skip
@@ -302,7 +302,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
         (r"Controller's error $\|e_c\|$", "e_c_norm"),
     ):
         items: list[Item] = []
-        for k, (_, t_s, samples) in every:  # the first run is on top
+        for k, (_, t_s, samples) in numbered:  # the first run is on top
             curves: list[tuple[Reals, Dash]] = [(getattr(samples, name), ())]
             curves += [(samples.threshold, (5, 2))] if name == "e_s_norm" else []
             items += [
@@ -333,11 +333,11 @@ def _events(runs: Sequence[ComparedRun]) -> Panel:
         sensor = run.record[SENSOR_MEASUREMENT]
         sent = sensor[sensor["event"] != NO_SEQUENCE]
         delivered = np.isin(sent["event"], run.record[CONTROLLER_DELIVERY]["sequence"])
-        t_s, at = sent["t_ns"] / NS_PER_S, np.full(len(sent), float(row))
+        t_s, heights = sent["t_ns"] / NS_PER_S, np.full(len(sent), float(row))
         items += [
-            Marks(x=t_s[delivered], y=at[delivered], marker="|", size=13.0, stroke=1.6,
+            Marks(x=t_s[delivered], y=heights[delivered], marker="|", size=13.0, stroke=1.6,
                   colour=series_colour(number)),
-            Marks(x=t_s[~delivered], y=at[~delivered], marker="x", size=4.5, colour=palette.LOST,
+            Marks(x=t_s[~delivered], y=heights[~delivered], marker="x", size=4.5, colour=palette.LOST,
                   label="lost"),
         ]  # fmt: skip
     ticks = {float(row): run.label for row, run in zip(rows, runs, strict=True)}

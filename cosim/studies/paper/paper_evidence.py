@@ -146,8 +146,8 @@ def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
         samples = run.at(np.linspace(0.0, run.reached_s, 4001))
         growth = np.exp(trigger.alpha_per_s * samples.t_s)
         # e_c jumps at a delivery, so its largest value may come just before.
-        before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, run.system.loop.n)
-        at_events = run.system.norms(before) * np.exp(trigger.alpha_per_s * run.event_s[1:])
+        e_c_before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, run.system.loop.n)
+        at_events = run.system.norms(e_c_before) * np.exp(trigger.alpha_per_s * run.event_s[1:])
         error = max((run.e_c_norm(samples) * growth).max(), at_events.max(initial=0.0))
         rows.append(
             {
