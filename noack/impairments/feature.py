@@ -129,10 +129,11 @@ class Scheduler(QueueDiscipline):
         """Return the number of each flow, from which the key of its packets follows."""
 
     @abstractmethod
-    def yields_ns(self, flow: int, other_flow: int) -> float:
+    def yields_ns(self, number: int, other_number: int) -> float:
         """Return how long after a packet of a flow one of another flow may arrive, to go first.
 
-        It is negative if that must arrive before; infinite if it always, or never, goes first.
+        Both flows are given by their numbers. It is negative if that must arrive before; infinite
+        if it always, or never, goes first.
         """
 
     def number(self, flow: int) -> int:

@@ -325,30 +325,28 @@ def _chosen_delays_s(rate: Rate, scheduler: Scheduler, stages: Sequence[_Stage])
 
     A change of the direction's settings makes the order of what waits final, so that any may go first.
     """
-    sections = range(len(stages[0].loops))
-    loops = [entry for entry in sections for _ in range(stages[0].loops[entry].loops)]
+    demands = stages[0].loops
     changes = any(stage.direction.link != stages[0].direction.link for stage in stages)
-    least_ns = [round(min(stage.loops[entry].least_s for stage in stages) * NS_PER_S) for entry in sections]
-    sent_ns = [
-        max(-(-int(rate.line_bits(demand.payload_bytes)) * NS_PER_S // rate.rate_bps), 1)
-        for demand in stages[0].loops
+    senders_ns = [
+        (
+            round(min(stage.loops[entry].least_s for stage in stages) * NS_PER_S),
+            max(-(-int(rate.line_bits(demand.payload_bytes)) * NS_PER_S // rate.rate_bps), 1),
+        )
+        for entry, demand in enumerate(demands)
     ]
-    bounds_s: dict[tuple[int, int], float] = {}
-    for loop, entry in enumerate(loops):
-        kind = entry, scheduler.number(loop)
-        if kind not in bounds_s:
-            sender = Sender(least_ns[entry], sent_ns[entry])
-            other_senders = Counter(
-                Sender(
-                    least_ns[other_entry],
-                    sent_ns[other_entry],
-                    math.inf if changes else scheduler.yields_ns(loop, other_loop),
-                )
-                for other_loop, other_entry in enumerate(loops)
-                if other_loop != loop
-            )
-            bounds_s[kind] = response_ns(sender, other_senders) / NS_PER_S
-    return [bounds_s[entry, scheduler.number(loop)] for loop, entry in enumerate(loops)]
+    entries = (entry for entry, demand in enumerate(demands) for _ in range(demand.loops))
+    kinds = [(entry, scheduler.number(loop)) for loop, entry in enumerate(entries)]
+    counts = Counter(kinds)
+    bounds_s = {}
+    for kind in counts:
+        entry, number = kind
+        others = Counter[tuple[int, int, float]]()
+        for (other_entry, other_number), count in (counts - Counter([kind])).items():
+            yields_ns = math.inf if changes else scheduler.yields_ns(number, other_number)
+            others[*senders_ns[other_entry], yields_ns] += count
+        other_senders = {Sender(*other): count for other, count in others.items()}
+        bounds_s[kind] = response_ns(Sender(*senders_ns[entry]), other_senders) / NS_PER_S
+    return [bounds_s[kind] for kind in kinds]
 
 
 def _queue_delay_s(rate: Rate, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> float:
