@@ -349,10 +349,7 @@ def settings_meaning(settings: LinkSettings) -> Iterator[tuple[str, str]]:
     """Yield (words, meaning) of the cap and the other settings."""
     if settings.mansd is not None:
         meaning = f"at most {settings.mansd} consecutive packets of a flow are not delivered"
-        yield (
-            f"mansd {settings.mansd}",
-            f"the cap (M − 1): {meaning}; the next one is always delivered",
-        )
+        yield f"mansd {settings.mansd}", f"the cap (M − 1): {meaning}; the next one is always delivered"
     for constraint in settings.constraints:
         yield constraint.text(), constraint.meaning()
     if settings.first_delivered:

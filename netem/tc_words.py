@@ -234,9 +234,8 @@ def tc_command(settings: LinkSettings, written: LinkSettings | None = None) -> T
         return TcCommand(None, tuple(lacks), ())
     text = " ".join([f"limit {settings.limit}", *(impairment.tc_text() for impairment in supported)])
     notes = [note for impairment in supported for note in impairment.tc_notes()]
-    order = [
-        _FIXED_ORDER.index(impairment.kind) for impairment in supported if impairment.kind in _FIXED_ORDER
-    ]
+    kinds = [impairment.kind for impairment in supported]
+    order = [_FIXED_ORDER.index(kind) for kind in kinds if kind in _FIXED_ORDER]
     if order != sorted(order):
         notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
     return TcCommand(text, tuple(lacks), tuple(dict.fromkeys(notes)))

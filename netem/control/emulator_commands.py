@@ -255,9 +255,5 @@ class _Console(Console):
         raise BrokenPipeError
 
 
-COMMANDS: Mapping[str, Callable[[Sequence[str]], ExitStatus]] = {
-    "show": _show,
-    "set": _set,
-    "watch": _watch,
-}
+COMMANDS: Mapping[str, Callable[[Sequence[str]], ExitStatus]] = {"show": _show, "set": _set, "watch": _watch}
 """The commands by name."""

@@ -152,12 +152,7 @@ class Clause:
         is_bare: bool = False,
     ) -> None:
         self.word, self.example, self.parts, self.synonyms = word, example, parts, synonyms
-        self.least, self.implied, self.complement, self.is_bare = (
-            least,
-            implied,
-            complement,
-            is_bare,
-        )
+        self.least, self.implied, self.complement, self.is_bare = least, implied, complement, is_bare
 
     @property
     def _values(self) -> list[Part]:

@@ -132,8 +132,7 @@ class Scheduler(QueueDiscipline):
     def yields_ns(self, number: int, other_number: int) -> float:
         """Return how long after a packet of a flow one of another flow may arrive, to go first.
 
-        Both flows are given by their numbers. It is negative if that must arrive before; infinite
-        if it always, or never, goes first.
+        It is negative if that must arrive before; infinite if it always, or never, goes first.
         """
 
     def number(self, flow: int) -> int:

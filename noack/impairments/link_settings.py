@@ -62,8 +62,7 @@ class LinkSettings(ScenarioSection):
     def reads_errors(self) -> bool:
         """Whether such a queue chooses by the errors that updates report."""
         return any(
-            isinstance(impairment, Rate) and isinstance(impairment.discipline, MaximumError)
-            for impairment in self.impairments
+            isinstance(rate, Rate) and isinstance(rate.discipline, MaximumError) for rate in self.impairments
         )
 
     @property
@@ -101,14 +100,12 @@ def require_order(impairments: Sequence[AnyImpairment]) -> None:
     Raises:
         ValueError: its effect would depend on the order; the message begins with the key.
     """
-    rates = [
-        (index, rate) for index, rate in enumerate(impairments) if isinstance(rate, Rate) and rate.scheduler
-    ]
-    for index, rate in rates[:1]:
+    rates = [(i, rate) for i, rate in enumerate(impairments) if isinstance(rate, Rate) and rate.scheduler]
+    for i, rate in rates[:1]:
         for number, beside in enumerate(impairments):
-            side = "before" if number < index else "after"
+            side = "before" if number < i else "after"
             least_s, largest_s = beside.delay_range_s(0.0, 0.0)
-            fits = number == index or isinstance(beside, Corrupt)
+            fits = number == i or isinstance(beside, Corrupt)
             fits = fits or (isinstance(beside, Delay) and least_s == largest_s)
             if not fits and not (side == "before" and isinstance(beside, LossOf | Blackout)):
                 raise ValueError(

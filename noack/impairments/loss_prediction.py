@@ -466,13 +466,11 @@ def _probability(settings: LinkSettings, kept_loss: _Kept) -> float:
             raise ValueError(f"{text}: the loss rate cannot be predicted: {note}")
         return rate
 
-    # Without the guarantee, more packets are lost: all but (1 − p)(1 − others).
-    other_rate = rate_at(0.0, settings.model_copy(update={"mansd": None, "constraints": ()}))
-    if other_rate > target and (other_rate := rate_at(0.0)) > target + _TINY:
-        raise ValueError(
-            f"{text}: impossible, the other impairments lose {brief_percent(other_rate)} already"
-        )
-    least = 0.0 if other_rate >= target else (target - other_rate) / (1 - other_rate)
+    # Without the guarantee, more packets are lost: all but (1 − p)(1 − base_rate).
+    base_rate = rate_at(0.0, settings.model_copy(update={"mansd": None, "constraints": ()}))
+    if base_rate > target and (base_rate := rate_at(0.0)) > target + _TINY:
+        raise ValueError(f"{text}: impossible, the other impairments lose {brief_percent(base_rate)} already")
+    least = 0.0 if base_rate >= target else (target - base_rate) / (1 - base_rate)
     probabilities = np.linspace(least, 1.0, _PARTS + 1)
     rates = [rate_at(least)]
     for low, high in pairwise(probabilities):

@@ -87,10 +87,8 @@ def chance_chain(probability: float, correlation: float, action: str) -> Chain:
 
 def _nodes(probability: float, correlation: float) -> tuple[Array, Array, Array]:
     """Return Gauss nodes and weights on both sides of the latent process's threshold."""
-    threshold, edge = (
-        -core.noack_normal_score(probability),
-        8.3,
-    )  # no uniform number has a score beyond
+    threshold = -core.noack_normal_score(probability)
+    edge = 8.3  # no uniform number has a score beyond
     innovation = math.sqrt(1 - correlation**2)
     sides = ((-edge, min(threshold, edge), 0.0), (max(threshold, -edge), edge, 1.0))
     counts = [max(12, math.ceil(3 * (high - low) / innovation)) for low, high, _ in sides]

@@ -46,10 +46,8 @@ def _session(endpoint: str, *, listen: bool) -> zenoh.Session:
     """Open a session with a router, or as the router to which nodes connect."""
     if not _ENDPOINT.fullmatch(endpoint):
         raise CallerError(f"router {endpoint}: give it as tcp/127.0.0.1:7447")
-    config, side, other_side = (
-        zenoh.Config(),
-        *(("listen", "connect") if listen else ("connect", "listen")),
-    )
+    config = zenoh.Config()
+    side, other_side = ("listen", "connect") if listen else ("connect", "listen")
     settings: dict[str, object] = {
         "mode": "router" if listen else "client",
         f"{side}/endpoints": [endpoint],

@@ -128,17 +128,13 @@ def update_delay(scenario: Scenario) -> DelayBound:
         CallerError: as :func:`link_loads`.
     """
     delays, loops_s = _largest_delays(_stages(scenario)[0])
-    impairments_s = {
-        f"network.impairments.{index}": max(delays_s)
-        for index, delays_s in enumerate(delays)
-        if any(delays_s)
-    }
-    given_s, longest_s = scenario.certificate.network_delay_s, scenario.network.link.longest_delay_s
-    if given_s is not None:
-        return DelayBound(impairments_s, loops_s, (given_s,) * len(loops_s))
-    return DelayBound(
-        impairments_s, loops_s, tuple(delay_s if math.isfinite(delay_s) else longest_s for delay_s in loops_s)
-    )
+    bounds_s = {f"network.impairments.{index}": max(delays_s) for index, delays_s in enumerate(delays)}
+    impairments_s = {key: bound_s for key, bound_s in bounds_s.items() if bound_s > 0}
+    longest_s = scenario.network.link.longest_delay_s
+    certified = tuple(delay_s if math.isfinite(delay_s) else longest_s for delay_s in loops_s)
+    if (given_s := scenario.certificate.network_delay_s) is not None:
+        certified = (given_s,) * len(loops_s)
+    return DelayBound(impairments_s, loops_s, certified)
 
 
 def proven_delays(scenario: Scenario) -> list[ProvenDelay | None]:

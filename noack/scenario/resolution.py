@@ -7,6 +7,7 @@ noise of its plant and of its observer's model.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from noack.protocol.record_tables import CLOCK_TABLES, LOOP, OWNER, RecordShape,
 from noack.scenario.link_load import proven_delays
 from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, loops_by_entry
 from noack.scenario.scenario_checks import input_at
-from noack.scenario.sections import AnyObserver, ModelSection
+from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
 from noack.settings.section import rows_of
 from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule
 
@@ -134,52 +135,39 @@ def _loops_with_delays(scenario: Scenario) -> list[list[Scenario]]:
 
 def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
     """Return the resolved scenarios of loops that differ in their names and seeds only."""
-    scenario = loops[0]
-    scenario.plant.system.require_installed()
-    model, plant = _explicit_model(scenario.model), scenario.plant
-    period_ns = scenario.timing.plant_period_ns
-    A_model, B_model, K = np.array(model.A), np.array(model.B), np.array(model.gain)
-    n, m = B_model.shape
-    is_linear, resolved = scenario.coverage.is_linear, list[Scenario]()
+    scenario, plant = loops[0], loops[0].plant
+    plant.system.require_installed()
+    model = _explicit_model(scenario.model)
     is_drawn = plant.initial_state_halfwidth is not None or plant.draw in ("uniform", "vertex")
-    own_plant = plant
-    for loop in loops:
-        if is_drawn or not resolved:
-            x0, A, B = np.array(plant.initial_state), A_model, B_model
-            if plant.initial_state_halfwidth is not None:
-                halfwidth = np.array(plant.initial_state_halfwidth)
-                rng = stream(loop.seeds.initial_state, "initial_state")
-                x0 += halfwidth * rng.uniform(-1, 1, n)
-            if plant.draw == "given":
-                A, B = np.array(plant.A), np.array(plant.B)
-            elif plant.draw in ("uniform", "vertex"):
-                rng = stream(loop.seeds.plant, "plant")
-                A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
-                B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
-            _require_finite("plant", A, B, period_ns)
-            drawn: dict[str, object] = {
-                "initial_state": tuple(x0.tolist()),
-                "initial_state_halfwidth": None,
-            }
-            if is_linear:
-                drawn |= {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
-            own_plant = plant.model_copy(update=drawn)
-        resolved.append(
-            loop.model_copy(
-                update={
-                    "model": model,
-                    "plant": own_plant,
-                    "observer": None,
-                }
-            )
-        )
+    plants = [_resolved_plant(loop, model) for loop in (loops if is_drawn else loops[:1])]
     if scenario.mode == "model":
-        H = A_model + B_model @ K
-        _require_finite("model", H, K.T, scenario.timing.controller_period_ns)
+        A, B, K = np.array(model.A), np.array(model.B), np.array(model.gain)
+        _require_finite("model", A + B @ K, K.T, scenario.timing.controller_period_ns)
     observer = _observer(scenario, model)
-    if observer is None:
-        return resolved
-    return [loop.model_copy(update={"observer": observer}) for loop in resolved]
+    return [
+        loop.model_copy(update={"model": model, "plant": own_plant, "observer": observer})
+        for loop, own_plant in zip(loops, cycle(plants), strict=False)
+    ]
+
+
+def _resolved_plant(loop: Scenario, model: ModelSection) -> PlantSection:
+    """Return the plant of a loop with numbers in place of random draws."""
+    plant, update = loop.plant, dict[str, object]()
+    A, B, x0 = np.array(model.A), np.array(model.B), np.array(plant.initial_state)
+    if plant.initial_state_halfwidth is not None:
+        rng = stream(loop.seeds.initial_state, "initial_state")
+        x0 += np.array(plant.initial_state_halfwidth) * rng.uniform(-1, 1, len(x0))
+    if plant.draw == "given":
+        A, B = np.array(plant.A), np.array(plant.B)
+    elif plant.draw in ("uniform", "vertex"):
+        rng = stream(loop.seeds.plant, "plant")
+        A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, A.shape)
+        B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, B.shape)
+    _require_finite("plant", A, B, loop.timing.plant_period_ns)
+    if loop.coverage.is_linear:
+        update = {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
+    update |= {"initial_state": tuple(x0.tolist()), "initial_state_halfwidth": None}
+    return plant.model_copy(update=update)
 
 
 def _explicit_model(model: ModelSection) -> ModelSection:

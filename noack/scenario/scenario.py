@@ -232,10 +232,7 @@ def _seeds(
 
 @cache
 def parts_model(parts: frozenset[str], *, others_optional: bool = False) -> type[ScenarioSection]:
-    """Return a model of some of a scenario's parts.
-
-    With ``others_optional`` the other parts are optional keys.
-    """
+    """Return a model of a scenario's parts; with ``others_optional`` the others are optional keys."""
     fields: dict[str, Any] = {}
     for name, field in Scenario.model_fields.items():
         kind: Any = field.annotation

@@ -88,10 +88,7 @@ def _docstrings(module: str) -> dict[str, dict[str, str]]:
     for section in [statement for statement in statements if isinstance(statement, ast.ClassDef)]:
         for pair in pairwise(section.body):
             match pair:
-                case (
-                    ast.AnnAssign(target=ast.Name(id=key)),
-                    ast.Expr(value=ast.Constant(value=str(text))),
-                ):
+                case (ast.AnnAssign(target=ast.Name(id=key)), ast.Expr(value=ast.Constant(value=str(text)))):
                     docstrings.setdefault(section.name, {})[key] = inspect.cleandoc(text)
     return docstrings
 

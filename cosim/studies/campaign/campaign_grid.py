@@ -187,12 +187,7 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     n, m = scenario.model.dimensions
     Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
     R = _weight(metrics.R, "metrics.R", m, "one row per input")
-    measured: _Measured = {
-        "Q": Q,
-        "R": R,
-        "settle": metrics.settle,
-        "most_events": metrics.most_events,
-    }
+    measured: _Measured = {"Q": Q, "R": R, "settle": metrics.settle, "most_events": metrics.most_events}
     if scenario.loops:
         if campaign.time != "sampled":
             raise CallerError('loops: a network that loops share needs time = "sampled"')

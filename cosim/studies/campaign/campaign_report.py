@@ -61,10 +61,7 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
     With ``shares``, the differences have the share of draws in which a metric is smaller, too.
     """
     campaign, metric_names = summary.campaign, summary.campaign.metrics.shown
-    headings = [
-        *(axis.called for axis in campaign.axes),
-        *(METRICS[name].heading for name in metric_names),
-    ]
+    headings = [*(axis.called for axis in campaign.axes), *(METRICS[name].heading for name in metric_names)]
     means = [
         (*result.point.labels.values(), *(written(result.estimates.get(name)) for name in metric_names))
         for result in summary.results

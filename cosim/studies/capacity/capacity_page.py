@@ -90,10 +90,7 @@ def write(result: CapacityResult, folder: Path, figure_files: FigureFiles | None
         MachineError: they cannot be written.
     """
     document = to_json(result.document(), indent=1, inf_nan_mode="null")
-    written = [
-        write_whole(folder / PAGE, page(result)),
-        write_whole(folder / RESULTS, document + b"\n"),
-    ]
+    written = [write_whole(folder / PAGE, page(result)), write_whole(folder / RESULTS, document + b"\n")]
     files = figure_files or FigureFiles(FigureFormat.SVG, SCREEN_IN)
     for figure in figures(result):
         written.append(folder / f"{figure.name}.{files.kind}")

@@ -120,11 +120,7 @@ def policies_of(kinds: Sequence[Kind]) -> dict[str, Entry]:
             loops.append(kind.under(change))
         return {"mode": mode, "loops": loops}
 
-    return {
-        PERIODIC: settings("zoh", periodic=True),
-        ZOH: settings("zoh"),
-        MODEL: settings("model"),
-    }
+    return {PERIODIC: settings("zoh", periodic=True), ZOH: settings("zoh"), MODEL: settings("model")}
 
 
 def sampling_period_s(loop: Scenario) -> float:

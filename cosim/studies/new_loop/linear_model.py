@@ -410,10 +410,7 @@ def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:
 
 def _matrix(name: str, matrix: Matrix, rows: Sequence[str], columns: Sequence[str]) -> str:
     entries = ([f"{value:.6g}" for value in row] for row in matrix)
-    table: Rows = [
-        [name, *columns],
-        *([row, *cells] for row, cells in zip(rows, entries, strict=True)),
-    ]
+    table: Rows = [[name, *columns], *([row, *cells] for row, cells in zip(rows, entries, strict=True))]
     return as_text(table)
 
 

@@ -87,11 +87,7 @@ class NewScenario:
     def to_json(self) -> Table:
         """Return the document of ``noack new --json``."""
         certificate = self.certificate and self.certificate.to_json()
-        return self.gain.to_json() | {
-            "toml": self.text,
-            "notes": self.notes,
-            "certificate": certificate,
-        }
+        return self.gain.to_json() | {"toml": self.text, "notes": self.notes, "certificate": certificate}
 
     def __repr__(self) -> str:
         return self.text

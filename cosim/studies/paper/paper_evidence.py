@@ -127,10 +127,7 @@ def _growth(scenario: Scenario, draws: int) -> Numbers:
         runs = [run_continuous(resolved_draw(scenario, draw, mode)) for draw in range(draws)]
         norms = [np.linalg.norm([state.x for state in run.before], axis=1) for run in runs]
         rises = [np.diff(n[run.delivered]) > 0 for n, run in zip(norms, runs, strict=True)]
-        growth[mode] = {
-            "stretches": sum(map(len, rises)),
-            "growing": sum(int(rise.sum()) for rise in rises),
-        }
+        growth[mode] = {"stretches": sum(map(len, rises)), "growing": sum(int(rise.sum()) for rise in rises)}
     return growth
 
 
@@ -200,11 +197,7 @@ def _loss(M: int) -> Numbers:
     """
     roots = np.roots([*[1.0] * (M - 1), -1.0])
     (half,) = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
-    return {
-        "half": float(half),
-        "at_0.8": 1 - 1 / sum(0.8**k for k in range(M)),
-        "most": (M - 1) / M,
-    }
+    return {"half": float(half), "at_0.8": 1 - 1 / sum(0.8**k for k in range(M)), "most": (M - 1) / M}
 
 
 def _exact_model(scenario: Scenario) -> Numbers:

@@ -138,13 +138,7 @@ class Delay(FileFeature, Impairment):
                 "delay 0s samples 1ms,2ms,10ms",
                 {"distribution": "empirical"},
             ),
-            Part(
-                "loss_correlation",
-                SIGNED_PERCENT,
-                "P",
-                "lossrel",
-                "loss 5% delay 10ms 2ms lossrel 50%",
-            ),
+            Part("loss_correlation", SIGNED_PERCENT, "P", "lossrel", "loss 5% delay 10ms 2ms lossrel 50%"),
             synonyms=("latency",),
         ),
     )

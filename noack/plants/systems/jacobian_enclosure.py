@@ -291,10 +291,7 @@ class EnclosedMotion:
         if expressions is None:
             raise NotEnclosedError("x is neither its state nor its state minus a constant")
         rates, states = (
-            [
-                number if isinstance(number, Enclosed) else Enclosed(_ball(float(number)), constant)
-                for number in part
-            ]
+            [term if isinstance(term, Enclosed) else Enclosed(_ball(float(term)), constant) for term in part]
             for part in expressions
         )
         for state, coordinate in zip(states, enclosed[: self.n], strict=True):
