@@ -84,10 +84,7 @@ def current_parameters(scenario: Scenario) -> Table:
 
 def scheduled(scenario: Scenario) -> list[ParameterChange]:
     """Return the changes that a scenario schedules."""
-    return [
-        ParameterChange(number, change.at_ns, dict(change.set))
-        for number, change in enumerate(scenario.changes)
-    ]
+    return [ParameterChange(i, change.at_ns, dict(change.set)) for i, change in enumerate(scenario.changes)]
 
 
 def settings_key(resolved: Scenario) -> tuple[int, ...]:
@@ -185,9 +182,7 @@ class ChangeSchedule(Generic[Prepared]):
             since_ns, change.number, change.settings, self._timeline[0].scenario, None
         )
         timeline = [*self._timeline]
-        first = bisect(
-            timeline, (since_ns, change.number), key=lambda applied: (applied.since_ns, applied.number)
-        )
+        first = bisect(timeline, (since_ns, change.number), key=attrgetter("since_ns", "number"))
         timeline.insert(first, entry)
         for index in range(first, len(timeline)):
             # A change that was refused has left its number to another one.
@@ -224,7 +219,7 @@ class ChangeSchedule(Generic[Prepared]):
 
     def at(self, t_ns: int) -> AppliedParameters[Prepared]:
         """The scenario that is in force at a time."""
-        return self._timeline[bisect(self._timeline, t_ns, key=lambda applied: applied.since_ns) - 1]
+        return self._timeline[bisect(self._timeline, t_ns, key=attrgetter("since_ns")) - 1]
 
     def between(self, first_ns: int, last_ns: int) -> Iterator[Scenario]:
         """Return the scenarios that are in force at any time within an interval."""
