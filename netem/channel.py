@@ -138,7 +138,7 @@ class Channel:
         datagram = ffi.new("noack_datagram *", {"message": message, "flow": flow, "bit": -1})
         datagram.size_bytes, datagram.arrival_ns = size_bytes, now_ns
         earlier_put = self.core.put
-        leaving = self._left(lambda: core.noack_channel_handle(self.core, datagram, now_ns))
+        leaving = self._departures(lambda: core.noack_channel_handle(self.core, datagram, now_ns))
         return leaving, self.core.put - earlier_put
 
     @property
@@ -150,10 +150,10 @@ class Channel:
         """Let what is due leave; return it in its order."""
         leaving: list[Leaving] = []
         while (due_ns := self.due_ns) <= now_ns:
-            leaving += self._left(partial(core.noack_channel_release, self.core, due_ns))
+            leaving += self._departures(partial(core.noack_channel_release, self.core, due_ns))
         return leaving
 
-    def _left(self, step: Callable[[], int]) -> list[Leaving]:
+    def _departures(self, step: Callable[[], int]) -> list[Leaving]:
         while (question := step()) != core.NOACK_DONE:
             self.answer(question)
         departures = (self.core.leaving[index] for index in range(self.core.leaving_count))

@@ -448,11 +448,11 @@ def _link_table(spec: LinkSpec) -> dict[str, object]:
     for key in ("seed", "return_path", "idle_s"):
         if getattr(spec, key) != getattr(LinkSpec, key):
             table[key] = getattr(spec, key)
-    sides = {"forward": _given(spec.forward), "reverse": _given(spec.reverse)}
+    sides = {"forward": _set_keys(spec.forward), "reverse": _set_keys(spec.reverse)}
     return table | {name: side for name, side in sides.items() if side}
 
 
-def _given(section: BaseModel) -> dict[str, object]:
+def _set_keys(section: BaseModel) -> dict[str, object]:
     """Return the keys of a section that differ from their defaults, and its kind."""
     return {
         key: _plain(getattr(section, key))
@@ -463,5 +463,5 @@ def _given(section: BaseModel) -> dict[str, object]:
 
 def _plain(value: object) -> object:
     if isinstance(value, BaseModel):
-        return _given(value)
+        return _set_keys(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value

@@ -68,7 +68,7 @@ class LinkState:
         long as this object lives."""
         self._memory: dict[str, Array] = {}
         self._stages: CData = None
-        self.core[0] = self._filled(settings, rows, tracks=bool(decisions))[0]
+        self.core[0] = self._new_link(settings, rows, tracks=bool(decisions))[0]
         _require(core.noack_recorded_check(self.core))
 
     @property
@@ -137,7 +137,7 @@ class LinkState:
         """
         earlier = self._memory, self._stages
         try:
-            changed = self._filled(settings, self.rows, tracks=self.tracks)
+            changed = self._new_link(settings, self.rows, tracks=self.tracks)
         except ValueError:  # the link goes on as it was
             self._memory, self._stages = earlier
             raise
@@ -146,7 +146,7 @@ class LinkState:
         self.settings = settings
         del earlier  # the core has read the earlier state
 
-    def _filled(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
+    def _new_link(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
         """Return a new ``noack_link`` of these settings, which shares the array of flows."""
         settings = with_kept_loss(settings)
         tables = StageTables(

@@ -289,7 +289,7 @@ def repeat_archive(
         finalize(ending, report=False, view=False)
         repeated = load_run(ending.run_dir)
         compare = _replayed if manifest.kind == "live" else _repeated
-        pairs = zip(_named(recorded), _named(repeated), strict=True)
+        pairs = zip(_named_loops(recorded), _named_loops(repeated), strict=True)
         compared = [compare(name, record, repeated_record) for (name, record), (_, repeated_record) in pairs]
         return Repetition(
             scenario=manifest.scenario,
@@ -341,7 +341,7 @@ def _scenario(path: Path, archived: Path, *, run_code: bool) -> Scenario:
     return scenario
 
 
-def _named(run: RecordedRun) -> Iterator[tuple[str, RunRecord]]:
+def _named_loops(run: RecordedRun) -> Iterator[tuple[str, RunRecord]]:
     """Yield the records of the loops with their names, and that of a network that they share."""
     if len(run.loops) == 1:  # its record has the rows of the network
         yield "", run.loops[0]

@@ -190,7 +190,7 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
             f"give 2 to {len(LABELS)} run directories to compare, not {len(directories)}; "
             "`noack fidelity` compares one with the ideal loop"
         )
-    runs = tuple(map(_compared, LABELS, directories))
+    runs = tuple(map(_open_run, LABELS, directories))
     first = runs[0].record.loop.n
     for run in runs[1:]:
         if run.record.loop.n != first:
@@ -201,7 +201,7 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
     return RunComparison(runs)
 
 
-def _compared(label: str, named_path: Path) -> ComparedRun:
+def _open_run(label: str, named_path: Path) -> ComparedRun:
     """Open a run of one loop, or a loop of a run: ``RUN:NAME``."""
     folder, colon, name = named_path.name.partition(":")
     loop = name if colon and not named_path.exists() else None

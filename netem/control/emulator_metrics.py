@@ -119,14 +119,14 @@ def metrics(report: Statistics) -> Iterator[Metric]:
 
 
 def _counter(name: str, text: str, labels: Sequence[str], rows: _Rows) -> Metric:
-    return _filled(CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
+    return _with_rows(CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
 
 
 def _gauge(name: str, text: str, labels: Sequence[str], rows: _Rows) -> Metric:
-    return _filled(GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
+    return _with_rows(GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
 
 
-def _filled(metric: CounterMetricFamily | GaugeMetricFamily, rows: _Rows) -> Metric:
+def _with_rows(metric: CounterMetricFamily | GaugeMetricFamily, rows: _Rows) -> Metric:
     for values, value in rows:
         if value is not None:
             metric.add_metric(values, value)

@@ -230,7 +230,7 @@ def _cells(
         ("", Text(sparkline(departures, top), "green")),
         ("loss", Text(_loss(side))),
         ("", Text(sparkline(losses, _top([*losses, side["loss"]["predicted"]])), "yellow")),
-        ("drawn", Text(_drawn(side))),
+        ("drawn", Text(_drawn_text(side))),
         ("lost", _wrapped(_lost_text(side), width)),
         ("", _wrapped(_further_counts(side), width)),
         ("burst", _burst(side, width)),
@@ -272,7 +272,7 @@ def _loss(side: DirectionStatistics) -> str:
     return percent_text(lost) + stale
 
 
-def _drawn(side: DirectionStatistics) -> str:
+def _drawn_text(side: DirectionStatistics) -> str:
     drawn, predicted = side["loss"]["drawn"], side["loss"]["predicted"]
     expected = "" if predicted is None else f", predicted {percent_text(predicted)}"
     return percent_text(drawn) + expected
@@ -384,7 +384,7 @@ def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:
         f"received {_flow(side, 'received')}",
         f"forwarded {_flow(side, 'forwarded')}",
         f"loss {_loss(side)}",
-        f"drawn {_drawn(side)}",
+        f"drawn {_drawn_text(side)}",
         f"longest loss burst {burst_text(side)}",
         f"forced {side['fates']['forced']:,}",
         f"delay p99 {time_text((side['recent'] or side)['delay_ns']['p99'])}",

@@ -112,21 +112,21 @@ def joint_chain(settings: LinkSettings) -> tuple[Array, Array, Array]:
     Raises:
         NotPredictableError: there is no such chain; the message is the reason.
     """
-    return _together([part for impairment in settings.impairments for part in impairment.chains()])
+    return _joint_chain([part for impairment in settings.impairments for part in impairment.chains()])
 
 
 def _constrained_rate(parts: Sequence[Chain | Pattern], guarantee: LossGuarantee) -> float:
     patterns = [part.lost for part in parts if isinstance(part, Pattern)]
     if len(patterns) == len(parts):
         return pattern_rate(_together_lost(patterns), guarantee)
-    return constrained_rate(*_together(parts), guarantee)
+    return constrained_rate(*_joint_chain(parts), guarantee)
 
 
 def _capped_rate(parts: Sequence[Chain | Pattern], mansd: int | None) -> float:
     patterns = [part for part in parts if isinstance(part, Pattern)]
     if len(patterns) == len(parts):
         return _pattern_rate([part.lost for part in patterns], mansd)
-    start, moves, ineffective = _together(parts)
+    start, moves, ineffective = _joint_chain(parts)
     if mansd is None:
         return float(_stationary(start, moves) @ ineffective)
     lost, passed = moves * ineffective, moves * (1 - ineffective)
@@ -159,7 +159,7 @@ def _together_lost(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     return lost
 
 
-def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
+def _joint_chain(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
     """Return the joint chain: start, matrix, probability of no effective delivery."""
     states = math.prod(len(part.lost if isinstance(part, Pattern) else part.start) for part in parts)
     if states > MOST_STATES:

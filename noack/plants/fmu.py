@@ -124,7 +124,7 @@ class FmuSystem:
         try:
             description = _described(path)
             self.about = _about(description)
-            self._instance = self._loaded(path, end, description)
+            self._instance = self._load(path, end, description)
             self._start(settings, x0, description)
         except CallerError:
             end.close()
@@ -153,7 +153,7 @@ class FmuSystem:
     def _wrong(self, message: str) -> NoReturn:
         raise CallerError(f"{self._place}: {message}")
 
-    def _loaded(self, path: Path, end: contextlib.ExitStack, description: "ModelDescription") -> "_Instance":
+    def _load(self, path: Path, end: contextlib.ExitStack, description: "ModelDescription") -> "_Instance":
         fmpy, folder = _fmpy(), end.enter_context(temporary_folder())
         fmpy.extract(str(path), str(folder))
         self._require_binary(folder, description)
@@ -237,7 +237,7 @@ def _described(path: Path) -> "ModelDescription":
         with path.open("rb") as content:  # FMPy does not close a file that it cannot read
             description = fmpy.read_model_description(content, validate=False)
     except Exception as error:  # a file that is not an FMU can raise any error
-        file.wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_short(error)}")
+        file.wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_one_line(error)}")
     if description.fmiVersion.startswith("1."):
         file.wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 are supported")
     if description.coSimulation is None:
@@ -276,11 +276,11 @@ class _Log:
         *_, status, _, message = arguments
         assert isinstance(status, int)
         if status > _WARNING and isinstance(message, bytes):
-            self._last = _short(message.decode(errors="replace"))
+            self._last = _one_line(message.decode(errors="replace"))
 
     def why(self, error: Exception) -> str:
         """Return an error's text, with the FMU's last message."""
-        return f"{_short(error)} ({self._last})" if self._last else _short(error)
+        return f"{_one_line(error)} ({self._last})" if self._last else _one_line(error)
 
 
 class _Variables:
@@ -296,7 +296,7 @@ class _Variables:
 
     def real(self, key: str, names: Sequence[str], refusal: Refusal) -> list["ScalarVariable"]:
         """Return real scalars that are not refused."""
-        variables = [self._named(key, name) for name in names]
+        variables = [self._variable(key, name) for name in names]
         twice = next((name for name, count in Counter(names).items() if count > 1), None)
         if twice is not None:
             raise CallerError(f'plant.system.{key}: "{twice}" is named twice')
@@ -307,7 +307,7 @@ class _Variables:
 
     def parameter(self, name: str, value: object) -> tuple["ScalarVariable", object]:
         """Return a variable and its start value."""
-        variable = self._named("parameters", name)
+        variable = self._variable("parameters", name)
         kinds, expected = _VALUES.get(variable.type, ((int,), "a whole number"))
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
             _refuse("parameters", variable, f"is of type {variable.type}; give {expected}, not {value!r}")
@@ -317,7 +317,7 @@ class _Variables:
             _refuse("parameters", variable, reason)
         return variable, value
 
-    def _named(self, key: str, name: str) -> "ScalarVariable":
+    def _variable(self, key: str, name: str) -> "ScalarVariable":
         if name in self._known:
             return self._known[name]
         close = difflib.get_close_matches(name, self._known, n=1)
@@ -402,7 +402,7 @@ def _fmpy() -> ModuleType:
         return import_module("fmpy")
 
 
-def _short(message: object) -> str:
+def _one_line(message: object) -> str:
     text = " ".join(str(message).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 

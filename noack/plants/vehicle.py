@@ -389,7 +389,7 @@ def _compiled(model: str) -> Compiled:
 
     dynamics, lateral = _dynamics(model), library("utils.tire_model", "formula_lateral")
     integrator_functions = [member for _, member in inspect.getmembers(jump_integrator, inspect.isfunction)]
-    functions: set[Callable[..., Any]] = {*_needed(dynamics), *integrator_functions, rates}
+    functions: set[Callable[..., Any]] = {*_with_callees(dynamics), *integrator_functions, rates}
     for function in functions - {lateral}:
         register_jitable(**_OPTIONS)(function)
     overload(lateral, jit_options=_OPTIONS)(_held)
@@ -425,20 +425,22 @@ def _held(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
 
 @cache
 def _folder(model: str) -> Path | None:
-    sources = {Path(inspect.getfile(function)) for function in _needed(_dynamics(model))}
+    sources = {Path(inspect.getfile(function)) for function in _with_callees(_dynamics(model))}
     sources |= {Path(__file__), Path(jump_integrator.__file__)}
     return cache_folder(f"vehicle-{model}", sorted(sources))
 
 
-def _needed(function: FunctionType) -> list[FunctionType]:
+def _with_callees(function: FunctionType) -> list[FunctionType]:
     """Return a function of the library and all library functions that it calls, also indirectly."""
     functions = [function]
     for caller in functions:  # grows
-        functions += [callee for callee in dict.fromkeys(_named(caller)) if callee not in functions]
+        functions += [
+            callee for callee in dict.fromkeys(_library_functions(caller)) if callee not in functions
+        ]
     return functions
 
 
-def _named(function: FunctionType) -> Iterator[FunctionType]:
+def _library_functions(function: FunctionType) -> Iterator[FunctionType]:
     names = function.__code__.co_names
     reachable = [function.__globals__.get(name) for name in names]
     for module in [value for value in reachable if isinstance(value, ModuleType)]:

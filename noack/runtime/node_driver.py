@@ -75,7 +75,7 @@ class NodeDriver(LiveDriver):
     ) -> None:
         super().__init__(machines, process.wire, admitted_ns=process.admitted_ns)
         # The file's name alone: the process is given a copy in the run directory.
-        self._named = f"controller.file ({Path(settings.file).name})"
+        self._label = f"controller.file ({Path(settings.file).name})"
         self._key, self._sockets = process.ticket.key, list[socket.socket]()
         self._clock, self._sent_clock = RunClock(0), b""
         self._to_send, self._received = bytearray(), bytearray()
@@ -88,9 +88,9 @@ class NodeDriver(LiveDriver):
         self._own, its = socket.socketpair()
         its.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
         with its:
-            self._program = self._started(unchanged(settings, "controller"), settings.runner, its)
+            self._program = self._start(unchanged(settings, "controller"), settings.runner, its)
 
-    def _started(self, path: Path, runner: Sequence[str], its: socket.socket) -> "subprocess.Popen[bytes]":
+    def _start(self, path: Path, runner: Sequence[str], its: socket.socket) -> "subprocess.Popen[bytes]":
         prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
         try:
             return subprocess.Popen(
@@ -107,7 +107,7 @@ class NodeDriver(LiveDriver):
                     f'controller.runner = "{runner[0]}": cannot be started: {error.strerror}'
                 ) from None
             raise CallerError(
-                f"{self._named}: cannot be started: {error.strerror}; it must be executable (chmod "
+                f"{self._label}: cannot be started: {error.strerror}; it must be executable (chmod "
                 "+x), and of this processor, or controller.runner names what runs it"
             ) from None
 
@@ -118,7 +118,7 @@ class NodeDriver(LiveDriver):
             answer = f"says {shortened(text)!r}" if text else self._how_it_ended()
             self.__exit__()
             raise CallerError(
-                f"{self._named}: {answer}; a node of this version says {_GREETING!r}: build it by "
+                f"{self._label}: {answer}; a node of this version says {_GREETING!r}: build it by "
                 "native/build.py --node"
             )
         self._own.setblocking(False)
@@ -197,7 +197,7 @@ class NodeDriver(LiveDriver):
             self._take_frames(sink)
         self._pass_rows(sink)
         if not goes_on:
-            raise PeerError(f"{self._named}: {self._how_it_ended()}")
+            raise PeerError(f"{self._label}: {self._how_it_ended()}")
 
     def take(self, data: bytes, source: SocketName, sink: RecordSink) -> None:
         """Pass the program a datagram that Python has received."""
@@ -222,13 +222,13 @@ class NodeDriver(LiveDriver):
         self._pass_rows(sink)
         end_reason = self._how_it_ended()
         if goes_on or self._program.returncode != 0:
-            raise PeerError(f"{self._named}: {end_reason}")
+            raise PeerError(f"{self._label}: {end_reason}")
         due_ns = self.next_deadline_ns()
         late_s = 0.0 if due_ns is None else (now_ns - due_ns) / NS_PER_S / self._clock.speed
         if min(late_s, began_s - self._tick_s) > _STUCK_S:
             steps = self.machines.machines[0].machine.step
             raise PeerError(
-                f"{self._named}: has sent {steps} ticks, and is {late_s:.1f} s late with the next; "
+                f"{self._label}: has sent {steps} ticks, and is {late_s:.1f} s late with the next; "
                 "it must send the row of each tick"
             )
 
@@ -267,7 +267,7 @@ class NodeDriver(LiveDriver):
             kind, size = _HEAD.unpack_from(received, begin)
             if size != self._sizes.get(kind):
                 raise PeerError(
-                    f"{self._named}: has sent a frame of kind {kind} and {size} bytes, which no "
+                    f"{self._label}: has sent a frame of kind {kind} and {size} bytes, which no "
                     "node of this version sends"
                 )
             if len(received) < begin + _HEAD.size + size:
@@ -299,7 +299,7 @@ class NodeDriver(LiveDriver):
             if kind == core.NOACK_TICKS:
                 sequence = struct.unpack_from("<q", content, 8)[0]
                 if sequence != (due := machine.first_number + machine.step):
-                    raise PeerError(f"{self._named}: has sent tick {sequence} in place of {due}")
+                    raise PeerError(f"{self._label}: has sent tick {sequence} in place of {due}")
                 machine.step += 1
                 self._tick_s = time.monotonic()
             if table.count == table.places:

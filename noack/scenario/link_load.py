@@ -182,7 +182,7 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
         if not isinstance(impairment, Rate | Opportunities):
             continue
         previous: LinkLoad | None = None
-        delay_s = _known(delays[index])
+        delay_s = _largest_bound(delays[index])
         by_loops = tuple(_by_loops(delays[index])) if len(delays[index]) > 1 else ()
         for begin, direction, loops in stages:
             window = _window(direction)
@@ -211,7 +211,7 @@ def _by_loops(delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
         yield f"loop{'s' * (len(loops) > 1)} {', '.join(spans)}", delay_s
 
 
-def _known(delays_s: Sequence[float]) -> float | None:
+def _largest_bound(delays_s: Sequence[float]) -> float | None:
     """Return the largest of the bounds of a delay; None: one is not known."""
     return max(delays_s) if math.isfinite(max(delays_s)) else None
 
@@ -238,7 +238,7 @@ def _slot_loads(
                 rate_bps=bits * len(slots[number]) / round_s,
                 mandatory_at_most_bps=must_pass / loop.least_s,
                 mandatory_at_least_bps=must_pass / loop.largest_s,
-                delay_bound_s=_known([delays_s[number]]),
+                delay_bound_s=_largest_bound([delays_s[number]]),
             )
 
 

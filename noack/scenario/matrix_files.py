@@ -56,7 +56,7 @@ def with_matrices(content: ReadTable, folder: Path, source: str) -> ReadTable:
         section = content.get(table)
         if isinstance(section, Mapping) and (names := _names(section)) is not None:
             file = NamedFile(section["file"], folder, f"{source}: {table}")
-            updated[table] = _replaced(section, keys, file, names)
+            updated[table] = _with_file(section, keys, file, names)
     return updated
 
 
@@ -77,7 +77,7 @@ def _names(section: ReadTable) -> Mapping[str, str] | None:
     return names if are_names and names.keys() <= {"A", "B", GAIN} else None
 
 
-def _replaced(
+def _with_file(
     section: ReadTable, keys: tuple[str, ...], file: NamedFile, names: Mapping[str, str]
 ) -> ReadTable:
     for key in ("A", "B"):
@@ -162,14 +162,14 @@ def _arrays(file: NamedFile) -> Arrays:
     try:
         if file.path.suffix == MAT:
             content = matrices_as_npz(content, _MOST_ENTRIES)
-        return _of_npz(content)
+        return _npz_arrays(content)
     except NotImplementedError:
         file.wrong("is of MATLAB's v7.3, which is HDF5; save it as v7: save(name, '-v7')")
     except Exception:  # an invalid file can raise any error
         file.wrong(f"is no {file.path.suffix} file, or a damaged one")
 
 
-def _of_npz(content: bytes) -> Arrays:
+def _npz_arrays(content: bytes) -> Arrays:
     """Return the arrays that are not too large, by name."""
     arrays = {}
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -269,12 +269,12 @@ def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matr
                 "give a state space, e.g. with .to_ss(), control.ss, or a tuple (A, B, C, D)"
             )
         A, B, C, D, dt = (getattr(system, key, None) for key in ("A", "B", "C", "D", "dt"))
-    matrices = {"A": _numbers_of("A", A), "B": _numbers_of("B", B)}
+    matrices = {"A": _finite_matrix("A", A), "B": _finite_matrix("B", B)}
     n, m = matrices["B"].shape
     try:
         require_shape(rows_of(matrices["A"]), "A", (n, n), "B has a row for each state")
         if gain is not None:
-            matrices[GAIN] = _numbers_of(GAIN, gain)
+            matrices[GAIN] = _finite_matrix(GAIN, gain)
             require_shape(rows_of(matrices[GAIN]), GAIN, (m, n), "a row per input, a column per state")
     except ValueError as error:
         raise CallerError(f"the system: {error}") from None
@@ -285,7 +285,7 @@ def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matr
     return matrices
 
 
-def _numbers_of(name: str, value: ArrayLike) -> Matrix:
+def _finite_matrix(name: str, value: ArrayLike) -> Matrix:
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -169,14 +169,14 @@ class ChangeSchedule(Generic[Prepared]):
         nothing, if the scenario would be invalid.
         """
         since_ns = max(change.t_ns, reached_ns + 1)
-        self._timeline = self._with(change, since_ns)
+        self._timeline = self._with_change(change, since_ns)
         return announcement_outputs(table, change, number, now_ns, since_ns)
 
     def check(self, change: ParameterChange, reached_ns: int) -> None:
         """Raise CallerError if the scenario would be invalid after a change; announce nothing."""
-        self._with(change, max(change.t_ns, reached_ns + 1))
+        self._with_change(change, max(change.t_ns, reached_ns + 1))
 
-    def _with(self, change: ParameterChange, since_ns: int) -> list[AppliedParameters[Prepared]]:
+    def _with_change(self, change: ParameterChange, since_ns: int) -> list[AppliedParameters[Prepared]]:
         """Return the scenarios with a change that is in force from a time on."""
         entry = AppliedParameters[Prepared](
             since_ns, change.number, change.settings, self._timeline[0].scenario, None

@@ -54,7 +54,7 @@ def load(path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.
     except CallerError as error:
         lines = str(error)
         for key, override in zip(keys, assignments, strict=True):
-            lines = _of_another_kind(lines, path, key, override.partition("=")[2])
+            lines = _explain_kind(lines, path, key, override.partition("=")[2])
         raise CallerError(_attributed(lines, path, keys) if keys else lines) from None
 
 
@@ -79,7 +79,7 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     network = scenario.network
     update: dict[str, object] = {}
     for place, section in network.directions.items():
-        read = _read(section, path.parent, f"{source}: {place}")
+        read = _without_files(section, path.parent, f"{source}: {place}")
         _, _, key = place.partition(".")
         update |= {key: section.model_copy(update=read)} if key else read
     scenario = scenario.model_copy(update={"network": network.model_copy(update=update)})
@@ -98,7 +98,7 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     return with_loop_tables(scenario, lambda place, loop: tables(f"{place}.", loop))
 
 
-def _read(section: DirectionSection, folder: Path, place: str) -> Table:
+def _without_files(section: DirectionSection, folder: Path, place: str) -> Table:
     impairments = tuple(
         impairment.without_files(folder, f"{place}.impairments.{number}")
         for number, impairment in enumerate(section.impairments)
@@ -164,7 +164,7 @@ def toml_text(content: ReadTable) -> str:
     return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
 
 
-def _of_another_kind(lines: str, path: Path, key: str, value: str) -> str:
+def _explain_kind(lines: str, path: Path, key: str, value: str) -> str:
     """Make one line of all mistakes that arise because only the kind of a table was set."""
     table, _, kind = key.rpartition(".")
     value, start = value.strip().strip("\"'"), re.escape(printable(f"{path}: {table}."))
@@ -257,12 +257,12 @@ def put(content: Table, key: str, value: object, source: str) -> None:
         if isinstance(table, dict):
             table = table.setdefault(part, {})
         else:
-            entries, number = _entry(table, part, f"{source}: {'.'.join(path[:depth])}")
+            entries, number = _list_entry(table, part, f"{source}: {'.'.join(path[:depth])}")
             table = entries[number]
     if isinstance(table, dict):
         table[last] = copy.deepcopy(value)
     else:
-        entries, number = _entry(table, last, f"{source}: {'.'.join(path)}")
+        entries, number = _list_entry(table, last, f"{source}: {'.'.join(path)}")
         entries[number] = copy.deepcopy(value)
 
 
@@ -279,7 +279,7 @@ def remove(content: Table, key: str) -> None:
         table.pop(last, None)
 
 
-def _entry(table: object, part: str, source: str) -> tuple[list[object], int]:
+def _list_entry(table: object, part: str, source: str) -> tuple[list[object], int]:
     """Return a list and the number of its entry that a part of a key names."""
     if not isinstance(table, list):
         raise CallerError(printable(f"{source} is not a table"))

@@ -307,12 +307,12 @@ def _locate(place: Sequence[str | int], root: type[ScenarioSection]) -> _Place:
             kind = choices[str(part)]
             continue
         path.append(part)
-        kind, section = _within(kind, part)
+        kind, section = _entry_kind(kind, part)
         alternatives = _choices(kind)
     return _Place(path, section, *alternatives, kind)
 
 
-def _within(kind: Kind, part: str | int) -> tuple[Kind, type[ScenarioSection] | None]:
+def _entry_kind(kind: Kind, part: str | int) -> tuple[Kind, type[ScenarioSection] | None]:
     """Return the annotation of an entry of ``kind``, and the section that contains the entry."""
     section = _section_of(kind)
     if section is not None:

@@ -68,7 +68,7 @@ def pareto_figure(
         (xs, dx), (ys, dy) = map(_means, pair)
         finite = np.isfinite(xs) & np.isfinite(ys)
         front = np.flatnonzero(finite)[undominated(xs[finite], ys[finite])]
-        colour, marker, dash = _look(i)
+        colour, marker, dash = _style(i)
         items += [
             Marks(x=xs, y=ys, x_error=dx, y_error=dy, colour=colour, reduced=False, marker=marker,
                   label=_name(name)),
@@ -104,7 +104,7 @@ def curve_figure(
     items: list[Item] = []
     for i, (name, estimates) in enumerate(series.items()):
         mean, half = (values[order] for values in _means(estimates))
-        colour, marker, dash = _look(i)
+        colour, marker, dash = _style(i)
         items += [
             Line(x=xs[order], y=mean, label=_name(name), colour=colour, size=4, marker=marker, dash=dash),
             Band(x=xs[order], low=mean - half, high=mean + half, colour=colour),
@@ -135,7 +135,7 @@ def heat_map_figure(
             low=finite.min(),
             high=finite.max(),
             label=METRICS[metric].label,
-            logarithmic=METRICS[metric].logarithmic and _far(finite),
+            logarithmic=METRICS[metric].logarithmic and _is_wide(finite),
         )
     axes = [
         Axis(label=_name(name), ticks=dict(enumerate(map(plain, labels))), grid=False)
@@ -167,7 +167,7 @@ def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> FigureD
     for i, (name, values) in enumerate(series.items()):
         xs = np.quantile(values, share, method="inverted_cdf")
         is_known = np.isfinite(xs)
-        colour, _, dash = _look(i)
+        colour, _, dash = _style(i)
         items.append(
             Line(x=xs[is_known], y=share[is_known], label=_name(name), colour=colour, dash=dash, steps="post")
         )
@@ -259,7 +259,7 @@ def _series(
     return groups
 
 
-def _look(i: int) -> tuple[Colour, str, Dash]:
+def _style(i: int) -> tuple[Colour, str, Dash]:
     """Return colour, marker and dashes of the i-th series."""
     return series_colour(i), MARKERS[i % len(MARKERS)], DASHES[i % len(DASHES)]
 
@@ -283,15 +283,15 @@ def _title(metric: Metric) -> str:
 def _axis(metric: Metric, values: Sequence[float] | Vector) -> Axis:
     """Return a metric's axis: logarithmic if the finite values are positive and far apart."""
     array = np.asarray(values)
-    is_log = METRICS[metric].logarithmic and _far(array[np.isfinite(array)])
+    is_log = METRICS[metric].logarithmic and _is_wide(array[np.isfinite(array)])
     return Axis(label=METRICS[metric].label, logarithmic=is_log)
 
 
 def _is_geometric(values: Vector) -> bool:
     """Whether values are far apart, and their middle is nearer to the geometric mean of the ends."""
     middle, ends = float(np.median(values)), (values.min(), values.max())
-    return _far(values) and middle - math.sqrt(ends[0] * ends[1]) < sum(ends) / 2 - middle
+    return _is_wide(values) and middle - math.sqrt(ends[0] * ends[1]) < sum(ends) / 2 - middle
 
 
-def _far(values: Vector) -> bool:
+def _is_wide(values: Vector) -> bool:
     return bool(len(values) and values.min() > 0 and values.max() >= _FAR * values.min())

@@ -222,17 +222,17 @@ def _unfinished(summary: CampaignSummary) -> Iterator[str]:
         unfinished = {ending: count for ending, count in result.ended.items() if ending != "finished"}
         if unfinished:
             counts = ", ".join(f"{n:,} {ending.replace('_', ' ')}" for ending, n in unfinished.items())
-            yield f"{_at(result.point.labels)} not all runs reached the horizon: {counts}"
+            yield f"{_place_text(result.point.labels)} not all runs reached the horizon: {counts}"
 
 
 def _bursts(summary: CampaignSummary) -> Iterator[str]:
     """Return, for each grid point without an enforced guarantee, how often it was exceeded."""
     for result in summary.results:
         if result.bursts is not None:
-            yield f"{_at(result.point.labels)} {result.bursts.text}"
+            yield f"{_place_text(result.point.labels)} {result.bursts.text}"
 
 
-def _at(labels: Mapping[str, str]) -> str:
+def _place_text(labels: Mapping[str, str]) -> str:
     return "At " + ", ".join(f"{axis} {label}" for axis, label in labels.items())
 
 

@@ -203,13 +203,13 @@ class CampaignSummary(NamedTuple):
 
 def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
     """Estimate all metrics and judge the claims; the runs of a few grid points are in memory."""
-    results = [_result(point, store) for point in store.points]
+    results = [_point_result(point, store) for point in store.points]
 
     def values(point: Point) -> Mapping[Metric, Vector]:
         return runs_at(point, store)[0]
 
     claims = list(judge_claims(campaign, store.points, values))
-    return CampaignSummary(campaign, store.draws, results, list(_compared(campaign, store)), claims)
+    return CampaignSummary(campaign, store.draws, results, list(_comparisons(campaign, store)), claims)
 
 
 def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], NDArray[np.generic]]:
@@ -218,7 +218,7 @@ def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], NDArray[n
     return measured(columns, point.certified_error), columns["status"]
 
 
-def _result(point: Point, store: Store) -> GridPointResult:
+def _point_result(point: Point, store: Store) -> GridPointResult:
     metrics, status = runs_at(point, store)
     bound_shares = metrics.get("certificate_used", np.zeros(0))
     return GridPointResult(
@@ -230,7 +230,7 @@ def _result(point: Point, store: Store) -> GridPointResult:
     )
 
 
-def _compared(campaign: Campaign, store: Store) -> Iterator[ComparedResult]:
+def _comparisons(campaign: Campaign, store: Store) -> Iterator[ComparedResult]:
     if campaign.compare is None:
         return
     axis, reference_label = campaign.compare.axis, label_of(campaign.compare.reference)

@@ -113,15 +113,15 @@ class LinearModel:
             "motion": f"the matrix logarithm of the plant's motion over {self.plant.step_ns * 1e-9:g} s",
             "exact": "the plant's own matrices",
         }[self.source]
-        return f"{source}, at x = {_shown(self.at)}, u = {_shown(self.input)}"
+        return f"{source}, at x = {_vector_text(self.at)}, u = {_vector_text(self.input)}"
 
     def _sentences(self) -> Iterator[str]:
         yield f"computed from {self.origin}"
         if not self.rests:
             move, *_ = np.linalg.lstsq(np.hstack([self.A, self.B]), -self.drift, rcond=None)
             x, u = np.split(np.concatenate([self.at, self.input]) + move, [len(self.A)])
-            yield f"no equilibrium: ẋ = {_shown(self.drift)} there"
-            yield f"the linear model rests at x = {_shown(x)}, u = {_shown(u)}"
+            yield f"no equilibrium: ẋ = {_vector_text(self.drift)} there"
+            yield f"the linear model rests at x = {_vector_text(x)}, u = {_vector_text(u)}"
         for within, error in self.errors:
             worst = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
             name = self.plant.state_names[worst]
@@ -414,7 +414,7 @@ def _matrix(name: str, matrix: Matrix, rows: Sequence[str], columns: Sequence[st
     return as_text(table)
 
 
-def _shown(values: Vector) -> str:
+def _vector_text(values: Vector) -> str:
     return f"({', '.join(f'{value:.4g}' for value in values)})"
 
 

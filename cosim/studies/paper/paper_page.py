@@ -179,14 +179,14 @@ def render(document: Document) -> str:
             model=point[BASE, POLICIES[0]],
             zoh=point[BASE, POLICIES[1]],
             apart=apart[BASE],
-            compared=list(_compared(point, apart[BASE])),
+            compared=list(_metric_rows(point, apart[BASE])),
             varied=list(_varied(point, apart)),
             **document["evidence"],
         )
     )
 
 
-def _compared(point: Mapping[Any, Any], apart: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _metric_rows(point: Mapping[Any, Any], apart: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the main table: a metric of both loops."""
     for name, difference in apart.items():
         spreads = (_spread(point[BASE, policy][name]) for policy in POLICIES)
@@ -237,16 +237,16 @@ def _wrapped(text: str) -> str:
         is_verbatim = code or fence or not start or start[0] in "|#!<"
         code ^= fence
         if paragraph and (is_verbatim or _ITEM.match(start)):
-            lines += _filled(paragraph)
+            lines += _wrapped_lines(paragraph)
             paragraph = ""
         if is_verbatim:
             lines.append(line)
         else:
             paragraph = f"{paragraph} {start}" if paragraph else line
-    return "\n".join([*lines, *_filled(paragraph), ""])
+    return "\n".join([*lines, *_wrapped_lines(paragraph), ""])
 
 
-def _filled(paragraph: str) -> list[str]:
+def _wrapped_lines(paragraph: str) -> list[str]:
     start = paragraph.lstrip()
     item = _ITEM.match(start)
     begin = len(paragraph) - len(start) + (item.end() if item else 0)

@@ -135,14 +135,14 @@ def _one_at_a_time(compiling: Function, lock: Path) -> Function:
         with ExitStack() as stack:
             with suppress(OSError):  # without file locks every process compiles
                 stack.enter_context(locked(lock, wait=True))
-            stack.enter_context(_to_the_end())
+            stack.enter_context(_signals_delayed())
             return compiling(signature)
 
     return compile_alone
 
 
 @contextmanager
-def _to_the_end() -> Iterator[None]:
+def _signals_delayed() -> Iterator[None]:
     """Delay handled signals: an exception in a Python callback of LLVM would crash the process."""
     received: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
