@@ -434,13 +434,11 @@ def _with_callees(function: FunctionType) -> list[FunctionType]:
     """Return a function of the library and all library functions that it calls, also indirectly."""
     functions = [function]
     for caller in functions:  # grows
-        functions += [
-            callee for callee in dict.fromkeys(_library_functions(caller)) if callee not in functions
-        ]
+        functions += [callee for callee in dict.fromkeys(_callees(caller)) if callee not in functions]
     return functions
 
 
-def _library_functions(function: FunctionType) -> Iterator[FunctionType]:
+def _callees(function: FunctionType) -> Iterator[FunctionType]:
     names = function.__code__.co_names
     reachable = [function.__globals__.get(name) for name in names]
     for module in [value for value in reachable if isinstance(value, ModuleType)]:

@@ -186,10 +186,7 @@ def _npz_arrays(content: bytes) -> Arrays:
     return arrays
 
 
-_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def _matrix(file: NamedFile, name: str, value: NDArray[np.generic]) -> Matrix:

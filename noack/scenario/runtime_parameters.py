@@ -123,11 +123,9 @@ def _is_number(annotation: object) -> bool:
 
 def _contains(value: object, matches: Callable[[object], bool]) -> bool:
     inner = [*value.values()] if isinstance(value, Mapping) else value
-    return (
-        any(_contains(entry, matches) for entry in inner)
-        if isinstance(inner, list | tuple)
-        else matches(value)
-    )
+    if isinstance(inner, list | tuple):
+        return any(_contains(entry, matches) for entry in inner)
+    return matches(value)
 
 
 def _in_words(keys: tuple[str, ...]) -> str:

@@ -128,14 +128,9 @@ def rows(result: CapacityResult) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of capacities."""
     last = result.plan.counts[-1]
     for case in result.capacities:
-        limits = [_capacity_text(case.limits[limit], last) for limit in LIMITS]
-        yield (
-            case.policy,
-            case.disturbance,
-            _capacity_text(case.any_limit, last),
-            case.limited_by or "–",
-            *limits,
-        )
+        limits = [_limit_text(case.limits[limit], last) for limit in LIMITS]
+        carried = _limit_text(case.any_limit, last)
+        yield case.policy, case.disturbance, carried, case.limited_by or "–", *limits
 
 
 def by_rate(plan: CapacityPlan) -> str:
@@ -217,8 +212,8 @@ def comparisons(result: CapacityResult) -> Iterator[str]:
             outcome = "loses"
         setting = "with a common disturbance" if disturbance == COMMON else "as in the scenario"
         yield (
-            f"{policy} against {PERIODIC}, {setting}: {outcome} ({_capacity_text(limit, last)} and "
-            f"{_capacity_text(periodic_limit, last)} loops)"
+            f"{policy} against {PERIODIC}, {setting}: {outcome} ({_limit_text(limit, last)} and "
+            f"{_limit_text(periodic_limit, last)} loops)"
         )
 
 
@@ -284,7 +279,7 @@ def live_row(point: LivePoint) -> tuple[str, ...]:
     return (point.policy, str(point.loops), *cells, str(point.unintended_losses), verdict)
 
 
-def _capacity_text(capacity: Capacity, last: int) -> str:
+def _limit_text(capacity: Capacity, last: int) -> str:
     def text(count: float) -> str:
         return f"≥ {last}" if math.isinf(count) else f"{count:g}"
 
