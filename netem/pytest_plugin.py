@@ -81,10 +81,10 @@ def pytest_runtest_makereport(
     """Say which network a failed test had, and how to have it again."""
     report = yield
     if report.failed and (links := item.stash.get(_LINKS, [])):
-        again = (
+        command = (
             f"the same losses again: pytest {_OPTION} {item.config.stash[_COMMON]} {shlex.quote(item.nodeid)}"
         )
-        text = "\n".join([*map(str, links), again])
+        text = "\n".join([*map(str, links), command])
         add = getattr(report.longrepr, "addsection", None)  # shown whatever --show-capture is
         if add is not None:
             add("lossy_udp", text)

@@ -367,9 +367,9 @@ def _statistics_lines(commands: CommandQueue, period_s: float, path: Path | None
             name = "standard output" if path is None else path
             report_line(f"statistics cannot be written to {name} ({error.strerror}); the relay continues")
             # Also, closing the file writes the buffer once more; this must not fail.
-            nothing = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nothing, file.fileno())
-            os.close(nothing)
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, file.fileno())
+            os.close(null)
 
     try:
         with StatisticsThread(commands, period_s, write, at_end=True):

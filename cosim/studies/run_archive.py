@@ -367,12 +367,12 @@ def _repeated(name: str, archived: RunRecord, repeated: RunRecord) -> _Compared:
 def first_difference(archived: RunRecord, repeated: RunRecord) -> ReplayDifference | None:
     """Return the first difference between the tables of two records, bit for bit."""
     rows_before = dict.fromkeys(archived.tables, 0)
-    nothing: Slice = {}
-    for recorded, again in zip_longest(archived.slices(), repeated.slices(), fillvalue=nothing):
+    empty: Slice = {}
+    for recorded, repetition in zip_longest(archived.slices(), repeated.slices(), fillvalue=empty):
         differences = [
             different
             for table in archived.tables
-            if (different := _in_table(table, rows_before[table], recorded, again)) is not None
+            if (different := _in_table(table, rows_before[table], recorded, repetition)) is not None
         ]
         if differences:
             return min(differences, key=lambda item: item.now_ns)
@@ -381,8 +381,8 @@ def first_difference(archived: RunRecord, repeated: RunRecord) -> ReplayDifferen
     return None
 
 
-def _in_table(table: str, rows_before: int, recorded: Slice, again: Slice) -> ReplayDifference | None:
-    rows, repeated_rows = (part.get(table, np.zeros(0)) for part in (recorded, again))
+def _in_table(table: str, rows_before: int, recorded: Slice, repetition: Slice) -> ReplayDifference | None:
+    rows, repeated_rows = (part.get(table, np.zeros(0)) for part in (recorded, repetition))
     if rows.tobytes() == repeated_rows.tobytes():
         return None
     for i, (row, repeated_row) in enumerate(zip(rows, repeated_rows, strict=False)):

@@ -83,8 +83,8 @@ class KeyNumber(NamedTuple):
     def cells(self) -> list[str]:
         """The values as text, each with its difference to the first run's."""
         return [
-            "-" if value is None else f"{value:.4g}" + (f" ({apart:+.3g})" if apart else "")
-            for value, apart in zip(self.values, self.differences, strict=True)
+            "-" if value is None else f"{value:.4g}" + (f" ({difference:+.3g})" if difference else "")
+            for value, difference in zip(self.values, self.differences, strict=True)
         ]
 
 
@@ -102,8 +102,8 @@ class RunComparison:
     def numbers(self) -> list[KeyNumber]:
         """The key numbers that at least one of the runs has."""
         values = {name: tuple(value(run.loop) for run in self.runs) for name, value in _NUMBERS.items()}
-        apart = [_distance(self.runs[0].record, run.record) for run in self.runs]
-        values["distance in x to A, RMS"], values["distance in x to A, maximum"] = zip(*apart, strict=True)
+        pairs = [_distance(self.runs[0].record, run.record) for run in self.runs]
+        values["distance in x to A, RMS"], values["distance in x to A, maximum"] = zip(*pairs, strict=True)
         return [KeyNumber(*entry) for entry in values.items() if any(v is not None for v in entry[1])]
 
     @cached_property
@@ -256,10 +256,10 @@ def _distance(first: RunRecord, second: RunRecord) -> tuple[float | None, float 
     _, at_a, at_b = np.intersect1d(a["t_ns"], b["t_ns"], return_indices=True)
     if first is second or not len(at_a):
         return None, None
-    apart = np.linalg.norm(b["x"][at_b] - a["x"][at_a], axis=1)
-    if not np.isfinite(apart).all():
+    distances = np.linalg.norm(b["x"][at_b] - a["x"][at_a], axis=1)
+    if not np.isfinite(distances).all():
         return None, None
-    return float(np.sqrt(np.mean(apart**2))), float(apart.max())
+    return float(np.sqrt(np.mean(distances**2))), float(distances.max())
 
 
 def _flat(settings: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -311,8 +311,8 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
                 )
                 for values, dash in curves
             ]
-        about = np.concatenate([getattr(samples, name) for samples in aligned])
-        y = Axis(label="norm", logarithmic=True, about=about, decades=_DECADES)
+        norms = np.concatenate([getattr(samples, name) for samples in aligned])
+        y = Axis(label="norm", logarithmic=True, about=norms, decades=_DECADES)
         rows.append(Row(panels=[Panel(title=title, items=items, x=longest, y=y)], height_in=_NORM_IN))
     events = replace(_events(runs), x=replace(longest, label=TIME, numbers=True))
     return FigureDescription(

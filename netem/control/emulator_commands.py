@@ -100,9 +100,9 @@ def main(arguments: Sequence[str]) -> ExitStatus:
         source, as_json = f"noack netem {command}", "--json" in options
         return failed(str(error), error.exit_status, source=source, as_json=as_json)
     except BrokenPipeError:  # the reader has closed the pipe
-        nothing = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nothing, sys.stdout.fileno())
-        os.close(nothing)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
         return ExitStatus.OK
 
 

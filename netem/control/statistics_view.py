@@ -359,8 +359,8 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
         table.add_column(heading, justify="right", no_wrap=True)
     for row, (link, name) in enumerate(listed):
         side = link[name]
-        beyond = side["mansd"] is not None and side["longest_loss_burst"] > side["mansd"]
-        style = "bold red" if beyond or any(side["unintended"].values()) else ""
+        exceeds = side["mansd"] is not None and side["longest_loss_burst"] > side["mansd"]
+        style = "bold red" if exceeds or any(side["unintended"].values()) else ""
         table.add_row(Text(names[row]), *(texts[row] for texts in columns.values()), style=style)
     hidden = len(rows) - len(listed)
     return Group(table, Text(f" … and {hidden} more", "dim")) if hidden else table

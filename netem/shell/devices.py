@@ -93,7 +93,7 @@ class DeviceLink:
 
     def client_text(self, flow: bytes) -> str:
         """Return a flow as text: protocol, end inside, end outside."""
-        version, protocol, is_fragment, _, near, far = struct.unpack_from("!4BHH", flow)
+        version, protocol, is_fragment, _, inner_port, outer_port = struct.unpack_from("!4BHH", flow)
         if version == 0:
             return "not IP"
         size, family = (4, socket.AF_INET) if version == 4 else (16, socket.AF_INET6)
@@ -104,7 +104,7 @@ class DeviceLink:
             words[0] += " fragments"
         words += [
             f"{host if version == 4 else f'[{host}]'}{f':{port}' if port else ''}"
-            for host, port in zip(hosts, (near, far), strict=True)
+            for host, port in zip(hosts, (inner_port, outer_port), strict=True)
         ]
         return " ".join(words)
 
@@ -135,14 +135,14 @@ def open_devices(spec: LinkSpec) -> DeviceLink:
         CallerError: the system does not permit it or lacks something, or there are too many shells.
     """
     try:
-        around = _range_here()
-        number, outer = _first_free(around)
+        addresses = _range_here()
+        number, outer = _first_free(addresses)
         own_namespace = _open_namespace()
         process.call("unshare", process.NEW_NETWORK)
     except PermissionError:
         _enter_outside()
     os.environ.pop(_ENTERED, None)
-    network = list(around.subnets(_STEP_BITS))[number]
+    network = list(addresses.subnets(_STEP_BITS))[number]
     outside, inside = network[1], network[2]
     inner = _open_tun(_INSIDE)
     _configure(_INSIDE, inside, network.prefixlen)
@@ -175,13 +175,13 @@ def _range_here() -> IPv4Network:
             )
         except OSError:  # this is not in a shell
             return _RANGE
-    around = IPv4Interface(f"{address}/{mask}").network
-    if around.prefixlen >= _MOST_BITS:
+    addresses = IPv4Interface(f"{address}/{mask}").network
+    if addresses.prefixlen >= _MOST_BITS:
         raise CallerError("shells nest three deep; give the words of several to one shell")
-    return around
+    return addresses
 
 
-def _first_free(around: IPv4Network) -> tuple[int, int]:
+def _first_free(addresses: IPv4Network) -> tuple[int, int]:
     """Open the outer device with the first free number; return the number and the device."""
     parts = 1 << _STEP_BITS
     for number in range(1, parts):  # the first part has the addresses of the shell around

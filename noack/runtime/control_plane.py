@@ -337,13 +337,13 @@ class ControlPlane:
 
     def request(
         self,
-        request: str,
+        queryable: str,
         content: object,
         *,
         timeout_s: float,
         give_up: Callable[[], bool] = lambda: False,
     ) -> bytes:
-        """Send a request (as JSON) to the queryable ``what/ROLE`` and return the answer.
+        """Send a request (as JSON) to ``queryable/ROLE`` and return the answer.
 
         The request is sent again while the queryable does not exist, and every five seconds: an
         interrupted connection may lose request or answer. So the answering side must accept a
@@ -355,7 +355,7 @@ class ControlPlane:
         while (left_s := deadline_s - time.monotonic()) > 0 and not give_up():
             wait_s = min(left_s, _REQUEST_AGAIN_S)
             replies = self.session.get(
-                self.key(request, self.role),
+                self.key(queryable, self.role),
                 FifoChannel(4),
                 payload=payload,
                 timeout=wait_s + _REQUEST_AGAIN_S,  # zenoh would report its own as an error answer
@@ -367,7 +367,7 @@ class ControlPlane:
             if reply is not None and reply.err is not None:
                 raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
             time.sleep(0.02)
-        raise NoAnswerError(f"no answer to {request!r} within {timeout_s:g} s")
+        raise NoAnswerError(f"no answer to {queryable!r} within {timeout_s:g} s")
 
 
 class ParameterUpdates:

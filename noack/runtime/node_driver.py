@@ -85,18 +85,18 @@ class NodeDriver(LiveDriver):
         rows = {kind: tables[kind].row_bytes - core.NOACK_LOOP_BYTES for kind in _ROWS}
         counts = ffi.sizeof("noack_node_counts")
         self._sizes = rows | {core.NOACK_NODE_COUNTS: counts, core.NOACK_NODE_UNSENT: 8}
-        self._own, its = socket.socketpair()
-        its.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
-        with its:
-            self._program = self._start(unchanged(settings, "controller"), settings.runner, its)
+        self._own, peer = socket.socketpair()
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
+        with peer:
+            self._program = self._start(unchanged(settings, "controller"), settings.runner, peer)
 
-    def _start(self, path: Path, runner: Sequence[str], its: socket.socket) -> "subprocess.Popen[bytes]":
+    def _start(self, path: Path, runner: Sequence[str], peer: socket.socket) -> "subprocess.Popen[bytes]":
         prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
         try:
             return subprocess.Popen(
                 [*runner, str(path)],
-                stdin=its.fileno(),
-                stdout=its.fileno(),
+                stdin=peer.fileno(),
+                stdout=peer.fileno(),
                 process_group=0,
                 # Not only the end of its input: the program may hang, or be stopped.
                 preexec_fn=partial(prctl, _PR_SET_PDEATHSIG, signal.SIGKILL),

@@ -175,11 +175,11 @@ def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[P
             _remove(folder, name, os.fstat(descriptor))
 
 
-def live_lock_files(kind: str, only: str = "") -> list[LockFile]:
+def live_lock_files(kind: str, only_name: str = "") -> list[LockFile]:
     """Return the lock files of a kind, or only that of a name, whose process runs, by name."""
     try:
         with open_private(*_inside(kind)) as folder:
-            candidates = [only + _SUFFIX] if only else sorted(folder.names())
+            candidates = [only_name + _SUFFIX] if only_name else sorted(folder.names())
             names = [name for name in candidates if name.endswith(_SUFFIX)]
             return [file for name in names if (file := _alive(folder, name)) is not None]
     except FileNotFoundError:

@@ -234,7 +234,7 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
     """
     size_bytes = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     with ExitStack() as undo:
-        beside = []
+        sockets = []
         try:
             with _shared(endpoint):
                 for peer in dict.fromkeys(peers):
@@ -245,13 +245,13 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
                     peer_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
                     peer_socket.bind(endpoint.getsockname())
                     peer_socket.connect(peer)
-                    beside.append(peer_socket)
-            for peer_socket in beside:
+                    sockets.append(peer_socket)
+            for peer_socket in sockets:
                 peer_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
         except OSError:
             return ()
         undo.pop_all()
-    return tuple(beside)
+    return tuple(sockets)
 
 
 @contextmanager

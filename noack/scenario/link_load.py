@@ -336,11 +336,11 @@ def _chosen_delays_s(rate: Rate, scheduler: Scheduler, stages: Sequence[_Stage])
     bounds_s = {}
     for kind in counts:
         entry, number = kind
-        others = Counter[tuple[int, int, float]]()
+        sender_counts = Counter[tuple[int, int, float]]()
         for (other_entry, other_number), count in (counts - Counter([kind])).items():
             yields_ns = math.inf if changes else scheduler.yields_ns(number, other_number)
-            others[*senders_ns[other_entry], yields_ns] += count
-        other_senders = {Sender(*other): count for other, count in others.items()}
+            sender_counts[*senders_ns[other_entry], yields_ns] += count
+        other_senders = {Sender(*sender_ns): count for sender_ns, count in sender_counts.items()}
         bounds_s[kind] = response_ns(Sender(*senders_ns[entry]), other_senders) / NS_PER_S
     return [bounds_s[kind] for kind in kinds]
 

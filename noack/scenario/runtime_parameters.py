@@ -58,8 +58,8 @@ def require_runtime_parameters(settings: ReadTable, trigger: PolicySettings) -> 
     for key, value in settings.items():
         if key not in allowed and not key.startswith(f"{LOSS}."):
             short = [name for name, full in SHORT.items() if full in (*allowed, _PROBABILITY)]
-            near = nearest_key(key, (*short, *allowed, _PROBABILITY))
-            hint = near and f"did you mean {near}?"
+            nearest = nearest_key(key, (*short, *allowed, _PROBABILITY))
+            hint = nearest and f"did you mean {nearest}?"
             all_known = f"these can: {_in_words(allowed)} (for short: {', '.join(short)})"
             raise ValueError(f"{key}: cannot be changed during a run; {hint or all_known}")
         if _contains(value, lambda entry: entry is None):

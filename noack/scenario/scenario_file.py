@@ -194,8 +194,8 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
         for name in names:  # an unknown section: the whole name may be similar to a key
             section, dot, _ = name.partition(".")
             if assignment.startswith(f"{section} = "):
-                near = nearest_key(name, (*SHORT, *known_keys(Scenario)))
-                hint = f"did you mean {near}?" if near else hint
+                nearest_name = nearest_key(name, (*SHORT, *known_keys(Scenario)))
+                hint = f"did you mean {nearest_name}?" if nearest_name else hint
                 return f"--set {name if dot else assignment}: unknown key; {hint}"
         if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):
             return f"--set {line['rest']}"

@@ -78,8 +78,8 @@ def parsed(text: str, source: str) -> Table:
     Raises:
         CallerError: the text is not TOML, or a key in it has too many parts.
     """
-    bare = _STRING.sub(lambda match: "" if match["comment"] else "_", text)
-    if _LONG_KEY.search(bare):
+    masked = _STRING.sub(lambda match: "" if match["comment"] else "_", text)
+    if _LONG_KEY.search(masked):
         raise CallerError(f"{source}: a key has more than {MOST_LEVELS} parts")
     try:
         return tomllib.loads(text)
@@ -128,8 +128,8 @@ def _missing(path: Path, model: type[ScenarioSection]) -> str:
         with suppress(CallerError):
             if required_keys <= read(file).keys():
                 candidates.append(str(file))
-    near = did_you_mean(str(path), candidates)
-    return f"{path}: no such file" + (f"; {near}" if near else "")
+    hint = did_you_mean(str(path), candidates)
+    return f"{path}: no such file" + (f"; {hint}" if hint else "")
 
 
 def _defined_twice(text: str, error: str) -> str | None:
@@ -156,15 +156,15 @@ def _keys_of_lines(text: str, last: int) -> list[tuple[int, str]]:
 
     keys, table, depth = list[tuple[int, str]](), "", 0
     lines = zip(text.split("\n"), _STRING.sub(hidden, text).split("\n"), strict=True)
-    for number, (line, bare) in enumerate(list(lines)[:last], 1):
-        header = _TABLE.match(bare) if depth == 0 else None
+    for number, (line, masked) in enumerate(list(lines)[:last], 1):
+        header = _TABLE.match(masked) if depth == 0 else None
         if header is not None:
             table = _plain(line[slice(*header.span(1))])
             keys.append((number, table))
-        elif depth == 0 and "=" in bare:
-            key = _plain(line[: bare.index("=")])
+        elif depth == 0 and "=" in masked:
+            key = _plain(line[: masked.index("=")])
             keys.append((number, f"{table}.{key}" if table else key))
-        depth += sum(map(bare.count, "[{")) - sum(map(bare.count, "]}"))
+        depth += sum(map(masked.count, "[{")) - sum(map(masked.count, "]}"))
     return keys
 
 

@@ -221,8 +221,8 @@ class DesignOutcome:
     def written(self) -> str:
         """Return the scenario of the best loop as TOML, under a new name."""
         name = f"{self.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}"
-        about = f"{self.name} with another gain: {self.verdict}."
-        return dumps(self.scenario.model_copy(update={"name": name, "description": about}))
+        description = f"{self.name} with another gain: {self.verdict}."
+        return dumps(self.scenario.model_copy(update={"name": name, "description": description}))
 
 
 def gain_text(K: Rows) -> str:

@@ -341,14 +341,14 @@ class DesignResult:
                 f"not confirmed: on fresh draws it takes {self.fresh.settling} {share}, "
                 f"{limits.settling_s:g} s are allowed; take more --draws"
             )
-        measured, missed = self.best.measured, []
+        measured, shortfalls = self.best.measured, []
         if measured.settling_high_s > limits.settling_s:
             allowed = f"({limits.settling_s:g} s allowed)"
-            missed.append(f"a settling time of {measured.settling} {share} {allowed}")
+            shortfalls.append(f"a settling time of {measured.settling} {share} {allowed}")
         for name, limit in limits.bounds.items():
             if self.best.bounds[name] > limit:
-                missed.append(f"{certified(name, self.best.bounds[name])} ({limit:g} allowed)")
-        return f"no design meets the limits; the closest has {' and '.join(missed)}, at {settings_text}"
+                shortfalls.append(f"{certified(name, self.best.bounds[name])} ({limit:g} allowed)")
+        return f"no design meets the limits; the closest has {' and '.join(shortfalls)}, at {settings_text}"
 
     def document(self) -> dict[str, object]:
         """Return the result as JSON."""

@@ -236,9 +236,9 @@ class EventSearch:
         return best, value
 
 
-def _rounded(entries: Vector, like: EventLoop, alpha_per_s: float, beta: float) -> EventLoop:
+def _rounded(entries: Vector, template: EventLoop, alpha_per_s: float, beta: float) -> EventLoop:
     """Return a loop with six digits: what is judged is what is printed."""
-    width = len(like.K[0])
+    width = len(template.K[0])
     *numbers, alpha_per_s, beta = (float(f"{entry:.6g}") for entry in (*entries, alpha_per_s, beta))
     K = tuple(tuple(numbers[i : i + width]) for i in range(0, len(numbers), width))
     return EventLoop(K, alpha_per_s, beta)

@@ -308,13 +308,13 @@ class NetworkSearch:
         stability = None
         while rung >= 0 and (stability := self.judge(candidate, rung)).verdict != "stable":
             rung, stability = rung - 1, None
-        beyond, limit = None, math.inf if candidate == self.original else self.limit
+        following, limit = None, math.inf if candidate == self.original else self.limit
         while rung + 1 < len(self.ladder) and self.cost(candidate, rung + 1) <= limit:
-            beyond = self.judge(candidate, rung + 1)
-            if beyond.verdict != "stable":
+            following = self.judge(candidate, rung + 1)
+            if following.verdict != "stable":
                 break
-            rung, stability, beyond = rung + 1, beyond, None
-        return Reached(candidate, rung, stability, beyond, self.cost(candidate, rung))
+            rung, stability, following = rung + 1, following, None
+        return Reached(candidate, rung, stability, following, self.cost(candidate, rung))
 
     def regulators(self) -> list[Candidate]:
         """Return LQR gains of the model with all hold strategies."""
@@ -497,11 +497,11 @@ def _figure(search: NetworkSearch, original: Reached, best: Reached) -> FigureDe
         items.append(Line(x=numbers[rungs], y=growth, colour=colour, label=label, marker="o"))
         if reached.stability is not None:
             x, y = numbers[[reached.rung]], np.array([reached.stability.upper])
-            about = f"{label}: proven"
-            items.append(Marks(x=x, y=y, colour=colour, marker="*", size=12, label=about))
-    along = "M" if wish.window is None else f"losses in {wish.window} updates"
+            mark_label = f"{label}: proven"
+            items.append(Marks(x=x, y=y, colour=colour, marker="*", size=12, label=mark_label))
+    x_label = "M" if wish.window is None else f"losses in {wish.window} updates"
     if wish.goal == "transmissions":
-        along = "time between updates [s]"
-    x_axis = Axis(label=along, whole=wish.goal == "network")
+        x_label = "time between updates [s]"
+    x_axis = Axis(label=x_label, whole=wish.goal == "network")
     panel = Panel(items=items, x=x_axis, y=Axis(label="growth per period"))
     return figure_of("growth", panel, _CAPTION)

@@ -135,8 +135,8 @@ class LinearModel:
             yield f"not controllable: the eigenvalues {eigenvalue_text(uncontrollable)} /s: {effect}"
 
     @staticmethod
-    def _is_rough(wide: Vector, near: Vector) -> bool:
-        return bool((near > np.maximum(_ROUGH * wide, _ROUGH_LEAST)).any())
+    def _is_rough(wide: Vector, narrow: Vector) -> bool:
+        return bool((narrow > np.maximum(_ROUGH * wide, _ROUGH_LEAST)).any())
 
 
 @dataclass(frozen=True)

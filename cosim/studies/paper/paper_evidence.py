@@ -207,7 +207,7 @@ def _exact_model(scenario: Scenario) -> Numbers:
     loop = loop_of(resolved)
     eigenvalues, vectors = np.linalg.eig(loop.H)
     BK, identity = loop.B @ loop.K, np.eye(loop.n)
-    apart = [
+    deviations = [
         float(np.linalg.norm(np.linalg.solve(value * identity - loop.A, BK @ chi) - chi))
         for value, chi in zip(eigenvalues, vectors.T, strict=True)
     ]
@@ -217,7 +217,7 @@ def _exact_model(scenario: Scenario) -> Numbers:
         "events": len(run.event_s),
         "times_s": times_s,
         "norms": np.linalg.norm(run.at(times_s).x, axis=1).tolist(),
-        "apart": max(*apart, _ROUNDING),
+        "apart": max(*deviations, _ROUNDING),
     }
 
 
@@ -385,14 +385,14 @@ def _sampled(scenario: Scenario, representative: int) -> Numbers:
     record = simulate(resolved)
     joined = align_tables(record)
     tested = record[SENSOR_MEASUREMENT]["event"] > 0  # event 0 happens without a test
-    beyond = joined.e_s_norm[tested] / joined.threshold[tested]
+    ratios = joined.e_s_norm[tested] / joined.threshold[tested]
     exact = continuous.at(joined.t_ns / NS_PER_S)
     return {
         "horizon_s": _SAMPLED_S,
         "period_s": resolved.timing.measurement_period_ns / NS_PER_S,
         "events": int(tested.sum()) + 1,
         "events_continuous": len(continuous.event_s),
-        "beyond": float(beyond.max()),
+        "beyond": float(ratios.max()),
         "rms": math.sqrt(float(((joined.x - exact.x) ** 2).sum(axis=1).mean())),
     }
 

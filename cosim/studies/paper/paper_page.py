@@ -160,7 +160,7 @@ def render(document: Document) -> str:
     """Return the page in Markdown, from the content of ``paper.json``."""
     summary = document["summary"]
     point = {tuple(point["axes"].values()): point["metrics"] for point in summary["points"]}
-    apart = {difference["axes"]["variation"]: difference["metrics"] for difference in summary["differences"]}
+    gaps = {difference["axes"]["variation"]: difference["metrics"] for difference in summary["differences"]}
     templates = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         undefined=StrictUndefined,
@@ -178,25 +178,25 @@ def render(document: Document) -> str:
             claims=summary["claims"],
             model=point[BASE, POLICIES[0]],
             zoh=point[BASE, POLICIES[1]],
-            apart=apart[BASE],
-            compared=list(_metric_rows(point, apart[BASE])),
-            varied=list(_varied(point, apart)),
+            apart=gaps[BASE],
+            compared=list(_metric_rows(point, gaps[BASE])),
+            varied=list(_varied(point, gaps)),
             **document["evidence"],
         )
     )
 
 
-def _metric_rows(point: Mapping[Any, Any], apart: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _metric_rows(point: Mapping[Any, Any], differences: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the main table: a metric of both loops."""
-    for name, difference in apart.items():
+    for name, difference in differences.items():
         spreads = (_spread(point[BASE, policy][name]) for policy in POLICIES)
         larger = share_text(difference["larger"])
         yield METRICS[name].label, *spreads, _spread(difference), larger  # type: ignore[index]
 
 
-def _varied(point: Mapping[Any, Any], apart: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _varied(point: Mapping[Any, Any], gaps: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of variations: medians of both loops."""
-    for name, differences in apart.items():
+    for name, differences in gaps.items():
         medians = (
             " / ".join(number(point[name, policy][metric]["median"]) for policy in POLICIES)
             for metric in ("transmissions", "lost_share", "inter_event_min_s", "settling_s")

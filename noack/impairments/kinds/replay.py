@@ -154,11 +154,11 @@ class Replay(FileFeature, Impairment):
                 f"{brief_percent(lost)} lost, delays up to {brief_number(self.longest_s)} s"
             )
         matching = "at its time since the start" if self.by == "time" else "by its number in its flow"
-        again = ", repeated" if self.repeat else ", once"
+        repetition = ", repeated" if self.repeat else ", once"
         share = "" if self.delay_share == 1 else f", with {brief_percent(self.delay_share)} of the delay"
         return (
             f"loses or delays each packet as recorded {matching}{share}: "
-            f"{recording}{offset_meaning(self.offset_s)}{again}"
+            f"{recording}{offset_meaning(self.offset_s)}{repetition}"
         )
 
     def stage(self, tables: StageTables) -> Stage:

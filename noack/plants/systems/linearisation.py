@@ -126,11 +126,11 @@ def _rounded(values: Matrix) -> Matrix:
 
 def _followed(system_at: SystemAt, x0: Vector, u: Vector, settling: int, ahead: int, step_ns: int) -> Matrix:
     """Return x after the settling, a step later, and at the end, (3, n)."""
-    system, met = system_at(x0), []
+    system, states = system_at(x0), []
     for step in range(settling + ahead):
-        met.append(system.x)
+        states.append(system.x)
         system.advance(u, step * step_ns, step_ns)
-    return np.array([*met, system.x])[[settling, settling + 1, -1]]
+    return np.array([*states, system.x])[[settling, settling + 1, -1]]
 
 
 def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, step_ns: int) -> LinearMotion:
@@ -159,9 +159,9 @@ def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, s
     if np.linalg.svd(start_offs, compute_uv=False)[-1] < _SINGULAR:
         return without(NO_STATE)
     step = step_offs @ np.linalg.inv(start_offs)
-    missed = np.linalg.matrix_power(step, ahead) @ start_offs - ahead_offs
+    errors = np.linalg.matrix_power(step, ahead) @ start_offs - ahead_offs
     sizes = np.maximum(*(np.linalg.norm(deviations[:n], axis=0) for deviations in (start_offs, ahead_offs)))
-    if (np.linalg.norm(missed, axis=0) > _MISSED * sizes).any():
+    if (np.linalg.norm(errors, axis=0) > _MISSED * sizes).any():
         return without(NO_STATE)
     if np.abs(np.linalg.eigvals(step)).min() < _FORGOTTEN:
         return without(NO_LOGARITHM)
@@ -220,14 +220,14 @@ def largest_errors(
     random = np.random.default_rng(0)
     offs = random.uniform(-1.0, 1.0, size=(_SAMPLES[motion.source], len(halfwidths)))
     offs[::2] = np.sign(offs[::2])
-    resting, still = change(x0, u0)
-    missed, largest = np.zeros(n), np.zeros(n)
+    resting, resting_change = change(x0, u0)
+    errors, largest = np.zeros(n), np.zeros(n)
     with np.errstate(all="ignore"):
         for off in offs * halfwidths:
             x, moved = change(x0 + off[:n], u0 + off[n:])
             expected = linear @ np.concatenate([x - resting, off[n:]])
-            missed = np.maximum(missed, np.abs(moved - still - expected))
+            errors = np.maximum(errors, np.abs(moved - resting_change - expected))
             largest = np.maximum(largest, np.abs(expected))
         # A state that does not move has no error but rounding.
-        rounding = _ROUNDING * (norm(largest) + norm(still) + norm(resting))
-        return np.where(missed <= rounding, 0.0, missed / largest)
+        rounding = _ROUNDING * (norm(largest) + norm(resting_change) + norm(resting))
+        return np.where(errors <= rounding, 0.0, errors / largest)
