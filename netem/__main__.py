@@ -21,30 +21,30 @@ with stoppable_imports():
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the emulator (stand-alone or in a run), a shell, or a command for a running emulator."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if given and given[0] in ("show", "set", "watch"):
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words and words[0] in ("show", "set", "watch"):
         from netem.control import emulator_commands  # a run's emulator starts without it
 
-        return emulator_commands.main(given)
-    as_json = "--json" in given
+        return emulator_commands.main(words)
+    as_json = "--json" in words
     joining = Parser(prog="noack netem", add_help=False, allow_abbrev=False)
     add_options(joining)
     try:
-        if given[:1] == ["shell"]:
+        if words[:1] == ["shell"]:
             from netem.shell.shell import shell  # a run's emulator starts without it
 
-            as_json = "--json" in given[: (*given, "--").index("--")]
-            return shell(given[1:])
-        _, more = joining.parse_known_args(given)
-        if not more:
-            with join_run("netem", given) as run:
+            as_json = "--json" in words[: (*words, "--").index("--")]
+            return shell(words[1:])
+        _, further_words = joining.parse_known_args(words)
+        if not further_words:
+            with join_run("netem", words) as run:
                 run_network(run)
             return ExitStatus.OK
         from netem.stand_alone import run_stand_alone  # a run's emulator starts without it
 
-        return run_stand_alone(given)
+        return run_stand_alone(words)
     except NoackError as error:
-        return failed(str(error), error.exit_status, who="noack netem", as_json=as_json)
+        return failed(str(error), error.exit_status, source="noack netem", as_json=as_json)
 
 
 def run_network(run: RunProcess) -> None:

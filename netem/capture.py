@@ -232,9 +232,9 @@ class CaptureWriter:
         if not self._closed:
             self._closed = True
             self._queue.put(None)
-        before = -1
-        while self._thread.is_alive() and self._bytes != before:
-            before = self._bytes
+        earlier_bytes = -1
+        while self._thread.is_alive() and self._bytes != earlier_bytes:
+            earlier_bytes = self._bytes
             self._thread.join(patience_s)
         if self._thread.is_alive() and self.error is None:
             self._fail(f"nothing could be written for {patience_s:g} s")
@@ -256,15 +256,15 @@ class CaptureWriter:
 
     def _write(self, blocks: bytes | memoryview) -> None:
         view = memoryview(blocks)
-        done = 0
+        written = 0
         try:
-            while done < len(view):
-                size = os.write(self._file, view[done:])
-                done += size
+            while written < len(view):
+                size = os.write(self._file, view[written:])
+                written += size
                 self._bytes += size
         except OSError:
             with suppress(OSError):  # remove an incomplete block; a pipe cannot be truncated
-                os.ftruncate(self._file, os.lseek(self._file, 0, os.SEEK_CUR) - done)
+                os.ftruncate(self._file, os.lseek(self._file, 0, os.SEEK_CUR) - written)
             raise
 
     def _fail(self, reason: str) -> None:

@@ -137,9 +137,9 @@ class Channel:
         message = {"sequence": number}
         datagram = ffi.new("noack_datagram *", {"message": message, "flow": flow, "bit": -1})
         datagram.size_bytes, datagram.arrival_ns = size_bytes, now_ns
-        put = self.core.put
-        left = self._left(lambda: core.noack_channel_handle(self.core, datagram, now_ns))
-        return left, self.core.put - put
+        earlier_put = self.core.put
+        leaving = self._departures(lambda: core.noack_channel_handle(self.core, datagram, now_ns))
+        return leaving, self.core.put - earlier_put
 
     @property
     def due_ns(self) -> int:
@@ -148,25 +148,25 @@ class Channel:
 
     def release(self, now_ns: int) -> list[Leaving]:
         """Let what is due leave; return it in its order."""
-        left: list[Leaving] = []
+        leaving: list[Leaving] = []
         while (due_ns := self.due_ns) <= now_ns:
-            left += self._left(partial(core.noack_channel_release, self.core, due_ns))
-        return left
+            leaving += self._departures(partial(core.noack_channel_release, self.core, due_ns))
+        return leaving
 
-    def _left(self, step: Callable[[], int]) -> list[Leaving]:
+    def _departures(self, step: Callable[[], int]) -> list[Leaving]:
         while (question := step()) != core.NOACK_DONE:
             self.answer(question)
-        some = (self.core.leaving[place] for place in range(self.core.leaving_count))
-        return [Leaving(one.flow, one.message.sequence, one.bit) for one in some]
+        departures = (self.core.leaving[index] for index in range(self.core.leaving_count))
+        return [Leaving(packet.flow, packet.message.sequence, packet.bit) for packet in departures]
 
     def take_rows(self) -> list[tuple[str, Rows]]:
         """Return all rows since the last call, in batches of a table in their order."""
-        channel, taken = self.core, self._taken
+        channel, batches = self.core, self._taken
         packets = self._packets[: channel.packet_count].view(PACKET_ROW).copy()
         releases = self._releases[: channel.release_count].copy()
         channel.packet_count = channel.release_count = 0
         self._taken = []
-        return [*taken, (NETEM_PACKET, packets), (NETEM_RELEASE, releases)]
+        return [*batches, (NETEM_PACKET, packets), (NETEM_RELEASE, releases)]
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Accept a change; it applies from the first datagram that arrives at or after its time T.
@@ -207,19 +207,19 @@ class Channel:
 
     def _add_places(self, count: int) -> None:
         """Add room for delayed datagrams."""
-        channel, before = self.core, self.core.places
-        heap = np.zeros(before + count, dtype_of("noack_heap_entry"))
-        heap[:before] = self._heap
-        delayed = ffi.new("noack_delayed[]", before + count)
-        ffi.memmove(delayed, self._delayed, before * ffi.sizeof("noack_delayed"))
+        channel, earlier_places = self.core, self.core.places
+        heap = np.zeros(earlier_places + count, dtype_of("noack_heap_entry"))
+        heap[:earlier_places] = self._heap
+        delayed = ffi.new("noack_delayed[]", earlier_places + count)
+        ffi.memmove(delayed, self._delayed, earlier_places * ffi.sizeof("noack_delayed"))
         self._heap, self._delayed = heap, delayed
         channel.heap, channel.delayed = pointer_to(heap, "noack_heap_entry *"), delayed
-        waiting: Rows = np.zeros(before + count, dtype_of("noack_waiting"))
-        waiting[:before] = self._waiting
+        waiting: Rows = np.zeros(earlier_places + count, dtype_of("noack_waiting"))
+        waiting[:earlier_places] = self._waiting
         self._waiting = waiting
         channel.waiting = pointer_to(waiting, "noack_waiting *")
-        channel.places = before + count
-        core.noack_channel_add_places(channel, before)
+        channel.places = earlier_places + count
+        core.noack_channel_add_places(channel, earlier_places)
 
 
 def channel_of(
@@ -241,7 +241,7 @@ def channel_of(
                 decisions=[()] if network else (),
             )
         )
-    schedule = None if network else ChangeSchedule(resolved, lambda one: one.network.link)
+    schedule = None if network else ChangeSchedule(resolved, lambda scenario: scenario.network.link)
     return Channel(links, loops=loops, first_number=start.first_number, schedule=schedule, network=network)
 
 
@@ -251,8 +251,8 @@ def require_stand_alone(network: Scenario) -> Scenario:
     Raises:
         CallerError: the network changes, has several loops, acknowledges, or chooses by errors.
     """
-    for name, given in (("changes", network.changes), ("loops", network.loops)):
-        if given:
+    for name, setting in (("changes", network.changes), ("loops", network.loops)):
+        if setting:
             raise CallerError(
                 f"network: the scenario has {name}; outside a run of noack a network serves one "
                 f"loop and does not change: remove {name}"

@@ -99,15 +99,15 @@ class _Formatter(argparse.HelpFormatter):
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         lines: list[str] = []
         for line in text.splitlines():
-            left = " " * (len(line) - len(line.lstrip()))
+            margin = " " * (len(line) - len(line.lstrip()))
             column = line.rfind("  ") + 2 if line.strip().count("  ") else 0
-            more = " " * column if column else left + (4 * " " if left else "")
+            further_indent = " " * column if column else margin + (4 * " " if margin else "")
             command = line.startswith("  noack") and not column
             wrapped = textwrap.wrap(
                 line,
                 width - 2 * command,
                 initial_indent=indent,
-                subsequent_indent=indent + more,
+                subsequent_indent=indent + further_indent,
                 break_long_words=False,
                 break_on_hyphens=False,
             )
@@ -172,12 +172,12 @@ def shell_parser() -> Parser:
     return parser
 
 
-def _add_words(group: argparse._ArgumentGroup, here: str, there: str) -> None:
-    group.add_argument("words", nargs="*", metavar="WORDS", help=f"impairments, {here} to {there}")
-    group.add_argument("--reverse", metavar="WORDS", nargs="+", help=f"impairments, {there} to {here} (none)")
+def _add_words(group: argparse._ArgumentGroup, side: str, peer: str) -> None:
+    group.add_argument("words", nargs="*", metavar="WORDS", help=f"impairments, {side} to {peer}")
+    group.add_argument("--reverse", metavar="WORDS", nargs="+", help=f"impairments, {peer} to {side} (none)")
     group.add_argument("--both", action="store_true", help="the words apply in both directions")
-    what = "client that sends" if here == "clients" else "flow that has"
-    group.add_argument("--idle", metavar="TIME", help=f"remove a {what} nothing for TIME (60s)")
+    subject = "client that sends" if side == "clients" else "flow that has"
+    group.add_argument("--idle", metavar="TIME", help=f"remove a {subject} nothing for TIME (60s)")
     group.add_argument("--seed", type=int, help="seed of the random streams (0)")
 
 
@@ -188,7 +188,7 @@ def shell_spec(options: argparse.Namespace) -> LinkSpec:
         CallerError: the command line has a mistake.
     """
     forward, reverse, seed = _directions(options)
-    forward, reverse = (read_files(one, Path()) for one in (forward, reverse))
+    forward, reverse = (read_files(settings, Path()) for settings in (forward, reverse))
     return LinkSpec(LINK_NAME, _NOWHERE, _NOWHERE, forward, reverse, seed, idle_s=_idle_s(options.idle))
 
 
@@ -200,7 +200,7 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
     """
     require_no_dashes(arguments)
     # With a space before it, argparse takes -1,2 for a word, not for an option.
-    words = [f" {one}" if re.match(r"-[0-9.]", one) else one for one in arguments]
+    words = [f" {argument}" if re.match(r"-[0-9.]", argument) else argument for argument in arguments]
     options = parser.parse_intermixed_args(words)
     if any(argument.partition("=")[0] == "--session" for argument in arguments):
         raise CallerError(
@@ -219,8 +219,8 @@ def specs_of(options: argparse.Namespace, *, read: bool = True) -> tuple[LinkSpe
     if options.links is not None:
         for name in ("listen", "to", "words", "reverse", "both", "one_way", "idle", "seed"):
             if getattr(options, name):
-                shown = name if name == "words" else f"--{name.replace('_', '-')}"
-                raise CallerError(f"{shown}: with --links, set this in the file")
+                option = name if name == "words" else f"--{name.replace('_', '-')}"
+                raise CallerError(f"{option}: with --links, set this in the file")
         return load_links(options.links, read=read)
     if options.explain:
         options.listen = options.listen or _EXAMPLE_LISTEN
@@ -234,7 +234,7 @@ def specs_of(options: argparse.Namespace, *, read: bool = True) -> tuple[LinkSpe
     to = parse_destination(options.to, "--to", listen)
     forward, reverse, seed = _directions(options)
     if read:
-        forward, reverse = (read_files(one, Path()) for one in (forward, reverse))
+        forward, reverse = (read_files(settings, Path()) for settings in (forward, reverse))
     return (
         LinkSpec(
             name=LINK_NAME,
@@ -315,17 +315,17 @@ def explain(specs: Sequence[LinkSpec], written: Sequence[LinkSpec], *, as_json: 
         print(json.dumps({"links": links}, indent=2))
         return
     console = Console(highlight=False)
-    for number, (spec, named) in enumerate(zip(specs, written, strict=True)):
+    for number, (spec, written_spec) in enumerate(zip(specs, written, strict=True)):
         if number:
             console.print()
         if not as_file:
             seed = f", seed {spec.seed}" if spec.seed else ""
             addresses = f"{address_text(spec.listen)} → {address_text(spec.to)}"
             console.print(Text(f"{spec.name}: {addresses}{seed}", "bold underline"))
-        _print_link(console, spec, named)
+        _print_link(console, spec, written_spec)
         if as_file:
             console.print(Text("\nas a file of links (--links)", "bold"))
-            toml = tomli_w.dumps({"link": [_link_table(named)]}).strip()
+            toml = tomli_w.dumps({"link": [_link_table(written_spec)]}).strip()
             console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)  # for copying
 
 
@@ -334,7 +334,7 @@ def _document(settings: LinkSettings) -> dict[str, object]:
     return {
         "words": words_of(settings),
         "settings": settings.model_dump(mode="json", exclude_none=True),
-        "meaning": [one.meaning() for one in settings.impairments]
+        "meaning": [impairment.meaning() for impairment in settings.impairments]
         + [f"{words}: {meaning}" for words, meaning in settings_meaning(settings)],
         "predicted_loss": prediction.rate,
         "predicted_loss_note": prediction.note,
@@ -349,53 +349,50 @@ def settings_meaning(settings: LinkSettings) -> Iterator[tuple[str, str]]:
     """Yield (words, meaning) of the cap and the other settings."""
     if settings.mansd is not None:
         meaning = f"at most {settings.mansd} consecutive packets of a flow are not delivered"
-        yield (
-            f"mansd {settings.mansd}",
-            f"the cap (M − 1): {meaning}; the next one is always delivered",
-        )
-    for one in settings.constraints:
-        yield one.text(), one.meaning()
+        yield f"mansd {settings.mansd}", f"the cap (M − 1): {meaning}; the next one is always delivered"
+    for constraint in settings.constraints:
+        yield constraint.text(), constraint.meaning()
     if settings.first_delivered:
         meaning = "the first packet of each flow is always delivered"
         yield "first", f"{meaning}; the cap for later packets is mansd"
-    if any(one.delays for one in settings.impairments):
+    if any(impairment.delays for impairment in settings.impairments):
         most = settings.limit
         yield f"limit {most}", f"at most {most} packets are delayed at once; more are dropped"
 
 
-def _print_link(console: Console, spec: LinkSpec, named: LinkSpec) -> None:
+def _print_link(console: Console, spec: LinkSpec, written: LinkSpec) -> None:
     if spec.return_path and spec.forward == spec.reverse:
-        _print_direction(console, "both directions, each by itself", spec.forward, named.forward)
+        _print_direction(console, "both directions, each by itself", spec.forward, written.forward)
         return
-    _print_direction(console, "forward, from clients to the server", spec.forward, named.forward)
+    _print_direction(console, "forward, from clients to the server", spec.forward, written.forward)
     console.print()
     if spec.return_path:
         title = "reverse, from the server to clients"
-        _print_direction(console, title, spec.reverse, named.reverse)
+        _print_direction(console, title, spec.reverse, written.reverse)
     else:
         console.print(Text("reverse: not relayed; the server's answers are discarded", "bold"))
 
 
-def _print_direction(console: Console, title: str, settings: LinkSettings, named: LinkSettings) -> None:
+def _print_direction(console: Console, title: str, settings: LinkSettings, written: LinkSettings) -> None:
     if settings == LinkSettings():
         console.print(Text(f"{title}: no impairment", "bold"))
         return
     console.print(Text(f"{title}, in this order", "bold"))
-    console.print(_table(settings, named, console.width))
+    console.print(_table(settings, written, console.width))
     console.print(Text(f"\nexpected loss rate: {_rate_text(settings)}"))
-    _print_tc(console, tc_command(settings, named))
+    _print_tc(console, tc_command(settings, written))
 
 
-def _table(settings: LinkSettings, named: LinkSettings, width: int) -> Table:
+def _table(settings: LinkSettings, written: LinkSettings, width: int) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=False)
     table.add_column(justify="right", style="dim")
     most = min(max(2 * width // 5, _NARROW_WIDTH), _WIDE_WIDTH)
     table.add_column(max_width=most, overflow="fold", style="bold")
     table.add_column(overflow="fold")
-    pairs = zip(settings.impairments, named.impairments, strict=True)
-    for number, (one, other) in enumerate(pairs, 1):
+    pairs = zip(settings.impairments, written.impairments, strict=True)
+    for number, (impairment, written_impairment) in enumerate(pairs, 1):
         # As text: a bracket in a file's name is not markup.
-        words, meaning = shortened(other.text(), 200), one.meaning()
+        words, meaning = shortened(written_impairment.text(), 200), impairment.meaning()
         table.add_row(str(number), Text(words), Text(meaning))
     if not settings.impairments:
         table.add_row("", "", "no impairment")
@@ -451,11 +448,11 @@ def _link_table(spec: LinkSpec) -> dict[str, object]:
     for key in ("seed", "return_path", "idle_s"):
         if getattr(spec, key) != getattr(LinkSpec, key):
             table[key] = getattr(spec, key)
-    sides = {"forward": _given(spec.forward), "reverse": _given(spec.reverse)}
+    sides = {"forward": _set_keys(spec.forward), "reverse": _set_keys(spec.reverse)}
     return table | {name: side for name, side in sides.items() if side}
 
 
-def _given(section: BaseModel) -> dict[str, object]:
+def _set_keys(section: BaseModel) -> dict[str, object]:
     """Return the keys of a section that differ from their defaults, and its kind."""
     return {
         key: _plain(getattr(section, key))
@@ -466,5 +463,5 @@ def _given(section: BaseModel) -> dict[str, object]:
 
 def _plain(value: object) -> object:
     if isinstance(value, BaseModel):
-        return _given(value)
+        return _set_keys(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value

@@ -201,9 +201,9 @@ class FateRecorder:
         """Copy rows into columns, in groups, to release the interpreter lock often."""
         while len(rows):
             part, rows = np.split(rows, [_GROUP_ROWS - self._gathered])
-            here = slice(self._gathered, self._gathered + len(part))
+            places = slice(self._gathered, self._gathered + len(part))
             for name, column in self._columns.items():
-                column[here] = part[_FIELDS.get(name, name)]
+                column[places] = part[_FIELDS.get(name, name)]
             self._gathered += len(part)
             if self._gathered == _GROUP_ROWS:
                 self._write()
@@ -237,8 +237,8 @@ class FateRecorder:
             self._failed = True
             self._report(f"cannot be written ({_reason(error)})")
 
-    def _report(self, what: str) -> None:
-        report_line(f"fate trace {self._path}: {what}; it cannot be replayed; the relay continues")
+    def _report(self, problem: str) -> None:
+        report_line(f"fate trace {self._path}: {problem}; it cannot be replayed; the relay continues")
 
 
 def _reason(error: OSError | ValueError) -> str:
@@ -278,19 +278,19 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
     links_recorded = list(settings)
     for link in links or ():
         if link not in links_recorded:
-            known = ", ".join(links_recorded)
-            raise CallerError(f"{path}: has no link {link!r}; its links: {known}")
+            names = ", ".join(links_recorded)
+            raise CallerError(f"{path}: has no link {link!r}; its links: {names}")
     columns = {name: table[name].to_numpy() for name in SCHEMA.names}
-    found: dict[tuple[str, Direction], Decisions] = {}
+    decisions: dict[tuple[str, Direction], Decisions] = {}
     guarantees: dict[tuple[str, Direction], Mapping[str, object]] = {}
     for link in links_recorded if links is None else links:
         for direction in DIRECTIONS:
-            here = (columns["link"] == link) & (columns["direction"] == direction)
-            rows = {name: column[here] for name, column in columns.items()}
-            found[link, direction] = _flows(rows, len(table), f"{path}: {link} {direction}")
-            given: _Direction = getattr(settings[link], direction)
-            guarantees[link, direction] = dict(given) if _is_kept(given, rows) else {}
-    return Fates(found, guarantees)
+            is_here = (columns["link"] == link) & (columns["direction"] == direction)
+            rows = {name: column[is_here] for name, column in columns.items()}
+            decisions[link, direction] = _flows(rows, len(table), f"{path}: {link} {direction}")
+            recorded: _Direction = getattr(settings[link], direction)
+            guarantees[link, direction] = dict(recorded) if _is_kept(recorded, rows) else {}
+    return Fates(decisions, guarantees)
 
 
 def _is_kept(settings: "_Direction", rows: Mapping[str, NDArray[np.int64]]) -> bool:
@@ -300,12 +300,13 @@ def _is_kept(settings: "_Direction", rows: Mapping[str, NDArray[np.int64]]) -> b
         return False
     if not settings.constraints:
         return True
-    rules = [one.rule for one in settings.constraints]
+    rules = [constraint.rule for constraint in settings.constraints]
     histories: dict[int, LossHistory] = {}
     order = np.lexsort((rows["packet"], rows["flow"]))
     flows, lost = rows["flow"][order].tolist(), (losses > 0)[order].tolist()
     return not any(
-        histories.setdefault(flow, LossHistory(rules)).add(one) for flow, one in zip(flows, lost, strict=True)
+        histories.setdefault(flow, LossHistory(rules)).add(is_lost)
+        for flow, is_lost in zip(flows, lost, strict=True)
     )
 
 
@@ -401,10 +402,10 @@ def _flows(rows: Mapping[str, NDArray[np.int64]], most_flows: int, place: str) -
     decisions = np.empty(len(order), dtype_of("noack_recorded"))
     for name in decisions.dtype.names or ():
         decisions[name] = rows[name][order]
-    found = [decisions[:0]] * (int(flows[-1]) + 1 if len(flows) else 0)
+    by_flow = [decisions[:0]] * (int(flows[-1]) + 1 if len(flows) else 0)
     for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
-        found[int(flows[begin])] = decisions[begin:end]
-    return found
+        by_flow[int(flows[begin])] = decisions[begin:end]
+    return by_flow
 
 
 def _check(rows: Mapping[str, NDArray[np.int64]], most_flows: int, place: str) -> None:
@@ -423,5 +424,5 @@ def _check(rows: Mapping[str, NDArray[np.int64]], most_flows: int, place: str) -
     )
     if not possible.all():
         k = int(np.flatnonzero(~possible)[0])
-        what = ", ".join(f"{name} {rows[name][k]}" for name in SCHEMA.names[2:])
-        raise CallerError(f"{place}: impossible decision: {what}")
+        values = ", ".join(f"{name} {rows[name][k]}" for name in SCHEMA.names[2:])
+        raise CallerError(f"{place}: impossible decision: {values}")

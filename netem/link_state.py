@@ -68,7 +68,7 @@ class LinkState:
         long as this object lives."""
         self._memory: dict[str, Array] = {}
         self._stages: CData = None
-        self.core[0] = self._filled(settings, rows, tracks=bool(decisions))[0]
+        self.core[0] = self._new_link(settings, rows, tracks=bool(decisions))[0]
         _require(core.noack_recorded_check(self.core))
 
     @property
@@ -116,7 +116,7 @@ class LinkState:
         core.noack_link_decide_many(
             self.core,
             len(rows),
-            *(pointer_to(one, "int64_t *") for one in (rows, sizes_bytes, arrivals_ns)),
+            *(pointer_to(array, "int64_t *") for array in (rows, sizes_bytes, arrivals_ns)),
             pointer_to(decisions, "noack_decision *"),
         )
         return decisions
@@ -135,46 +135,46 @@ class LinkState:
             settings: the new settings.
             latest_ns: (rows,) last departure time of the packets in flight of each flow; −1: none.
         """
-        kept = self._memory, self._stages
+        earlier = self._memory, self._stages
         try:
-            after = self._filled(settings, self.rows, tracks=self.tracks)
+            changed = self._new_link(settings, self.rows, tracks=self.tracks)
         except ValueError:  # the link goes on as it was
-            self._memory, self._stages = kept
+            self._memory, self._stages = earlier
             raise
-        core.noack_link_change(self.core, after, pointer_to(latest_ns, "int64_t *"))
-        self.core[0] = after[0]
+        core.noack_link_change(self.core, changed, pointer_to(latest_ns, "int64_t *"))
+        self.core[0] = changed[0]
         self.settings = settings
-        del kept  # the core has read the earlier state
+        del earlier  # the core has read the earlier state
 
-    def _filled(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
+    def _new_link(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
         """Return a new ``noack_link`` of these settings, which shares the array of flows."""
         settings = with_kept_loss(settings)
         tables = StageTables(
-            scored=any(getattr(one, "loss_correlation", 0) != 0 for one in settings.impairments)
+            scored=any(getattr(impairment, "loss_correlation", 0) != 0 for impairment in settings.impairments)
         )
-        named = list(_stages(settings, tables, self._seed, self._name))
-        stages, places = ffi.new("noack_stage[]", max(len(named), 1)), 0
-        for row, (stage, key, _) in zip(stages, named, strict=False):
+        keyed = list(_stages(settings, tables, self._seed, self._name))
+        stages, places = ffi.new("noack_stage[]", max(len(keyed), 1)), 0
+        for row, (stage, key, _) in zip(stages, keyed, strict=False):
             _write_stage(row, stage, key, places)
             places += stage.queue_places
-        rules = [one.rule for one in settings.constraints]
-        windows = [(one.limit, one.window) for one in rules if isinstance(one, LossesInWindow)]
+        rules = [constraint.rule for constraint in settings.constraints]
+        windows = [(rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow)]
         link = ffi.new(
             "noack_link *",
             {
                 "stages": stages,
-                "stage_count": len(named),
+                "stage_count": len(keyed),
                 "recorded_flows": len(self._decisions_begin) - 1,
                 "recovery": max(
-                    (one.deliveries for one in rules if isinstance(one, DeliveriesBetweenBursts)),
+                    (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts)),
                     default=0,
                 ),
                 "mansd": -1 if settings.longest_burst is None else settings.longest_burst,
                 "limit": settings.limit,
-                "tracks": tracks or any(one.delays for one in settings.impairments),
+                "tracks": tracks or any(impairment.delays for impairment in settings.impairments),
                 "rows": rows,
                 "departure_places": places,
-                "scheduler": next((place for place, (stage, *_) in enumerate(named) if stage.schedules), -1),
+                "scheduler": next((index for index, (stage, *_) in enumerate(keyed) if stage.schedules), -1),
             },
         )
         link.recent_width = 1 << link.mansd.bit_length() if link.tracks and link.mansd >= 0 else 1
@@ -193,10 +193,10 @@ class LinkState:
         self._memory = {
             **tables_of,
             "decisions_begin": self._decisions_begin,
-            "memory": np.zeros((rows, len(named)), dtype_of("noack_stage_memory")),
+            "memory": np.zeros((rows, len(keyed)), dtype_of("noack_stage_memory")),
             "recent_ns": np.full((rows, link.recent_width), core.NOACK_NEVER_NS, np.int64),
             "losses": np.zeros((rows, link.loss_width), np.int64),
-            "queues": np.zeros(len(named), dtype_of("noack_queue")),
+            "queues": np.zeros(len(keyed), dtype_of("noack_queue")),
             "departures_ns": np.zeros(places, np.int64),
             "flows": self.flows,
         }
@@ -232,8 +232,8 @@ def _stages(
     numbers: Counter[str] = Counter()
     for impairment in settings.impairments:
         number = numbers[impairment.kind] + 1
-        own = impairment.kind if number == 1 else f"{impairment.kind} {number}"
-        stream = ("netem", *name, own)
+        stream_name = impairment.kind if number == 1 else f"{impairment.kind} {number}"
+        stream = ("netem", *name, stream_name)
         tables.key = stream_key(seed, *stream)
         stage = impairment.stage(tables)
         if stage is not None:

@@ -131,7 +131,7 @@ class LossyUdp:
             CallerError: a word is wrong.
             PeerError: the relay has ended.
         """
-        if unknown := [one for one in directions if one not in DIRECTIONS]:
+        if unknown := [direction for direction in directions if direction not in DIRECTIONS]:
             raise CallerError(f"directions: {unknown[0]!r}; the directions are forward and reverse")
         commands, _ = self._running()
         commands.change(self._spec.name, directions, _settings(words, "words"))
@@ -178,16 +178,16 @@ class LossyUdp:
             relay.close()
 
 
-def _text(address: str | Sequence[str | int], what: str) -> str:
+def _text(address: str | Sequence[str | int], argument: str) -> str:
     if isinstance(address, str):
         return address
     match address:
         case [str(host), int(port), *_]:
             return address_text((host, port))
-    raise CallerError(f"{what}: {address!r}; give host and port, or 'host:port'")
+    raise CallerError(f"{argument}: {address!r}; give host and port, or 'host:port'")
 
 
-def _settings(words: str, what: str) -> LinkSettings:
+def _settings(words: str, argument: str) -> LinkSettings:
     if not isinstance(words, str):
-        raise CallerError(f"{what}: {words!r}; give words such as 'loss 30% mansd 4'")
+        raise CallerError(f"{argument}: {words!r}; give words such as 'loss 30% mansd 4'")
     return read_files(settings_of(words), Path())

@@ -33,15 +33,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Choose the seed of all tests of this process: a given one, or a random one."""
-    given = {
+    seed_texts = {
         _OPTION: config.getoption(_OPTION),
         SEED: os.environ.get(SEED),
         "noack_seed": config.getini("noack_seed"),
     }
-    for name, text in given.items():
+    for name, text in seed_texts.items():
         if text and not (text.isdecimal() and int(text) < 2**64):
             raise pytest.UsageError(f"{name} {text}: must be 0 or more, below 2^64")
-    seeds = [int(text) for text in given.values() if text]
+    seeds = [int(text) for text in seed_texts.values() if text]
     config.stash[_COMMON] = seeds[0] if seeds else secrets.randbits(32)
 
 
@@ -66,8 +66,8 @@ def lossy_udp(request: pytest.FixtureRequest) -> Iterator[Callable[..., LossyUdp
             seed: int | None = None,
             listen: str | Sequence[str | int] = "127.0.0.1:0",
         ) -> LossyUdp:
-            own, name = common if seed is None else seed, f"link {len(links) + 1}"
-            link = LossyUdp(to, words, reverse=reverse, seed=own, listen=listen, name=name)
+            link_seed, name = common if seed is None else seed, f"link {len(links) + 1}"
+            link = LossyUdp(to, words, reverse=reverse, seed=link_seed, listen=listen, name=name)
             links.append(stack.enter_context(link))
             return link
 
@@ -81,10 +81,10 @@ def pytest_runtest_makereport(
     """Say which network a failed test had, and how to have it again."""
     report = yield
     if report.failed and (links := item.stash.get(_LINKS, [])):
-        again = (
+        command = (
             f"the same losses again: pytest {_OPTION} {item.config.stash[_COMMON]} {shlex.quote(item.nodeid)}"
         )
-        text = "\n".join([*map(str, links), again])
+        text = "\n".join([*map(str, links), command])
         add = getattr(report.longrepr, "addsection", None)  # shown whatever --show-capture is
         if add is not None:
             add("lossy_udp", text)

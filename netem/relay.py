@@ -68,7 +68,7 @@ class Relay:
             open_links(self.specs) if devices is None else [devices]
         )
         self._warnings = [LinkWarnings(spec) for spec in self.specs]
-        self._losses = [UnintendedLosses(spec.name, one) for spec in specs for one in DIRECTIONS]
+        self._losses = [UnintendedLosses(spec.name, side) for spec in specs for side in DIRECTIONS]
         self._epoch_ns = self._rarely_ns = 0
         self._taps = tuple(taps)
         data = any(tap.wants_data for tap in self._taps)
@@ -131,8 +131,8 @@ class Relay:
         if link not in names:
             raise CallerError(f"link {link}: there is none of this name, but {', '.join(names)}")
         number = 2 * names.index(link) + DIRECTIONS.index(direction)
-        one = self._directions[number]
-        one.change(settings, self._memory.latest_ns(number, one.rows))
+        relayed = self._directions[number]
+        relayed.change(settings, self._memory.latest_ns(number, relayed.rows))
         self._stamp_arrivals(number)
 
     def report(self) -> Sequence[LinkReport]:
@@ -251,8 +251,8 @@ class Relay:
         forward, reverse = self._directions[2 * number : 2 * number + 2]
         if isinstance(link, DeviceLink):
             self._memory.core.devices = 1
-            for place, device in enumerate(link.devices):
-                self._memory.watch(device, place)
+            for index, device in enumerate(link.devices):
+                self._memory.watch(device, index)
             forward.row.sends = core.NOACK_LINK_SOCKET
             reverse.row.sends = core.NOACK_LISTENING_SOCKET
             return

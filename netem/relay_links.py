@@ -185,7 +185,7 @@ _RECVERR = ((socket.IPPROTO_IP, 11), (socket.IPPROTO_IPV6, 25))
 Endpoint = socket.socket
 
 
-def socket_name(address: Address, what: str) -> SocketName:
+def socket_name(address: Address, setting: str) -> SocketName:
     """Return an address in the form that sockets use.
 
     Raises:
@@ -196,7 +196,7 @@ def socket_name(address: Address, what: str) -> SocketName:
         results = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM, flags=numeric)
     except OSError as error:
         raise CallerError(
-            f"{what}: {address[0]}: not an address of IPv4 or IPv6 ({error.strerror})"
+            f"{setting}: {address[0]}: not an address of IPv4 or IPv6 ({error.strerror})"
         ) from None
     name = results[0][4]
     assert isinstance(name[0], str)
@@ -215,8 +215,8 @@ def listen(spec: LinkSpec, name: SocketName) -> Endpoint:
         CallerError: the address cannot be bound.
     """
     endpoint = _udp_socket(name)
-    what = f"link {spec.name}: UDP port {address_text(spec.listen)}"
-    bind_to(endpoint, name, what, "listen on another, or on port 0 for any")
+    title = f"link {spec.name}: UDP port {address_text(spec.listen)}"
+    bind_to(endpoint, name, title, "listen on another, or on port 0 for any")
     _prepare(endpoint)
     return endpoint
 
@@ -449,9 +449,9 @@ def _refuse_loops(links: Sequence[OpenLink]) -> None:
     for link in links:
         by_port[link.address[1]].append((link, link.name))
     following = {
-        link.spec.name: other
+        link.spec.name: next_link
         for link in links
-        for other, name in by_port.get(link.spec.to[1], ())
+        for next_link, name in by_port.get(link.spec.to[1], ())
         if leads_to(link.server, name)
     }
     for link in links:

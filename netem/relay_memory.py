@@ -176,7 +176,7 @@ class RelayMemory:
         relay.free_block = begin
         relay.free_blocks += blocks
         self._block_next = np.concatenate((self._block_next, following))
-        self._places = np.array([one.ctypes.data for one in self._chunks], np.intp)
+        self._places = np.array([chunk.ctypes.data for chunk in self._chunks], np.intp)
         relay.block_count = len(self._block_next)
         relay.block_next = pointer_to(self._block_next, "int32_t *")
         relay.chunks = pointer_to(self._places, "uint8_t * *")
@@ -219,7 +219,7 @@ class RelayDirection(LinkState):
         return np.frombuffer(ffi.buffer(getattr(self.row, name)), np.int64).copy()
 
     def _set_keeps(self) -> None:
-        flips_bits = any(one.flips_bits for one in self.settings.impairments)
+        flips_bits = any(impairment.flips_bits for impairment in self.settings.impairments)
         self.row.keeps = self.tracks or flips_bits
 
 

@@ -66,7 +66,7 @@ class RunNetwork:
             for loop in range(self._loops):
                 direction.start_flow(loop, number * self._loops + loop)
             self._directions.append(direction)
-        self._schedule = ChangeSchedule(resolved, lambda one: one.network.link)
+        self._schedule = ChangeSchedule(resolved, lambda scenario: scenario.network.link)
         self._reached_ns = -1
 
     def open(
@@ -102,8 +102,8 @@ class RunNetwork:
         clients["name"][: self._loops] = name_array(self._sensor)
         core.noack_client_insert(relay, 0)
         sends = (core.NOACK_LINK_SOCKET, core.NOACK_DESTINATION_NAME)
-        for direction, destination, by in zip(self._directions, destinations, sends, strict=False):
-            direction.set_server(destination, by)
+        for direction, destination, addressing in zip(self._directions, destinations, sends, strict=False):
+            direction.set_server(destination, addressing)
         self._directions[0].row.full = 1  # refuse other sources
 
     def set_clock(self, clock: RunClock) -> None:
@@ -147,7 +147,7 @@ class RunNetwork:
     @property
     def received(self) -> Sequence[int]:
         """(2,) Datagrams received in each direction, without those of other sources."""
-        return [one.counters.received for one in self._directions]
+        return [direction.counters.received for direction in self._directions]
 
     @property
     def refused(self) -> int:
@@ -162,21 +162,21 @@ class RunNetwork:
     @property
     def sent(self) -> int:
         """Datagrams and copies that were sent."""
-        return sum(int(one.counts_of("delays").sum()) for one in self._directions)
+        return sum(int(direction.counts_of("delays").sum()) for direction in self._directions)
 
     @property
     def send_errors(self) -> Sequence[int]:
         """Numbers of datagrams that could not be sent or stored, by errno."""
-        counts = np.sum([one.counts_of("errors") for one in self._directions], axis=0)
+        counts = np.sum([direction.counts_of("errors") for direction in self._directions], axis=0)
         return [int(count) for count in counts]
 
     def _drive(self, until_ns: int) -> int:
         """Relay until the core returns, and do what it needs; return the reason."""
-        relay, one = self._relay, self._directions[0]
+        relay, updates = self._relay, self._directions[0]
         reason: int = core.noack_relay_run(relay, until_ns)
         if reason == core.NOACK_CHANGE_DUE:
-            for settings in due_settings(self._schedule, one.settings, relay.now_ns):
-                one.change(settings, self._memory.latest_ns(0, one.rows))
+            for settings in due_settings(self._schedule, updates.settings, relay.now_ns):
+                updates.change(settings, self._memory.latest_ns(0, updates.rows))
             self._relay.change_ns = self._schedule.next_ns
         elif reason == core.NOACK_STORE_FULL:
             self._memory.add_room()

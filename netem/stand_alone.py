@@ -109,7 +109,7 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
         try:
             totals = relay(specs, options)
         except NoackError as error:  # reported in the format of the log
-            return failed(str(error), error.exit_status, who="noack netem", as_json=options.json)
+            return failed(str(error), error.exit_status, source="noack netem", as_json=options.json)
         report_totals(totals, options)
     return ExitStatus.UNINTENDED_LOSSES if unintended(totals) else ExitStatus.OK
 
@@ -180,10 +180,10 @@ def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
     fates = read_fates(path, [spec.name for spec in specs])
 
     def settings(spec: LinkSpec, direction: Direction) -> LinkSettings:
-        given: LinkSettings = getattr(spec, direction)
-        if given.longest_burst is not None:
-            return given
-        return given.model_copy(update=fates.guarantees[spec.name, direction])
+        own_settings: LinkSettings = getattr(spec, direction)
+        if own_settings.longest_burst is not None:
+            return own_settings
+        return own_settings.model_copy(update=fates.guarantees[spec.name, direction])
 
     return [
         replace(
@@ -206,14 +206,14 @@ def check_options(options: argparse.Namespace) -> None:
     if options.capture == "-" and (options.json or options.stats is not None):
         raise CallerError("--capture -: --json and --stats use standard output, too")
     files = {
-        f"--{name.replace('_', '-')}": Path(given).resolve()
+        f"--{name.replace('_', '-')}": Path(file).resolve()
         for name in ("links", "replay_fates", "record_fates", "capture", "stats_file")
-        if (given := getattr(options, name, None)) is not None and str(given) != "-"
+        if (file := getattr(options, name, None)) is not None and str(file) != "-"
     }
     for name, path in files.items():
-        for other, same in files.items():
-            if name > other and path == same and not path.is_char_device():
-                raise CallerError(f"{name} {path}: {other} has the same file; choose another")
+        for other_name, other_path in files.items():
+            if name > other_name and path == other_path and not path.is_char_device():
+                raise CallerError(f"{name} {path}: {other_name} has the same file; choose another")
 
 
 @contextmanager
@@ -339,11 +339,11 @@ def attached(relay: Relay, options: argparse.Namespace) -> Iterator[AttachedRela
 
 
 @contextmanager
-def _metrics(commands: CommandQueue, where: str) -> Iterator[None]:
+def _metrics(commands: CommandQueue, host_port: str) -> Iterator[None]:
     require_package()
     from netem.control.emulator_metrics import EmulatorMetrics  # an optional package
 
-    with metrics_server(where, EmulatorMetrics(commands).collect) as address:
+    with metrics_server(host_port, EmulatorMetrics(commands).collect) as address:
         report_line(f"metrics: http://{address_text(address)}/metrics")
         yield
 
@@ -367,9 +367,9 @@ def _statistics_lines(commands: CommandQueue, period_s: float, path: Path | None
             name = "standard output" if path is None else path
             report_line(f"statistics cannot be written to {name} ({error.strerror}); the relay continues")
             # Also, closing the file writes the buffer once more; this must not fail.
-            nothing = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nothing, file.fileno())
-            os.close(nothing)
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, file.fileno())
+            os.close(null)
 
     try:
         with StatisticsThread(commands, period_s, write, at_end=True):

@@ -43,7 +43,7 @@ KEYWORDS = (*_CLAUSES, *_SETTINGS, "seed")
 """Words that begin a clause."""
 _WORDS = [word for kind in _KINDS for clause in kind.clauses for word in clause.described()]
 _AFTER = {
-    word.name: ", or after ".join(other.after for other in _WORDS if other.name == word.name)
+    word.name: ", or after ".join(same_word.preceding for same_word in _WORDS if same_word.name == word.name)
     for word in _WORDS
     if word.name not in _CLAUSES
 }
@@ -110,10 +110,10 @@ def parse(words: str | Sequence[str]) -> LinkWords:
         else:
             _validated(_LINK, {_SETTINGS[word]: settings[word]}, reader)
     seed = settings.pop("seed", None)
-    given: Table = {_SETTINGS[word]: value for word, value in settings.items()}
-    given |= {"impairments": tuple(impairments), "constraints": tuple(constraints)}
+    content: Table = {_SETTINGS[word]: value for word, value in settings.items()}
+    content |= {"impairments": tuple(impairments), "constraints": tuple(constraints)}
     try:
-        return LinkWords(LinkSettings.model_validate(given), seed)
+        return LinkWords(LinkSettings.model_validate(content), seed)
     except ValidationError as error:
         # Each setting is valid by itself; the error is a combination of settings.
         key, _, message = _message(error).partition(": ")
@@ -158,9 +158,9 @@ def require_no_dashes(arguments: Sequence[str]) -> None:
             raise CallerError(f"{argument}: write words without the dashes, e.g. {EXAMPLES[word]}")
 
 
-def _validated(kind: TypeAdapter[T], given: object, reader: WordReader) -> T:
+def _validated(kind: TypeAdapter[T], content: object, reader: WordReader) -> T:
     try:
-        return kind.validate_json(json.dumps(given))  # strict mode: lists for tuples only in JSON
+        return kind.validate_json(json.dumps(content))  # strict mode: lists for tuples only in JSON
     except ValidationError as error:
         reader.wrong(_message(error))
 
@@ -170,22 +170,22 @@ def _message(error: ValidationError) -> str:
     if first["type"] == "value_error":
         return str(first["ctx"]["error"])
     name = next((f"{part} " for part in reversed(first["loc"]) if isinstance(part, str)), "")
-    what = "is missing" if first["type"] == "missing" else first["msg"]
-    return name + what.removeprefix("Input ").removeprefix("Tuple ")
+    problem = "is missing" if first["type"] == "missing" else first["msg"]
+    return name + problem.removeprefix("Input ").removeprefix("Tuple ")
 
 
 def _check_place(
-    reader: WordReader, impairment: Impairment, before: Sequence[Impairment], *, bare_gap: bool
+    reader: WordReader, impairment: Impairment, earlier: Sequence[Impairment], *, bare_gap: bool
 ) -> None:
     if isinstance(impairment, Reorder):
-        if not any(one.delays for one in before):
+        if not any(other.delays for other in earlier):
             reader.wrong("nothing before it delays a packet; it goes after delay or rate")
-        if isinstance(before[-1], Reorder):
-            how = "reorder PERCENT gap N"
+        if isinstance(earlier[-1], Reorder):
+            example = "reorder PERCENT gap N"
             reader.wrong(
-                f"there is a reorder before it; write {how}"
+                f"there is a reorder before it; write {example}"
                 if bare_gap
-                else f"there is a reorder, or a gap, before it; write {how}"
+                else f"there is a reorder, or a gap, before it; write {example}"
             )
 
 
@@ -206,35 +206,36 @@ class TcCommand(NamedTuple):
     """Differences in behaviour."""
 
 
-def tc_command(settings: LinkSettings, named: LinkSettings | None = None) -> TcCommand:
+def tc_command(settings: LinkSettings, written: LinkSettings | None = None) -> TcCommand:
     """Return the nearest words of tc's own netem, and the settings that they leave out.
 
-    ``named`` are the same settings, with the names of files instead of their content.
+    ``written`` are the same settings, with the names of files instead of their content.
     """
     supported: list[Impairment] = []
     lacks: list[str] = []
-    pairs = zip(settings.impairments, (named or settings).impairments, strict=True)
-    wanted = [(one, other.text()) for one, other in pairs if one.tc_text()]
-    for one, words in wanted:
-        if share := getattr(one, "loss_correlation", 0.0):
+    pairs = zip(settings.impairments, (written or settings).impairments, strict=True)
+    expressible = [(impairment, original.text()) for impairment, original in pairs if impairment.tc_text()]
+    for impairment, words in expressible:
+        if share := getattr(impairment, "loss_correlation", 0.0):
             lacks.append(f"lossrel {percent_text(share)} (a delay correlated with loss)")
-        what = one.tc_lacks(supported)
-        if any(other.kind == one.kind for other in supported):
-            what = f"a second {one.kind}"
-        if what:
-            lacks.append(f"{shortened(words, _LONGEST)} ({what})")
+        lack = impairment.tc_lacks(supported)
+        if any(earlier.kind == impairment.kind for earlier in supported):
+            lack = f"a second {impairment.kind}"
+        if lack:
+            lacks.append(f"{shortened(words, _LONGEST)} ({lack})")
         else:
-            supported.append(one)
+            supported.append(impairment)
     if settings.mansd is not None:
         lacks.append(f"mansd {settings.mansd} (a cap on consecutive losses)")
-    lacks += [f"{one.text()} (a constraint on losses)" for one in settings.constraints]
+    lacks += [f"{constraint.text()} (a constraint on losses)" for constraint in settings.constraints]
     if settings.first_delivered:
         lacks.append("first (that the first packet of each flow is delivered)")
-    if wanted and not supported:
+    if expressible and not supported:
         return TcCommand(None, tuple(lacks), ())
-    text = " ".join([f"limit {settings.limit}", *(one.tc_text() for one in supported)])
-    notes = [note for one in supported for note in one.tc_notes()]
-    order = [_FIXED_ORDER.index(one.kind) for one in supported if one.kind in _FIXED_ORDER]
+    text = " ".join([f"limit {settings.limit}", *(impairment.tc_text() for impairment in supported)])
+    notes = [note for impairment in supported for note in impairment.tc_notes()]
+    kinds = [impairment.kind for impairment in supported]
+    order = [_FIXED_ORDER.index(kind) for kind in kinds if kind in _FIXED_ORDER]
     if order != sorted(order):
         notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
     return TcCommand(text, tuple(lacks), tuple(dict.fromkeys(notes)))

@@ -45,11 +45,11 @@ def main() -> None:
             command.register_commands(*(words or _completed_words())[:1])
             command.run_program(server)  # a command handles signals itself
         except NoackError as error:
-            sys.exit(failed(str(error), error.exit_status, who="noack", as_json=as_json))
+            sys.exit(failed(str(error), error.exit_status, source="noack", as_json=as_json))
         except Exception as error:
             if (line := exhausted_limit(error)) is None:
                 raise
-            sys.exit(failed(line, NoackError.exit_status, who="noack", as_json=as_json))
+            sys.exit(failed(line, NoackError.exit_status, source="noack", as_json=as_json))
 
 
 def _completed_words() -> list[str]:

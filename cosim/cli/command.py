@@ -97,10 +97,10 @@ class Program(TyperGroup):
         except typer.TyperException as error:
             status = ExitStatus.CALLER
             if message := self._line(error, words):
-                failed(message, status, who=NAME, as_json="--json" in words)
+                failed(message, status, source=NAME, as_json="--json" in words)
         except OSError as error:  # help is written to a full disk
             text, as_json = f"cannot write: {why(error)}", "--json" in words
-            status = failed(text, ExitStatus.FAILED, who=NAME, as_json=as_json)
+            status = failed(text, ExitStatus.FAILED, source=NAME, as_json=as_json)
         if standalone_mode:
             sys.exit(int(status or 0))
         return status

@@ -177,18 +177,18 @@ def _checked_entries(path: Path, archive: zipfile.ZipFile, most_bytes: int) -> d
         raise CallerError(f"{path}: has {len(infos):,} entries, more than an archive may have")
     entries: dict[str, zipfile.ZipInfo] = {}
     for info in infos:
-        name, shown = info.filename, printable(info.filename)
+        name, shown_name = info.filename, printable(info.filename)
         parts = name.split("/")
         if not all(_PART.fullmatch(part) and part not in (".", "..") for part in parts):
-            raise CallerError(f"{path}: {shown}: not the name of a file in a run directory")
+            raise CallerError(f"{path}: {shown_name}: not the name of a file in a run directory")
         if name != MANIFEST and not (
             (len(parts) == 1 and parts[0] in _FILES) or (len(parts) == 2 and parts[0] in _FOLDERS)
         ):
-            raise CallerError(f"{path}: {shown}: an archive has no such file")
+            raise CallerError(f"{path}: {shown_name}: an archive has no such file")
         if name in entries:
-            raise CallerError(f"{path}: {shown}: is there twice")
+            raise CallerError(f"{path}: {shown_name}: is there twice")
         if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
-            raise CallerError(f"{path}: {shown}: is compressed; noack's archives are not")
+            raise CallerError(f"{path}: {shown_name}: is compressed; noack's archives are not")
         entries[name] = info
     if sum(info.file_size for info in infos) > most_bytes:
         raise CallerError(f"{path}: its entries overlap")
@@ -289,8 +289,8 @@ def repeat_archive(
         finalize(ending, report=False, view=False)
         repeated = load_run(ending.run_dir)
         compare = _replayed if manifest.kind == "live" else _repeated
-        pairs = zip(_named(recorded), _named(repeated), strict=True)
-        compared = [compare(name, record, other) for (name, record), (_, other) in pairs]
+        pairs = zip(_named_loops(recorded), _named_loops(repeated), strict=True)
+        compared = [compare(name, record, repeated_record) for (name, record), (_, repeated_record) in pairs]
         return Repetition(
             scenario=manifest.scenario,
             kind=manifest.kind,
@@ -341,7 +341,7 @@ def _scenario(path: Path, archived: Path, *, run_code: bool) -> Scenario:
     return scenario
 
 
-def _named(run: RecordedRun) -> Iterator[tuple[str, RunRecord]]:
+def _named_loops(run: RecordedRun) -> Iterator[tuple[str, RunRecord]]:
     """Yield the records of the loops with their names, and that of a network that they share."""
     if len(run.loops) == 1:  # its record has the rows of the network
         yield "", run.loops[0]
@@ -366,31 +366,31 @@ def _repeated(name: str, archived: RunRecord, repeated: RunRecord) -> _Compared:
 
 def first_difference(archived: RunRecord, repeated: RunRecord) -> ReplayDifference | None:
     """Return the first difference between the tables of two records, bit for bit."""
-    before = dict.fromkeys(archived.tables, 0)
-    nothing: Slice = {}
-    for recorded, again in zip_longest(archived.slices(), repeated.slices(), fillvalue=nothing):
+    rows_before = dict.fromkeys(archived.tables, 0)
+    empty: Slice = {}
+    for recorded, repetition in zip_longest(archived.slices(), repeated.slices(), fillvalue=empty):
         differences = [
             different
             for table in archived.tables
-            if (different := _in_table(table, before[table], recorded, again)) is not None
+            if (different := _in_table(table, rows_before[table], recorded, repetition)) is not None
         ]
         if differences:
-            return min(differences, key=lambda each: each.now_ns)
+            return min(differences, key=lambda item: item.now_ns)
         for table in archived.tables:
-            before[table] += len(recorded[table])
+            rows_before[table] += len(recorded[table])
     return None
 
 
-def _in_table(table: str, before: int, recorded: Slice, again: Slice) -> ReplayDifference | None:
-    rows, others = (part.get(table, np.zeros(0)) for part in (recorded, again))
-    if rows.tobytes() == others.tobytes():
+def _in_table(table: str, rows_before: int, recorded: Slice, repetition: Slice) -> ReplayDifference | None:
+    rows, repeated_rows = (part.get(table, np.zeros(0)) for part in (recorded, repetition))
+    if rows.tobytes() == repeated_rows.tobytes():
         return None
-    for i, (row, other) in enumerate(zip(rows, others, strict=False)):
-        if row.tobytes() != other.tobytes():
-            return rows_differ(table, before + i, row, other)
-    common, longer = min(len(rows), len(others)), max(rows, others, key=len)
+    for i, (row, repeated_row) in enumerate(zip(rows, repeated_rows, strict=False)):
+        if row.tobytes() != repeated_row.tobytes():
+            return rows_differ(table, rows_before + i, row, repeated_row)
+    common, longer = min(len(rows), len(repeated_rows)), max(rows, repeated_rows, key=len)
     description = "the row is missing in the " + ("repetition" if len(rows) > common else "archive")
-    return difference(table, before + common, int(longer[common]["now_ns"]), description)
+    return difference(table, rows_before + common, int(longer[common]["now_ns"]), description)
 
 
 def _numbers(archived: Path, repeated: Path) -> list[tuple[str, ...]]:

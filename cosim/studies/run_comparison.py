@@ -83,8 +83,8 @@ class KeyNumber(NamedTuple):
     def cells(self) -> list[str]:
         """The values as text, each with its difference to the first run's."""
         return [
-            "-" if value is None else f"{value:.4g}" + (f" ({apart:+.3g})" if apart else "")
-            for value, apart in zip(self.values, self.differences, strict=True)
+            "-" if value is None else f"{value:.4g}" + (f" ({difference:+.3g})" if difference else "")
+            for value, difference in zip(self.values, self.differences, strict=True)
         ]
 
 
@@ -102,8 +102,8 @@ class RunComparison:
     def numbers(self) -> list[KeyNumber]:
         """The key numbers that at least one of the runs has."""
         values = {name: tuple(value(run.loop) for run in self.runs) for name, value in _NUMBERS.items()}
-        apart = [_distance(self.runs[0].record, run.record) for run in self.runs]
-        values["distance in x to A, RMS"], values["distance in x to A, maximum"] = zip(*apart, strict=True)
+        pairs = [_distance(self.runs[0].record, run.record) for run in self.runs]
+        values["distance in x to A, RMS"], values["distance in x to A, maximum"] = zip(*pairs, strict=True)
         return [KeyNumber(*entry) for entry in values.items() if any(v is not None for v in entry[1])]
 
     @cached_property
@@ -142,8 +142,8 @@ class RunComparison:
             save_figure(overlay_figure(self.runs), path, width)
             return
         if path.suffix != ".html":
-            known = ", ".join(FIGURE_SUFFIXES)
-            raise CallerError(f"{path}: a comparison is written as .html, {known}")
+            suffixes = ", ".join(FIGURE_SUFFIXES)
+            raise CallerError(f"{path}: a comparison is written as .html, {suffixes}")
         if width is not None:
             raise CallerError(f"{path}: a page has its own width; --width is that of a figure")
         template = templates(Path(__file__).parent).get_template("overlay.html.jinja")
@@ -190,7 +190,7 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
             f"give 2 to {len(LABELS)} run directories to compare, not {len(directories)}; "
             "`noack fidelity` compares one with the ideal loop"
         )
-    runs = tuple(map(_compared, LABELS, directories))
+    runs = tuple(map(_open_run, LABELS, directories))
     first = runs[0].record.loop.n
     for run in runs[1:]:
         if run.record.loop.n != first:
@@ -201,15 +201,15 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
     return RunComparison(runs)
 
 
-def _compared(label: str, given: Path) -> ComparedRun:
+def _open_run(label: str, named_path: Path) -> ComparedRun:
     """Open a run of one loop, or a loop of a run: ``RUN:NAME``."""
-    folder, colon, name = given.name.partition(":")
-    loop = name if colon and not given.exists() else None
-    path = given if loop is None else given.with_name(folder)
+    folder, colon, name = named_path.name.partition(":")
+    loop = name if colon and not named_path.exists() else None
+    path = named_path if loop is None else named_path.with_name(folder)
     path = chosen_run(path, path.parent)
     outcome, record = reopen(path), load_record(path, loop)
-    shown = path if loop is None else given
-    return ComparedRun(label, shown, outcome.summary.of_loop(record.scenario.name), record)
+    shown_path = path if loop is None else named_path
+    return ComparedRun(label, shown_path, outcome.summary.of_loop(record.scenario.name), record)
 
 
 def _claims(verdict: str) -> Callable[[LoopSummary], int]:
@@ -250,16 +250,16 @@ _NUMBERS: dict[str, Callable[[LoopSummary], float | None]] = {
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def _distance(first: RunRecord, other: RunRecord) -> tuple[float | None, float | None]:
+def _distance(first: RunRecord, second: RunRecord) -> tuple[float | None, float | None]:
     """RMS and maximum of ‖x − x'‖ over the common times of two records; None if not finite."""
-    a, b = first[PLANT_STEP], other[PLANT_STEP]
+    a, b = first[PLANT_STEP], second[PLANT_STEP]
     _, at_a, at_b = np.intersect1d(a["t_ns"], b["t_ns"], return_indices=True)
-    if first is other or not len(at_a):
+    if first is second or not len(at_a):
         return None, None
-    apart = np.linalg.norm(b["x"][at_b] - a["x"][at_a], axis=1)
-    if not np.isfinite(apart).all():
+    distances = np.linalg.norm(b["x"][at_b] - a["x"][at_a], axis=1)
+    if not np.isfinite(distances).all():
         return None, None
-    return float(np.sqrt(np.mean(apart**2))), float(apart.max())
+    return float(np.sqrt(np.mean(distances**2))), float(distances.max())
 
 
 def _flat(settings: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -286,13 +286,13 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
         aligned = [align_tables(run.record) for run in runs]
     times = [np.asarray(samples.t_ns / NS_PER_S, dtype=np.float64) for samples in aligned]
     longest = time_axis(max(times, key=lambda t_s: t_s.max(initial=0.0)), numbers=False)
-    every = list(enumerate(zip(runs, times, aligned, strict=True)))
+    numbered = list(enumerate(zip(runs, times, aligned, strict=True)))
     panels = [
         # Each run's line is thinner than the line below it.
         Panel(x=longest, y=Axis(label=plain(name)), legend=() if i else None, items=[
             Line(x=t_s, y=samples.x[:, i], label=f"{run.label}: {plain(run.title, 60)}",
                  colour=series_colour(k), width=max(_WIDEST * _NARROWER**k, 0.8))
-            for k, (run, t_s, samples) in every
+            for k, (run, t_s, samples) in numbered
         ])
         for i, name in enumerate(runs[0].record.loop.state_names[:_MOST_STATES])
     ]  # fmt: skip
@@ -302,7 +302,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
         (r"Controller's error $\|e_c\|$", "e_c_norm"),
     ):
         items: list[Item] = []
-        for k, (_, t_s, samples) in every:  # the first run is on top
+        for k, (_, t_s, samples) in numbered:  # the first run is on top
             curves: list[tuple[Reals, Dash]] = [(getattr(samples, name), ())]
             curves += [(samples.threshold, (5, 2))] if name == "e_s_norm" else []
             items += [
@@ -311,8 +311,8 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
                 )
                 for values, dash in curves
             ]
-        about = np.concatenate([getattr(samples, name) for samples in aligned])
-        y = Axis(label="norm", logarithmic=True, about=about, decades=_DECADES)
+        norms = np.concatenate([getattr(samples, name) for samples in aligned])
+        y = Axis(label="norm", logarithmic=True, about=norms, decades=_DECADES)
         rows.append(Row(panels=[Panel(title=title, items=items, x=longest, y=y)], height_in=_NORM_IN))
     events = replace(_events(runs), x=replace(longest, label=TIME, numbers=True))
     return FigureDescription(
@@ -333,11 +333,11 @@ def _events(runs: Sequence[ComparedRun]) -> Panel:
         sensor = run.record[SENSOR_MEASUREMENT]
         sent = sensor[sensor["event"] != NO_SEQUENCE]
         delivered = np.isin(sent["event"], run.record[CONTROLLER_DELIVERY]["sequence"])
-        t_s, at = sent["t_ns"] / NS_PER_S, np.full(len(sent), float(row))
+        t_s, heights = sent["t_ns"] / NS_PER_S, np.full(len(sent), float(row))
         items += [
-            Marks(x=t_s[delivered], y=at[delivered], marker="|", size=13.0, stroke=1.6,
+            Marks(x=t_s[delivered], y=heights[delivered], marker="|", size=13.0, stroke=1.6,
                   colour=series_colour(number)),
-            Marks(x=t_s[~delivered], y=at[~delivered], marker="x", size=4.5, colour=palette.LOST,
+            Marks(x=t_s[~delivered], y=heights[~delivered], marker="x", size=4.5, colour=palette.LOST,
                   label="lost"),
         ]  # fmt: skip
     ticks = {float(row): run.label for row, run in zip(rows, runs, strict=True)}

@@ -88,16 +88,16 @@ def find(name: str | None) -> str:
         PeerError: it is still starting.
     """
     files = _files()
-    begun = [file.path.stem for file in private_folder.live_lock_files(_STARTING)]
-    if name not in files and (name in begun or (name is None and begun and not files)):
+    starting_names = [file.path.stem for file in private_folder.live_lock_files(_STARTING)]
+    if name not in files and (name in starting_names or (name is None and starting_names and not files)):
         raise PeerError(
-            f"emulator {name or begun[0]!r} is starting; "
+            f"emulator {name or starting_names[0]!r} is starting; "
             "it prints `ready` on standard output when it accepts commands"
         )
     if not files:
-        which = "" if name is None else f" {name!r}"
+        name_text = "" if name is None else f" {name!r}"
         raise CallerError(
-            f"no emulator{which} accepts commands; start one with `noack netem --control NAME …`"
+            f"no emulator{name_text} accepts commands; start one with `noack netem --control NAME …`"
         )
     if name is None and len(files) > 1:
         raise CallerError(f"which emulator? Running: {', '.join(files)}")
@@ -160,8 +160,8 @@ class ControlServer:
                 raise MachineError(f"live control cannot be started: {cause_of(error)}") from None
             stack.callback(self._session.close)
             self._queryables = [
-                (self._session.declare_queryable(self._key(what), RingChannel(_QUERIES)), answer)
-                for what, answer in (
+                (self._session.declare_queryable(self._key(query), RingChannel(_QUERIES)), answer)
+                for query, answer in (
                     ("report", lambda _: self._thread.now()),
                     ("settings", self._settings),
                     ("change", self._change),
@@ -174,8 +174,8 @@ class ControlServer:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def _key(self, what: str) -> str:
-        return f"netem/{self._name}/{what}"
+    def _key(self, query: str) -> str:
+        return f"netem/{self._name}/{query}"
 
     def _serve(self) -> None:
         for queryable, answer in self._queryables:

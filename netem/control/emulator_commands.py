@@ -53,14 +53,14 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self._session.close()  # type: ignore[no-untyped-call]
 
-    def ask(self, what: str, **content: object) -> Any:
+    def ask(self, query: str, **content: object) -> Any:
         """Send the query ``report``, ``settings`` or ``change``, and return the answer.
 
         Raises:
             CallerError: the query has a mistake.
             PeerError: there is no answer.
         """
-        key = f"netem/{self._name}/{what}"
+        key = f"netem/{self._name}/{query}"
         answer = answer_to(self._session, key, json.dumps(content), _ANSWER_S)
         if answer is not None:
             return json.loads(answer)
@@ -93,26 +93,28 @@ _NAME_HELP = "the emulator's --control NAME; optional if only one runs"
 
 def main(arguments: Sequence[str]) -> ExitStatus:
     """Run a command; the first argument is one of :data:`COMMANDS`."""
-    command, *rest = arguments
+    command, *options = arguments
     try:
-        return COMMANDS[command](rest)
+        return COMMANDS[command](options)
     except NoackError as error:
-        who, as_json = f"noack netem {command}", "--json" in rest
-        return failed(str(error), error.exit_status, who=who, as_json=as_json)
+        source, as_json = f"noack netem {command}", "--json" in options
+        return failed(str(error), error.exit_status, source=source, as_json=as_json)
     except BrokenPipeError:  # the reader has closed the pipe
-        nothing = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nothing, sys.stdout.fileno())
-        os.close(nothing)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
         return ExitStatus.OK
 
 
-def _parser(command: str, description: str, examples: Sequence[str], json_help: str, **more: Any) -> Parser:
+def _parser(
+    command: str, description: str, examples: Sequence[str], json_help: str, **options: Any
+) -> Parser:
     parser = Parser(
         prog=f"noack netem {command}",
         description=description,
         epilog="\n  ".join(["examples:", *examples]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        **more,
+        **options,
     )
     parser.add_argument("--control", metavar="NAME", help="the same as NAME")
     parser.add_argument("--json", action="store_true", help=json_help)
@@ -165,7 +167,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     options.name, settings = _name_and_settings(options.words)
     settings = read_files(settings, Path())
     with Client(_chosen(options)) as client:
-        before = client.ask("settings")
+        earlier = client.ask("settings")
         answer = client.ask(
             "change",
             link=options.link,
@@ -179,19 +181,19 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
         for direction in DIRECTIONS:
             words = link[direction]["words"] or "no impairment"
             print(f"{link['name']} {direction}: {words}", flush=True)
-    _warn_of_removed_caps(before["links"], answer["links"])
+    _warn_of_removed_caps(earlier["links"], answer["links"])
     return ExitStatus.OK
 
 
-def _warn_of_removed_caps(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> None:
-    for old, new in zip(before, after, strict=True):
+def _warn_of_removed_caps(earlier: Sequence[Mapping[str, Any]], later: Sequence[Mapping[str, Any]]) -> None:
+    for old, new in zip(earlier, later, strict=True):
         for direction in DIRECTIONS:
-            was, now = (
-                guarantee_words(LinkSettings.model_validate_json(json.dumps(one["settings"])))
-                for one in (old[direction], new[direction])
+            words_before, words_after = (
+                guarantee_words(LinkSettings.model_validate_json(json.dumps(link_direction["settings"])))
+                for link_direction in (old[direction], new[direction])
             )
-            kept = {words.partition(" ")[0] for words in now}
-            if removed := [words for words in was if words.partition(" ")[0] not in kept]:
+            kept_names = {words.partition(" ")[0] for words in words_after}
+            if removed := [words for words in words_before if words.partition(" ")[0] not in kept_names]:
                 print(
                     f"noack netem set: {new['name']} {direction} no longer has "
                     f"{', '.join(removed)}; the words replaced all settings",
@@ -202,13 +204,13 @@ def _warn_of_removed_caps(before: Sequence[Mapping[str, Any]], after: Sequence[M
 
 def _name_and_settings(words: Sequence[str]) -> tuple[str | None, LinkSettings]:
     """Separate the emulator's name, if the words begin with one, from the settings."""
-    name, rest = None, words
+    name, setting_words = None, words
     if words and words[0] in running():
-        name, rest = words[0], words[1:]
-    if not rest:
+        name, setting_words = words[0], words[1:]
+    if not setting_words:
         raise CallerError("words are missing, for example: loss 5% mansd 4; or: loss none")
     try:
-        return name, settings_of(rest)
+        return name, settings_of(setting_words)
     except CallerError:
         if name is None:
             with suppress(CallerError):
@@ -253,9 +255,5 @@ class _Console(Console):
         raise BrokenPipeError
 
 
-COMMANDS: Mapping[str, Callable[[Sequence[str]], ExitStatus]] = {
-    "show": _show,
-    "set": _set,
-    "watch": _watch,
-}
+COMMANDS: Mapping[str, Callable[[Sequence[str]], ExitStatus]] = {"show": _show, "set": _set, "watch": _watch}
 """The commands by name."""

@@ -82,12 +82,14 @@ class EmulatorMetrics:
         yield from metrics(self._latest)
 
 
-def metrics(found: Statistics) -> Iterator[Metric]:
+def metrics(report: Statistics) -> Iterator[Metric]:
     """Yield the metrics of a relay's statistics; ``docs/operations.md`` lists them."""
-    links: Any = found["links"]
+    links: Any = report["links"]
     sides: Any = [([link["name"], name], link[name]) for link in links for name in DIRECTIONS]
-    yield _gauge("elapsed_seconds", "time since the emulator started", [], [([], found["elapsed_s"])])
-    yield _gauge("clients", "clients of a link", ["link"], [([one["name"]], one["clients"]) for one in links])
+    yield _gauge("elapsed_seconds", "time since the emulator started", [], [([], report["elapsed_s"])])
+    yield _gauge(
+        "clients", "clients of a link", ["link"], [([link["name"]], link["clients"]) for link in links]
+    )
     for name, (key, text) in _OF_LINK.items():
         yield _counter(name, text, ["link"], [([link["name"]], link[key]) for link in links])
     for name, (key, text) in _COUNTERS.items():
@@ -101,7 +103,7 @@ def metrics(found: Statistics) -> Iterator[Metric]:
             name,
             text,
             [*_LABELS, label],
-            [([*labels, which], count) for labels, side in sides for which, count in side[key].items()],
+            [([*labels, value], count) for labels, side in sides for value, count in side[key].items()],
         )
     for name, (key, text) in _TIMES.items():
         yield _gauge(
@@ -117,14 +119,14 @@ def metrics(found: Statistics) -> Iterator[Metric]:
 
 
 def _counter(name: str, text: str, labels: Sequence[str], rows: _Rows) -> Metric:
-    return _filled(CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
+    return _with_rows(CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
 
 
 def _gauge(name: str, text: str, labels: Sequence[str], rows: _Rows) -> Metric:
-    return _filled(GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
+    return _with_rows(GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
 
 
-def _filled(metric: CounterMetricFamily | GaugeMetricFamily, rows: _Rows) -> Metric:
+def _with_rows(metric: CounterMetricFamily | GaugeMetricFamily, rows: _Rows) -> Metric:
     for values, value in rows:
         if value is not None:
             metric.add_metric(values, value)

@@ -157,7 +157,7 @@ class CommandQueue:
         def command() -> None:
             for direction in directions:
                 self._relay.change(link, direction, settings)
-            (report,) = (one for one in self._relay.report() if one.name == link)
+            (report,) = (link_report for link_report in self._relay.report() if link_report.name == link)
             for direction in directions:
                 counters = replace(getattr(report, direction).counters)
                 self._in_force[link, direction] = AppliedSettings(settings, counters)
@@ -280,32 +280,32 @@ class Statistics(TypedDict):
     links: list[LinkStatistics]
 
 
-def statistics(after: Snapshot, before: Snapshot | None = None) -> Statistics:
+def statistics(latest: Snapshot, earlier: Snapshot | None = None) -> Statistics:
     """Return the statistics of a relay; the recent rates need an earlier snapshot."""
-    earlier = {link.name: link for link in before.links} if before is not None else {}
-    seconds = (after.elapsed_ns - before.elapsed_ns) / NS_PER_S if before is not None else 0.0
-    links = [_link(link, earlier.get(link.name), seconds, after) for link in after.links]
+    earlier_links = {link.name: link for link in earlier.links} if earlier is not None else {}
+    seconds = (latest.elapsed_ns - earlier.elapsed_ns) / NS_PER_S if earlier is not None else 0.0
+    links = [_link(link, earlier_links.get(link.name), seconds, latest) for link in latest.links]
     return {
-        "time": datetime.fromtimestamp(after.unix_ns / NS_PER_S, UTC).isoformat(),
-        "elapsed_s": after.elapsed_ns / NS_PER_S,
+        "time": datetime.fromtimestamp(latest.unix_ns / NS_PER_S, UTC).isoformat(),
+        "elapsed_s": latest.elapsed_ns / NS_PER_S,
         "links": links,
     }
 
 
-def _link(after: LinkReport, before: LinkReport | None, seconds: float, snapshot: Snapshot) -> LinkStatistics:
+def _link(new: LinkReport, old: LinkReport | None, seconds: float, snapshot: Snapshot) -> LinkStatistics:
     def direction(name: Direction) -> DirectionStatistics:
-        in_force = snapshot.in_force[after.name, name]
-        return _direction(getattr(after, name), in_force, getattr(before, name, None), seconds)
+        in_force = snapshot.in_force[new.name, name]
+        return _direction(getattr(new, name), in_force, getattr(old, name, None), seconds)
 
     return {
-        "name": after.name,
-        "listen": address_text(after.listen),
-        "to": address_text(after.to),
-        "clients": after.clients,
-        "clients_ever": after.clients_ever,
-        "refused": after.refused,
-        "discarded": after.discarded,
-        "port_unreachable": after.port_unreachable,
+        "name": new.name,
+        "listen": address_text(new.listen),
+        "to": address_text(new.to),
+        "clients": new.clients,
+        "clients_ever": new.clients_ever,
+        "refused": new.refused,
+        "discarded": new.discarded,
+        "port_unreachable": new.port_unreachable,
         "forward": direction("forward"),
         "reverse": direction("reverse"),
     }
@@ -314,7 +314,7 @@ def _link(after: LinkReport, before: LinkReport | None, seconds: float, snapshot
 def _direction(
     report: DirectionReport,
     in_force: AppliedSettings,
-    before: DirectionReport | None,
+    earlier: DirectionReport | None,
     seconds: float,
 ) -> DirectionStatistics:
     counters, since, words = report.counters, in_force.since, in_force.words
@@ -332,7 +332,7 @@ def _direction(
         "held_back": counters.held_back,
         "longest_loss_burst": counters.longest_loss_burst,
         "mansd": report.settings.longest_burst,
-        "constraints": [one.text() for one in report.settings.constraints],
+        "constraints": [constraint.text() for constraint in report.settings.constraints],
         "loss": {
             "realised": loss_share(new),
             "lost": _share(new, new.dropped + new.corrupted + new.overflowed + new.blacked_out),
@@ -350,12 +350,12 @@ def _direction(
         "lateness_ns": quantiles(report.lateness),
         "delay_histogram": coarse(report.delays),
         "lateness_histogram": coarse(report.lateness),
-        "recent": _recent(report, before, seconds) if before is not None and seconds > 0 else None,
+        "recent": _recent(report, earlier, seconds) if earlier is not None and seconds > 0 else None,
     }
 
 
-def _recent(after: DirectionReport, before: DirectionReport, seconds: float) -> RecentRates:
-    new = after.counters - before.counters
+def _recent(latest: DirectionReport, earlier: DirectionReport, seconds: float) -> RecentRates:
+    new = latest.counters - earlier.counters
     return {
         "seconds": seconds,
         "received_per_s": new.received / seconds,
@@ -363,8 +363,8 @@ def _recent(after: DirectionReport, before: DirectionReport, seconds: float) -> 
         "forwarded_per_s": new.forwarded / seconds,
         "forwarded_bits_per_s": new.forwarded_bytes * 8 / seconds,
         "loss": loss_share(new),
-        "delay_ns": quantiles(after.delays - before.delays),
-        "lateness_ns": quantiles(after.lateness - before.lateness),
+        "delay_ns": quantiles(latest.delays - earlier.delays),
+        "lateness_ns": quantiles(latest.lateness - earlier.lateness),
     }
 
 
@@ -440,8 +440,8 @@ class StatisticsThread:
         Raises:
             PeerError: the relay has ended, or does not answer.
         """
-        before = self._snapshots[0] if self._snapshots else None
-        return statistics(self._commands.snapshot(), before)
+        earlier = self._snapshots[0] if self._snapshots else None
+        return statistics(self._commands.snapshot(), earlier)
 
     def _run(self) -> None:
         due_s = time.monotonic()
@@ -455,6 +455,6 @@ class StatisticsThread:
             self._show_next(self._commands.look())
 
     def _show_next(self, snapshot: Snapshot) -> None:
-        before = self._snapshots[-1] if self._snapshots else None
+        earlier = self._snapshots[-1] if self._snapshots else None
         self._snapshots.append(snapshot)
-        self._show(statistics(snapshot, before))
+        self._show(statistics(snapshot, earlier))

@@ -124,7 +124,7 @@ class History:
             return [None] * points
         begin_s = self.latest["elapsed_s"] - _SPAN_S
         width_s = _SPAN_S / points
-        found: list[list[float]] = [[] for _ in range(points)]
+        by_point: list[list[float]] = [[] for _ in range(points)]
         for end_s, recent in self._samples[link, direction]:
             value: float | None = recent[key]  # type: ignore[literal-required]
             if value is None:
@@ -132,8 +132,8 @@ class History:
             first = int(max(end_s - recent["seconds"] - begin_s, 0) / width_s)
             last = min(int((end_s - begin_s) / width_s - 1e-9), points - 1)
             for point in range(first, max(last, first) + 1):
-                found[min(point, points - 1)].append(value)
-        return [sum(values) / len(values) if values else None for values in found]
+                by_point[min(point, points - 1)].append(value)
+        return [sum(values) / len(values) if values else None for values in by_point]
 
 
 def picture_of(statistics: Statistics, title: str, width: int) -> RenderableType:
@@ -164,11 +164,11 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
         grid.add_column(width=column)
     lines = 2
     forward, reverse = (_cells(history, link, name, column) for name in DIRECTIONS)
-    for (label, left), (_, right) in zip(forward, reverse, strict=True):
-        if not (label + left.plain + right.plain).strip():  # a chart without data
+    for (label, forward_text), (_, reverse_text) in zip(forward, reverse, strict=True):
+        if not (label + forward_text.plain + reverse_text.plain).strip():  # a chart without data
             continue
-        grid.add_row(label, left, right)
-        lines += 1 + max(cell.plain.count("\n") for cell in (left, right))
+        grid.add_row(label, forward_text, reverse_text)
+        lines += 1 + max(cell.plain.count("\n") for cell in (forward_text, reverse_text))
     unintended = _unintended(link)
     ends = (link[end].removesuffix(":0") for end in ("listen", "to"))  # a shell's have no port
     title = Text.assemble((link["name"], "bold"), f"  {' → '.join(ends)}  ", (_clients_text(link), "dim"))
@@ -211,48 +211,48 @@ def _cells(
     history: History, link: LinkStatistics, direction: Direction, width: int
 ) -> list[tuple[str, Text]]:
     """Return the label and the text of each row of a direction."""
-    of = link[direction]
+    side = link[direction]
 
     def series(key: str) -> Sequence[float | None]:
         return history.series(link["name"], direction, key, width)
 
     arrivals, departures = series("received_per_s"), series("forwarded_per_s")
     losses, top = series("loss"), _top([*arrivals, *departures])
-    recent, delay, late = of["recent"], of["delay_ns"], of["lateness_ns"]
+    recent, delay, late = side["recent"], side["delay_ns"], side["lateness_ns"]
     if recent is not None and recent["delay_ns"]["p50"] is not None:
         delay, late = recent["delay_ns"], recent["lateness_ns"]
     return [
         ("", Text(_ARROWS[direction], "bold cyan")),
-        ("", _wrapped(of["words"] or "no impairment", width)),
-        ("received", Text(_flow(of, "received"))),
+        ("", _wrapped(side["words"] or "no impairment", width)),
+        ("received", Text(_flow(side, "received"))),
         ("", Text(sparkline(arrivals, top), "green")),
-        ("forwarded", Text(_flow(of, "forwarded"))),
+        ("forwarded", Text(_flow(side, "forwarded"))),
         ("", Text(sparkline(departures, top), "green")),
-        ("loss", Text(_loss(of))),
-        ("", Text(sparkline(losses, _top([*losses, of["loss"]["predicted"]])), "yellow")),
-        ("drawn", Text(_drawn(of))),
-        ("lost", _wrapped(_lost_text(of), width)),
-        ("", _wrapped(_further_counts(of), width)),
-        ("burst", _burst(of, width)),
+        ("loss", Text(_loss(side))),
+        ("", Text(sparkline(losses, _top([*losses, side["loss"]["predicted"]])), "yellow")),
+        ("drawn", Text(_drawn_text(side))),
+        ("lost", _wrapped(_lost_text(side), width)),
+        ("", _wrapped(_further_counts(side), width)),
+        ("burst", _burst(side, width)),
         ("delay", Text(_times(delay, width))),
         ("lateness", Text(_times(late, width))),
-        ("in flight", Text(f"{of['in_flight']:,}, max {of['most_in_flight']:,}")),
+        ("in flight", Text(f"{side['in_flight']:,}, max {side['most_in_flight']:,}")),
     ]
 
 
-def _rate(of: DirectionStatistics, key: str) -> str:
+def _rate(side: DirectionStatistics, key: str) -> str:
     """Return a recent rate in datagrams per second; without one, the number of datagrams."""
-    recent = of["recent"]
+    recent = side["recent"]
     if recent is None:
-        return f"{of[key]:,}"  # type: ignore[literal-required]
+        return f"{side[key]:,}"  # type: ignore[literal-required]
     return rate_text(recent[f"{key}_per_s"])  # type: ignore[literal-required]
 
 
-def _flow(of: DirectionStatistics, key: str) -> str:
+def _flow(side: DirectionStatistics, key: str) -> str:
     """Return :func:`_rate`, and the rate in bits per second."""
-    recent = of["recent"]
+    recent = side["recent"]
     bits = "" if recent is None else with_unit(recent[f"{key}_bits_per_s"], _BIT_RATES)  # type: ignore[literal-required]
-    return f"{_rate(of, key)}  {bits}".strip()
+    return f"{_rate(side, key)}  {bits}".strip()
 
 
 def _times(times: DelayQuantiles, width: int) -> str:
@@ -266,49 +266,49 @@ def _top(values: Sequence[float | None]) -> float:
     return max((value for value in values if value is not None), default=0.0)
 
 
-def _loss(of: DirectionStatistics) -> str:
-    lost, realised = of["loss"]["lost"], of["loss"]["realised"]
+def _loss(side: DirectionStatistics) -> str:
+    lost, realised = side["loss"]["lost"], side["loss"]["realised"]
     stale = f", with stale {percent_text(realised)}" if realised != lost else ""
     return percent_text(lost) + stale
 
 
-def _drawn(of: DirectionStatistics) -> str:
-    drawn, predicted = of["loss"]["drawn"], of["loss"]["predicted"]
+def _drawn_text(side: DirectionStatistics) -> str:
+    drawn, predicted = side["loss"]["drawn"], side["loss"]["predicted"]
     expected = "" if predicted is None else f", predicted {percent_text(predicted)}"
     return percent_text(drawn) + expected
 
 
-def _lost_text(of: DirectionStatistics) -> str:
-    lost = [(fate.replace("_", " "), of["fates"][fate]) for fate in _LOST]
-    lost.append(("stale", of["delivered_out_of_order"]))
+def _lost_text(side: DirectionStatistics) -> str:
+    lost = [(fate.replace("_", " "), side["fates"][fate]) for fate in _LOST]
+    lost.append(("stale", side["delivered_out_of_order"]))
     return ", ".join(f"{number:,} {cause}" for cause, number in lost if number) or "0"
 
 
-def _further_counts(of: DirectionStatistics) -> str:
+def _further_counts(side: DirectionStatistics) -> str:
     counts = {
-        "duplicated": of["duplicated"],
-        "held back for the guarantee": of["held_back"],
-        "received before the last change": of["received_before"],
+        "duplicated": side["duplicated"],
+        "held back for the guarantee": side["held_back"],
+        "received before the last change": side["received_before"],
     }
-    return ", ".join(f"{number:,} {what}" for what, number in counts.items() if number)
+    return ", ".join(f"{number:,} {title}" for title, number in counts.items() if number)
 
 
-def burst_text(of: DirectionStatistics) -> str:
+def burst_text(side: DirectionStatistics) -> str:
     """Return the longest loss burst beside its cap, and the constraints."""
-    cap = of["mansd"]
-    limits = ["no cap" if cap is None else f"cap {cap:,}", *of["constraints"]]
-    return f"{of['longest_loss_burst']:,}, {', '.join(limits)}"
+    cap = side["mansd"]
+    limits = ["no cap" if cap is None else f"cap {cap:,}", *side["constraints"]]
+    return f"{side['longest_loss_burst']:,}, {', '.join(limits)}"
 
 
-def _burst(of: DirectionStatistics, width: int) -> Text:
-    longest, cap, forced = of["longest_loss_burst"], of["mansd"], of["fates"]["forced"]
-    text = Text(burst_text(of))
+def _burst(side: DirectionStatistics, width: int) -> Text:
+    longest, cap, forced = side["longest_loss_burst"], side["mansd"], side["fates"]["forced"]
+    text = Text(burst_text(side))
     end = Text(f"  {forced:,} forced", "magenta") if forced else Text()
     room = width - len(text) - len(end) - 2
     if cap is not None and room > 0:
         style = "green" if longest < cap else "yellow" if longest == cap else "bold red"
-        filled, rest = bar(longest / cap if cap else float(longest > 0), room)
-        text.append("  ").append(filled, style).append(rest, "dim")
+        filled, unfilled = bar(longest / cap if cap else float(longest > 0), room)
+        text.append("  ").append(filled, style).append(unfilled, "dim")
     return text.append_text(end)
 
 
@@ -316,17 +316,17 @@ def _wrapped(text: str, width: int) -> Text:
     return Text("\n".join(textwrap.wrap(text, width, max_lines=_WORDS_LINES, placeholder=" …")))
 
 
-def _burst_of_cap(of: DirectionStatistics) -> str:
-    return f"{of['longest_loss_burst']:,}/{_NONE if of['mansd'] is None else of['mansd']}"
+def _burst_of_cap(side: DirectionStatistics) -> str:
+    return f"{side['longest_loss_burst']:,}/{_NONE if side['mansd'] is None else side['mansd']}"
 
 
 _COLUMNS: dict[str, Callable[[DirectionStatistics], str]] = {
-    "received": lambda of: _rate(of, "received"),
-    "forwarded": lambda of: _rate(of, "forwarded"),
-    "loss": lambda of: percent_text(of["loss"]["lost"]),
-    "predicted": lambda of: percent_text(of["loss"]["predicted"]),
+    "received": lambda side: _rate(side, "received"),
+    "forwarded": lambda side: _rate(side, "forwarded"),
+    "loss": lambda side: percent_text(side["loss"]["lost"]),
+    "predicted": lambda side: percent_text(side["loss"]["predicted"]),
     "burst/cap": _burst_of_cap,
-    "p99": lambda of: time_text((of["recent"] or of)["delay_ns"]["p99"]),
+    "p99": lambda side: time_text((side["recent"] or side)["delay_ns"]["p99"]),
 }
 """Columns of the table: heading and text."""
 _OPTIONAL = ("predicted", "p99", "forwarded")
@@ -336,10 +336,10 @@ _OPTIONAL = ("predicted", "p99", "forwarded")
 def _table(history: History, latest: Statistics, width: int, lines: int) -> RenderableType:
     """Return a table with a row for each direction that has received datagrams."""
     rows = _used(latest)
-    shown = rows[:lines]
-    names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in shown]
+    listed = rows[:lines]
+    names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in listed]
     name_width = min(max(map(len, names), default=0), width // 3)
-    columns = {heading: [text(link[name]) for link, name in shown] for heading, text in _COLUMNS.items()}
+    columns = {heading: [text(link[name]) for link, name in listed] for heading, text in _COLUMNS.items()}
 
     def room() -> int:
         widths = [max(map(len, (heading, *texts))) for heading, texts in columns.items()]
@@ -350,19 +350,19 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
             del columns[heading]
     chart_width = min(room() - 1, _CHART_WIDTH)
     if chart_width >= _MIN_CHART_WIDTH:
-        series = [history.series(link["name"], name, "received_per_s", chart_width) for link, name in shown]
-        columns["last minute"[:chart_width]] = [sparkline(one, _top(one)) for one in series]
+        series = [history.series(link["name"], name, "received_per_s", chart_width) for link, name in listed]
+        columns["last minute"[:chart_width]] = [sparkline(rates, _top(rates)) for rates in series]
 
     table = Table(box=None, padding=(0, 1, 0, 0), header_style="dim", pad_edge=False)
     table.add_column(" link", no_wrap=True, overflow="ellipsis", width=name_width)
     for heading in columns:
         table.add_column(heading, justify="right", no_wrap=True)
-    for row, (link, name) in enumerate(shown):
-        of = link[name]
-        beyond = of["mansd"] is not None and of["longest_loss_burst"] > of["mansd"]
-        style = "bold red" if beyond or any(of["unintended"].values()) else ""
+    for row, (link, name) in enumerate(listed):
+        side = link[name]
+        exceeds = side["mansd"] is not None and side["longest_loss_burst"] > side["mansd"]
+        style = "bold red" if exceeds or any(side["unintended"].values()) else ""
         table.add_row(Text(names[row]), *(texts[row] for texts in columns.values()), style=style)
-    hidden = len(rows) - len(shown)
+    hidden = len(rows) - len(listed)
     return Group(table, Text(f" … and {hidden} more", "dim")) if hidden else table
 
 
@@ -373,24 +373,24 @@ def _used(statistics: Statistics) -> list[tuple[LinkStatistics, Direction]]:
 
 def plain_lines(statistics: Statistics) -> list[str]:
     """Return a line of text for each direction that has received datagrams."""
-    return [_plain_line(statistics["elapsed_s"], *one) for one in _used(statistics)]
+    return [_plain_line(statistics["elapsed_s"], *row) for row in _used(statistics)]
 
 
 def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:
-    of = link[name]
+    side = link[name]
     parts = [
         f"{elapsed_s:.1f} s",
         f"{link['name']} {name}",
-        f"received {_flow(of, 'received')}",
-        f"forwarded {_flow(of, 'forwarded')}",
-        f"loss {_loss(of)}",
-        f"drawn {_drawn(of)}",
-        f"longest loss burst {burst_text(of)}",
-        f"forced {of['fates']['forced']:,}",
-        f"delay p99 {time_text((of['recent'] or of)['delay_ns']['p99'])}",
-        f"in flight {of['in_flight']:,}",
+        f"received {_flow(side, 'received')}",
+        f"forwarded {_flow(side, 'forwarded')}",
+        f"loss {_loss(side)}",
+        f"drawn {_drawn_text(side)}",
+        f"longest loss burst {burst_text(side)}",
+        f"forced {side['fates']['forced']:,}",
+        f"delay p99 {time_text((side['recent'] or side)['delay_ns']['p99'])}",
+        f"in flight {side['in_flight']:,}",
     ]
-    parts += [f"UNINTENDED {n:,} {cause}" for cause, n in of["unintended"].items() if n]
+    parts += [f"UNINTENDED {n:,} {cause}" for cause, n in side["unintended"].items() if n]
     return "  ".join(parts)
 
 
@@ -479,9 +479,9 @@ def _single_keys() -> Iterator[bool]:
     if not sys.stdin.isatty():
         yield False
         return
-    before = termios.tcgetattr(sys.stdin)
+    attributes = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)
     try:
         yield True
     finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, attributes)

@@ -93,36 +93,36 @@ class DeviceLink:
 
     def client_text(self, flow: bytes) -> str:
         """Return a flow as text: protocol, end inside, end outside."""
-        version, protocol, is_fragment, _, near, far = struct.unpack_from("!4BHH", flow)
+        version, protocol, is_fragment, _, inner_port, outer_port = struct.unpack_from("!4BHH", flow)
         if version == 0:
             return "not IP"
         size, family = (4, socket.AF_INET) if version == 4 else (16, socket.AF_INET6)
-        hosts = (socket.inet_ntop(family, flow[at : at + size]) for at in (8, 24))
+        hosts = (socket.inet_ntop(family, flow[begin : begin + size]) for begin in (8, 24))
         names = {1: "icmp", 6: "tcp", 17: "udp", 58: "icmpv6"}
         words = [names.get(protocol, f"protocol {protocol}")]
         if is_fragment:
             words[0] += " fragments"
         words += [
             f"{host if version == 4 else f'[{host}]'}{f':{port}' if port else ''}"
-            for host, port in zip(hosts, (near, far), strict=True)
+            for host, port in zip(hosts, (inner_port, outer_port), strict=True)
         ]
         return " ".join(words)
 
     @contextmanager
     def inside(self) -> Iterator[None]:
         """Let this thread be inside within the context: what it starts then stays there."""
-        here = _open_namespace()
+        own_namespace = _open_namespace()
         process.call("setns", self.namespace, process.NEW_NETWORK)
         try:
             yield
         finally:
-            process.call("setns", here, process.NEW_NETWORK)
-            os.close(here)
+            process.call("setns", own_namespace, process.NEW_NETWORK)
+            os.close(own_namespace)
 
     def close(self) -> None:
         """Close the devices, which end with that."""
-        for one in (*self.devices, *self.statistics, self.namespace):
-            os.close(one)
+        for descriptor in (*self.devices, *self.statistics, self.namespace):
+            os.close(descriptor)
 
 
 def open_devices(spec: LinkSpec) -> DeviceLink:
@@ -135,25 +135,25 @@ def open_devices(spec: LinkSpec) -> DeviceLink:
         CallerError: the system does not permit it or lacks something, or there are too many shells.
     """
     try:
-        around = _range_here()
-        number, outer = _first_free(around)
-        here = _open_namespace()
+        addresses = _range_here()
+        number, outer = _first_free(addresses)
+        own_namespace = _open_namespace()
         process.call("unshare", process.NEW_NETWORK)
     except PermissionError:
         _enter_outside()
     os.environ.pop(_ENTERED, None)
-    own = list(around.subnets(_STEP_BITS))[number]
-    outside, inside = own[1], own[2]
+    network = list(addresses.subnets(_STEP_BITS))[number]
+    outside, inside = network[1], network[2]
     inner = _open_tun(_INSIDE)
-    _configure(_INSIDE, inside, own.prefixlen)
+    _configure(_INSIDE, inside, network.prefixlen)
     has_six = _ip("route add ::/0 dev noack0", "route add 0.0.0.0/0 dev noack0")
     for setting in ("ipv4/ip_forward", "ipv6/conf/all/forwarding"):
         with suppress(OSError):  # without it, shells in this one reach only this one
             Path("/proc/sys/net", setting).write_text("1")
     namespace, inner_counts = _open_namespace(), _open_counts()
-    process.call("setns", here, process.NEW_NETWORK)
-    os.close(here)
-    _configure(name := f"noack{number}", outside, own.prefixlen)
+    process.call("setns", own_namespace, process.NEW_NETWORK)
+    os.close(own_namespace)
+    _configure(name := f"noack{number}", outside, network.prefixlen)
     return DeviceLink(
         replace(spec, listen=(str(inside), 0), to=(str(outside), 0)),
         (inner, outer),
@@ -175,13 +175,13 @@ def _range_here() -> IPv4Network:
             )
         except OSError:  # this is not in a shell
             return _RANGE
-    around = IPv4Interface(f"{address}/{mask}").network
-    if around.prefixlen >= _MOST_BITS:
+    addresses = IPv4Interface(f"{address}/{mask}").network
+    if addresses.prefixlen >= _MOST_BITS:
         raise CallerError("shells nest three deep; give the words of several to one shell")
-    return around
+    return addresses
 
 
-def _first_free(around: IPv4Network) -> tuple[int, int]:
+def _first_free(addresses: IPv4Network) -> tuple[int, int]:
     """Open the outer device with the first free number; return the number and the device."""
     parts = 1 << _STEP_BITS
     for number in range(1, parts):  # the first part has the addresses of the shell around
@@ -226,13 +226,13 @@ def _ip(*commands: str) -> bool:
     """Run commands of ``ip``; return whether all succeed. The last one must, without IPv6, too."""
     lines = "\n".join(commands).encode()
     try:
-        done = subprocess.run(["ip", "-force", "-batch", "-"], input=lines, capture_output=True)
+        result = subprocess.run(["ip", "-force", "-batch", "-"], input=lines, capture_output=True)
     except OSError:
         raise CallerError("a shell needs `ip` (Debian: apt install iproute2)") from None
-    errors = done.stderr.decode(errors="replace").splitlines()
+    errors = result.stderr.decode(errors="replace").splitlines()
     if f"Command failed -:{len(commands)}" in errors:
         raise CallerError(f"ip {commands[-1]}: {errors[-2]}")
-    return done.returncode == 0
+    return result.returncode == 0
 
 
 def _open_namespace() -> int:

@@ -69,26 +69,26 @@ def enter_namespaces() -> None:
 
 def children() -> set[int]:
     """Return the process ids of this process's children."""
-    found = set()
+    ids = set()
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it has ended
             state = (process / "stat").read_bytes().rpartition(b")")[2]
             if int(state.split()[1]) == os.getpid():
-                found.add(int(process.name))
-    return found
+                ids.add(int(process.name))
+    return ids
 
 
-def end_children(kept: Collection[int] = ()) -> None:
+def end_children(spared: Collection[int] = ()) -> None:
     """End all children and adopted descendants but some, by SIGTERM and, if they go on, SIGKILL."""
     late_s = time.monotonic() + _GRACE_S
-    asked: set[int] = set()
-    while left := children().difference(kept):
+    terminated: set[int] = set()
+    while remaining := children().difference(spared):
         late = time.monotonic() > late_s
-        for child in left if late else left - asked:
+        for child in remaining if late else remaining - terminated:
             os.kill(child, signal.SIGKILL if late else signal.SIGTERM)
             os.kill(child, signal.SIGCONT)  # a stopped process, too
-        asked |= left
-        for child in left:
+        terminated |= remaining
+        for child in remaining:
             with suppress(ChildProcessError):
                 os.waitpid(child, os.WNOHANG)
         time.sleep(_POLL_S)
@@ -98,7 +98,7 @@ def guard(parent: int, command: list[str]) -> int:
     """Run a command; return its exit status when all processes that it started have ended."""
     ending = {signal.SIGTERM, signal.SIGHUP}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGCHLD})
-    before = {one: signal.signal(one, signal.SIG_IGN) for one in (signal.SIGINT, signal.SIGQUIT)}
+    handlers = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGQUIT)}
     adopt_orphans()
     group = os.getpgrp()
     os.setpgid(0, 0)  # what kills the whole group does not kill this process
@@ -108,8 +108,8 @@ def guard(parent: int, command: list[str]) -> int:
         with suppress(OSError):  # the group has ended
             os.setpgid(0, group)
         call("prctl", _DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-        for one, handler in before.items():
-            signal.signal(one, handler if handler is signal.SIG_IGN else signal.SIG_DFL)
+        for number, handler in handlers.items():
+            signal.signal(number, handler if handler is signal.SIG_IGN else signal.SIG_DFL)
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         try:
@@ -123,9 +123,9 @@ def guard(parent: int, command: list[str]) -> int:
             status = 128 + signal.SIGTERM
             break
         with suppress(ChildProcessError):
-            while (found := os.waitpid(-1, os.WNOHANG))[0]:
-                if found[0] == child:
-                    status = os.waitstatus_to_exitcode(found[1])
+            while (reaped := os.waitpid(-1, os.WNOHANG))[0]:
+                if reaped[0] == child:
+                    status = os.waitstatus_to_exitcode(reaped[1])
     end_children()
     return 1 if status is None else status if status >= 0 else 128 - status
 

@@ -33,8 +33,8 @@ def shell(arguments: Sequence[str]) -> int:
     """
     words, command = list(arguments), []
     if "--" in words:
-        place = words.index("--")
-        words, command = words[:place], words[place + 1 :]
+        index = words.index("--")
+        words, command = words[:index], words[index + 1 :]
     parser = shell_parser()
     add_recording_options(parser, shell=True)
     options = parsed(parser, words)
@@ -43,10 +43,10 @@ def shell(arguments: Sequence[str]) -> int:
         raise CallerError("--view and --capture - take the terminal, which the command has")
     check_options(options)
     command = command or [os.environ.get("SHELL") or "/bin/sh"]
-    outside = [_split(one) for one in options.outside or ()]
-    for one in (command, *outside):
-        if shutil.which(one[0]) is None:
-            raise CallerError(f"{one[0]}: there is no such program")
+    outside = [_split(text) for text in options.outside or ()]
+    for argv in (command, *outside):
+        if shutil.which(argv[0]) is None:
+            raise CallerError(f"{argv[0]}: there is no such program")
     with log_format(options.log_format):
         program = _Program(open_devices(spec), command, outside)
         totals = relay([program.devices.spec], options, program)
@@ -83,7 +83,7 @@ class _Program:
         addresses = {"NOACK_OUTSIDE": spec.to[0]}
         if self.devices.outside6 is not None:
             addresses["NOACK_OUTSIDE6"] = self.devices.outside6
-        kept = process.children()
+        earlier_children = process.children()
         process.adopt_orphans()
         processes = [_start(command) for command in self._outside]
         with self.devices.inside():
@@ -94,11 +94,11 @@ class _Program:
         try:
             yield lambda: main.poll() is not None
         finally:
-            for one in (main, *processes):
-                one.terminate()
-            for one in (main, *processes):
-                one.wait(_ENDS_S)
-            process.end_children(kept)  # of a guard that was killed
+            for program in (main, *processes):
+                program.terminate()
+            for program in (main, *processes):
+                program.wait(_ENDS_S)
+            process.end_children(earlier_children)  # of a guard that was killed
             self.status = main.returncode if main.returncode >= 0 else 128 - main.returncode
             if signals.received is not None:
                 self.status = signals.status

@@ -21,7 +21,7 @@ class Word(NamedTuple):
 
     name: str
     example: str
-    after: str = ""
+    preceding: str = ""
     """The words that precede it; empty: it begins a clause."""
     grammar: str = ""
     """Its clause, for ``--help``; T is a time, P a percentage, N a number. Empty: another word has
@@ -78,10 +78,10 @@ class Part:
         written = self.quantity.text(value[0] if len(value) == 1 else value)
         return f"{self.word} {written}".strip()
 
-    def described(self, after: str) -> Iterator[Word]:
+    def described(self, preceding: str) -> Iterator[Word]:
         """Yield the part's words, given those before it."""
         if self.word:
-            yield Word(self.word, self.example, after)
+            yield Word(self.word, self.example, preceding)
 
 
 def flag(word: str, example: str, key: str, value: bool) -> Part:
@@ -115,9 +115,9 @@ class FileOr(Part):
             return super().text(settings)
         return shlex.quote(f"./{name}" if name == self.word else name)
 
-    def described(self, after: str) -> Iterator[Word]:
+    def described(self, preceding: str) -> Iterator[Word]:
         if self.word:
-            first = after.removesuffix(" FILE")
+            first = preceding.removesuffix(" FILE")
             yield Word(self.word, self.example, first, f"{first} {self.word} {self.symbol}")
 
 
@@ -152,12 +152,7 @@ class Clause:
         is_bare: bool = False,
     ) -> None:
         self.word, self.example, self.parts, self.synonyms = word, example, parts, synonyms
-        self.least, self.implied, self.complement, self.is_bare = (
-            least,
-            implied,
-            complement,
-            is_bare,
-        )
+        self.least, self.implied, self.complement, self.is_bare = least, implied, complement, is_bare
 
     @property
     def _values(self) -> list[Part]:
@@ -183,14 +178,14 @@ class Clause:
                 share = table[part.keys[0]]
                 assert isinstance(share, float)
                 table[self._values[1].keys[0]] = 1 - share
-        options, given = {part.word: part for part in self._options}, dict[str, str]()
+        options, words_by_key = {part.word: part for part in self._options}, dict[str, str]()
         while (word := reader.accept(*options)) is not None:
             keys = {*options[word].keys, *options[word].implied}
-            if earlier := [given.get(key, self.word) for key in table.keys() & keys]:
-                other = f"{word} and {earlier[0]} exclude each other"
-                reader.wrong(f"{word} is given twice" if word in earlier else other)
+            if earlier := [words_by_key.get(key, self.word) for key in table.keys() & keys]:
+                conflict = f"{word} and {earlier[0]} exclude each other"
+                reader.wrong(f"{word} is given twice" if word in earlier else conflict)
             options[word].read(reader, table)
-            given |= dict.fromkeys(keys, word)
+            words_by_key |= dict.fromkeys(keys, word)
         return table
 
     def writes(self, settings: BaseModel) -> bool:
@@ -211,18 +206,18 @@ class Clause:
     def grammar(self) -> str:
         """The clause in ``--help``."""
         values = [part.grammar for part in self._values]
-        needed, optional = values[: self.least], values[self.least :]
+        required, optional = values[: self.least], values[self.least :]
         nested = "".join(f"[{symbol} " for symbol in optional).rstrip() + "]" * len(optional)
         options = [f"[{part.grammar}]" for part in self._options]
         first = "" if self.is_bare else self.word
-        return " ".join(filter(None, [first, *needed, nested, *options]))
+        return " ".join(filter(None, [first, *required, nested, *options]))
 
-    def described(self, before: str = "") -> Iterator[Word]:
+    def described(self, preceding: str = "") -> Iterator[Word]:
         """Yield the clause's words, given those before it; the first word comes first."""
-        needed = [part.grammar for part in self._values[: self.least]]
-        after = " ".join(filter(None, [before, "" if self.is_bare else self.word, *needed]))
-        yield Word(self.word, self.example, before, f"{before} {self.grammar}".strip())
+        required = [part.grammar for part in self._values[: self.least]]
+        clause_words = " ".join(filter(None, [preceding, "" if self.is_bare else self.word, *required]))
+        yield Word(self.word, self.example, preceding, f"{preceding} {self.grammar}".strip())
         for synonym in self.synonyms:
-            yield Word(synonym, self.example, before)
+            yield Word(synonym, self.example, preceding)
         for part in self.parts:
-            yield from part.described(after)
+            yield from part.described(clause_words)

@@ -96,15 +96,15 @@ class Feature(ScenarioSection):
         """Return the condition under which the prediction of the loss rate holds."""
         return ""
 
-    def tc_lacks(self, before: Sequence["Impairment"]) -> str:
-        """Return the missing feature of tc, which applies the impairments ``before`` before it."""
+    def tc_lacks(self, earlier: Sequence["Impairment"]) -> str:
+        """Return the missing feature of tc, which applies the impairments ``earlier`` before it."""
         return self.tc_missing
 
 
 def numbers_text(numbers: Sequence[object]) -> str:
     """Return the first numbers of flows in words."""
-    more = ",..." if len(numbers) > _MOST_SHOWN else ""
-    return f"{','.join(map(str, numbers[:_MOST_SHOWN]))}{more}"
+    ending = ",..." if len(numbers) > _MOST_SHOWN else ""
+    return f"{','.join(map(str, numbers[:_MOST_SHOWN]))}{ending}"
 
 
 class QueueDiscipline(Feature):
@@ -129,7 +129,7 @@ class Scheduler(QueueDiscipline):
         """Return the number of each flow, from which the key of its packets follows."""
 
     @abstractmethod
-    def yields_ns(self, flow: int, other: int) -> float:
+    def yields_ns(self, number: int, other_number: int) -> float:
         """Return how long after a packet of a flow one of another flow may arrive, to go first.
 
         It is negative if that must arrive before; infinite if it always, or never, goes first.

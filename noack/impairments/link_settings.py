@@ -56,13 +56,13 @@ class LinkSettings(ScenarioSection):
     @property
     def chooses(self) -> bool:
         """Whether the queue of a rate chooses what it sends when the link is free."""
-        return any(isinstance(one, Rate) and one.scheduler for one in self.impairments)
+        return any(isinstance(impairment, Rate) and impairment.scheduler for impairment in self.impairments)
 
     @property
     def reads_errors(self) -> bool:
         """Whether such a queue chooses by the errors that updates report."""
         return any(
-            isinstance(one, Rate) and isinstance(one.discipline, MaximumError) for one in self.impairments
+            isinstance(rate, Rate) and isinstance(rate.discipline, MaximumError) for rate in self.impairments
         )
 
     @property
@@ -100,16 +100,16 @@ def require_order(impairments: Sequence[AnyImpairment]) -> None:
     Raises:
         ValueError: its effect would depend on the order; the message begins with the key.
     """
-    rates = [(place, one) for place, one in enumerate(impairments) if isinstance(one, Rate) and one.scheduler]
-    for place, rate in rates[:1]:
-        for number, other in enumerate(impairments):
-            where = "before" if number < place else "after"
-            least_s, largest_s = other.delay_range_s(0.0, 0.0)
-            fits = number == place or isinstance(other, Corrupt)
-            fits = fits or (isinstance(other, Delay) and least_s == largest_s)
-            if not fits and not (where == "before" and isinstance(other, LossOf | Blackout)):
+    rates = [(i, rate) for i, rate in enumerate(impairments) if isinstance(rate, Rate) and rate.scheduler]
+    for i, rate in rates[:1]:
+        for number, beside in enumerate(impairments):
+            side = "before" if number < i else "after"
+            least_s, largest_s = beside.delay_range_s(0.0, 0.0)
+            fits = number == i or isinstance(beside, Corrupt)
+            fits = fits or (isinstance(beside, Delay) and least_s == largest_s)
+            if not fits and not (side == "before" and isinstance(beside, LossOf | Blackout)):
                 raise ValueError(
-                    f"impairments.{number}: {other.kind} cannot stand {where} a rate with "
+                    f"impairments.{number}: {beside.kind} cannot stand {side} a rate with "
                     f"{rate.discipline.kind}; losses and blackouts can stand before such a rate, "
                     "constant delays and corruption before or after it"
                 )
@@ -154,7 +154,7 @@ class Counters:
     """Maximum number of consecutive losses of a flow under the present settings."""
     most_in_flight: int = 0
 
-    def __sub__(self, before: "Counters") -> "Counters":
-        """Return what was counted since ``before``; the two maxima have no meaning then."""
-        pairs = zip(astuple(self), astuple(before), strict=True)
+    def __sub__(self, earlier: "Counters") -> "Counters":
+        """Return what was counted since ``earlier``; the two maxima have no meaning then."""
+        pairs = zip(astuple(self), astuple(earlier), strict=True)
         return Counters(*(now - then for now, then in pairs))

@@ -224,21 +224,21 @@ class LossAutomaton:
         return self._after(states, 0)
 
     def _after(self, states: Indices, lost: int) -> Indices:
-        after: Indices = self._next[states, lost]
-        if (unknown := after == _UNKNOWN).any():
+        following: Indices = self._next[states, lost]
+        if (unknown := following == _UNKNOWN).any():
             for state in np.unique(states[unknown]).tolist():
                 self._next[state, lost] = self._number(self._states[state], bool(lost))
-            after = self._next[states, lost]
-        return after
+            following = self._next[states, lost]
+        return following
 
     def _number(self, state: tuple[int, ...], lost: bool) -> int:
         """Return the number of the state after an outcome; −1 if it is not allowed."""
         following = []
-        for rule, own in zip(self._rules, state, strict=True):
-            after, value = rule.after(own, lost)
+        for rule, rule_state in zip(self._rules, state, strict=True):
+            next_state, value = rule.after(rule_state, lost)
             if value > rule.limit:
                 return _FORBIDDEN
-            following.append(after)
+            following.append(next_state)
         key = tuple(following)
         if key not in self._numbers:
             self._numbers[key] = len(self._states)
@@ -260,14 +260,14 @@ class Moves(NamedTuple):
 def list_moves(guarantee: LossGuarantee, most: int) -> Moves | None:
     """Return all states of a guarantee, the nearest ones first; None: there are more than ``most``."""
     automaton = LossAutomaton(guarantee)
-    known, lost, delivered = 1, list[int](), list[int]()
-    while len(lost) < known <= most:
-        states = np.arange(len(lost), known)
+    count, lost, delivered = 1, list[int](), list[int]()
+    while len(lost) < count <= most:
+        states = np.arange(len(lost), count)
         after_loss, after_delivery = automaton.after_loss(states), automaton.after_delivery(states)
         lost += after_loss.tolist()
         delivered += after_delivery.tolist()
-        known = max(known, 1 + int(after_loss.max()), 1 + int(after_delivery.max()))
-    return Moves(np.array(lost), np.array(delivered)) if known <= most else None
+        count = max(count, 1 + int(after_loss.max()), 1 + int(after_delivery.max()))
+    return Moves(np.array(lost), np.array(delivered)) if count <= most else None
 
 
 _MOST_STATES, _MOST_STEPS = 200_000, 200_000_000
@@ -275,7 +275,7 @@ Pattern = tuple[bool, ...]
 """Whether each update is delivered, from the first one on."""
 
 
-def find_pattern_beyond(guarantee: LossGuarantee, other: LossGuarantee) -> Pattern | None:
+def find_pattern_beyond(guarantee: LossGuarantee, implied: LossGuarantee) -> Pattern | None:
     """Return a shortest pattern that a guarantee allows and another one forbids.
 
     None: there is none, so the guarantee implies the other one. A rule of the other guarantee is
@@ -292,8 +292,8 @@ def find_pattern_beyond(guarantee: LossGuarantee, other: LossGuarantee) -> Patte
         CallerError: the guarantee has too many states.
     """
     states = _States(guarantee)
-    found = [states.pattern_against(rule) for rule in other.rules]
-    return min((one for one in found if one is not None), key=len, default=None)
+    patterns = [states.pattern_against(rule) for rule in implied.rules]
+    return min((pattern for pattern in patterns if pattern is not None), key=len, default=None)
 
 
 class _States:
@@ -310,8 +310,8 @@ class _States:
         """The state before each state, and 1 if the update between was delivered, else 0."""
         self._origins[reached[reached > 0]] = np.column_stack(np.divmod(places[reached > 0], 2))
         self._depths = np.zeros(len(self._origins), int)
-        for state, (before, _) in enumerate(self._origins[1:].tolist(), 1):
-            self._depths[state] = self._depths[before] + 1
+        for state, (previous, _) in enumerate(self._origins[1:].tolist(), 1):
+            self._depths[state] = self._depths[previous] + 1
 
     def _require(self, is_small: bool) -> None:
         if not is_small:
@@ -354,16 +354,16 @@ class _States:
 
     def _with_near_bursts(self, deliveries: int) -> Pattern | None:
         """Return a shortest pattern with fewer deliveries between two bursts of losses."""
-        found: list[Pattern] = []
+        patterns: list[Pattern] = []
         states = np.flatnonzero(self._after_loss >= 0)
-        after = self._after_loss[states]
+        reached = self._after_loss[states]
         for between in range(1, deliveries):
-            after = self._after_delivery[after]
-            found += [
+            reached = self._after_delivery[reached]
+            patterns += [
                 (*self._to(state), False, *[True] * between, False)
-                for state in states[self._after_loss[after] >= 0][:1].tolist()
+                for state in states[self._after_loss[reached] >= 0][:1].tolist()
             ]
-        return min(found, key=len, default=None)
+        return min(patterns, key=len, default=None)
 
     def _to(self, state: int) -> Pattern:
         """Return a shortest pattern that reaches a state."""

@@ -112,21 +112,21 @@ def joint_chain(settings: LinkSettings) -> tuple[Array, Array, Array]:
     Raises:
         NotPredictableError: there is no such chain; the message is the reason.
     """
-    return _together([part for impairment in settings.impairments for part in impairment.chains()])
+    return _joint_chain([part for impairment in settings.impairments for part in impairment.chains()])
 
 
 def _constrained_rate(parts: Sequence[Chain | Pattern], guarantee: LossGuarantee) -> float:
     patterns = [part.lost for part in parts if isinstance(part, Pattern)]
     if len(patterns) == len(parts):
         return pattern_rate(_together_lost(patterns), guarantee)
-    return constrained_rate(*_together(parts), guarantee)
+    return constrained_rate(*_joint_chain(parts), guarantee)
 
 
 def _capped_rate(parts: Sequence[Chain | Pattern], mansd: int | None) -> float:
     patterns = [part for part in parts if isinstance(part, Pattern)]
     if len(patterns) == len(parts):
         return _pattern_rate([part.lost for part in patterns], mansd)
-    start, moves, ineffective = _together(parts)
+    start, moves, ineffective = _joint_chain(parts)
     if mansd is None:
         return float(_stationary(start, moves) @ ineffective)
     lost, passed = moves * ineffective, moves * (1 - ineffective)
@@ -159,7 +159,7 @@ def _together_lost(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     return lost
 
 
-def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
+def _joint_chain(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
     """Return the joint chain: start, matrix, probability of no effective delivery."""
     states = math.prod(len(part.lost if isinstance(part, Pattern) else part.start) for part in parts)
     if states > MOST_STATES:
@@ -167,14 +167,14 @@ def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
     start: Array = np.ones(1)
     moves: Array = np.ones((1, 1))
     chains = [part.chain if isinstance(part, Pattern) else part for part in parts]
-    done: list[Chain] = []
+    joined: list[Chain] = []
     for chain in chains:
-        n, others = len(chain.start), len(start)
+        n, size_so_far = len(chain.start), len(start)
         start = np.kron(start, chain.start).astype(np.float64)
         moves = np.kron(moves, chain.moves).astype(np.float64)
-        done = [chain_before._replace(acts=np.repeat(chain_before.acts, n)) for chain_before in done]
-        done.append(chain._replace(acts=np.tile(chain.acts, others)))
-    return start, moves, _ineffective(done, states)
+        joined = [chain_before._replace(acts=np.repeat(chain_before.acts, n)) for chain_before in joined]
+        joined.append(chain._replace(acts=np.tile(chain.acts, size_so_far)))
+    return start, moves, _ineffective(joined, states)
 
 
 def _ineffective(chains: Sequence[Chain], states: int) -> Array:
@@ -184,9 +184,9 @@ def _ineffective(chains: Sequence[Chain], states: int) -> Array:
     """Axis 0: packet intact, corrupt. Axis 1: no copy, intact copy, corrupt copy. Axis 2: state."""
     shares[0, 0] = 1.0
     for chain in chains:
-        if chain.what == "lose":
+        if chain.action == "lose":
             passes = passes * (1 - chain.acts)
-        elif chain.what == "duplicate":
+        elif chain.action == "duplicate":
             copied = shares.sum(axis=1) * chain.acts
             shares *= 1 - chain.acts
             shares[0, 1] += copied[0]
@@ -235,8 +235,8 @@ class LossProcess:
     @property
     def is_independent(self) -> bool:
         """Whether every packet is lost with the same probability, independently."""
-        given = self._loss_given_state
-        return bool(np.ptp(given) <= _ROUNDING)
+        loss_given_state = self._loss_given_state
+        return bool(np.ptp(loss_given_state) <= _ROUNDING)
 
     @property
     def largest_probability(self) -> float:
@@ -281,8 +281,8 @@ class LossProcess:
             if (further == reached).all():
                 break
             reached = further
-        kept = np.ix_(reached, reached)
-        return OutcomeChain(lost[kept], delivered[kept])
+        reachable = np.ix_(reached, reached)
+        return OutcomeChain(lost[reachable], delivered[reachable])
 
     def keeps(self, guarantee: LossGuarantee, packets: int) -> float:
         """Return the probability that the first packets keep a guarantee by chance.
@@ -294,33 +294,33 @@ class LossProcess:
         after_loss, after_delivery = reachable_moves(guarantee, _MOST_STEPS // n)
         allowed = after_loss >= 0
         lost, passed = self.moves * self.lost, self.moves * (1 - self.lost)
-        at = np.zeros((len(after_loss), n))
+        weights = np.zeros((len(after_loss), n))
         if self.first_delivered and packets > 0:
-            at[after_delivery[0]] = self.start @ self.moves
+            weights[after_delivery[0]] = self.start @ self.moves
             packets -= 1
         else:
-            at[0] = self.start
-        if at.size <= _MOST_SQUARED:
+            weights[0] = self.start
+        if weights.size <= _MOST_SQUARED:
             states = np.arange(len(after_loss))
             matrix = np.zeros((len(states), n, len(states), n))
             matrix[states[allowed], :, after_loss[allowed]] += lost
             matrix[states, :, after_delivery] += passed
-            power = np.linalg.matrix_power(matrix.reshape(at.size, at.size), packets)
-            return float(min((at.ravel() @ power).sum(), 1.0))
+            power = np.linalg.matrix_power(matrix.reshape(weights.size, weights.size), packets)
+            return float(min((weights.ravel() @ power).sum(), 1.0))
         if packets > _MOST_STEPS:
             raise NotPredictableError(f"{packets} packets are too many to compute with")
         for _ in range(packets):
-            following = np.zeros_like(at)
-            np.add.at(following, after_delivery, at @ passed)
-            np.add.at(following, after_loss[allowed], at[allowed] @ lost)
-            at = following
-        return float(min(at.sum(), 1.0))
+            following = np.zeros_like(weights)
+            np.add.at(following, after_delivery, weights @ passed)
+            np.add.at(following, after_loss[allowed], weights[allowed] @ lost)
+            weights = following
+        return float(min(weights.sum(), 1.0))
 
     @property
     def _loss_given_state(self) -> Array:
         """The probability of a loss, given each state before it that can be reached; (k,)."""
-        reached, before = self.start > 0, -1
-        while before != (before := int(np.count_nonzero(reached))):
+        reached, count = self.start > 0, -1
+        while count != (count := int(np.count_nonzero(reached))):
             reached = reached | (reached @ self.moves > 0)
         loss_given_state: Array = (self.moves @ self.lost)[reached]
         return loss_given_state
@@ -351,15 +351,15 @@ class OutcomeChain(NamedTuple):
 
         moves = self.lost + self.delivered > 0
         _, labels = connected_components(moves, connection="strong")
-        left = labels[(moves & (labels[:, None] != labels)).any(axis=1)]
-        kept = ~np.isin(labels, left)
-        if len(set(labels[kept])) > 1:
+        transient_labels = labels[(moves & (labels[:, None] != labels)).any(axis=1)]
+        lasting = ~np.isin(labels, transient_labels)
+        if len(set(labels[lasting])) > 1:
             raise NotPredictableError("the losses depend on what happens at the beginning")
-        return OutcomeChain(self.lost[np.ix_(kept, kept)], self.delivered[np.ix_(kept, kept)])
+        return OutcomeChain(self.lost[np.ix_(lasting, lasting)], self.delivered[np.ix_(lasting, lasting)])
 
-    def distribution(self, every: int = 1) -> Array:
-        """Return the mean distribution before the packets 0, ``every``, 2 ``every``, …, (n,)."""
-        moves = np.linalg.matrix_power(self.lost + self.delivered, every)
+    def distribution(self, spacing: int = 1) -> Array:
+        """Return the mean distribution before the packets 0, ``spacing``, 2 ``spacing``, …, (n,)."""
+        moves = np.linalg.matrix_power(self.lost + self.delivered, spacing)
         return _stationary(np.eye(len(moves))[-1], moves)
 
 
@@ -403,22 +403,22 @@ def with_kept_loss(settings: LinkSettings) -> LinkSettings:
     Raises:
         ValueError: there is none; one line.
     """
-    found = [
+    kept_losses = [
         _Kept(number, impairment, impairment.loss)
         for number, impairment in enumerate(settings.impairments)
         if isinstance(impairment, LossOf)
         and isinstance(impairment.loss, BernoulliLoss)
         and impairment.loss.keep
     ]
-    if not found:
+    if not kept_losses:
         return settings
-    kept = found[0]
-    if len(found) > 1:
-        raise ValueError(f"{kept.impairment.text()}: only one loss of a direction can be kept")
+    kept_loss = kept_losses[0]
+    if len(kept_losses) > 1:
+        raise ValueError(f"{kept_loss.impairment.text()}: only one loss of a direction can be kept")
     key = _key(settings)
     if key not in _found:
-        remember({key: _probability(settings, kept)})
-    return _with_probability(settings, kept, _found[key])
+        remember({key: _probability(settings, kept_loss)})
+    return _with_probability(settings, kept_loss, _found[key])
 
 
 def found_probabilities(*links: LinkSettings) -> dict[str, float]:
@@ -448,32 +448,32 @@ def _matters(impairment: Impairment) -> bool:
         return True
 
 
-def _with_probability(settings: LinkSettings, kept: _Kept, probability: float) -> LinkSettings:
-    loss = kept.loss.model_copy(update={"probability": probability, "keep": False})
+def _with_probability(settings: LinkSettings, kept_loss: _Kept, probability: float) -> LinkSettings:
+    loss = kept_loss.loss.model_copy(update={"probability": probability, "keep": False})
     impairments: list[Impairment] = list(settings.impairments)
-    impairments[kept.number] = kept.impairment.model_copy(update={"loss": loss})
+    impairments[kept_loss.number] = kept_loss.impairment.model_copy(update={"loss": loss})
     return settings.model_copy(update={"impairments": tuple(impairments)})
 
 
-def _probability(settings: LinkSettings, kept: _Kept) -> float:
+def _probability(settings: LinkSettings, kept_loss: _Kept) -> float:
     from scipy.optimize import brentq  # slow to import
 
-    text, target = kept.impairment.text(), kept.loss.probability
+    text, target = kept_loss.impairment.text(), kept_loss.loss.probability
 
-    def rate_at(probability: float, of: LinkSettings = settings) -> float:
-        rate, note = predict(_with_probability(of, kept, float(probability)))
+    def rate_at(probability: float, link_settings: LinkSettings = settings) -> float:
+        rate, note = predict(_with_probability(link_settings, kept_loss, float(probability)))
         if rate is None:
             raise ValueError(f"{text}: the loss rate cannot be predicted: {note}")
         return rate
 
-    # Without the guarantee, more packets are lost: all but (1 − p)(1 − others).
-    others = rate_at(0.0, settings.model_copy(update={"mansd": None, "constraints": ()}))
-    if others > target and (others := rate_at(0.0)) > target + _TINY:
-        raise ValueError(f"{text}: impossible, the other impairments lose {brief_percent(others)} already")
-    least = 0.0 if others >= target else (target - others) / (1 - others)
-    places = np.linspace(least, 1.0, _PARTS + 1)
+    # Without the guarantee, more packets are lost: all but (1 − p)(1 − base_rate).
+    base_rate = rate_at(0.0, settings.model_copy(update={"mansd": None, "constraints": ()}))
+    if base_rate > target and (base_rate := rate_at(0.0)) > target + _TINY:
+        raise ValueError(f"{text}: impossible, the other impairments lose {brief_percent(base_rate)} already")
+    least = 0.0 if base_rate >= target else (target - base_rate) / (1 - base_rate)
+    probabilities = np.linspace(least, 1.0, _PARTS + 1)
     rates = [rate_at(least)]
-    for low, high in pairwise(places):
+    for low, high in pairwise(probabilities):
         if rates[-1] >= target - _TINY:
             return round(float(low), _DIGITS)
         rates.append(rate_at(high))

@@ -39,7 +39,7 @@ class Chain(NamedTuple):
     start: Array  # (n,) Distribution before the first packet
     moves: Array  # (n, n) Transition matrix
     acts: Array  # (n,) Probability in each state that it acts on the packet
-    what: str = "lose"  # The action: ``lose``, ``corrupt`` or ``duplicate``
+    action: str = "lose"  # The action: ``lose``, ``corrupt`` or ``duplicate``
     probability: float = 0.0  # Probability that it acts on a copy
 
 
@@ -68,7 +68,7 @@ def pattern(period: int, lost: Iterable[int]) -> Pattern:
     return Pattern(flags)
 
 
-def chance_chain(probability: float, correlation: float, what: str) -> Chain:
+def chance_chain(probability: float, correlation: float, action: str) -> Chain:
     """Return the chain of :mod:`noack.impairments.feature`, with its action.
 
     Raises:
@@ -76,21 +76,19 @@ def chance_chain(probability: float, correlation: float, what: str) -> Chain:
     """
     if correlation == 0.0 or probability in (0.0, 1.0):
         certain = np.ones(1), np.ones((1, 1)), np.array([probability])
-        return Chain(*certain, what, probability)
+        return Chain(*certain, action, probability)
     nodes, weights, acts = _nodes(probability, correlation)
     innovation = math.sqrt(1 - correlation**2)
     steps = (nodes - correlation * nodes[:, None]) / innovation
     moves = stochastic(np.exp(-(steps**2) / 2) * weights)
     start = np.exp(-(nodes**2) / 2) * weights
-    return Chain(start / start.sum(), moves, acts, what, probability)
+    return Chain(start / start.sum(), moves, acts, action, probability)
 
 
 def _nodes(probability: float, correlation: float) -> tuple[Array, Array, Array]:
     """Return Gauss nodes and weights on both sides of the latent process's threshold."""
-    threshold, edge = (
-        -core.noack_normal_score(probability),
-        8.3,
-    )  # no uniform number has a score beyond
+    threshold = -core.noack_normal_score(probability)
+    edge = 8.3  # no uniform number has a score beyond
     innovation = math.sqrt(1 - correlation**2)
     sides = ((-edge, min(threshold, edge), 0.0), (max(threshold, -edge), edge, 1.0))
     counts = [max(12, math.ceil(3 * (high - low) / innovation)) for low, high, _ in sides]
@@ -133,16 +131,16 @@ def pattern_rate(lost: NDArray[np.bool_], guarantee: LossGuarantee) -> float:
         NotPredictableError: that takes too long.
     """
     automaton, state, losses = LossAutomaton(guarantee), np.zeros(1, np.int64), 0
-    seen: dict[int, tuple[int, int]] = {}
+    visits: dict[int, tuple[int, int]] = {}
     for period in range(_MOST_STEPS // len(lost) + 1):
-        if int(state[0]) in seen:
-            first, before = seen[int(state[0])]
-            return (losses - before) / ((period - first) * len(lost))
-        seen[int(state[0])] = period, losses
+        if int(state[0]) in visits:
+            first, earlier_losses = visits[int(state[0])]
+            return (losses - earlier_losses) / ((period - first) * len(lost))
+        visits[int(state[0])] = period, losses
         for wish in lost.tolist():
-            after = automaton.after_loss(state) if wish else state
-            if wish and after[0] >= 0:
-                state, losses = after, losses + 1
+            after_loss = automaton.after_loss(state) if wish else state
+            if wish and after_loss[0] >= 0:
+                state, losses = after_loss, losses + 1
             else:
                 state = automaton.after_delivery(state)
     raise NotPredictableError("the losses repeat only after too many packets to compute with")
@@ -169,8 +167,8 @@ def moves_by_outcome(
     count = len(after_loss)
     allowed = after_loss >= 0
 
-    def to(targets: NDArray[np.int64], which: NDArray[np.bool_]) -> "csr_array[np.float64]":
-        places = np.flatnonzero(which)
+    def to(targets: NDArray[np.int64], allows: NDArray[np.bool_]) -> "csr_array[np.float64]":
+        places = np.flatnonzero(allows)
         shape = (count, count)
         return sparse.csr_array((np.ones(len(places)), (places, targets[places])), shape)
 
@@ -212,9 +210,9 @@ def _stationary(joint: "csr_array[np.float64]", start: Array) -> Array:
     closed = np.setdiff1d(labels, labels[sources[leaves]])
     if len(closed) > 1:
         raise NotPredictableError("the loss rate depends on what happens at the beginning")
-    kept = np.flatnonzero(labels == closed[0])
+    recurrent = np.flatnonzero(labels == closed[0])
     distribution = np.zeros(len(start))
-    distribution[places[kept]] = _balance(part[kept][:, kept])
+    distribution[places[recurrent]] = _balance(part[recurrent][:, recurrent])
     return distribution
 
 
@@ -232,10 +230,10 @@ def _balance(moves: "csr_array[np.float64]") -> Array:
         return distribution
     for _ in range(_WARM_UP):
         distribution = (distribution + moves.T @ distribution) / 2
-    others = np.delete(np.arange(count), likely := int(np.argmax(distribution)))
+    unlikely = np.delete(np.arange(count), likely := int(np.argmax(distribution)))
     system = (eye_array(count) - moves.T).tocsc()
-    flow = moves[[likely]].toarray()[0, others]
+    flow = moves[[likely]].toarray()[0, unlikely]
     distribution[likely] = 1.0
-    distribution[others] = np.maximum(linalg.splu(system[others][:, others].tocsc()).solve(flow), 0.0)
+    distribution[unlikely] = np.maximum(linalg.splu(system[unlikely][:, unlikely].tocsc()).solve(flow), 0.0)
     distribution /= distribution.sum()
     return distribution

@@ -277,13 +277,13 @@ class WordReader:
         """Read the next word if it is one of these; return it, or None."""
         return self._take() if self._peek() in words else None
 
-    def unknown(self, word: str, known: Collection[str]) -> NoReturn:
+    def unknown(self, word: str, known_words: Collection[str]) -> NoReturn:
         """Raise a CallerError for an unknown word; name the nearest known word."""
-        longer = sorted(name for name in known if name.startswith(word))
+        longer = sorted(name for name in known_words if name.startswith(word))
         if longer:
             self.wrong(f"words are not shortened; did you mean {' or '.join(longer)}?")
-        close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-        hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
+        close = difflib.get_close_matches(word, known_words, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known_words)}"
         self.wrong(f"no such word; {hint}")
 
     def _peek(self) -> str | None:

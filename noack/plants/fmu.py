@@ -93,12 +93,12 @@ class FmuSettings(FileSettings, PlantSettings):
         Raises:
             ValueError: the numbers differ.
         """
-        why = f"the model has {n} states and {m} inputs"
-        require_length(self.state_variables, "plant.system.state_variables", n, why)
-        require_length(self.input_variables, "plant.system.input_variables", m, why)
-        require_length(self.initial_variables or None, "plant.system.initial_variables", n, why)
-        require_length(self.operating_state, "plant.system.operating_state", n, why)
-        require_length(self.operating_input, "plant.system.operating_input", m, why)
+        dimensions = f"the model has {n} states and {m} inputs"
+        require_length(self.state_variables, "plant.system.state_variables", n, dimensions)
+        require_length(self.input_variables, "plant.system.input_variables", m, dimensions)
+        require_length(self.initial_variables or None, "plant.system.initial_variables", n, dimensions)
+        require_length(self.operating_state, "plant.system.operating_state", n, dimensions)
+        require_length(self.operating_input, "plant.system.operating_input", m, dimensions)
 
     def system(self, start: PlantStart) -> PlantSystem:
         return FmuSystem(self, start.x0)
@@ -124,7 +124,7 @@ class FmuSystem:
         try:
             description = _described(path)
             self.about = _about(description)
-            self._instance = self._loaded(path, end, description)
+            self._instance = self._load(path, end, description)
             self._start(settings, x0, description)
         except CallerError:
             end.close()
@@ -138,8 +138,8 @@ class FmuSystem:
         try:
             with quiet():
                 self._inputs.set(u + self._operating_input)
-                done = self._instance.fmu.doStep(t_ns * 1e-9, dt_ns * 1e-9)
-                if done is not None and done[1]:
+                status = self._instance.fmu.doStep(t_ns * 1e-9, dt_ns * 1e-9)
+                if status is not None and status[1]:
                     raise RuntimeError("it requests the end of the simulation")
                 self._read()
         except Exception as error:  # as above
@@ -153,18 +153,18 @@ class FmuSystem:
     def _wrong(self, message: str) -> NoReturn:
         raise CallerError(f"{self._place}: {message}")
 
-    def _loaded(self, path: Path, end: contextlib.ExitStack, description: "ModelDescription") -> "_Instance":
+    def _load(self, path: Path, end: contextlib.ExitStack, description: "ModelDescription") -> "_Instance":
         fmpy, folder = _fmpy(), end.enter_context(temporary_folder())
         fmpy.extract(str(path), str(folder))
         self._require_binary(folder, description)
-        before = Path.cwd()
+        working_folder = Path.cwd()
         try:
             with quiet(), contextlib.redirect_stdout(io.StringIO()):
                 fmu = fmpy.instantiate_fmu(
                     str(folder), description, fmi_type="CoSimulation", logger=self._log.take
                 )
         finally:
-            os.chdir(before)  # if loading fails, FMPy does not change back
+            os.chdir(working_folder)  # if loading fails, FMPy does not change back
         instance = _Instance(fmu)
         end.callback(instance.release)
         return instance
@@ -176,11 +176,11 @@ class FmuSystem:
         name = description.coSimulation.modelIdentifier + fmpy.sharedLibraryExtension
         if (folder / "binaries" / platform / name).is_file():
             return
-        there = sorted(entry.name for entry in (folder / "binaries").glob("*") if entry.is_dir())
-        has = f"binaries for {', '.join(there)} only" if there else "no binaries"
+        platforms = sorted(entry.name for entry in (folder / "binaries").glob("*") if entry.is_dir())
+        content = f"binaries for {', '.join(platforms)} only" if platforms else "no binaries"
         sources = (folder / "sources").is_dir()
         hint = "; it has sources, which `fmpy compile` can compile" if sources else ""
-        self._wrong(f"has {has}; this machine needs {platform}/{name}{hint}")
+        self._wrong(f"has {content}; this machine needs {platform}/{name}{hint}")
 
     def _start(self, settings: FmuSettings, x0: Vector, description: "ModelDescription") -> None:
         fmu, variables = self._instance.fmu, _Variables(description)
@@ -221,10 +221,10 @@ def variables_of(path: Path) -> dict[str, list[str]]:
 
     The states are the variables whose derivatives the FMU names; if it names none, its outputs.
     """
-    real = [one for one in _described(path).modelVariables if _not_a_real_scalar(one) is None]
-    states = [one.derivative.name for one in real if one.derivative is not None]
-    outputs = [one.name for one in real if one.causality == "output"]
-    inputs = [one.name for one in real if one.causality == "input"]
+    real = [variable for variable in _described(path).modelVariables if _not_a_real_scalar(variable) is None]
+    states = [variable.derivative.name for variable in real if variable.derivative is not None]
+    outputs = [variable.name for variable in real if variable.causality == "output"]
+    inputs = [variable.name for variable in real if variable.causality == "input"]
     return {"state_variables": states or outputs, "input_variables": inputs}
 
 
@@ -237,7 +237,7 @@ def _described(path: Path) -> "ModelDescription":
         with path.open("rb") as content:  # FMPy does not close a file that it cannot read
             description = fmpy.read_model_description(content, validate=False)
     except Exception as error:  # a file that is not an FMU can raise any error
-        file.wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_short(error)}")
+        file.wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_one_line(error)}")
     if description.fmiVersion.startswith("1."):
         file.wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 are supported")
     if description.coSimulation is None:
@@ -276,11 +276,11 @@ class _Log:
         *_, status, _, message = arguments
         assert isinstance(status, int)
         if status > _WARNING and isinstance(message, bytes):
-            self._last = _short(message.decode(errors="replace"))
+            self._last = _one_line(message.decode(errors="replace"))
 
     def why(self, error: Exception) -> str:
         """Return an error's text, with the FMU's last message."""
-        return f"{_short(error)} ({self._last})" if self._last else _short(error)
+        return f"{_one_line(error)} ({self._last})" if self._last else _one_line(error)
 
 
 class _Variables:
@@ -296,38 +296,38 @@ class _Variables:
 
     def real(self, key: str, names: Sequence[str], refusal: Refusal) -> list["ScalarVariable"]:
         """Return real scalars that are not refused."""
-        variables = [self._named(key, name) for name in names]
+        variables = [self._variable(key, name) for name in names]
         twice = next((name for name, count in Counter(names).items() if count > 1), None)
         if twice is not None:
             raise CallerError(f'plant.system.{key}: "{twice}" is named twice')
         for variable in variables:
-            if why := _not_a_real_scalar(variable) or refusal(variable):
-                _refuse(key, variable, why)
+            if reason := _not_a_real_scalar(variable) or refusal(variable):
+                _refuse(key, variable, reason)
         return variables
 
     def parameter(self, name: str, value: object) -> tuple["ScalarVariable", object]:
         """Return a variable and its start value."""
-        variable = self._named("parameters", name)
-        kinds, needed = _VALUES.get(variable.type, ((int,), "a whole number"))
+        variable = self._variable("parameters", name)
+        kinds, expected = _VALUES.get(variable.type, ((int,), "a whole number"))
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            _refuse("parameters", variable, f"is of type {variable.type}; give {needed}, not {value!r}")
+            _refuse("parameters", variable, f"is of type {variable.type}; give {expected}, not {value!r}")
         if variable.causality == "input":
             _refuse("parameters", variable, "is an input; its value at rest is operating_input")
-        if why := _not_settable(variable):
-            _refuse("parameters", variable, why)
+        if reason := _not_settable(variable):
+            _refuse("parameters", variable, reason)
         return variable, value
 
-    def _named(self, key: str, name: str) -> "ScalarVariable":
+    def _variable(self, key: str, name: str) -> "ScalarVariable":
         if name in self._known:
             return self._known[name]
         close = difflib.get_close_matches(name, self._known, n=1)
-        some = ", ".join(list(self._known)[:8])
-        hint = f"did you mean {close[0]}?" if close else f"it has {some}"
+        examples = ", ".join(list(self._known)[:8])
+        hint = f"did you mean {close[0]}?" if close else f"it has {examples}"
         raise CallerError(f'plant.system.{key}: the FMU has no variable "{name}"; {hint}')
 
 
-def _refuse(key: str, variable: "ScalarVariable", why: str) -> NoReturn:
-    raise CallerError(f'plant.system.{key}: the FMU\'s "{variable.name}" {why}')
+def _refuse(key: str, variable: "ScalarVariable", reason: str) -> NoReturn:
+    raise CallerError(f'plant.system.{key}: the FMU\'s "{variable.name}" {reason}')
 
 
 class _Port:
@@ -337,22 +337,22 @@ class _Port:
         self._fmu, self._size = fmu, len(variables)
         places: dict[str, tuple[list[int], list[int]]] = {}
         for index, variable in enumerate(variables):
-            at, references = places.setdefault(variable.type, ([], []))
-            at.append(index)
+            indices, references = places.setdefault(variable.type, ([], []))
+            indices.append(index)
             references.append(variable.valueReference)
-        self._places = [(kind, at, references) for kind, (at, references) in places.items()]
+        self._places = [(kind, indices, references) for kind, (indices, references) in places.items()]
 
     def get(self) -> Vector:
         """Return the variables' values."""
         values = np.empty(self._size)
-        for kind, at, references in self._places:
-            values[at] = getattr(self._fmu, f"get{kind}")(references)
+        for kind, indices, references in self._places:
+            values[indices] = getattr(self._fmu, f"get{kind}")(references)
         return values
 
     def set(self, values: Vector) -> None:
         """Set the variables to values."""
-        for kind, at, references in self._places:
-            _set(self._fmu, kind, references, values[at].tolist())
+        for kind, indices, references in self._places:
+            _set(self._fmu, kind, references, values[indices].tolist())
 
 
 def _set(fmu: "_FMU", kind: str, references: Sequence[int], values: Sequence[object]) -> None:
@@ -387,8 +387,8 @@ def _not_settable(variable: "ScalarVariable") -> str | None:
 
 def _not_initial(variable: "ScalarVariable") -> str | None:
     """Refuse a variable to which x(0) cannot be written."""
-    why = _not_settable(variable)
-    return why and f"{why}; name variables whose initial is exact or approx, or none: []"
+    reason = _not_settable(variable)
+    return reason and f"{reason}; name variables whose initial is exact or approx, or none: []"
 
 
 def _about(description: "ModelDescription") -> str:
@@ -402,8 +402,8 @@ def _fmpy() -> ModuleType:
         return import_module("fmpy")
 
 
-def _short(what: object) -> str:
-    text = " ".join(str(what).split())
+def _one_line(message: object) -> str:
+    text = " ".join(str(message).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
@@ -416,8 +416,8 @@ def temporary_folder() -> Iterator[Path]:
     """
     if not hasattr(os, "getuid"):
         raise CallerError('plant.system.kind: "fmu" needs Linux or macOS')
-    for left in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        _remove_if_left(left)
+    for abandoned in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        _remove_if_left(abandoned)
     while True:
         folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
         lock = _locked(folder)
@@ -458,18 +458,18 @@ def _locked(folder: Path) -> int | None:
 @contextmanager
 def quiet() -> Iterator[None]:
     """Discard all output that native code prints in this context; it may print at every step."""
-    kept = []
+    copies = []
     with suppress(OSError):  # a stream that is closed stays closed
         for stream in _STREAMS:
-            kept.append((stream, os.dup(stream)))  # noqa: PERF401
+            copies.append((stream, os.dup(stream)))  # noqa: PERF401
     null = os.open(os.devnull, os.O_WRONLY)
-    for stream, _ in kept:
+    for stream, _ in copies:
         os.dup2(null, stream)
     os.close(null)
     try:
         yield
     finally:
         ctypes.CDLL(None).fflush(None)  # otherwise its buffer is printed later
-        for stream, copy in kept:
+        for stream, copy in copies:
             os.dup2(copy, stream)
             os.close(copy)

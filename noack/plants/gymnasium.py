@@ -68,16 +68,16 @@ class GymnasiumSettings(FileSettings, PlantSettings):
         Raises:
             ValueError: the numbers differ.
         """
-        why = f"the model has {n} states and {m} inputs"
-        require_length(self.entries, "plant.system.entries", n, why)
-        require_length(self.operating_state, "plant.system.operating_state", n, why)
+        reason = f"the model has {n} states and {m} inputs"
+        require_length(self.entries, "plant.system.entries", n, reason)
+        require_length(self.operating_state, "plant.system.operating_state", n, reason)
         if self.entries is not None and len({*self.entries}) < n:
             raise ValueError("plant.system.entries: an entry is there twice")
         if self.actuation is not None:
-            rows, of = len(self.actuation), "plant.system.actuation"
-            require_shape(self.actuation, of, (rows, m), why)
-            why = f"{of} has {rows} rows"
-            require_length(self.operating_action, "plant.system.operating_action", rows, why)
+            rows, key = len(self.actuation), "plant.system.actuation"
+            require_shape(self.actuation, key, (rows, m), reason)
+            reason = f"{key} has {rows} rows"
+            require_length(self.operating_action, "plant.system.operating_action", rows, reason)
 
     def require_installed(self) -> None:
         super().require_installed()
@@ -104,8 +104,8 @@ class GymnasiumSettings(FileSettings, PlantSettings):
 
 def own_step_s(environment: UserCode) -> float | None:
     """Return the time of a step that an environment itself has, s; None if it has none."""
-    own = (getattr(environment, name, None) for name in ("dt", "tau"))
-    return next((float(step) for step in own if step), None)
+    steps = (getattr(environment, name, None) for name in ("dt", "tau"))
+    return next((float(step) for step in steps if step), None)
 
 
 class Environment:
@@ -121,12 +121,12 @@ class Environment:
         self._settings = settings
         self.place = f'plant.system.id = "{settings.id}"'
         """What messages begin with."""
-        given = dict(settings.parameters)
+        arguments = dict(settings.parameters)
         if settings.file is not None:
-            given["xml_file"] = str(unchanged(settings, "plant.system"))
+            arguments["xml_file"] = str(unchanged(settings, "plant.system"))
         gymnasium = import_module("gymnasium")
         try:
-            self._own: UserCode = gymnasium.make(settings.id, **given).unwrapped
+            self._own: UserCode = gymnasium.make(settings.id, **arguments).unwrapped
             self._observation, _ = self._own.reset(seed=0)
         except Exception as error:  # an environment can raise any error
             self.wrong(f"{type(error).__name__}: {one_line(error)}")
@@ -182,13 +182,13 @@ class Environment:
         own_s = self.step_s
         if abs(own_s * 1e9 - step_ns) <= 1:
             return
-        wanted = f"its step is {own_s:g} s; set plant.rate_hz = {1 / own_s:.9g}"
+        remedy = f"its step is {own_s:g} s; set plant.rate_hz = {1 / own_s:.9g}"
         longer, shorter = step_ns * 1e-9 / own_s, own_s / (step_ns * 1e-9)
         if longer > 1 and abs(longer - round(longer)) < _ALIKE:
-            wanted += f" and plant.measure_every = {round(longer)} to measure as often as now"
+            remedy += f" and plant.measure_every = {round(longer)} to measure as often as now"
         elif shorter > 1 and abs(shorter - round(shorter)) < _ALIKE:
-            wanted += f"; it cannot make {round(shorter)} steps of the plant out of its one"
-        self.wrong(wanted)
+            remedy += f"; it cannot make {round(shorter)} steps of the plant out of its one"
+        self.wrong(remedy)
 
     def x(self) -> Vector:
         """Return x, (n,)."""
@@ -204,8 +204,8 @@ class Environment:
         state = self._state()
         if _OBSERVATION in self._names:
             if not np.all(np.abs(self.x() - x0) <= _ALIKE * (np.abs(x0) + 1.0)):
-                here = self.x().tolist()
-                self.wrong(f"an observation cannot be set; set plant.initial_state = {here}")
+                observation = self.x().tolist()
+                self.wrong(f"an observation cannot be set; set plant.initial_state = {observation}")
             return
         state[self._entries] = x0 + self._offset
         name = ""

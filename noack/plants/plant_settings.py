@@ -121,10 +121,10 @@ class PlantSettings(ScenarioSection):
         Raises:
             ValueError: it cannot.
         """
-        for what, names, count in (("states", self.states, n), ("inputs", self.inputs, m)):
+        for title, names, count in (("states", self.states, n), ("inputs", self.inputs, m)):
             if names and len(names) != count:
                 raise ValueError(
-                    f"plant.system: it has {len(names)} {what} ({', '.join(names)}); the model has {count}"
+                    f"plant.system: it has {len(names)} {title} ({', '.join(names)}); the model has {count}"
                 )
 
     def require_installed(self) -> None:
@@ -240,25 +240,25 @@ class OdeSystem:
 
         The numbers may be of any kind, in arrays of objects.
         """
-        here = self.x
-        if len(here) != len(self._state):
+        x_now = self.x
+        if len(x_now) != len(self._state):
             return None
-        z, equations = self._state + (x - here), self._equations
+        z, equations = self._state + (x - x_now), self._equations
         rates = equations.derivative(t_s, z, equations.physical(u))
         return np.asarray(rates), equations.output(z)
 
     def rates(self, x: Vector, u: Vector) -> Vector | None:
         """Return dx/dt at t = 0, (n,); None unless x is z, or z minus a constant."""
-        output, here = self._equations.output, self.x
-        off = 1e-3 * np.arange(1.0, len(here) + 1)
-        if len(here) != len(self._state):
+        output, x_now = self._equations.output, self.x
+        off = 1e-3 * np.arange(1.0, len(x_now) + 1)
+        if len(x_now) != len(self._state):
             return None
-        if not np.allclose(output(self._state + off) - here, off, rtol=0.0, atol=1e-9):
+        if not np.allclose(output(self._state + off) - x_now, off, rtol=0.0, atol=1e-9):
             return None
         try:
-            rates = self._equations.derivative(0.0, self._state + (x - here), self._equations.physical(u))
+            rates = self._equations.derivative(0.0, self._state + (x - x_now), self._equations.physical(u))
         except (ArithmeticError, ValueError):  # outside the equations' domain
-            return np.full_like(here, np.nan)
+            return np.full_like(x_now, np.nan)
         return np.asarray(rates, dtype=np.float64)
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
@@ -300,8 +300,8 @@ class OdeSystem:
             slope = np.asarray(self._guarded(t_s, z, v))
             escaped = not np.linalg.norm(z) < _ESCAPE * np.linalg.norm(self._state)
         if np.isfinite(slope).all() and not escaped:
-            why = _GAVE_UP.get(code, "the tolerance cannot be met")
-            raise SystemFailedError(f"the plant's equations cannot be integrated at {t_s:.6g} s: {why}")
+            reason = _GAVE_UP.get(code, "the tolerance cannot be met")
+            raise SystemFailedError(f"the plant's equations cannot be integrated at {t_s:.6g} s: {reason}")
 
     def _guarded(self, t_s: float, z: Vector, v: Vector) -> Sequence[float] | Vector:
         """Return f, or NaN after an exception: an exception cannot stop the integrator."""

@@ -98,8 +98,8 @@ class PythonSystem:
 
     def _make_system(self, plant: UserCode, x0: Vector, m: int) -> PlantSystem:
         if hasattr(plant, "derivative") == hasattr(plant, "advance"):
-            both = "both derivative and" if hasattr(plant, "advance") else "neither derivative nor"
-            raise TypeError(f"it has {both} advance; one of them is needed")
+            methods = "both derivative and" if hasattr(plant, "advance") else "neither derivative nor"
+            raise TypeError(f"it has {methods} advance; one of them is needed")
         if hasattr(plant, "advance"):
             return _Stepping(plant, x0)
         z0 = np.array(plant.state(x0.copy()) if hasattr(plant, "state") else x0, dtype=np.float64)

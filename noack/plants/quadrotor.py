@@ -52,11 +52,11 @@ class QuadrotorSettings(EquationSettings):
 
         def derivative(t_s: float, z: Vector, v: Vector) -> tuple[float, ...]:
             _, _, _, roll, pitch, yaw, v_x, v_y, v_z, p, q, r = z.tolist()
-            beyond, torque_x, torque_y, torque_z = v.tolist()
+            extra_thrust, torque_x, torque_y, torque_z = v.tolist()
             sin_roll, cos_roll = sin(roll), cos(roll)
             sin_pitch, cos_pitch = sin(pitch), cos(pitch)
             sin_yaw, cos_yaw = sin(yaw), cos(yaw)
-            lift = gravity + beyond / mass
+            lift = gravity + extra_thrust / mass
             turning = q * sin_roll + r * cos_roll
             return (
                 v_x,

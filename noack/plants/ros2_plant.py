@@ -51,11 +51,11 @@ class Ros2System(Ros2Peer):
 
     def connect(self) -> None:
         super().connect()
-        here, wanted = self.first_answer, self._x0
-        if not np.all(np.abs(here - wanted) <= _START_TOLERANCE * (np.abs(wanted) + 1.0)):
+        first_x, x0 = self.first_answer, self._x0
+        if not np.all(np.abs(first_x - x0) <= _START_TOLERANCE * (np.abs(x0) + 1.0)):
             raise CallerError(
-                f'{_PLACE}.kind = "ros2": x is {here.tolist()} at the start; '
-                f"plant.initial_state is {wanted.tolist()}"
+                f'{_PLACE}.kind = "ros2": x is {first_x.tolist()} at the start; '
+                f"plant.initial_state is {x0.tolist()}"
             )
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:

@@ -231,8 +231,8 @@ def _output_kinematic(z: Vector, parameters: Parameters) -> Vector:
 
 
 def _start_by_library(name: str, x0: Vector, speed: float, parameters: Parameters) -> list[float]:
-    started: list[float] = library(name)(_start(x0, speed, parameters), parameters)
-    return started
+    state: list[float] = library(name)(_start(x0, speed, parameters), parameters)
+    return state
 
 
 _MODELS = {
@@ -314,7 +314,7 @@ def compiled_dynamics(model: str) -> Compiled | None:
     from numba.core.errors import NumbaError
 
     if not is_compiled(model):
-        _print(while_compiling("the vehicle's equations", kept=_folder(model) is not None))
+        _print(while_compiling("the vehicle's equations", is_cached=_folder(model) is not None))
     compiled = _compiled(model)
     example = (
         np.zeros(1),
@@ -327,8 +327,8 @@ def compiled_dynamics(model: str) -> Compiled | None:
     try:
         compiled.compile(tuple(map(numba.typeof, example)))
     except NumbaError as error:  # numba may not support another version of the library
-        why = str(error).partition("\n")[0]
-        _print(f"warning: the vehicle's equations stay slow, as they cannot be compiled: {why}")
+        reason = str(error).partition("\n")[0]
+        _print(f"warning: the vehicle's equations stay slow, as they cannot be compiled: {reason}")
         return None
     return compiled
 
@@ -388,8 +388,8 @@ def _compiled(model: str) -> Compiled:
     from numba.extending import overload, register_jitable  # an extra of noack
 
     dynamics, lateral = _dynamics(model), library("utils.tire_model", "formula_lateral")
-    own = [member for _, member in inspect.getmembers(jump_integrator, inspect.isfunction)]
-    functions: set[Callable[..., Any]] = {*_needed(dynamics), *own, rates}
+    integrator_functions = [member for _, member in inspect.getmembers(jump_integrator, inspect.isfunction)]
+    functions: set[Callable[..., Any]] = {*_with_callees(dynamics), *integrator_functions, rates}
     for function in functions - {lateral}:
         register_jitable(**_OPTIONS)(function)
     overload(lateral, jit_options=_OPTIONS)(_held)
@@ -425,20 +425,20 @@ def _held(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
 
 @cache
 def _folder(model: str) -> Path | None:
-    sources = {Path(inspect.getfile(function)) for function in _needed(_dynamics(model))}
+    sources = {Path(inspect.getfile(function)) for function in _with_callees(_dynamics(model))}
     sources |= {Path(__file__), Path(jump_integrator.__file__)}
     return cache_folder(f"vehicle-{model}", sorted(sources))
 
 
-def _needed(function: FunctionType) -> list[FunctionType]:
+def _with_callees(function: FunctionType) -> list[FunctionType]:
     """Return a function of the library and all library functions that it calls, also indirectly."""
-    needed = [function]
-    for caller in needed:  # grows
-        needed += [other for other in dict.fromkeys(_named(caller)) if other not in needed]
-    return needed
+    functions = [function]
+    for caller in functions:  # grows
+        functions += [callee for callee in dict.fromkeys(_callees(caller)) if callee not in functions]
+    return functions
 
 
-def _named(function: FunctionType) -> Iterator[FunctionType]:
+def _callees(function: FunctionType) -> Iterator[FunctionType]:
     names = function.__code__.co_names
     reachable = [function.__globals__.get(name) for name in names]
     for module in [value for value in reachable if isinstance(value, ModuleType)]:

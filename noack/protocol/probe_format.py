@@ -78,11 +78,11 @@ class ProbeDatagram(NamedTuple):
 
 def encode_probe(content: ProbeDatagram, size_bytes: int = PROBE_BYTES) -> bytes:
     """Return the datagram, padded to ``size_bytes``."""
-    kind, *numbers, seen = content
+    kind, *numbers, seen_bits = content
     begin = _BEFORE_CRC.pack(MAGIC, VERSION, kind, 0)
-    body = _BODY.pack(*numbers, seen.to_bytes(16, "little"))
-    rest = body.ljust(size_bytes - _BODY_AT, b"\0")
-    return begin + _CRC.pack(zlib.crc32(rest, zlib.crc32(begin))) + rest
+    body = _BODY.pack(*numbers, seen_bits.to_bytes(16, "little"))
+    checked = body.ljust(size_bytes - _BODY_AT, b"\0")
+    return begin + _CRC.pack(zlib.crc32(checked, zlib.crc32(begin))) + checked
 
 
 def decode_probe(data: bytes) -> ProbeDatagram:
@@ -103,17 +103,17 @@ def decode_probe(data: bytes) -> ProbeDatagram:
     fields = _BODY.unpack_from(data, _BODY_AT)
     if reserved or kind not in ProbeKind.__members__.values():
         raise ValueError("impossible")
-    found = ProbeDatagram._make((ProbeKind(kind), *fields[:-1], int.from_bytes(fields[-1], "little")))
+    probe = ProbeDatagram._make((ProbeKind(kind), *fields[:-1], int.from_bytes(fields[-1], "little")))
     possible = (
-        found.sequence <= MAX_PROBES
-        and found.planned <= MAX_PROBES
-        and found.number <= _LATEST_NS
-        and found.newest <= _LATEST_NS
-        and SHORTEST_PERIOD_NS <= found.period_ns <= LONGEST_PERIOD_NS
-        and abs(found.start_ns) <= _LATEST_NS
-        and abs(found.sent_ns) <= _LATEST_NS
-        and (kind == ProbeKind.END or found.sent_ns >= found.scheduled_ns(found.sequence))
+        probe.sequence <= MAX_PROBES
+        and probe.planned <= MAX_PROBES
+        and probe.number <= _LATEST_NS
+        and probe.newest <= _LATEST_NS
+        and SHORTEST_PERIOD_NS <= probe.period_ns <= LONGEST_PERIOD_NS
+        and abs(probe.start_ns) <= _LATEST_NS
+        and abs(probe.sent_ns) <= _LATEST_NS
+        and (kind == ProbeKind.END or probe.sent_ns >= probe.scheduled_ns(probe.sequence))
     )
     if not possible:
         raise ValueError("impossible")
-    return found
+    return probe

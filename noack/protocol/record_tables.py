@@ -278,9 +278,9 @@ def largest(shapes: Iterable[RecordShape]) -> RecordShape:
 
 
 @lru_cache
-def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of a loop's tables; ``more`` has further sizes of `RecordShape`."""
-    shape = RecordShape(n, m, **more)  # type: ignore[arg-type]
+def tables(n: int, m: int, **sizes: int) -> Mapping[str, np.dtype[np.void]]:
+    """Return the row types of a loop's tables; ``sizes`` has further sizes of `RecordShape`."""
+    shape = RecordShape(n, m, **sizes)  # type: ignore[arg-type]
     return {
         table.name: np.dtype([*_fields((*COMMON, *table.columns), shape)])
         for table in TABLES
@@ -289,15 +289,15 @@ def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:
 
 
 def _fields(columns: tuple[Column, ...], shape: RecordShape) -> list[tuple[object, ...]]:
-    found: list[tuple[object, ...]] = []
+    fields: list[tuple[object, ...]] = []
     for column in columns:
         if not column.exists(shape):
             continue
         if column.entries is None:
-            found.append((column.name, column.dtype))
+            fields.append((column.name, column.dtype))
         elif (entries := column.entries(shape)) > 0:
-            found.append((column.name, column.dtype, (entries,)))
-    return found
+            fields.append((column.name, column.dtype, (entries,)))
+    return fields
 
 
 UPDATES, ACKNOWLEDGEMENTS, ACTUATIONS = 0, 1, 1

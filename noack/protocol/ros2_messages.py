@@ -61,11 +61,11 @@ def is_installed() -> bool:
     return find_spec("rosbags") is not None
 
 
-def require_installed(what: str) -> None:
+def require_installed(subject: str) -> None:
     """Raise CallerError if the library for ROS 2 messages is not installed."""
     if not is_installed():
         raise CallerError(
-            f"{what} needs the package rosbags, which is not installed; pip install 'noack[ros]'"
+            f"{subject} needs the package rosbags, which is not installed; pip install 'noack[ros]'"
         )
 
 
@@ -126,8 +126,8 @@ def read_joint_state(data: bytes) -> Entries:
 
 
 def _time(t_ns: int) -> "Msg":
-    seconds, rest = divmod(max(t_ns, 0), NS_PER_S)
-    return _store().types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
+    seconds, nanoseconds = divmod(max(t_ns, 0), NS_PER_S)
+    return _store().types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
 
 
 def name_part(text: str) -> str:
@@ -157,15 +157,15 @@ def row_entries(
         inputs: names of the inputs.
     """
     is_event = rows["event"] >= 0 if table == SENSOR_MEASUREMENT else np.ones(len(rows), np.bool_)
-    for place in np.flatnonzero(is_event).tolist():
-        row = rows[place]
+    for row_index in np.flatnonzero(is_event).tolist():
+        row = rows[row_index]
         t_ns = int(row["t_ns"])
         if table == SENSOR_MEASUREMENT:
             columns = ("event", "e_s_norm", "compared", "threshold")
             values = np.array([float(row[name]) for name in columns])
-            yield place, "event", Entries(t_ns, columns, values)
+            yield row_index, "event", Entries(t_ns, columns, values)
             continue
         x = row["x"][: len(states)]
-        yield place, TOPICS[table][0], Entries(t_ns, states, x)
+        yield row_index, TOPICS[table][0], Entries(t_ns, states, x)
         if table == PLANT_STEP:
-            yield place, "input", Entries(t_ns, inputs, row["u"][: len(inputs)])
+            yield row_index, "input", Entries(t_ns, inputs, row["u"][: len(inputs)])

@@ -46,14 +46,12 @@ def _session(endpoint: str, *, listen: bool) -> zenoh.Session:
     """Open a session with a router, or as the router to which nodes connect."""
     if not _ENDPOINT.fullmatch(endpoint):
         raise CallerError(f"router {endpoint}: give it as tcp/127.0.0.1:7447")
-    config, side, other = (
-        zenoh.Config(),
-        *(("listen", "connect") if listen else ("connect", "listen")),
-    )
+    config = zenoh.Config()
+    side, other_side = ("listen", "connect") if listen else ("connect", "listen")
     settings: dict[str, object] = {
         "mode": "router" if listen else "client",
         f"{side}/endpoints": [endpoint],
-        f"{other}/endpoints": [],
+        f"{other_side}/endpoints": [],
         f"{side}/exit_on_failure": True,
         f"{side}/timeout_ms": _OPEN_MS,
         "scouting/multicast/enabled": False,
@@ -69,8 +67,8 @@ def _session(endpoint: str, *, listen: bool) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         reason = str(error).partition(" at /")[0]
-        what = "listen on" if listen else "reach a router of ROS 2 at"
-        raise CallerError(f"cannot {what} {endpoint}: {reason}") from None
+        task = "listen on" if listen else "reach a router of ROS 2 at"
+        raise CallerError(f"cannot {task} {endpoint}: {reason}") from None
 
 
 class Publisher:

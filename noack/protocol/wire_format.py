@@ -228,18 +228,18 @@ class Encoder:
             raise ValueError(
                 f"a datagram carries a vector of 1 to {MAX_DIMENSION} entries, not shape {vector.shape}"
             )
-        own = self._message
+        core_message = self._message
         try:
             if not 0 <= message.loop <= MAX_LOOPS:
                 raise OverflowError(f"loop {message.loop}")
-            own.flow, own.loop, own.t_ns = message.flow, message.loop, message.t_ns
-            own.error_level = message.error_level.to_bytes(1, "little")[0]
-            own.sequence = _signed(message.sequence)
+            core_message.flow, core_message.loop, core_message.t_ns = message.flow, message.loop, message.t_ns
+            core_message.error_level = message.error_level.to_bytes(1, "little")[0]
+            core_message.sequence = _signed(message.sequence)
         except OverflowError as error:
             raise ValueError(f"a number does not fit its field: {error}") from None
-        own.entries = vector.size
-        own.vector[0 : vector.size] = vector.tolist()
-        size_bytes = core.noack_wire_encode(self._wire.core, own, self._datagram)
+        core_message.entries = vector.size
+        core_message.vector[0 : vector.size] = vector.tolist()
+        size_bytes = core.noack_wire_encode(self._wire.core, core_message, self._datagram)
         datagram = bytes(ffi.buffer(self._datagram, size_bytes))
         if self._wire.seal is None:
             return datagram

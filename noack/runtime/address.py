@@ -16,37 +16,37 @@ LOOPBACK = "127.0.0.1"
 _FORM = re.compile(r"(?:\[(?P<six>[^\[\]]+)\]|(?P<host>[^\[\]:]*)):(?P<port>[0-9]{1,5})")
 
 
-def parse_address(text: str, what: str, like: Address | None = None) -> Address:
+def parse_address(text: str, setting: str, like: Address | None = None) -> Address:
     """Parse an address such as ``127.0.0.1:9000``, ``[::1]:9000``, ``localhost:9000`` or ``:9000``.
 
     Without a host it is the loopback, of the address family of ``like`` (by default IPv4). Raise
-    CallerError if it has another form, or the host does not exist; ``what`` names the setting.
+    CallerError if it has another form, or the host does not exist; ``setting`` is in the message.
     """
-    found = _FORM.fullmatch(text)
-    if found is None or int(found["port"]) > 65_535:
+    match = _FORM.fullmatch(text)
+    if match is None or int(match["port"]) > 65_535:
         hint = "; put an IPv6 address in brackets" if text.count(":") > 1 else ""
         raise CallerError(
-            f"{what}: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; found {text!r}{hint}"
+            f"{setting}: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; found {text!r}{hint}"
         )
     family = socket.AF_INET if like is None else family_of(like)
-    host = found["six"] or found["host"] or ("::1" if family == socket.AF_INET6 else LOOPBACK)
-    wanted = socket.AF_INET6 if found["six"] else socket.AF_UNSPEC
+    host = match["six"] or match["host"] or ("::1" if family == socket.AF_INET6 else LOOPBACK)
+    family_hint = socket.AF_INET6 if match["six"] else socket.AF_UNSPEC
     try:
-        entries = socket.getaddrinfo(host, int(found["port"]), wanted, socket.SOCK_DGRAM)
+        entries = socket.getaddrinfo(host, int(match["port"]), family_hint, socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a host name"
-        raise CallerError(f"{what}: {host}: no such host ({reason})") from None
+        raise CallerError(f"{setting}: {host}: no such host ({reason})") from None
     best = min(entries, key=lambda entry: entry[0] != family)
-    host, port, *more = best[4]
-    scope = more[1] if more else 0
+    host, port, *extra = best[4]
+    scope = extra[1] if extra else 0
     return (f"{host}%{scope}" if scope else str(host)), int(port)
 
 
-def parse_destination(text: str, what: str, like: Address | None = None) -> Address:
+def parse_destination(text: str, setting: str, like: Address | None = None) -> Address:
     """As :func:`parse_address`, for an address to which datagrams are sent: port 0 is refused."""
-    address = parse_address(text, what, like)
+    address = parse_address(text, setting, like)
     if address[1] == 0:
-        raise CallerError(f"{what}: expected a port from 1 to 65535; found {text!r}")
+        raise CallerError(f"{setting}: expected a port from 1 to 65535; found {text!r}")
     return address
 
 

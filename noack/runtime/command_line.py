@@ -63,8 +63,8 @@ class JsonLog(io.TextIOBase):
 
     def write(self, text: str, /) -> int:
         """Write text; a line is written when it is complete."""
-        *lines, rest = (getattr(self._unfinished, "text", "") + text).split("\n")
-        self._unfinished.text = rest
+        *lines, unfinished = (getattr(self._unfinished, "text", "") + text).split("\n")
+        self._unfinished.text = unfinished
         for line in lines:
             if line.strip():
                 self._log_line(_COLOURS.sub("", line).strip())
@@ -94,25 +94,25 @@ class JsonLog(io.TextIOBase):
             self._stream.flush()
 
     def _log_line(self, line: str) -> None:
-        found = _LINE.fullmatch(line)
-        if found is None:
+        match = _LINE.fullmatch(line)
+        if match is None:
             self.log("info", "noack", line)
         else:
-            self.log("warning" if found["warning"] else "info", found["source"], found["message"])
+            self.log("warning" if match["warning"] else "info", match["source"], match["message"])
 
 
 @contextmanager
-def log_format(wanted: LogFormat) -> Iterator[None]:
+def log_format(log_as: LogFormat) -> Iterator[None]:
     """Write standard error in a format within the context."""
-    before = sys.stderr
-    if wanted is LogFormat.TEXT or before is None or isinstance(before, JsonLog):
+    stream = sys.stderr
+    if log_as is LogFormat.TEXT or stream is None or isinstance(stream, JsonLog):
         yield
         return
-    sys.stderr = JsonLog(before)
+    sys.stderr = JsonLog(stream)
     try:
         yield
     finally:
-        sys.stderr = before
+        sys.stderr = stream
 
 
 def log_event(level: str, source: str, message: str, **fields: object) -> bool:
@@ -135,14 +135,14 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise CallerError."""
-        what = message.removeprefix("argument ")
-        raise CallerError(f"{what}; see `{self.prog} --help`")
+        mistake = message.removeprefix("argument ")
+        raise CallerError(f"{mistake}; see `{self.prog} --help`")
 
 
-def failed(message: str, status: ExitStatus, *, who: str, as_json: bool) -> ExitStatus:
+def failed(message: str, status: ExitStatus, *, source: str, as_json: bool) -> ExitStatus:
     """Print why a command failed, one line per mistake, and return its exit status.
 
-    Each line begins with ``who``, such as ``noack netem``. With ``as_json`` a JSON document is
+    Each line begins with ``source``, such as ``noack netem``. With ``as_json`` a JSON document is
     also printed to standard output.
     """
     with suppress(OSError):  # standard output may be closed or full
@@ -150,8 +150,8 @@ def failed(message: str, status: ExitStatus, *, who: str, as_json: bool) -> Exit
             reason = {"status": int(status), "reason": message}
             print(json.dumps({"error": message, "exit": reason}, indent=2), flush=True)
     for line in message.splitlines():
-        if not log_event("error", who, line):
-            print_to_stderr(f"{who}: {line}")
+        if not log_event("error", source, line):
+            print_to_stderr(f"{source}: {line}")
     return status
 
 
@@ -175,11 +175,11 @@ class Signals:
         handled = set(_ENDING)
         if _HANGUP and signal.getsignal(_HANGUP) == signal.SIG_IGN:
             handled.remove(_HANGUP)
-        before = {number: signal.signal(number, self._note) for number in handled}
+        handlers = {number: signal.signal(number, self._note) for number in handled}
         try:
             yield self
         finally:
-            for number, handler in before.items():
+            for number, handler in handlers.items():
                 signal.signal(number, handler)
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
@@ -246,12 +246,12 @@ def _default_replaced(handler: Callable[[int, FrameType | None], None]) -> Itera
         yield
         return
     usual = (signal.SIG_DFL, signal.default_int_handler, _end_at_once)
-    before = {number: signal.getsignal(number) for number in _ENDING}
-    replaced = {number: found for number, found in before.items() if found in usual}
+    handlers = {number: signal.getsignal(number) for number in _ENDING}
+    replaced = {number: previous for number, previous in handlers.items() if previous in usual}
     for number in replaced:
         signal.signal(number, handler)
     try:
         yield
     finally:
-        for number, found in replaced.items():
-            signal.signal(number, found)
+        for number, previous in replaced.items():
+            signal.signal(number, previous)

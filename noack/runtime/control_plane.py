@@ -66,8 +66,8 @@ def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Sess
     # Processes on the coordinator's host need neither TLS nor asyncio.
     from noack.runtime.connections.coordinator_link import Destination, coordinator_link
 
-    own = remote.coordinator, remote.certificate, remote.private_key
-    destination = Destination(remote.host, remote.port, *own, key.hex())
+    credentials = remote.coordinator, remote.certificate, remote.private_key
+    destination = Destination(remote.host, remote.port, *credentials, key.hex())
     address = address_text((remote.host, remote.port))
     with ExitStack() as stack:
         try:
@@ -85,20 +85,20 @@ def socket_path(kind: str, name: str) -> str:
     It may have at most 107 bytes, so it goes through an open descriptor.
     """
     with open_private(kind, create=True) as folder:
-        known = _FOLDERS.get(folder.path)
-        if known is None or not os.path.samestat(os.fstat(known), os.fstat(folder.descriptor)):
-            known = _FOLDERS[folder.path] = os.dup(folder.descriptor)
-    return f"/proc/self/fd/{known}/{name}.sock"
+        descriptor = _FOLDERS.get(folder.path)
+        if descriptor is None or not os.path.samestat(os.fstat(descriptor), os.fstat(folder.descriptor)):
+            descriptor = _FOLDERS[folder.path] = os.dup(folder.descriptor)
+    return f"/proc/self/fd/{descriptor}/{name}.sock"
 
 
 def session_config(path: str, *, listen: bool) -> zenoh.Config:
     """Return the zenoh configuration of a session that listens on a socket, or connects to it."""
     config = zenoh.Config()
-    side, other = ("listen", "connect") if listen else ("connect", "listen")
+    side, other_side = ("listen", "connect") if listen else ("connect", "listen")
     settings: dict[str, object] = {
         "mode": "router" if listen else "client",
         f"{side}/endpoints": [f"unixsock-stream/{path}"],
-        f"{other}/endpoints": [],
+        f"{other_side}/endpoints": [],
         f"{side}/exit_on_failure": True,
         f"{side}/timeout_ms": _CONNECT_MS,
         f"{side}/retry": _RETRY,
@@ -209,8 +209,8 @@ class ControlPlane:
                 else self._resources.enter_context(open_remote_session(ticket.remote, ticket.key))
             )
         except zenoh.ZError as error:
-            what = "start the control plane" if listen else "reach the run's coordinator"
-            raise NoAnswerError(f"cannot {what}: {cause_of(error)}") from None
+            task = "start the control plane" if listen else "reach the run's coordinator"
+            raise NoAnswerError(f"cannot {task}: {cause_of(error)}") from None
         session, key = self.session, self.key
         self._token = session.liveliness().declare_token(key("alive", role, self.instance))
         self._coordinator = session.liveliness().declare_subscriber(
@@ -325,9 +325,9 @@ class ControlPlane:
         query.drop()  # type: ignore[no-untyped-call]
 
     @staticmethod
-    def refuse(query: zenoh.Query, why: str) -> None:
+    def refuse(query: zenoh.Query, reason: str) -> None:
         """Answer a request with an error."""
-        query.reply_err(why)
+        query.reply_err(reason)
         query.drop()  # type: ignore[no-untyped-call]
 
     @staticmethod
@@ -337,13 +337,13 @@ class ControlPlane:
 
     def request(
         self,
-        what: str,
+        queryable: str,
         content: object,
         *,
         timeout_s: float,
         give_up: Callable[[], bool] = lambda: False,
     ) -> bytes:
-        """Send a request (as JSON) to the queryable ``what/ROLE`` and return the answer.
+        """Send a request (as JSON) to ``queryable/ROLE`` and return the answer.
 
         The request is sent again while the queryable does not exist, and every five seconds: an
         interrupted connection may lose request or answer. So the answering side must accept a
@@ -355,7 +355,7 @@ class ControlPlane:
         while (left_s := deadline_s - time.monotonic()) > 0 and not give_up():
             wait_s = min(left_s, _REQUEST_AGAIN_S)
             replies = self.session.get(
-                self.key(what, self.role),
+                self.key(queryable, self.role),
                 FifoChannel(4),
                 payload=payload,
                 timeout=wait_s + _REQUEST_AGAIN_S,  # zenoh would report its own as an error answer
@@ -367,7 +367,7 @@ class ControlPlane:
             if reply is not None and reply.err is not None:
                 raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
             time.sleep(0.02)
-        raise NoAnswerError(f"no answer to {what!r} within {timeout_s:g} s")
+        raise NoAnswerError(f"no answer to {queryable!r} within {timeout_s:g} s")
 
 
 class ParameterUpdates:
@@ -387,11 +387,11 @@ class ParameterUpdates:
         while (message := self._plane.next_change()) is not None:
             with suppress(PeerError):  # not from the coordinator
                 self._waiting.append(parse_message(ChangeAnnouncement, message))
-        taken: list[ChangeAnnouncement] = []
-        while self._waiting and (at_most is None or len(taken) < at_most):
+        updates: list[ChangeAnnouncement] = []
+        while self._waiting and (at_most is None or len(updates) < at_most):
             announced = self._waiting.pop(0)
             remember(announced.kept_losses)
             if announced.number >= self._next_number:  # a late process receives some twice
                 self._next_number = announced.number + 1
-                taken.append(announced)
-        return taken
+                updates.append(announced)
+        return updates

@@ -211,14 +211,14 @@ def _require_writable(folder: Path) -> None:
         raise CallerError(f"{folder}: rows could not be kept there: {nearest} is not writable")
 
 
-def own_host(other: Address) -> str:
+def own_host(address: Address) -> str:
     """Return the numeric address from which this host sends to another one.
 
     Raise PeerError without a route.
     """
-    with socket.socket(family_of(other), socket.SOCK_DGRAM) as probe:
+    with socket.socket(family_of(address), socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(other)  # sends nothing
+            probe.connect(address)  # sends nothing
         except OSError as error:
-            raise PeerError(f"cannot reach {address_text(other)}: {why(error)}") from None
+            raise PeerError(f"cannot reach {address_text(address)}: {why(error)}") from None
         return str(probe.getsockname()[0])

@@ -138,11 +138,11 @@ class LiveDriver:
             receivers: the sockets of the peers.
             sources: where the messages of every run come from; also where acknowledgements do.
         """
-        for place, sender in enumerate(senders):
-            self.core.senders[place] = sender.fileno()
+        for index, sender in enumerate(senders):
+            self.core.senders[index] = sender.fileno()
         self.core.receiver_count = len(receivers)
-        for place, receiver in enumerate(receivers):
-            self.core.receivers[place] = receiver.fileno()
+        for index, receiver in enumerate(receivers):
+            self.core.receivers[index] = receiver.fileno()
             if self.core.process.loops > 1:  # several datagrams then come as one message
                 with suppress(OSError):
                     receiver.setsockopt(socket.IPPROTO_UDP, _UDP_GRO, 1)
@@ -161,12 +161,12 @@ class LiveDriver:
 
     def drive(self, until_ns: int, sink: RecordSink) -> None:
         """Work until about a time of the run; pass on the rows of the record."""
-        own, machines = self.core, self.machines
-        while (reason := core.noack_drive(own, until_ns)) != core.NOACK_DRIVEN:
+        driver, machines = self.core, self.machines
+        while (reason := core.noack_drive(driver, until_ns)) != core.NOACK_DRIVEN:
             if reason == core.NOACK_DRIVER_ROWS:
                 self._pass_rows(sink)
             elif reason == core.NOACK_DRIVER_QUESTION:
-                machines.answer(own.question)
+                machines.answer(driver.question)
             elif reason == core.NOACK_DRIVER_OPEN:
                 self._open_datagram()
             else:
@@ -203,12 +203,12 @@ class LiveDriver:
     def acknowledgements(self) -> dict[str, object]:
         """Counters of the acknowledgements of all loops."""
         reports = [machine.acknowledgements for machine in self._each_machine()]
-        rejected = [rejected_of(one) for one in reports]
-        by_reason = {reason.value: sum(one[reason] for one in rejected) for reason in Rejection}
+        rejected = [rejected_of(report) for report in reports]
+        by_reason = {reason.value: sum(report[reason] for report in rejected) for reason in Rejection}
         return {
-            "accepted": sum(one.accepted for one in reports),
+            "accepted": sum(report.accepted for report in reports),
             "rejected": {reason: n for reason, n in by_reason.items() if n},
-            "loops": [reception_report(one) for one in reports],
+            "loops": [reception_report(report) for report in reports],
         }
 
     def _each_machine(self) -> list[CData]:
@@ -228,19 +228,19 @@ class LiveDriver:
 
     def _open_datagram(self) -> None:
         """Decrypt the vector of the datagram in place."""
-        own, seal = self.core, self._wire.seal
+        driver, seal = self.core, self._wire.seal
         assert seal is not None
-        memory = ffi.buffer(own.datagram, own.datagram_bytes)
+        memory = ffi.buffer(driver.datagram, driver.datagram_bytes)
         vector = seal.open(bytes(memory), HEADER_BYTES)
         if vector is not None:
             memory[HEADER_BYTES : HEADER_BYTES + len(vector)] = vector
-        own.opened = core.NOACK_NOT_AUTHENTIC if vector is None else core.NOACK_OPENED
+        driver.opened = core.NOACK_NOT_AUTHENTIC if vector is None else core.NOACK_OPENED
 
     def _seal_datagram(self) -> None:
         """Encrypt the vector of the datagram in place, and write its tag."""
-        own, seal = self.core, self._wire.seal
+        driver, seal = self.core, self._wire.seal
         assert seal is not None
-        memory = ffi.buffer(own.datagram, own.datagram_bytes)
+        memory = ffi.buffer(driver.datagram, driver.datagram_bytes)
         memory[:] = seal.close(bytes(memory[:HEADER_BYTES]), bytes(memory[HEADER_BYTES:-TAG_BYTES]))
 
 
@@ -290,15 +290,15 @@ class LoopChannel(CountingSocket):
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
-        driver, own = self._driver, self._driver.core
-        for peer, address in zip(own.sources, self._expected, strict=False):
+        driver, driver_core = self._driver, self._driver.core
+        for peer, address in zip(driver_core.sources, self._expected, strict=False):
             self.count_received(address, peer.received)
-        self._sources.add_others(own.foreign)
-        own.foreign = 0
+        self._sources.add_others(driver_core.foreign)
+        driver_core.foreign = 0
         rejected = {reason.value: n for reason, n in driver.rejected.items()}
         return super().report() | {
-            "sent": own.sent,
-            "send_errors": errors_by_text(own.errors),
+            "sent": driver_core.sent,
+            "send_errors": errors_by_text(driver_core.errors),
             "sends": self._sends.name.lower(),
             "accepted": driver.accepted,
             "rejected": self.rejected(rejected),

@@ -75,7 +75,7 @@ class NodeDriver(LiveDriver):
     ) -> None:
         super().__init__(machines, process.wire, admitted_ns=process.admitted_ns)
         # The file's name alone: the process is given a copy in the run directory.
-        self._named = f"controller.file ({Path(settings.file).name})"
+        self._label = f"controller.file ({Path(settings.file).name})"
         self._key, self._sockets = process.ticket.key, list[socket.socket]()
         self._clock, self._sent_clock = RunClock(0), b""
         self._to_send, self._received = bytearray(), bytearray()
@@ -85,18 +85,18 @@ class NodeDriver(LiveDriver):
         rows = {kind: tables[kind].row_bytes - core.NOACK_LOOP_BYTES for kind in _ROWS}
         counts = ffi.sizeof("noack_node_counts")
         self._sizes = rows | {core.NOACK_NODE_COUNTS: counts, core.NOACK_NODE_UNSENT: 8}
-        self._own, its = socket.socketpair()
-        its.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
-        with its:
-            self._program = self._started(unchanged(settings, "controller"), settings.runner, its)
+        self._own, peer = socket.socketpair()
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
+        with peer:
+            self._program = self._start(unchanged(settings, "controller"), settings.runner, peer)
 
-    def _started(self, path: Path, runner: Sequence[str], its: socket.socket) -> "subprocess.Popen[bytes]":
+    def _start(self, path: Path, runner: Sequence[str], peer: socket.socket) -> "subprocess.Popen[bytes]":
         prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
         try:
             return subprocess.Popen(
                 [*runner, str(path)],
-                stdin=its.fileno(),
-                stdout=its.fileno(),
+                stdin=peer.fileno(),
+                stdout=peer.fileno(),
                 process_group=0,
                 # Not only the end of its input: the program may hang, or be stopped.
                 preexec_fn=partial(prctl, _PR_SET_PDEATHSIG, signal.SIGKILL),
@@ -107,7 +107,7 @@ class NodeDriver(LiveDriver):
                     f'controller.runner = "{runner[0]}": cannot be started: {error.strerror}'
                 ) from None
             raise CallerError(
-                f"{self._named}: cannot be started: {error.strerror}; it must be executable (chmod "
+                f"{self._label}: cannot be started: {error.strerror}; it must be executable (chmod "
                 "+x), and of this processor, or controller.runner names what runs it"
             ) from None
 
@@ -115,10 +115,10 @@ class NodeDriver(LiveDriver):
         """Wait for the program's first line; raise CallerError if it is not that of a node."""
         text = self._first_line().decode(errors="replace").strip()
         if text != _GREETING:
-            how = f"says {shortened(text)!r}" if text else self._how_it_ended()
+            answer = f"says {shortened(text)!r}" if text else self._how_it_ended()
             self.__exit__()
             raise CallerError(
-                f"{self._named}: {how}; a node of this version says {_GREETING!r}: build it by "
+                f"{self._label}: {answer}; a node of this version says {_GREETING!r}: build it by "
                 "native/build.py --node"
             )
         self._own.setblocking(False)
@@ -129,10 +129,10 @@ class NodeDriver(LiveDriver):
         with suppress(TimeoutError):
             while not line.endswith(b"\n") and len(line) < _GREETING_BYTES:
                 self._own.settimeout(max(until_s - time.monotonic(), 1e-6))
-                if not (one := self._own.recv(1)):
+                if not (byte := self._own.recv(1)):
                     self._is_closed = True
                     break
-                line += one
+                line += byte
         return line
 
     def __exit__(self, *_: object) -> None:
@@ -159,7 +159,7 @@ class NodeDriver(LiveDriver):
             data = self._settings()
             first = _HEAD.pack(core.NOACK_NODE_SETTINGS, len(data))
             with suppress(BrokenPipeError):  # drive() finds that it has ended
-                socket.send_fds(self._own, [first[:1]], [one.fileno() for one in self._sockets])
+                socket.send_fds(self._own, [first[:1]], [endpoint.fileno() for endpoint in self._sockets])
             self._to_send += first[1:] + data
         elif now != self._sent_clock:
             self._put(core.NOACK_NODE_CLOCK, now)
@@ -197,7 +197,7 @@ class NodeDriver(LiveDriver):
             self._take_frames(sink)
         self._pass_rows(sink)
         if not goes_on:
-            raise PeerError(f"{self._named}: {self._how_it_ended()}")
+            raise PeerError(f"{self._label}: {self._how_it_ended()}")
 
     def take(self, data: bytes, source: SocketName, sink: RecordSink) -> None:
         """Pass the program a datagram that Python has received."""
@@ -220,15 +220,15 @@ class NodeDriver(LiveDriver):
             goes_on = self._exchange(min(wait_s, _LOOK_S), select.POLLIN)
             self._take_frames(sink)
         self._pass_rows(sink)
-        why = self._how_it_ended()
+        end_reason = self._how_it_ended()
         if goes_on or self._program.returncode != 0:
-            raise PeerError(f"{self._named}: {why}")
+            raise PeerError(f"{self._label}: {end_reason}")
         due_ns = self.next_deadline_ns()
         late_s = 0.0 if due_ns is None else (now_ns - due_ns) / NS_PER_S / self._clock.speed
         if min(late_s, began_s - self._tick_s) > _STUCK_S:
-            done = self.machines.machines[0].machine.step
+            steps = self.machines.machines[0].machine.step
             raise PeerError(
-                f"{self._named}: has sent {done} ticks, and is {late_s:.1f} s late with the next; "
+                f"{self._label}: has sent {steps} ticks, and is {late_s:.1f} s late with the next; "
                 "it must send the row of each tick"
             )
 
@@ -262,36 +262,36 @@ class NodeDriver(LiveDriver):
 
     def _take_frames(self, sink: RecordSink) -> None:
         """Put the complete frames where the core's driver puts what they have."""
-        at, received = 0, bytes(self._received)
-        while at + _HEAD.size <= len(received):
-            kind, size = _HEAD.unpack_from(received, at)
+        begin, received = 0, bytes(self._received)
+        while begin + _HEAD.size <= len(received):
+            kind, size = _HEAD.unpack_from(received, begin)
             if size != self._sizes.get(kind):
                 raise PeerError(
-                    f"{self._named}: has sent a frame of kind {kind} and {size} bytes, which no "
+                    f"{self._label}: has sent a frame of kind {kind} and {size} bytes, which no "
                     "node of this version sends"
                 )
-            if len(received) < at + _HEAD.size + size:
+            if len(received) < begin + _HEAD.size + size:
                 break
-            content = received[at + _HEAD.size : at + _HEAD.size + size]
+            content = received[begin + _HEAD.size : begin + _HEAD.size + size]
             self._take_frame(kind, content, sink)
-            at += _HEAD.size + size
-        del self._received[:at]
+            begin += _HEAD.size + size
+        del self._received[:begin]
         core.noack_process_begin(self.machines.core)  # its next tick
 
     def _take_frame(self, kind: int, content: bytes, sink: RecordSink) -> None:
-        own, machine = self.core, self.machines.machines[0].machine
+        driver, machine = self.core, self.machines.machines[0].machine
         if kind == core.NOACK_NODE_UNSENT:
             (number,) = struct.unpack("<q", content)
-            own.errors[number % len(own.errors)] += 1
+            driver.errors[number % len(driver.errors)] += 1
         elif kind == core.NOACK_NODE_COUNTS:
             counts = ffi.from_buffer("noack_node_counts *", content)
-            own.sent, own.sources[0].received = counts.sent, counts.received
-            own.foreign += counts.foreign - self._foreign
+            driver.sent, driver.sources[0].received = counts.sent, counts.received
+            driver.foreign += counts.foreign - self._foreign
             self._foreign = counts.foreign
             machine.received.accepted = counts.accepted
             machine.received.rejected = counts.rejected
         else:
-            table = own.process.tables[kind]
+            table = driver.process.tables[kind]
             row = table.rows + table.count * table.row_bytes + core.NOACK_LOOP_BYTES
             ffi.memmove(row - core.NOACK_LOOP_BYTES, bytes(core.NOACK_LOOP_BYTES), 2)
             ffi.memmove(row, content, len(content))
@@ -299,7 +299,7 @@ class NodeDriver(LiveDriver):
             if kind == core.NOACK_TICKS:
                 sequence = struct.unpack_from("<q", content, 8)[0]
                 if sequence != (due := machine.first_number + machine.step):
-                    raise PeerError(f"{self._named}: has sent tick {sequence} in place of {due}")
+                    raise PeerError(f"{self._label}: has sent tick {sequence} in place of {due}")
                 machine.step += 1
                 self._tick_s = time.monotonic()
             if table.count == table.places:
@@ -313,8 +313,8 @@ class NodeDriver(LiveDriver):
             if self._is_closed:
                 return "the program has closed its stream, but has not ended"
             return f"the program has not answered for {_PATIENCE_S:g} s"
-        how = f"exit status {code}"
+        end = f"exit status {code}"
         if code < 0:  # real-time signals have no names
-            names = {one.value: one.name for one in signal.Signals}
-            how = f"killed by {names.get(-code, f'signal {-code}')}"
-        return f"the program has ended: {how}"
+            names = {number.value: number.name for number in signal.Signals}
+            end = f"killed by {names.get(-code, f'signal {-code}')}"
+        return f"the program has ended: {end}"

@@ -34,10 +34,10 @@ def private_folder() -> Path:
     return Path(base or tempfile.gettempdir()) / f"noack-{os.getuid()}"
 
 
-def require_name(name: str, what: str) -> None:
+def require_name(name: str, kind: str) -> None:
     """Raise CallerError unless a name is fit for a file."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
-        raise CallerError(f"{what} {name!r}: use letters, digits, _ and -, at most 64")
+        raise CallerError(f"{kind} {name!r}: use letters, digits, _ and -, at most 64")
 
 
 class PrivateFolder:
@@ -78,9 +78,9 @@ class PrivateFolder:
         """Return the names of all files."""
         return os.listdir(self.descriptor)  # noqa: PTH208 - a Path has no descriptor
 
-    def link(self, name: str, other: str) -> None:
+    def link(self, name: str, second_name: str) -> None:
         """Give a file a second name; raise FileExistsError if that exists."""
-        os.link(name, other, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
+        os.link(name, second_name, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
     def remove(self, name: str) -> None:
         """Remove a file; raise FileNotFoundError if there is none."""
@@ -175,12 +175,12 @@ def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[P
             _remove(folder, name, os.fstat(descriptor))
 
 
-def live_lock_files(kind: str, only: str = "") -> list[LockFile]:
+def live_lock_files(kind: str, only_name: str = "") -> list[LockFile]:
     """Return the lock files of a kind, or only that of a name, whose process runs, by name."""
     try:
         with open_private(*_inside(kind)) as folder:
-            known = [only + _SUFFIX] if only else sorted(folder.names())
-            names = [name for name in known if name.endswith(_SUFFIX)]
+            candidates = [only_name + _SUFFIX] if only_name else sorted(folder.names())
+            names = [name for name in candidates if name.endswith(_SUFFIX)]
             return [file for name in names if (file := _alive(folder, name)) is not None]
     except FileNotFoundError:
         return []
@@ -219,9 +219,9 @@ def _remove(folder: PrivateFolder, name: str, status: os.stat_result) -> None:
     """Remove a file, and what is left of its process's socket, unless it was replaced."""
     with _locked(folder):
         if folder.remove_same(name, status):
-            for left in (socket := name.removesuffix(_SUFFIX) + ".sock", f"{socket}.lock"):
+            for remnant in (socket := name.removesuffix(_SUFFIX) + ".sock", f"{socket}.lock"):
                 with suppress(FileNotFoundError):
-                    folder.remove(left)
+                    folder.remove(remnant)
 
 
 @contextmanager

@@ -103,7 +103,7 @@ def run_loop(
     end_ns: int | None,
     stop: Callable[[], bool],
     turns_after_end: int = 0,
-    all_done: Callable[[bool], bool] = lambda done: done,
+    all_done: Callable[[bool], bool] = lambda is_done: is_done,
     external_inputs: Callable[[int], Sequence[Record | Notice]] = lambda now_ns: (),
 ) -> int:
     """Drive until simulated time ``end_ns`` (None: no end), or until ``stop()``.
@@ -266,12 +266,12 @@ class _Mapping(NamedTuple):
 def _mappings() -> Iterator[_Mapping]:
     """Yield the code, and what this process alone may write."""
     guard_end = 0
-    for found in _MAPPING.finditer(_MAPPINGS.read_text()):
-        first, end, rights = int(found[1], 16), int(found[2], 16), found[3]
+    for match in _MAPPING.finditer(_MAPPINGS.read_text()):
+        first, end, rights = int(match[1], 16), int(match[2], 16), match[3]
         is_stack = guard_end == first
         if rights == "---":  # a thread's stack begins with such a guard
             guard_end = end
         elif rights[2] == "x":
             yield _Mapping(first, end - first, _MADV_POPULATE_READ)
-        elif rights[1] == "w" and not is_stack and found[4] == "0":
+        elif rights[1] == "w" and not is_stack and match[4] == "0":
             yield _Mapping(first, end - first, _MADV_POPULATE_WRITE)

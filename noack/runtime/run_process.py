@@ -149,10 +149,10 @@ class RunProcess:
             print_to_stderr(f"noack {self.role}: {verb}")
         return begin.addresses
 
-    def _request(self, what: str, request: ControlMessage, answer: type[M], timeout_s: float) -> M:
+    def _request(self, query: str, request: ControlMessage, answer: type[M], timeout_s: float) -> M:
         """Send the coordinator a request of this process; return the answer."""
         try:
-            message = self.plane.request(what, request, timeout_s=timeout_s, give_up=self._gives_up)
+            message = self.plane.request(query, request, timeout_s=timeout_s, give_up=self._gives_up)
         except PeerError as error:
             # The reason to stop explains more than a missing answer.
             raise PeerError(self.life.reason) if self.life.reason else error from None
@@ -202,8 +202,8 @@ class RunProcess:
             # Before the barrier: locking memory may take a tenth of a second.
             realtime(settings.enabled, settings.fifo_priority, place) as self._applied,
         ):
-            wanted = len(self.phases_ns) * _BUFFER_BYTES  # it may be late to the start
-            enlarge_buffer(endpoint, min(wanted, _LARGEST_BUFFER_BYTES))
+            size_bytes = len(self.phases_ns) * _BUFFER_BYTES  # it may be late to the start
+            enlarge_buffer(endpoint, min(size_bytes, _LARGEST_BUFFER_BYTES))
             yield endpoint
 
     def run(self, driver: Driver, channel: CountingSocket, machine: Reconfigurable) -> None:
@@ -290,15 +290,15 @@ class RunProcess:
             self.life.apply(Event.STOP, f"overrun: {late_s:g} s late; reduce the speed or the rates")
         return reached_ns
 
-    def _all_done(self, done: bool) -> bool:
+    def _all_done(self, is_done: bool) -> bool:
         """Whether plant and controller have done their last steps; told whether this process has.
 
         One that was stopped for a while does them after the horizon. The others must still receive
         what it sends then.
         """
-        if done and self.role in WITH_DEADLINES:
+        if is_done and self.role in WITH_DEADLINES:
             self.plane.announce_done()
-        return done and self.plane.done().issuperset(WITH_DEADLINES)
+        return is_done and self.plane.done().issuperset(WITH_DEADLINES)
 
     @property
     def _end_ns(self) -> int:
@@ -307,8 +307,8 @@ class RunProcess:
 
     def fail(self, error: BaseException) -> None:
         """Stop with an error as the reason."""
-        known = isinstance(error, NoackError)
-        self.life.reason = one_line(error) if known else f"internal error: {error!r}"
+        is_expected = isinstance(error, NoackError)
+        self.life.reason = one_line(error) if is_expected else f"internal error: {error!r}"
 
     @property
     def ended(self) -> str:
@@ -373,9 +373,9 @@ def lifeline_cut() -> bool:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that all processes have."""
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
-    where.add_argument("--invitation", type=Path, metavar="FILE", help="from `noack record --listen`")
+    origin = parser.add_mutually_exclusive_group()
+    origin.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    origin.add_argument("--invitation", type=Path, metavar="FILE", help="from `noack record --listen`")
     parser.add_argument(
         "--runs",
         type=Path,
@@ -402,15 +402,15 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
             one from within the context, has then become one line on standard error, without a
             traceback; with ``--json`` also a document on standard output.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
     parser = Parser(
         prog=f"noack {role}",
         description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
     )
     add_options(parser)
     signals = Signals()
-    with _exit_status(role, signals, as_json="--json" in given):
-        options = parser.parse_args(given)
+    with _exit_status(role, signals, as_json="--json" in words):
+        options = parser.parse_args(words)
         with signals.handled():
             require_limits()
             if options.invitation is None:
@@ -440,17 +440,17 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
 @contextmanager
 def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None]:
     """Turn errors and signals within the context into a line and an exit status."""
-    who = f"noack {role}"
+    source = f"noack {role}"
     try:
         yield
     except NoackError as error:
         if signals.received is None:
-            sys.exit(failed(str(error), error.exit_status, who=who, as_json=as_json))
+            sys.exit(failed(str(error), error.exit_status, source=source, as_json=as_json))
     except Exception as error:
         if (line := exhausted_limit(error)) is not None:
-            sys.exit(failed(line, ExitStatus.FAILED, who=who, as_json=as_json))
+            sys.exit(failed(line, ExitStatus.FAILED, source=source, as_json=as_json))
         traceback.print_exc()
-        print(f"{who}: internal error, see above", file=sys.stderr)
+        print(f"{source}: internal error, see above", file=sys.stderr)
         sys.exit(ExitStatus.FAILED)
     if signals.received is not None:
         sys.exit(signals.status)
@@ -479,8 +479,8 @@ def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> Ticke
             raise PeerError("no invitation")
     ticket = read_invitation(invitation, runs)
     assert ticket.remote is not None  # else it is no invitation
-    where = address_text((ticket.remote.host, ticket.remote.port))
-    print(f"noack {role}: joining run of {ticket.scenario.name!r} at {where}", file=sys.stderr)
+    host_port = address_text((ticket.remote.host, ticket.remote.port))
+    print(f"noack {role}: joining run of {ticket.scenario.name!r} at {host_port}", file=sys.stderr)
     return ticket
 
 
@@ -489,9 +489,9 @@ def _wait_for(find: Callable[[], T], signals: Signals, waiting: str) -> T:
     until_s = time.monotonic() + _TICKET_TIMEOUT_S
     if not find():
         print(waiting, file=sys.stderr)
-    while not (found := find()) and signals.received is None and time.monotonic() < until_s:
+    while not (result := find()) and signals.received is None and time.monotonic() < until_s:
         time.sleep(_POLL_S)
-    return found
+    return result
 
 
 def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:

@@ -52,22 +52,22 @@ def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
 
     Raise CallerError if no such run is active, or several are.
     """
-    found = active_runs()
+    runs = active_runs()
     fitting = [
         run
-        for run in found
+        for run in runs
         if (session is None or run.session == session)
         and (run_dir is None or Path(run.run_dir) == run_dir.resolve())
     ]
     if len(fitting) == 1:
         return fitting[0]
-    if not found:
+    if not runs:
         raise CallerError("no run is active; start one, e.g. `noack demo`")
-    active = "active: " + ", ".join(run.run_dir for run in fitting or found)
+    active = "active: " + ", ".join(run.run_dir for run in fitting or runs)
     if fitting:
         raise CallerError(f"several runs are {active}; choose one by --run DIRECTORY")
-    which = f"in session {session!r}" if run_dir is None else f"in {run_dir}"
-    raise CallerError(f"no run is active {which}; {active}")
+    criterion = f"in session {session!r}" if run_dir is None else f"in {run_dir}"
+    raise CallerError(f"no run is active {criterion}; {active}")
 
 
 def request_change(run: OpenRun, settings: Mapping[str, object]) -> ChangeReply:

@@ -52,22 +52,22 @@ class SpoolWriter:
         self._folder = folder
         self._writer = writer
         self._files: dict[str, BinaryIO] = {}
-        with self._named():
+        with self._errors_with_path():
             folder.mkdir(exist_ok=True)
 
     def append(self, table: str, first: int, payload: bytes) -> None:
         """Write one batch through to the operating system."""
-        with self._named():
+        with self._errors_with_path():
             _write_complete(self._open(table), _CHUNK.pack(first, len(payload)) + payload)
 
     def prepare(self, tables: Iterable[str]) -> None:
         """Open the files of tables before the first rows."""
-        with self._named():
+        with self._errors_with_path():
             for table in tables:
                 self._open(table)
 
     @contextlib.contextmanager
-    def _named(self) -> Iterator[None]:
+    def _errors_with_path(self) -> Iterator[None]:
         """Turn a system error into one with the folder and the reason."""
         try:
             yield
@@ -137,14 +137,14 @@ def batches_in(data: memoryview) -> tuple[list[tuple[int, memoryview]], int]:
 
     Of each batch: the number of its first row, and the rows.
     """
-    found, begin, rows = [], 0, _CHUNK.size
+    batches, begin, rows = [], 0, _CHUNK.size
     while rows <= len(data):
         first, length = _CHUNK.unpack_from(data, begin)
         if (end := rows + length) > len(data):
             break
-        found.append((first, data[rows:end]))
+        batches.append((first, data[rows:end]))
         begin, rows = end, end + _CHUNK.size
-    return found, begin
+    return batches, begin
 
 
 def batch_bytes(data: memoryview) -> int | None:

@@ -52,13 +52,13 @@ _REPORT_ATTEMPTS = 3
 
 def contain(ranges: Ranges, first: int, end: int) -> bool:
     """Return whether one of the ranges has all numbers from ``first`` to before ``end``."""
-    after = bisect_right(ranges, first, key=lambda known: known[0])
-    return after > 0 and end <= ranges[after - 1][1]
+    index = bisect_right(ranges, first, key=lambda entry: entry[0])
+    return index > 0 and end <= ranges[index - 1][1]
 
 
 def overlap(ranges: Ranges, first: int, end: int) -> bool:
     """Return whether the ranges have one of the numbers from ``first`` to before ``end``."""
-    index = bisect_right(ranges, first, key=lambda known: known[1])
+    index = bisect_right(ranges, first, key=lambda entry: entry[1])
     return index < len(ranges) and ranges[index][0] < end
 
 
@@ -80,8 +80,8 @@ class ReceivedRows:
 
     def add(self, first: int, end: int) -> None:
         """Add the numbers from ``first`` to before ``end``."""
-        low = bisect_left(self.ranges, first, key=lambda known: known[1])
-        high = bisect_right(self.ranges, end, key=lambda known: known[0])
+        low = bisect_left(self.ranges, first, key=lambda entry: entry[1])
+        high = bisect_right(self.ranges, end, key=lambda entry: entry[0])
         if low < high:
             first = min(first, self.ranges[low][0])
             end = max(end, self.ranges[high - 1][1])
@@ -89,7 +89,7 @@ class ReceivedRows:
 
     def missing(self, total: int) -> list[tuple[int, int]]:
         """The ranges that have not arrived, among ``total`` numbers from 0."""
-        edges = [0, *(edge for known in self.ranges for edge in known), total]
+        edges = [0, *(edge for entry in self.ranges for edge in entry), total]
         gaps = zip(edges[::2], edges[1::2], strict=True)
         return [(low, min(high, total)) for low, high in gaps if low < min(high, total)]
 
@@ -178,7 +178,7 @@ class TelemetryBuffer:
 
     def stored(self) -> dict[str, Ranges]:
         """Ranges of the rows that were stored, by table."""
-        return {table: found.ranges for table, found in self._stored.items()}
+        return {table: received.ranges for table, received in self._stored.items()}
 
     def resend(self, missing: Mapping[str, Ranges], publish: Publish) -> int:
         """Publish the held batches again that overlap missing row ranges; return their number."""
@@ -191,9 +191,9 @@ class TelemetryBuffer:
 
     def _publish_rows(self, table: str, rows: NDArray[np.void]) -> None:
         if table in self._by_loop:
-            before = self._by_loop[table]
-            self._by_loop[table] = counts = np.bincount(rows[LOOP], minlength=len(before))
-            counts[: len(before)] += before
+            earlier = self._by_loop[table]
+            self._by_loop[table] = counts = np.bincount(rows[LOOP], minlength=len(earlier))
+            counts[: len(earlier)] += earlier
         self._send(table, len(rows), rows.tobytes())
 
     def _send(self, table: str, rows: int, payload: bytes) -> None:
@@ -214,17 +214,17 @@ class TelemetryBuffer:
 
     def _forget(self, rows: Mapping[str, Ranges]) -> None:
         """Drop batches that are on disk; plan to send older ones again that are not."""
-        held: deque[_Batch] = deque()
+        remaining: deque[_Batch] = deque()
         old = 0
         for i, batch in enumerate(self._held):
             table, first, count, _ = batch
             if not contain(rows.get(table, ()), first, first + count):
-                held.append(batch)
+                remaining.append(batch)
                 old += i < self._old
         # Newer batches may have been in flight when the recorder sent its confirmation.
-        self._to_resend = deque(islice(held, old))
-        self._held, self._old = held, len(held)
-        self._held_bytes = sum(len(batch[3]) for batch in held)
+        self._to_resend = deque(islice(remaining, old))
+        self._held, self._old = remaining, len(remaining)
+        self._held_bytes = sum(len(batch[3]) for batch in remaining)
 
     def _header(self, first: int, rows: int) -> bytes:
         return json.dumps({"first": first, "rows": rows, "generation": self._generation}).encode()
@@ -232,8 +232,8 @@ class TelemetryBuffer:
 
 def first_row(header: bytes) -> tuple[int, int]:
     """Generation and number of a batch's first row, from its header; raise PeerError if invalid."""
-    found = parse_message(BatchHeader, header)
-    return found.generation, found.first
+    message = parse_message(BatchHeader, header)
+    return message.generation, message.first
 
 
 def persisted_rows(plane: ControlPlane, generation: int) -> Mapping[str, Sequence[tuple[int, int]]]:

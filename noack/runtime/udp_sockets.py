@@ -56,14 +56,14 @@ def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
     """
     address = host, port
     endpoint = socket.socket(family_of(address), socket.SOCK_DGRAM)
-    what, remedy = f"UDP port {address_text(address)}", f"set {key} to another port, or to 0 for any"
-    bind_to(endpoint, address, what, remedy)
+    title, remedy = f"UDP port {address_text(address)}", f"set {key} to another port, or to 0 for any"
+    bind_to(endpoint, address, title, remedy)
     endpoint.setblocking(False)
     enlarge_buffer(endpoint)
     return endpoint
 
 
-def bind_to(endpoint: socket.socket, name: SocketName, what: str, remedy: str) -> None:
+def bind_to(endpoint: socket.socket, name: SocketName, title: str, remedy: str) -> None:
     """Bind a socket; if that fails, close it and raise CallerError."""
     try:
         endpoint.bind(name)
@@ -74,7 +74,7 @@ def bind_to(endpoint: socket.socket, name: SocketName, what: str, remedy: str) -
             errno.EACCES: "needs privileges that this user does not have",
             errno.EADDRNOTAVAIL: "is no address of this machine",
         }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
-        raise CallerError(f"{what} {reason}; {remedy}") from None
+        raise CallerError(f"{title} {reason}; {remedy}") from None
 
 
 def drops_of(endpoint: socket.socket) -> int | None:
@@ -85,10 +85,10 @@ def drops_of(endpoint: socket.socket) -> int | None:
     together, as it does between processes of several loops, count as one.
     """
     try:
-        found = endpoint.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * _MEMINFO_WORDS)
+        data = endpoint.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * _MEMINFO_WORDS)
     except OSError:
         return None
-    words = struct.unpack(f"={len(found) // 4}I", found[: len(found) // 4 * 4])
+    words = struct.unpack(f"={len(data) // 4}I", data[: len(data) // 4 * 4])
     return words[_MEMINFO_DROPS] if len(words) > _MEMINFO_DROPS else None
 
 
@@ -98,7 +98,7 @@ def errors_by_text(errors: Sequence[int]) -> dict[str, int]:
     Args:
         errors: numbers of datagrams by errno.
     """
-    return {str(OSError(one, os.strerror(one))): n for one, n in enumerate(errors) if n}
+    return {str(OSError(number, os.strerror(number))): n for number, n in enumerate(errors) if n}
 
 
 class CountingSocket(ABC):
@@ -125,15 +125,15 @@ class CountingSocket(ABC):
         self, endpoint: socket.socket, destinations: Sequence[Address], peers: Sequence[Address]
     ) -> None:
         self._destination, self._peers = destinations[0], frozenset(peers)
-        others = [address for address in dict.fromkeys(destinations) if address not in peers]
-        opened = open_beside(endpoint, [*peers, *others])
+        other_destinations = [address for address in dict.fromkeys(destinations) if address not in peers]
+        opened = open_beside(endpoint, [*peers, *other_destinations])
         if not opened:
             raise PeerError("the system refused to open a socket for each peer")
-        self._opened = dict(zip([*dict.fromkeys(peers), *others], opened, strict=True))
+        self._opened = dict(zip([*dict.fromkeys(peers), *other_destinations], opened, strict=True))
         self.peer_sockets = [self._opened[address] for address in dict.fromkeys(peers)]
         self.senders = [self._opened[address] for address in destinations]
         """Sockets connected to the destinations."""
-        self._unexpected = [endpoint, *(self._opened[address] for address in others)]
+        self._unexpected = [endpoint, *(self._opened[address] for address in other_destinations)]
         for unexpected in self._unexpected:
             unexpected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNKNOWN_BYTES)
         self._flood, self._sources = FloodWatch(), SourceCount(peers)
@@ -149,11 +149,11 @@ class CountingSocket(ABC):
         line = self._flood.next_interval(self._shed())
         if line is not None:
             sink.notice(Notice(now_ns, "info", line))
-        left = _READ_AT_ONCE
-        while (left or self._begins) and self._flood.left > 0:
+        reads_left = _READ_AT_ONCE
+        while (reads_left or self._begins) and self._flood.left > 0:
             if not self._read(now_ns, sink):
                 break
-            left = max(left - 1, 0)
+            reads_left = max(reads_left - 1, 0)
         self._begins = False
 
     def _read(self, now_ns: int, sink: RecordSink) -> bool:
@@ -187,7 +187,7 @@ class CountingSocket(ABC):
         A drop of the kernel is one datagram, or up to 64 that the peer sent together, each for
         another loop.
         """
-        drops = [drops_of(one) for one in self.peer_sockets]
+        drops = [drops_of(endpoint) for endpoint in self.peer_sockets]
         return {
             "local": address_text(self._unexpected[0].getsockname()),
             "destination": address_text(self._destination),
@@ -234,24 +234,24 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
     """
     size_bytes = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     with ExitStack() as undo:
-        beside = []
+        sockets = []
         try:
             with _shared(endpoint):
                 for peer in dict.fromkeys(peers):
-                    one = undo.enter_context(socket.socket(endpoint.family, socket.SOCK_DGRAM))
-                    one.setblocking(False)
+                    peer_socket = undo.enter_context(socket.socket(endpoint.family, socket.SOCK_DGRAM))
+                    peer_socket.setblocking(False)
                     # Before it receives: a stall of a few milliseconds fills the default buffer.
-                    enlarge_buffer(one, size_bytes)
-                    one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-                    one.bind(endpoint.getsockname())
-                    one.connect(peer)
-                    beside.append(one)
-            for one in beside:
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
+                    enlarge_buffer(peer_socket, size_bytes)
+                    peer_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+                    peer_socket.bind(endpoint.getsockname())
+                    peer_socket.connect(peer)
+                    sockets.append(peer_socket)
+            for peer_socket in sockets:
+                peer_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
         except OSError:
             return ()
         undo.pop_all()
-    return tuple(beside)
+    return tuple(sockets)
 
 
 @contextmanager
@@ -287,16 +287,16 @@ class FloodWatch:
 
         ``dropped`` is the number of datagrams that the kernel has dropped so far.
         """
-        before, self._dropped = self._dropped, dropped
-        came = self._allowed - self.left + dropped - before
-        too_many = came > IN_AN_INTERVAL if self.is_flood else dropped > before or self.left == 0
+        earlier, self._dropped = self._dropped, dropped
+        arrived = self._allowed - self.left + dropped - earlier
+        too_many = arrived > IN_AN_INTERVAL if self.is_flood else dropped > earlier or self.left == 0
         line = None
         if self.is_flood:
             self._calm = 0 if too_many else self._calm + 1
             if self._calm >= self._needed:
                 line = self._end()
         elif too_many:
-            line = self._begin(before)
+            line = self._begin(earlier)
         self.left = self._allowed = IN_A_FLOOD if self.is_flood else IN_AN_INTERVAL
         return line
 
@@ -344,9 +344,9 @@ class SourceCount:
         """Datagrams by source; the rare sources together are ``others``."""
         self._fold()
         self._forget(_REPORTED_SOURCES)
-        named = [*self._peers.items(), *self._others.most_common()]
-        found = {address_text(source): n for source, n in named if n}
-        return found | ({"others": self._more} if self._more else {})
+        sources = [*self._peers.items(), *self._others.most_common()]
+        counts = {address_text(source): n for source, n in sources if n}
+        return counts | ({"others": self._more} if self._more else {})
 
     def _fold(self) -> None:
         if self._last is None:
@@ -361,6 +361,6 @@ class SourceCount:
 
     def _forget(self, most: int) -> None:
         """Keep the ``most`` frequent sources: forged ones must not fill the memory."""
-        kept = Counter(dict(self._others.most_common(most)))
-        self._more += self._others.total() - kept.total()
-        self._others = kept
+        frequent = Counter(dict(self._others.most_common(most)))
+        self._more += self._others.total() - frequent.total()
+        self._others = frequent

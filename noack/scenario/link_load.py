@@ -104,7 +104,7 @@ class DelayBound(NamedTuple):
     def is_certified(self) -> bool:
         """Whether the certificates cover every delay; times are whole nanoseconds."""
         pairs = zip(self.certified, self.loops_s, strict=True)
-        return all(round(own_s * NS_PER_S) >= largest_s * NS_PER_S - 0.5 for own_s, largest_s in pairs)
+        return all(round(bound_s * NS_PER_S) >= largest_s * NS_PER_S - 0.5 for bound_s, largest_s in pairs)
 
 
 def link_loads(scenario: Scenario) -> list[LinkLoad]:
@@ -117,8 +117,8 @@ def link_loads(scenario: Scenario) -> list[LinkLoad]:
         CallerError: a loop cannot be resolved, or its trigger excludes its model.
     """
     updates, actuations = _stages(scenario)
-    found = _link_loads(updates, Flow.UPDATE, "network")
-    return found + _link_loads(actuations, Flow.ACTUATION, "network.actuation")
+    update_loads = _link_loads(updates, Flow.UPDATE, "network")
+    return update_loads + _link_loads(actuations, Flow.ACTUATION, "network.actuation")
 
 
 def update_delay(scenario: Scenario) -> DelayBound:
@@ -128,11 +128,13 @@ def update_delay(scenario: Scenario) -> DelayBound:
         CallerError: as :func:`link_loads`.
     """
     delays, loops_s = _largest_delays(_stages(scenario)[0])
-    own_s = {f"network.impairments.{place}": max(one) for place, one in enumerate(delays) if any(one)}
-    given_s, else_s = scenario.certificate.network_delay_s, scenario.network.link.longest_delay_s
-    if given_s is not None:
-        return DelayBound(own_s, loops_s, (given_s,) * len(loops_s))
-    return DelayBound(own_s, loops_s, tuple(one if math.isfinite(one) else else_s for one in loops_s))
+    bounds_s = {f"network.impairments.{index}": max(delays_s) for index, delays_s in enumerate(delays)}
+    impairments_s = {key: bound_s for key, bound_s in bounds_s.items() if bound_s > 0}
+    longest_s = scenario.network.link.longest_delay_s
+    certified = tuple(delay_s if math.isfinite(delay_s) else longest_s for delay_s in loops_s)
+    if (given_s := scenario.certificate.network_delay_s) is not None:
+        certified = (given_s,) * len(loops_s)
+    return DelayBound(impairments_s, loops_s, certified)
 
 
 def proven_delays(scenario: Scenario) -> list[ProvenDelay | None]:
@@ -153,8 +155,8 @@ def proven_delays(scenario: Scenario) -> list[ProvenDelay | None]:
 def _stages(scenario: Scenario) -> tuple[list[_Stage], list[_Stage]]:
     """Return the parts of the run between changes of settings: updates, actuations."""
     sections = loop_sections(scenario)
-    loops = [loop_scenario(scenario, one) for one in sections]
-    counts = [one.count for one in sections]
+    loops = [loop_scenario(scenario, section) for section in sections]
+    counts = [section.count for section in sections]
     updates, actuations = list[_Stage](), list[_Stage]()
     for number in range(len(scenario.changes) + 1):
         begin = f"from changes.{number - 1} on, " if number else ""
@@ -169,58 +171,58 @@ def _stages(scenario: Scenario) -> tuple[list[_Stage], list[_Stage]]:
 
 
 def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoad]:
-    found: list[LinkLoad] = []
+    loads: list[LinkLoad] = []
     if not stages:
-        return found
+        return loads
     delays, _ = _largest_delays(stages)
-    for place, one in enumerate(stages[0].direction.impairments):
-        key = f"{path}.impairments.{place}"
-        if isinstance(one, Schedule):
-            found += _slot_loads(one, stages, (key, flow), delays[place])
-        if not isinstance(one, Rate | Opportunities):
+    for index, impairment in enumerate(stages[0].direction.impairments):
+        key = f"{path}.impairments.{index}"
+        if isinstance(impairment, Schedule):
+            loads += _slot_loads(impairment, stages, (key, flow), delays[index])
+        if not isinstance(impairment, Rate | Opportunities):
             continue
-        before: LinkLoad | None = None
-        delay_s = _known(delays[place])
-        by_loops = tuple(_by_loops(delays[place])) if len(delays[place]) > 1 else ()
+        previous: LinkLoad | None = None
+        delay_s = _largest_bound(delays[index])
+        by_loops = tuple(_by_loops(delays[index])) if len(delays[index]) > 1 else ()
         for begin, direction, loops in stages:
             window = _window(direction)
-            bits = [int(one.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
+            bits = [int(impairment.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
             needed_bps = (
                 sum(b / loop.least_s for b, loop in zip(bits, loops, strict=True)),
                 sum(b / loop.largest_s for b, loop in zip(bits, loops, strict=True)),
             )
             at_most_bps, at_least_bps = (_share(window) * bps for bps in needed_bps)
             load = LinkLoad(
-                begin, key, flow, window, one.rate_bps, at_most_bps, at_least_bps, delay_s, by_loops
+                begin, key, flow, window, impairment.rate_bps, at_most_bps, at_least_bps, delay_s, by_loops
             )
-            if before is None or load._replace(begin=before.begin) != before:
-                found.append(load)
-            before = load
-    return found
+            if previous is None or load._replace(begin=previous.begin) != previous:
+                loads.append(load)
+            previous = load
+    return loads
 
 
 def _by_loops(delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
     """Yield each bound of a delay, with the loops that have it, such as ``loops 0, 2 to 4``."""
     for delay_s in dict.fromkeys(delays_s):
-        loops = {loop for loop, own_s in enumerate(delays_s) if own_s == delay_s}
+        loops = {loop for loop, loop_delay_s in enumerate(delays_s) if loop_delay_s == delay_s}
         begins = sorted(loops - {loop + 1 for loop in loops})
         ends = sorted(loops - {loop - 1 for loop in loops})
         spans = (str(a) if a == b else f"{a} to {b}" for a, b in zip(begins, ends, strict=True))
         yield f"loop{'s' * (len(loops) > 1)} {', '.join(spans)}", delay_s
 
 
-def _known(delays_s: Sequence[float]) -> float | None:
+def _largest_bound(delays_s: Sequence[float]) -> float | None:
     """Return the largest of the bounds of a delay; None: one is not known."""
     return max(delays_s) if math.isfinite(max(delays_s)) else None
 
 
 def _slot_loads(
-    one: Schedule, stages: Sequence[_Stage], path: tuple[str, Flow], delays_s: Sequence[float]
+    schedule: Schedule, stages: Sequence[_Stage], path: tuple[str, Flow], delays_s: Sequence[float]
 ) -> Iterator[LinkLoad]:
     """Yield for each entry of [[loops]] what its loop with the fewest slots needs of them."""
     key, flow = path
-    first, slots = 0, _slots(one, stages)
-    round_s = len(one.order) * one.slot_ns / NS_PER_S
+    first, slots = 0, _slots(schedule, stages)
+    round_s = len(schedule.order) * schedule.slot_ns / NS_PER_S
     for entry, loops in enumerate(stages[0].loops):
         number = min(range(first, first + loops.loops), key=lambda loop: len(slots[loop]))
         first += loops.loops
@@ -236,20 +238,20 @@ def _slot_loads(
                 rate_bps=bits * len(slots[number]) / round_s,
                 mandatory_at_most_bps=must_pass / loop.least_s,
                 mandatory_at_least_bps=must_pass / loop.largest_s,
-                delay_bound_s=_known([delays_s[number]]),
+                delay_bound_s=_largest_bound([delays_s[number]]),
             )
 
 
-def _slots(one: Schedule, stages: Sequence[_Stage]) -> list[list[int]]:
+def _slots(schedule: Schedule, stages: Sequence[_Stage]) -> list[list[int]]:
     """Return the slots of each loop of the run."""
     loops = sum(demand.loops for demand in stages[0].loops)
-    return [*one.slots, *([] for _ in range(loops))][:loops]
+    return [*schedule.slots, *([] for _ in range(loops))][:loops]
 
 
 def _window(direction: DirectionSection) -> LossWindow:
     link = direction.link
     windows = join_guarantee(link.mansd, link.constraints).windows
-    return min(windows, key=lambda one: one.losses / one.packets, default=LossWindow(1, 1))
+    return min(windows, key=lambda window: window.losses / window.packets, default=LossWindow(1, 1))
 
 
 def _share(window: LossWindow) -> float:
@@ -263,29 +265,31 @@ def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], list[f
     impairment has one for all; infinite: there is none.
     """
     least_s, largest_s = 0.0, [0.0] * sum(demand.loops for demand in stages[0].loops)
-    found, copied = list[list[float]](), False
-    for one in stages[0].direction.impairments:  # they cannot change
+    delays_s, copied = list[list[float]](), False
+    for impairment in stages[0].direction.impairments:  # they cannot change
         spread_s = max(largest_s) - least_s
-        if isinstance(one, Schedule | Rate):
-            if isinstance(one, Schedule):
-                found.append(_slot_delays_s(one, stages, spread_s, copied=copied))
-            elif one.scheduler is not None:
-                found.append(_chosen_delays_s(one, one.scheduler, stages))
+        if isinstance(impairment, Schedule | Rate):
+            if isinstance(impairment, Schedule):
+                delays_s.append(_slot_delays_s(impairment, stages, spread_s, copied=copied))
+            elif impairment.scheduler is not None:
+                delays_s.append(_chosen_delays_s(impairment, impairment.scheduler, stages))
             else:
-                found.append([_queue_delay_s(one, stages, spread_s, copied=copied)])
+                delays_s.append([_queue_delay_s(impairment, stages, spread_s, copied=copied)])
             largest_s = [
-                before_s + own_s for before_s, own_s in zip(largest_s, cycle(found[-1]), strict=False)
+                before_s + added_s for before_s, added_s in zip(largest_s, cycle(delays_s[-1]), strict=False)
             ]
         else:
-            found.append([one.longest_s if one.is_bounded else math.inf])
-            ranges_s = {before_s: one.delay_range_s(least_s, before_s) for before_s in set(largest_s)}
+            delays_s.append([impairment.longest_s if impairment.is_bounded else math.inf])
+            ranges_s = {before_s: impairment.delay_range_s(least_s, before_s) for before_s in set(largest_s)}
             largest_s = [ranges_s[before_s][1] for before_s in largest_s]
             least_s = min(ranges_s.values())[0]
-        copied = copied or one.copies
-    return found, largest_s
+        copied = copied or impairment.copies
+    return delays_s, largest_s
 
 
-def _slot_delays_s(one: Schedule, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> list[float]:
+def _slot_delays_s(
+    schedule: Schedule, stages: Sequence[_Stage], spread_s: float, *, copied: bool
+) -> list[float]:
     """Return the bounds for the slots of each loop; see :func:`_queue_delay_s`."""
     least_s = [
         min(stage.loops[entry].least_s for stage in stages)
@@ -295,78 +299,78 @@ def _slot_delays_s(one: Schedule, stages: Sequence[_Stage], spread_s: float, *, 
     share = max(_share(_window(stage.direction)) for stage in stages)
     if any(stage.direction.constraints for stage in stages):
         share = math.inf
-    found = []
-    for slots, own_s in zip(_slots(one, stages), least_s, strict=True):
-        least_ns, count = round(own_s * NS_PER_S), len(slots)
-        round_ns, copies = len(one.order) * one.slot_ns, 2 if copied else 1
+    delays_s = []
+    for slots, loop_least_s in zip(_slots(schedule, stages), least_s, strict=True):
+        least_ns, count = round(loop_least_s * NS_PER_S), len(slots)
+        round_ns, copies = len(schedule.order) * schedule.slot_ns, 2 if copied else 1
         bounds = [math.inf]
         if copies * round_ns <= count * least_ns:
-            waits_ns = (one.wait_ns(slots, n + 1) for n in range(copies * count))
+            waits_ns = (schedule.wait_ns(slots, n + 1) for n in range(copies * count))
             bounds.append(max(t_ns - n // copies * least_ns for n, t_ns in enumerate(waits_ns)))
         if slots and share == 0:
-            bounds.append(one.wait_ns(slots, one.queue))
+            bounds.append(schedule.wait_ns(slots, schedule.queue))
         elif slots and round_ns * share <= count * least_ns:
-            waits_ns = (one.wait_ns(slots, one.queue + n + 1) for n in range(count))
+            waits_ns = (schedule.wait_ns(slots, schedule.queue + n + 1) for n in range(count))
             bounds.append(max(t_ns - n * least_ns / share for n, t_ns in enumerate(waits_ns)))
-        found.append(min(bounds) / NS_PER_S + spread_s)
-    return found
+        delays_s.append(min(bounds) / NS_PER_S + spread_s)
+    return delays_s
 
 
-def _chosen_delays_s(one: Rate, chooses: Scheduler, stages: Sequence[_Stage]) -> list[float]:
+def _chosen_delays_s(rate: Rate, scheduler: Scheduler, stages: Sequence[_Stage]) -> list[float]:
     """Return the bounds for each loop of a rate that chooses what it sends.
 
     A change of the direction's settings makes the order of what waits final, so that any may go first.
     """
-    sections = range(len(stages[0].loops))
-    loops = [entry for entry in sections for _ in range(stages[0].loops[entry].loops)]
+    demands = stages[0].loops
     changes = any(stage.direction.link != stages[0].direction.link for stage in stages)
-    least_ns = [round(min(stage.loops[entry].least_s for stage in stages) * NS_PER_S) for entry in sections]
-    sent_ns = [
-        max(-(-int(one.line_bits(demand.payload_bytes)) * NS_PER_S // one.rate_bps), 1)
-        for demand in stages[0].loops
+    senders_ns = [
+        (
+            round(min(stage.loops[entry].least_s for stage in stages) * NS_PER_S),
+            max(-(-int(rate.line_bits(demand.payload_bytes)) * NS_PER_S // rate.rate_bps), 1),
+        )
+        for entry, demand in enumerate(demands)
     ]
-    found: dict[tuple[int, int], float] = {}
-    for loop, entry in enumerate(loops):
-        kind = entry, chooses.number(loop)
-        if kind not in found:
-            own = Sender(least_ns[entry], sent_ns[entry])
-            others = Counter(
-                Sender(
-                    least_ns[other], sent_ns[other], math.inf if changes else chooses.yields_ns(loop, number)
-                )
-                for number, other in enumerate(loops)
-                if number != loop
-            )
-            found[kind] = response_ns(own, others) / NS_PER_S
-    return [found[entry, chooses.number(loop)] for loop, entry in enumerate(loops)]
+    entries = (entry for entry, demand in enumerate(demands) for _ in range(demand.loops))
+    kinds = [(entry, scheduler.number(loop)) for loop, entry in enumerate(entries)]
+    counts = Counter(kinds)
+    bounds_s = {}
+    for kind in counts:
+        entry, number = kind
+        sender_counts = Counter[tuple[int, int, float]]()
+        for (other_entry, other_number), count in (counts - Counter([kind])).items():
+            yields_ns = math.inf if changes else scheduler.yields_ns(number, other_number)
+            sender_counts[*senders_ns[other_entry], yields_ns] += count
+        other_senders = {Sender(*sender_ns): count for sender_ns, count in sender_counts.items()}
+        bounds_s[kind] = response_ns(Sender(*senders_ns[entry]), other_senders) / NS_PER_S
+    return [bounds_s[kind] for kind in kinds]
 
 
-def _queue_delay_s(one: Rate, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> float:
+def _queue_delay_s(rate: Rate, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> float:
     """Return the bound for the least M and the shortest times between transmissions of the run.
 
     What waits in the queue at a change was sent before it, so no stage has a bound of its own.
 
     Args:
-        one: the bottleneck.
+        rate: the bottleneck.
         stages: the parts of the run.
         spread_s: by how much the delays before the queue can differ.
         copied: datagrams may have been sent twice before the queue.
     """
-    if not isinstance(one.discipline, TailDrop) or math.isinf(spread_s):
+    if not isinstance(rate.discipline, TailDrop) or math.isinf(spread_s):
         return math.inf
-    bits = [int(one.line_bits(loop.payload_bytes)) for loop in stages[0].loops]
+    bits = [int(rate.line_bits(loop.payload_bytes)) for loop in stages[0].loops]
     counts = [loop.loops for loop in stages[0].loops]
     by_loops = zip(*(stage.loops for stage in stages), strict=True)
-    least_s: list[float] = [min(one.least_s for one in each) for each in by_loops]
+    least_s: list[float] = [min(demand.least_s for demand in demands) for demands in by_loops]
     every_bps: float = sum(b * k / d for b, k, d in zip(bits, counts, least_s, strict=True))
     together = sum(b * k for b, k in zip(bits, counts, strict=True))
     copies = 2 if copied else 1
-    if copies * every_bps <= one.rate_bps:
-        return copies * (together + every_bps * spread_s) / one.rate_bps
+    if copies * every_bps <= rate.rate_bps:
+        return copies * (together + every_bps * spread_s) / rate.rate_bps
     needed_bps = every_bps * max(_share(_window(stage.direction)) for stage in stages)
-    if needed_bps < one.rate_bps and not any(stage.direction.constraints for stage in stages):
-        waiting = one.queue * max(bits) + together + needed_bps * spread_s
-        return waiting / (one.rate_bps - needed_bps)
+    if needed_bps < rate.rate_bps and not any(stage.direction.constraints for stage in stages):
+        waiting = rate.queue * max(bits) + together + needed_bps * spread_s
+        return waiting / (rate.rate_bps - needed_bps)
     return math.inf
 
 
@@ -374,12 +378,12 @@ def require_slots(scenario: Scenario) -> None:
     """Raise CallerError if a schedule has no slot for a loop, or one for another loop."""
     loops = sum(section.count for section in loop_sections(scenario))
     for path, section in scenario.network.directions.items():
-        for place, one in enumerate(section.impairments):
-            flows = len(one.slots) if isinstance(one, Schedule) else loops
+        for index, impairment in enumerate(section.impairments):
+            flows = len(impairment.slots) if isinstance(impairment, Schedule) else loops
             if flows != loops:
                 wrong = f"loop {flows} has no slot" if flows < loops else f"a slot is for loop {flows - 1}"
                 raise CallerError(
-                    f"{path}.impairments.{place}.order: {wrong}; the run has the loops "
+                    f"{path}.impairments.{index}.order: {wrong}; the run has the loops "
                     f"0 to {loops - 1}, and each needs a slot (-1: an idle slot)"
                 )
 
@@ -410,10 +414,10 @@ def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str
             f"{math.ceil(load.mandatory_at_most_bps)} bit/s; then the queue grows without bound"
         )
     delay = update_delay(scenario)
-    unknown = [key for key, own_s in delay.impairments_s.items() if math.isinf(own_s)]
+    unknown = [key for key, impairment_s in delay.impairments_s.items() if math.isinf(impairment_s)]
     covered = f"the certificates cover {delay.certified_s:.3g} s; see certificate.network_delay_s"
     if not unknown and not delay.is_certified:
-        parts = ", ".join(f"{key} {own_s:.3g} s" for key, own_s in delay.impairments_s.items())
+        parts = ", ".join(f"{key} {impairment_s:.3g} s" for key, impairment_s in delay.impairments_s.items())
         yield f"updates may be delayed by up to {delay.largest_s:.3g} s ({parts}), {covered}"
     elif set(unknown) - {load.key for load in overloaded}:
         yield f"no bound of the delay of updates is known ({', '.join(unknown)}), {covered}"

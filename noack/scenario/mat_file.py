@@ -29,14 +29,14 @@ def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
     """
     command = python_command("-m", __name__, most_entries)
     try:
-        done = subprocess.run(command, input=content, capture_output=True, timeout=_PATIENCE_S, check=False)
+        reader = subprocess.run(command, input=content, capture_output=True, timeout=_PATIENCE_S, check=False)
     except subprocess.TimeoutExpired:
         raise ValueError("it cannot be read in time") from None
-    if done.returncode == _MODERN:
+    if reader.returncode == _MODERN:
         raise NotImplementedError
-    if done.returncode != 0:
+    if reader.returncode != 0:
         raise ValueError("it cannot be read")
-    return done.stdout
+    return reader.stdout
 
 
 def _main() -> int:
@@ -51,11 +51,14 @@ def _main() -> int:
             if np.prod(shape, dtype=float) <= most_entries and kind in _OF_NUMBERS
         ]
         file.seek(0)
-        read = loadmat(file, variable_names=names)  # type: ignore[arg-type]
+        variables = loadmat(file, variable_names=names)  # type: ignore[arg-type]
     except NotImplementedError:
         return _MODERN
-    found = {name: read[name].toarray() if hasattr(read[name], "toarray") else read[name] for name in names}
-    np.savez(sys.stdout.buffer, allow_pickle=False, **found)
+    arrays = {
+        name: variables[name].toarray() if hasattr(variables[name], "toarray") else variables[name]
+        for name in names
+    }
+    np.savez(sys.stdout.buffer, allow_pickle=False, **arrays)
     return 0
 
 

@@ -46,18 +46,18 @@ def with_matrices(content: ReadTable, folder: Path, source: str) -> ReadTable:
     B. Names are relative to ``folder``. Invalid content is returned unchanged. If a file cannot be
     read or lacks a matrix, CallerError has one line, which begins with ``source``.
     """
-    read = dict(content)
+    updated = dict(content)
     if isinstance(loops := content.get("loops"), list):
-        read["loops"] = [
-            with_matrices(one, folder, f"{source}: loops.{place}") if _is_flat(one) else one
-            for place, one in enumerate(loops)
+        updated["loops"] = [
+            with_matrices(loop, folder, f"{source}: loops.{index}") if _is_flat(loop) else loop
+            for index, loop in enumerate(loops)
         ]
     for table, keys in (("model", ("A", "B", GAIN)), ("plant", ("A", "B"))):
         section = content.get(table)
         if isinstance(section, Mapping) and (names := _names(section)) is not None:
             file = NamedFile(section["file"], folder, f"{source}: {table}")
-            read[table] = _replaced(section, keys, file, names)
-    return read
+            updated[table] = _with_file(section, keys, file, names)
+    return updated
 
 
 def _is_flat(loop: object) -> bool:
@@ -77,15 +77,15 @@ def _names(section: ReadTable) -> Mapping[str, str] | None:
     return names if are_names and names.keys() <= {"A", "B", GAIN} else None
 
 
-def _replaced(
+def _with_file(
     section: ReadTable, keys: tuple[str, ...], file: NamedFile, names: Mapping[str, str]
 ) -> ReadTable:
     for key in ("A", "B"):
         if key in section:
             file.wrong(f"the file has {key}, and so has the scenario; give one or the other")
-    found = read_matrices(file, names)
-    rest = {key: value for key, value in section.items() if key not in ("file", "names")}
-    return {key: found[key].tolist() for key in keys if key in found} | rest
+    matrices = read_matrices(file, names)
+    other_settings = {key: value for key, value in section.items() if key not in ("file", "names")}
+    return {key: matrices[key].tolist() for key in keys if key in matrices} | other_settings
 
 
 def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> dict[str, Matrix]:
@@ -97,23 +97,23 @@ def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> di
     """
     names = names or {}
     arrays = _arrays(file)
-    found: dict[str, Matrix] = {}
+    matrices: dict[str, Matrix] = {}
     for key in ("A", "B"):
         name = names.get(key, key)
         if name not in arrays:
             file.wrong(_missing(name, arrays))
-        found[key] = _matrix(file, name, arrays[name])
+        matrices[key] = _matrix(file, name, arrays[name])
     if GAIN in names and names[GAIN] not in arrays:
         file.wrong(_missing(names[GAIN], arrays))
     gains = [name for name in (_GAINS if GAIN not in names else (names[GAIN],)) if name in arrays]
     if len(gains) > 1:
         file.wrong(f'has {" and ".join(gains)}; say which by names = {{ gain = "…" }}')
     for name in gains:
-        found[GAIN] = _matrix(file, name, arrays[name])
+        matrices[GAIN] = _matrix(file, name, arrays[name])
     C, D, dt = (arrays.get(key) for key in ("C", "D", "dt"))
-    if (why := unfit(C, D, dt, len(found["A"]))) is not None:
-        file.wrong(why)
-    return found
+    if (reason := unfit(C, D, dt, len(matrices["A"]))) is not None:
+        file.wrong(reason)
+    return matrices
 
 
 def unfit(C: ArrayLike | None, D: ArrayLike | None, dt: ArrayLike | None, n: int) -> str | None:
@@ -162,16 +162,16 @@ def _arrays(file: NamedFile) -> Arrays:
     try:
         if file.path.suffix == MAT:
             content = matrices_as_npz(content, _MOST_ENTRIES)
-        return _of_npz(content)
+        return _npz_arrays(content)
     except NotImplementedError:
         file.wrong("is of MATLAB's v7.3, which is HDF5; save it as v7: save(name, '-v7')")
     except Exception:  # an invalid file can raise any error
         file.wrong(f"is no {file.path.suffix} file, or a damaged one")
 
 
-def _of_npz(content: bytes) -> Arrays:
+def _npz_arrays(content: bytes) -> Arrays:
     """Return the arrays that are not too large, by name."""
-    found = {}
+    arrays = {}
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         for entry in archive.infolist():
             name = entry.filename.removesuffix(".npy")
@@ -182,14 +182,11 @@ def _of_npz(content: bytes) -> Arrays:
                 shape, _, kind = read_header(array)
                 if np.prod(shape, dtype=float) <= _MOST_ENTRIES and kind.kind in _NUMBERS + "c":
                     array.seek(0)
-                    found[name] = np.lib.format.read_array(array, allow_pickle=False)
-    return found
+                    arrays[name] = np.lib.format.read_array(array, allow_pickle=False)
+    return arrays
 
 
-_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def _matrix(file: NamedFile, name: str, value: NDArray[np.generic]) -> Matrix:
@@ -269,30 +266,30 @@ def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matr
                 "give a state space, e.g. with .to_ss(), control.ss, or a tuple (A, B, C, D)"
             )
         A, B, C, D, dt = (getattr(system, key, None) for key in ("A", "B", "C", "D", "dt"))
-    found = {"A": _numbers_of("A", A), "B": _numbers_of("B", B)}
-    n, m = found["B"].shape
+    matrices = {"A": _finite_matrix("A", A), "B": _finite_matrix("B", B)}
+    n, m = matrices["B"].shape
     try:
-        require_shape(rows_of(found["A"]), "A", (n, n), "B has a row for each state")
+        require_shape(rows_of(matrices["A"]), "A", (n, n), "B has a row for each state")
         if gain is not None:
-            found[GAIN] = _numbers_of(GAIN, gain)
-            require_shape(rows_of(found[GAIN]), GAIN, (m, n), "a row per input, a column per state")
+            matrices[GAIN] = _finite_matrix(GAIN, gain)
+            require_shape(rows_of(matrices[GAIN]), GAIN, (m, n), "a row per input, a column per state")
     except ValueError as error:
         raise CallerError(f"the system: {error}") from None
-    if (why := unfit(C, D, dt, n)) is not None:
-        raise CallerError(f"the system: {why}")
-    if gain is not None and (why := instability(found["A"], found["B"], found[GAIN])) is not None:
-        raise CallerError(f"gain: {why}")
-    return found
+    if (reason := unfit(C, D, dt, n)) is not None:
+        raise CallerError(f"the system: {reason}")
+    if gain is not None and (reason := instability(matrices["A"], matrices["B"], matrices[GAIN])) is not None:
+        raise CallerError(f"gain: {reason}")
+    return matrices
 
 
-def _numbers_of(name: str, value: ArrayLike) -> Matrix:
+def _finite_matrix(name: str, value: ArrayLike) -> Matrix:
     try:
-        found = np.asarray(value, dtype=np.float64)
+        matrix = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         raise CallerError(f"{name}: is not a matrix of real numbers") from None
-    if found.ndim != 2 or not found.size or not np.isfinite(found).all():
+    if matrix.ndim != 2 or not matrix.size or not np.isfinite(matrix).all():
         raise CallerError(f"{name}: a matrix of finite numbers is needed, by rows: [[1, 2], [3, 4]]")
-    return found
+    return matrix
 
 
 def _labels(system: object, key: str) -> Sequence[str] | None:

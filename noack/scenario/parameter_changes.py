@@ -49,10 +49,10 @@ def settings_bytes(settings: ReadTable) -> bytes:
 
 def settings_of(data: bytes) -> Table:
     """Read settings from the record; raise ValueError if the data are not settings."""
-    found = json.loads(data.rstrip(b"\0"))
-    if not isinstance(found, dict):
+    settings = json.loads(data.rstrip(b"\0"))
+    if not isinstance(settings, dict):
         raise ValueError("a change is a table of keys and values")
-    return found
+    return settings
 
 
 def changed(scenario: Scenario, settings: ReadTable) -> Scenario:
@@ -77,14 +77,14 @@ def current_parameters(scenario: Scenario) -> Table:
     network = {
         LOSS: loss,
         MANSD: scenario.network.mansd,
-        CONSTRAINTS: [one.model_dump(mode="json") for one in scenario.network.constraints],
+        CONSTRAINTS: [constraint.model_dump(mode="json") for constraint in scenario.network.constraints],
     }
     return {**network, **values, SETPOINT: setpoint}
 
 
 def scheduled(scenario: Scenario) -> list[ParameterChange]:
     """Return the changes that a scenario schedules."""
-    return [ParameterChange(number, one.at_ns, dict(one.set)) for number, one in enumerate(scenario.changes)]
+    return [ParameterChange(i, change.at_ns, dict(change.set)) for i, change in enumerate(scenario.changes)]
 
 
 def settings_key(resolved: Scenario) -> tuple[int, ...]:
@@ -99,9 +99,9 @@ def settings_key(resolved: Scenario) -> tuple[int, ...]:
 CHANGED = "change"  # level of the notice of a change
 
 
-def change_notice(change: ParameterChange, more: str = "") -> Notice:
+def change_notice(change: ParameterChange, suffix: str = "") -> Notice:
     """Return the notice of a change for the run's log."""
-    text = f"{text_of(change.settings)} from {change.t_ns / NS_PER_S:.3f} s on{more}"
+    text = f"{text_of(change.settings)} from {change.t_ns / NS_PER_S:.3f} s on{suffix}"
     return Notice(change.t_ns, CHANGED, text)
 
 
@@ -147,7 +147,7 @@ class ChangeSchedule(Generic[Prepared]):
     def __init__(self, scenario: Scenario, prepare: Callable[[Scenario], Prepared] | None = None) -> None:
         self._prepare = prepare
         self._results: dict[tuple[tuple[int, int], ...], tuple[Scenario, Prepared | None, ReadTable]] = {}
-        self._all = [AppliedParameters[Prepared](-(2**63), -1, {}, scenario, None)]
+        self._timeline = [AppliedParameters[Prepared](-(2**63), -1, {}, scenario, None)]
         self._taken = 1
 
     def of_alike(self, scenario: Scenario) -> "ChangeSchedule[Prepared]":
@@ -169,61 +169,61 @@ class ChangeSchedule(Generic[Prepared]):
         nothing, if the scenario would be invalid.
         """
         since_ns = max(change.t_ns, reached_ns + 1)
-        self._all = self._with(change, since_ns)
+        self._timeline = self._with_change(change, since_ns)
         return announcement_outputs(table, change, number, now_ns, since_ns)
 
     def check(self, change: ParameterChange, reached_ns: int) -> None:
         """Raise CallerError if the scenario would be invalid after a change; announce nothing."""
-        self._with(change, max(change.t_ns, reached_ns + 1))
+        self._with_change(change, max(change.t_ns, reached_ns + 1))
 
-    def _with(self, change: ParameterChange, since_ns: int) -> list[AppliedParameters[Prepared]]:
+    def _with_change(self, change: ParameterChange, since_ns: int) -> list[AppliedParameters[Prepared]]:
         """Return the scenarios with a change that is in force from a time on."""
         entry = AppliedParameters[Prepared](
-            since_ns, change.number, change.settings, self._all[0].scenario, None
+            since_ns, change.number, change.settings, self._timeline[0].scenario, None
         )
-        every = [*self._all]
-        first = bisect(every, (since_ns, change.number), key=lambda one: (one.since_ns, one.number))
-        every.insert(first, entry)
-        for place in range(first, len(every)):
+        timeline = [*self._timeline]
+        first = bisect(timeline, (since_ns, change.number), key=attrgetter("since_ns", "number"))
+        timeline.insert(first, entry)
+        for index in range(first, len(timeline)):
             # A change that was refused has left its number to another one.
-            key = tuple((one.number, id(one.settings)) for one in every[1 : place + 1])
+            key = tuple((applied.number, id(applied.settings)) for applied in timeline[1 : index + 1])
             if key not in self._results:
-                scenario, own = every[place - 1].scenario, every[place].settings
-                scenario = changed(scenario, own)
+                scenario, settings = timeline[index - 1].scenario, timeline[index].settings
+                scenario = changed(scenario, settings)
                 prepared = self._prepare(scenario) if self._prepare is not None else None
-                self._results[key] = scenario, prepared, own  # the id stays its own
+                self._results[key] = scenario, prepared, settings  # the id stays its own
             scenario, prepared, _ = self._results[key]
-            every[place] = every[place]._replace(scenario=scenario, prepared=prepared)
-        return every
+            timeline[index] = timeline[index]._replace(scenario=scenario, prepared=prepared)
+        return timeline
 
     @property
     def next_ns(self) -> int:
         """Time at which the next scenario that is not yet applied takes effect."""
-        return self._all[self._taken].since_ns if self._taken < len(self._all) else NEVER_NS
+        return self._timeline[self._taken].since_ns if self._taken < len(self._timeline) else NEVER_NS
 
     def take(self, t_ns: int) -> Sequence[AppliedParameters[Prepared]]:
         """Return the scenarios that are due at a time and not yet applied, in their order."""
-        due = [one for one in self._all[self._taken :] if one.since_ns <= t_ns]
+        due = [applied for applied in self._timeline[self._taken :] if applied.since_ns <= t_ns]
         self._taken += len(due)
         return due
 
     @property
     def has_changes(self) -> bool:
         """Whether a change has been announced."""
-        return len(self._all) > 1
+        return len(self._timeline) > 1
 
     @property
     def last(self) -> Scenario:
         """The scenario with all announced changes."""
-        return self._all[-1].scenario
+        return self._timeline[-1].scenario
 
     def at(self, t_ns: int) -> AppliedParameters[Prepared]:
         """The scenario that is in force at a time."""
-        return self._all[bisect(self._all, t_ns, key=lambda one: one.since_ns) - 1]
+        return self._timeline[bisect(self._timeline, t_ns, key=attrgetter("since_ns")) - 1]
 
     def between(self, first_ns: int, last_ns: int) -> Iterator[Scenario]:
         """Return the scenarios that are in force at any time within an interval."""
-        for place, one in enumerate(self._all):
-            ended = place + 1 < len(self._all) and self._all[place + 1].since_ns <= first_ns
-            if one.since_ns <= last_ns and not ended:
-                yield one.scenario
+        for index, applied in enumerate(self._timeline):
+            has_ended = index + 1 < len(self._timeline) and self._timeline[index + 1].since_ns <= first_ns
+            if applied.since_ns <= last_ns and not has_ended:
+                yield applied.scenario

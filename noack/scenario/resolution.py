@@ -7,6 +7,7 @@ noise of its plant and of its observer's model.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from noack.protocol.record_tables import CLOCK_TABLES, LOOP, OWNER, RecordShape,
 from noack.scenario.link_load import proven_delays
 from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, loops_by_entry
 from noack.scenario.scenario_checks import input_at
-from noack.scenario.sections import AnyObserver, ModelSection
+from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
 from noack.settings.section import rows_of
 from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule
 
@@ -122,11 +123,11 @@ def loop_named(scenario: Scenario, name: str | None) -> Scenario:
 
 def _loops_with_delays(scenario: Scenario) -> list[list[Scenario]]:
     """Return the loops of each entry, each with the bound of its updates' delay in this run."""
-    entries, known = loops_by_entry(scenario), scenario.certificate.proven_delay
-    if known is not None and known.loops > 1:  # a loop of several, by loop_named
+    entries, proven_delay = loops_by_entry(scenario), scenario.certificate.proven_delay
+    if proven_delay is not None and proven_delay.loops > 1:  # a loop of several, by loop_named
         return entries
     delays = proven_delays(scenario)
-    if known is None and not any(delays):
+    if proven_delay is None and not any(delays):
         return entries
     sections = iter([scenario.certificate.with_proven_delay(delay) for delay in delays])
     return [[loop.model_copy(update={"certificate": next(sections)}) for loop in loops] for loops in entries]
@@ -134,63 +135,50 @@ def _loops_with_delays(scenario: Scenario) -> list[list[Scenario]]:
 
 def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
     """Return the resolved scenarios of loops that differ in their names and seeds only."""
-    scenario = loops[0]
-    scenario.plant.system.require_installed()
-    model, plant = _explicit_model(scenario.model), scenario.plant
-    period_ns = scenario.timing.plant_period_ns
-    A_model, B_model, K = np.array(model.A), np.array(model.B), np.array(model.gain)
-    n, m = B_model.shape
-    is_linear, found = scenario.coverage.is_linear, list[Scenario]()
+    scenario, plant = loops[0], loops[0].plant
+    plant.system.require_installed()
+    model = _explicit_model(scenario.model)
     is_drawn = plant.initial_state_halfwidth is not None or plant.draw in ("uniform", "vertex")
-    own_plant = plant
-    for loop in loops:
-        if is_drawn or not found:
-            x0, A, B = np.array(plant.initial_state), A_model, B_model
-            if plant.initial_state_halfwidth is not None:
-                halfwidth = np.array(plant.initial_state_halfwidth)
-                rng = stream(loop.seeds.initial_state, "initial_state")
-                x0 += halfwidth * rng.uniform(-1, 1, n)
-            if plant.draw == "given":
-                A, B = np.array(plant.A), np.array(plant.B)
-            elif plant.draw in ("uniform", "vertex"):
-                rng = stream(loop.seeds.plant, "plant")
-                A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
-                B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
-            _require_finite("plant", A, B, period_ns)
-            drawn: dict[str, object] = {
-                "initial_state": tuple(x0.tolist()),
-                "initial_state_halfwidth": None,
-            }
-            if is_linear:
-                drawn |= {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
-            own_plant = plant.model_copy(update=drawn)
-        found.append(
-            loop.model_copy(
-                update={
-                    "model": model,
-                    "plant": own_plant,
-                    "observer": None,
-                }
-            )
-        )
+    plants = [_resolved_plant(loop, model) for loop in (loops if is_drawn else loops[:1])]
     if scenario.mode == "model":
-        H = A_model + B_model @ K
-        _require_finite("model", H, K.T, scenario.timing.controller_period_ns)
+        A, B, K = np.array(model.A), np.array(model.B), np.array(model.gain)
+        _require_finite("model", A + B @ K, K.T, scenario.timing.controller_period_ns)
     observer = _observer(scenario, model)
-    if observer is None:
-        return found
-    return [loop.model_copy(update={"observer": observer}) for loop in found]
+    return [
+        loop.model_copy(update={"model": model, "plant": own_plant, "observer": observer})
+        for loop, own_plant in zip(loops, cycle(plants), strict=False)
+    ]
+
+
+def _resolved_plant(loop: Scenario, model: ModelSection) -> PlantSection:
+    """Return the plant of a loop with numbers in place of random draws."""
+    plant, update = loop.plant, dict[str, object]()
+    A, B, x0 = np.array(model.A), np.array(model.B), np.array(plant.initial_state)
+    if plant.initial_state_halfwidth is not None:
+        rng = stream(loop.seeds.initial_state, "initial_state")
+        x0 += np.array(plant.initial_state_halfwidth) * rng.uniform(-1, 1, len(x0))
+    if plant.draw == "given":
+        A, B = np.array(plant.A), np.array(plant.B)
+    elif plant.draw in ("uniform", "vertex"):
+        rng = stream(loop.seeds.plant, "plant")
+        A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, A.shape)
+        B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, B.shape)
+    _require_finite("plant", A, B, loop.timing.plant_period_ns)
+    if loop.coverage.is_linear:
+        update = {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
+    update |= {"initial_state": tuple(x0.tolist()), "initial_state_halfwidth": None}
+    return plant.model_copy(update=update)
 
 
 def _explicit_model(model: ModelSection) -> ModelSection:
     if model.name is not None:
-        named = model.named
+        named_model = model.named
         return ModelSection(
-            A=rows_of(named.A),
-            B=rows_of(named.B),
-            gain=model.gain or rows_of(named.K),
-            state_names=model.state_names or named.state_names,
-            input_names=model.input_names or named.input_names,
+            A=rows_of(named_model.A),
+            B=rows_of(named_model.B),
+            gain=model.gain or rows_of(named_model.K),
+            state_names=model.state_names or named_model.state_names,
+            input_names=model.input_names or named_model.input_names,
             allow_unstable=model.allow_unstable,
         )
     n, m = np.array(model.B).shape
@@ -290,10 +278,10 @@ def rule_of(resolved: Scenario) -> TriggerRule:
 
 def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
     """Return the set point x_r, (n,), of a resolved scenario, and u_r, (m,); None if it is 0."""
-    given = resolved.controller.setpoint
-    if not any(given or ()):
+    setpoint = resolved.controller.setpoint
+    if not any(setpoint or ()):
         return None
-    x_r = np.array(given)
+    x_r = np.array(setpoint)
     return x_r, input_at(*resolved.model.matrices, x_r)
 
 
@@ -305,7 +293,7 @@ def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
 def shape_of(resolved: Scenario) -> RecordShape:
     """Return the sizes of a loop's vectors in the record."""
     n, m = resolved.model.dimensions
-    disturbed = {one.at for one in resolved.plant.disturbances}
+    disturbed = {disturbance.at for disturbance in resolved.plant.disturbances}
     return RecordShape(
         n,
         m,
@@ -332,7 +320,7 @@ def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
     The rows of the network are those of all loops; each other row of a machine begins with the
     number of its loop. Vectors have the largest size of all loops.
     """
-    shapes = {shape_of(loop_scenario(scenario, one)) for one in loop_sections(scenario)}
+    shapes = {shape_of(loop_scenario(scenario, section)) for section in loop_sections(scenario)}
     return {
         table: np.dtype([(LOOP, "<u2"), *dtype.descr]) if has_loop(table) else dtype
         for table, dtype in tables(**vars(largest(shapes))).items()
@@ -397,10 +385,10 @@ def steady_state(resolved: Scenario) -> SteadyState:
     L = np.eye(n) if observer is None else observer.steady_gain(assumed_model(resolved))
     if L is None:
         return SteadyState(np.full((n, len(C)), np.nan), np.inf, np.full((n, n), np.inf))
-    rest = np.eye(n) - L @ C
-    radius = float(np.abs(np.linalg.eigvals(rest @ A)).max())
+    update_factor = np.eye(n) - L @ C
+    radius = float(np.abs(np.linalg.eigvals(update_factor @ A)).max())
     if radius >= 1:
         return SteadyState(L, radius, np.full((n, n), np.inf))
-    added = rest @ Q @ rest.T + L @ true.R @ L.T
-    covariance = np.asarray(solve_discrete_lyapunov(rest @ A, added), dtype=np.float64)
+    added = update_factor @ Q @ update_factor.T + L @ true.R @ L.T
+    covariance = np.asarray(solve_discrete_lyapunov(update_factor @ A, added), dtype=np.float64)
     return SteadyState(L, radius, covariance)

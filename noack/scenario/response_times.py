@@ -28,37 +28,37 @@ class Sender(NamedTuple):
     """δ: how long after a datagram one of this loop may arrive, to be sent before it."""
 
 
-def response_ns(own: Sender, others: Mapping[Sender, int]) -> float:
+def response_ns(sender: Sender, other_senders: Mapping[Sender, int]) -> float:
     """Return the largest delay in ns of a loop's datagrams; infinite: no bound is known.
 
     Args:
-        own: the loop.
-        others: how many other loops of each kind there are.
+        sender: the loop.
+        other_senders: how many other loops of each kind there are.
     """
-    before = [(*one, count) for one, count in others.items() if one.after_ns > -math.inf]
-    together = [(own.least_ns, own.sent_ns), *((d, c * count) for d, c, _, count in before)]
+    interfering = [(*kind, count) for kind, count in other_senders.items() if kind.after_ns > -math.inf]
+    together = [(sender.least_ns, sender.sent_ns), *((d, c * count) for d, c, _, count in interfering)]
     if sum(Fraction(c, d) for d, c in together) >= 1:
         return math.inf
-    longest_ns = max((one.sent_ns for one in others), default=0)
+    longest_ns = max((kind.sent_ns for kind in other_senders), default=0)
     busy_ns = _least(lambda t: longest_ns + sum(-(-t // d) * c for d, c in together))
-    begins = [(own.least_ns, 0)]
-    begins += [(d, int(after)) for d, _, after, _ in before if after < math.inf]
-    if sum((busy_ns + abs(after)) // d + 1 for d, after in begins) > _MOST_ARRIVALS:
+    begins = [(sender.least_ns, 0)]
+    begins += [(d, int(delta)) for d, _, delta, _ in interfering if delta < math.inf]
+    if sum((busy_ns + abs(delta)) // d + 1 for d, delta in begins) > _MOST_ARRIVALS:
         return math.inf
-    arrivals_ns = {a for d, after in begins for a in range(max(-after, -after % d), busy_ns, d)}
-    return max(_delay_ns(a, own, others) for a in arrivals_ns)
+    arrivals_ns = {a for d, delta in begins for a in range(max(-delta, -delta % d), busy_ns, d)}
+    return max(_delay_ns(a, sender, other_senders) for a in arrivals_ns)
 
 
-def _delay_ns(a: int, own: Sender, others: Mapping[Sender, int]) -> int:
+def _delay_ns(a: int, sender: Sender, other_senders: Mapping[Sender, int]) -> int:
     """Return the largest delay of a datagram that arrives at a."""
-    blocking_ns = max((one.sent_ns for one in others if a + one.after_ns < 0), default=0)
-    earlier_ns = blocking_ns + a // own.least_ns * own.sent_ns
-    kinds = [(*one, count) for one, count in others.items() if a + one.after_ns >= 0]
+    blocking_ns = max((kind.sent_ns for kind in other_senders if a + kind.after_ns < 0), default=0)
+    earlier_ns = blocking_ns + a // sender.least_ns * sender.sent_ns
+    kinds = [(*kind, count) for kind, count in other_senders.items() if a + kind.after_ns >= 0]
 
     def begin_ns(w: int) -> int:
-        return earlier_ns + sum(count * c * (1 + int(min(w, a + after)) // d) for d, c, after, count in kinds)
+        return earlier_ns + sum(count * c * (1 + int(min(w, a + delta)) // d) for d, c, delta, count in kinds)
 
-    return _least(begin_ns) + own.sent_ns - a
+    return _least(begin_ns) + sender.sent_ns - a
 
 
 def _least(step: Callable[[int], int]) -> int:

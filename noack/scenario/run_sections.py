@@ -80,9 +80,9 @@ class ScheduledChange(ScenarioSection):
 
     @field_validator("set")
     @classmethod
-    def _with_full_keys(cls, given: Table) -> Table:
-        settings = {full_key(name): value for name, value in given.items()}
-        if len(settings) < len(given):
+    def _with_full_keys(cls, entries: Table) -> Table:
+        settings = {full_key(name): value for name, value in entries.items()}
+        if len(settings) < len(entries):
             raise ValueError("a key is given twice, by its short name, too")
         return settings
 
@@ -121,14 +121,14 @@ class PortsSection(ScenarioSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        taken: dict[int, str] = {}
+        keys_by_port: dict[int, str] = {}
         for key in type(self).model_fields:
             port = getattr(self, key)
-            if port and port in taken:
+            if port and port in keys_by_port:
                 raise ValueError(
-                    f"{key}: port {port} is already given to {taken[port]}; take another, or 0 for any"
+                    f"{key}: port {port} is already given to {keys_by_port[port]}; take another, or 0 for any"
                 )
-            taken[port] = key
+            keys_by_port[port] = key
         return self
 
 
@@ -212,8 +212,8 @@ class LoopSection(ScenarioSection):
         for key in SHARED:
             if isinstance(content, dict) and key in content:
                 raise ValueError(f"{key}: all loops share it; set it at the top level")
-        named = content.get("scenario") if isinstance(content, dict) else None
-        if named is not None and not isinstance(named, str | dict):
+        scenario = content.get("scenario") if isinstance(content, dict) else None
+        if scenario is not None and not isinstance(scenario, str | dict):
             raise ValueError("scenario: should be the name of a scenario file, in quotes")
         return content
 

@@ -54,23 +54,23 @@ def trigger_parameters(trigger: PolicySettings) -> tuple[str, ...]:
 
 def require_runtime_parameters(settings: ReadTable, trigger: PolicySettings) -> None:
     """Raise ValueError unless all keys are runtime parameters; the message lists these."""
-    known = (LOSS, MANSD, CONSTRAINTS, *trigger_parameters(trigger), SETPOINT)
+    allowed = (LOSS, MANSD, CONSTRAINTS, *trigger_parameters(trigger), SETPOINT)
     for key, value in settings.items():
-        if key not in known and not key.startswith(f"{LOSS}."):
-            short = [name for name, full in SHORT.items() if full in (*known, _PROBABILITY)]
-            near = nearest_key(key, (*short, *known, _PROBABILITY))
-            hint = near and f"did you mean {near}?"
-            all_known = f"these can: {_list(known)} (for short: {', '.join(short)})"
+        if key not in allowed and not key.startswith(f"{LOSS}."):
+            short = [name for name, full in SHORT.items() if full in (*allowed, _PROBABILITY)]
+            nearest = nearest_key(key, (*short, *allowed, _PROBABILITY))
+            hint = nearest and f"did you mean {nearest}?"
+            all_known = f"these can: {_in_words(allowed)} (for short: {', '.join(short)})"
             raise ValueError(f"{key}: cannot be changed during a run; {hint or all_known}")
-        if _has(value, lambda one: one is None):
+        if _contains(value, lambda entry: entry is None):
             raise ValueError(f"{key}: needs a value")
 
 
 def require_finite(settings: ReadTable) -> None:
     """Raise CallerError if a value has a number that is not finite, which no message can carry."""
     for key, value in settings.items():
-        if _has(value, lambda one: isinstance(one, float) and not math.isfinite(one)):
-            raise CallerError(f"{key} = {_value(value)}: should be a finite number")
+        if _contains(value, lambda entry: isinstance(entry, float) and not math.isfinite(entry)):
+            raise CallerError(f"{key} = {_text(value)}: should be a finite number")
 
 
 def put_settings(content: Table, settings: ReadTable) -> None:
@@ -102,29 +102,31 @@ def is_of_loss_alone(settings: ReadTable) -> bool:
 
 def text_of(settings: ReadTable) -> str:
     """Return settings as text: ``network.mansd = 2, trigger.beta = 0.3``."""
-    return ", ".join(f"{key} = {_value(value)}" for key, value in sorted(settings.items()))
+    return ", ".join(f"{key} = {_text(value)}" for key, value in sorted(settings.items()))
 
 
-def _value(value: object) -> str:
+def _text(value: object) -> str:
     if isinstance(value, Mapping):
-        inner = ", ".join(f"{key} = {_value(one)}" for key, one in value.items())
+        inner = ", ".join(f"{key} = {_text(entry)}" for key, entry in value.items())
         return f"{{ {inner} }}"
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_value, value))}]"
+        return f"[{', '.join(map(_text, value))}]"
     if isinstance(value, int | float) and not isinstance(value, bool):
         return "…" if isinstance(value, int) and abs(value) > 10**300 else f"{value:g}"  # no float
     return json.dumps(value)
 
 
 def _is_number(annotation: object) -> bool:
-    kinds = [one for one in (get_args(annotation) or (annotation,)) if one is not NoneType]
+    kinds = [kind for kind in (get_args(annotation) or (annotation,)) if kind is not NoneType]
     return all(kind in (int, float) for kind in kinds)
 
 
-def _has(value: object, found: Callable[[object], bool]) -> bool:
+def _contains(value: object, matches: Callable[[object], bool]) -> bool:
     inner = [*value.values()] if isinstance(value, Mapping) else value
-    return any(_has(one, found) for one in inner) if isinstance(inner, list | tuple) else found(value)
+    if isinstance(inner, list | tuple):
+        return any(_contains(entry, matches) for entry in inner)
+    return matches(value)
 
 
-def _list(keys: tuple[str, ...]) -> str:
+def _in_words(keys: tuple[str, ...]) -> str:
     return f"{', '.join(keys[:-1])} and {keys[-1]}"

@@ -41,9 +41,9 @@ class Scenario(ScenarioTables):
     def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler, /) -> Table:
         """Return the JSON Schema; a scenario whose loops all have a file needs no tables of a loop."""
         schema = super().__get_pydantic_json_schema__(core_schema, handler)
-        whole = handler.resolve_ref_schema(schema)
-        whole["required"] = [key for key in whole["required"] if key not in LOOP_NEEDS]
-        whole["anyOf"] = [{"required": ["loops"]}, {"required": [*LOOP_NEEDS]}]
+        resolved_schema = handler.resolve_ref_schema(schema)
+        resolved_schema["required"] = [key for key in resolved_schema["required"] if key not in LOOP_NEEDS]
+        resolved_schema["anyOf"] = [{"required": ["loops"]}, {"required": [*LOOP_NEEDS]}]
         return schema
 
 
@@ -125,19 +125,19 @@ def with_loop_tables(
     entry sets itself, or that its scenario file has, are used.
     """
     sections = []
-    for place, section in enumerate(scenario.loops or ()):
+    for index, section in enumerate(scenario.loops or ()):
         update: Table = {}
         file = section.scenario if isinstance(section.scenario, dict) else {}
-        changed = change(f"loops.{place}", loop_scenario(scenario, section))
+        changed = change(f"loops.{index}", loop_scenario(scenario, section))
         for path, table in changed.items():
             part, _, inner = path.partition(".")
             content = table.content()
-            if (own := getattr(section, part)) is not None and (not inner or inner in own):
-                update[part] = own | {inner: content} if inner else content
+            if (entry_table := getattr(section, part)) is not None and (not inner or inner in entry_table):
+                update[part] = entry_table | {inner: content} if inner else content
             elif part in file:
-                given = file[part]
-                own = given | {inner: content} if inner and isinstance(given, dict) else content
-                update["scenario"] = file = {**file, part: own}
+                in_file = file[part]
+                new_table = in_file | {inner: content} if inner and isinstance(in_file, dict) else content
+                update["scenario"] = file = {**file, part: new_table}
         sections.append(section.model_copy(update=update))
     return scenario.model_copy(update={"loops": tuple(sections) or None})
 
@@ -155,11 +155,11 @@ def loop_scenario(scenario: Scenario, section: LoopSection) -> Scenario:
         loop = _with_parts(loop, section.scenario, PARTS, "scenario.")
     content: Table = {} if section.mode is None else {"mode": section.mode}
     for part, kinds in _KINDS.items():
-        if (given := getattr(section, part)) is None:
+        if (entry_table := getattr(section, part)) is None:
             continue
-        own = getattr(loop, part)
-        template = {} if own is None else own.content()
-        content[part] = given if any(kind in given for kind in kinds) else template | given
+        base_section = getattr(loop, part)
+        template = {} if base_section is None else base_section.content()
+        content[part] = entry_table if any(kind in entry_table for kind in kinds) else template | entry_table
     if content:
         loop = _with_parts(loop, content, content)
     if content or section.scenario is not None:
@@ -172,32 +172,32 @@ def _with_parts(scenario: Scenario, content: ReadTable, parts: Iterable[str], pl
     """Return a scenario with other parts; raise ValueError, after the place, if one is invalid."""
     model = parts_model(frozenset(parts))
     try:
-        found = model.model_validate_json(json.dumps(content))
+        validated = model.model_validate_json(json.dumps(content))
     except ValidationError as error:
         raise ValueError(place + explain(error, "", model)[0].removeprefix(": ")) from None
-    return scenario.model_copy(update={part: getattr(found, part) for part in parts})
+    return scenario.model_copy(update={part: getattr(validated, part) for part in parts})
 
 
 def check_loops(scenario: Scenario) -> None:
     """Raise ValueError unless the loops can run together; the message begins with the key."""
     names: dict[str, int] = {}
     has_program = False
-    for place, section in enumerate(scenario.loops or ()):
+    for index, section in enumerate(scenario.loops or ()):
         try:
             has_program |= loop_scenario(scenario, section).controller.is_program
         except ValueError as error:
-            raise ValueError(f"loops.{place}.{error}") from None
+            raise ValueError(f"loops.{index}.{error}") from None
         for name in section.names:
             if name in names:
                 raise ValueError(
-                    f"loops.{place}.name: the name {name} is already given by loops.{names[name]}"
+                    f"loops.{index}.name: the name {name} is already given by loops.{names[name]}"
                 )
-            names[name] = place
+            names[name] = index
         if len(names) > MOST_LOOPS:
-            raise ValueError(f"loops.{place}.count: a run has at most {MOST_LOOPS} loops")
+            raise ValueError(f"loops.{index}.count: a run has at most {MOST_LOOPS} loops")
         if has_program and len(names) > 1:
             raise ValueError(
-                f'loops.{place}: a run of several loops has no controller.kind = "program", whose '
+                f'loops.{index}: a run of several loops has no controller.kind = "program", whose '
                 'program has one loop; use "linear"'
             )
 
@@ -224,21 +224,21 @@ def _seeds(
         drawn += [dict(zip(drawn_names, values, strict=True)) for values in by_loop]
     all_seeds: list[SeedsSection] = []
     for section in sections:
-        given = section.seeds.model_dump(exclude_none=True)
-        own = drawn[len(all_seeds) : len(all_seeds) + section.count]
-        all_seeds += [seeds.model_copy(update=values | given) for values in own]
+        entry_seeds = section.seeds.model_dump(exclude_none=True)
+        drawn_seeds = drawn[len(all_seeds) : len(all_seeds) + section.count]
+        all_seeds += [seeds.model_copy(update=values | entry_seeds) for values in drawn_seeds]
     return all_seeds
 
 
 @cache
-def parts_model(parts: frozenset[str], *, others: bool = False) -> type[ScenarioSection]:
-    """Return a model of some of a scenario's parts; with ``others``, those are optional keys."""
+def parts_model(parts: frozenset[str], *, others_optional: bool = False) -> type[ScenarioSection]:
+    """Return a model of a scenario's parts; with ``others_optional`` the others are optional keys."""
     fields: dict[str, Any] = {}
     for name, field in Scenario.model_fields.items():
         kind: Any = field.annotation
         if name in parts:
             fields[name] = (kind, field)
-        elif others:
+        elif others_optional:
             fields[name] = (kind | None, None)
     model: type[ScenarioSection] = create_model("LoopParts", __base__=ScenarioSection, **fields)
     return model

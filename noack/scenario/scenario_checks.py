@@ -73,8 +73,8 @@ def check_kept_loss(scenario: ScenarioTables) -> None:
     """Raise ValueError if a loss rate cannot be kept; with a trace, as soon as it has been read."""
     network = scenario.network
     for key, section in network.directions.items():
-        losses = [getattr(one, "loss", None) for one in section.link.impairments]
-        if any(isinstance(one, TraceLoss) for one in losses):
+        losses = [getattr(impairment, "loss", None) for impairment in section.link.impairments]
+        if any(isinstance(loss, TraceLoss) for loss in losses):
             continue
         try:
             with_kept_loss(section.link)
@@ -115,18 +115,18 @@ def input_at(A: Matrix, B: Matrix, x_r: Vector) -> Vector:
     """
     drift = A @ x_r
     u_r = np.asarray(np.linalg.lstsq(B, -drift, rcond=None)[0], dtype=np.float64)
-    left = np.abs(drift + B @ u_r)
+    residual = np.abs(drift + B @ u_r)
     largest = max(float(np.abs(drift).max()), float(np.abs(A).max() * np.abs(x_r).max()))
-    if not x_r.any() or (np.isfinite(left).all() and left.max() <= _ROUNDING * largest):
+    if not x_r.any() or (np.isfinite(residual).all() and residual.max() <= _ROUNDING * largest):
         return u_r
     states = _equilibria(A, B)
     if not states.shape[1]:
         raise ValueError("no equilibrium of the model, which has none but 0: Âx + B̂u = 0")
     nearest = states @ (states.T @ x_r)
-    shown = ", ".join(f"{value:.12g}" for value in np.where(np.abs(nearest) < 1e-12, 0.0, nearest))
+    nearest_text = ", ".join(f"{value:.12g}" for value in np.where(np.abs(nearest) < 1e-12, 0.0, nearest))
     raise ValueError(
         f"no equilibrium of the model (Âx + B̂u = 0); those are a space of dimension "
-        f"{states.shape[1]}, and the nearest one is [{shown}]"
+        f"{states.shape[1]}, and the nearest one is [{nearest_text}]"
     )
 
 
@@ -139,28 +139,29 @@ def _equilibria(A: Matrix, B: Matrix) -> Matrix:
 
 
 def _check_plant(scenario: ScenarioTables) -> None:
-    (n, m), plant, why = scenario.model.dimensions, scenario.plant, _dimensions(scenario)
-    require_shape(plant.uncertainty_A, "plant.uncertainty_A", (n, n), why)
-    require_shape(plant.uncertainty_B, "plant.uncertainty_B", (n, m), why)
-    require_shape(plant.A, "plant.A", (n, n), why)
-    require_shape(plant.B, "plant.B", (n, m), why)
+    (n, m), plant, dimensions = scenario.model.dimensions, scenario.plant, _dimensions(scenario)
+    require_shape(plant.uncertainty_A, "plant.uncertainty_A", (n, n), dimensions)
+    require_shape(plant.uncertainty_B, "plant.uncertainty_B", (n, m), dimensions)
+    require_shape(plant.A, "plant.A", (n, n), dimensions)
+    require_shape(plant.B, "plant.B", (n, m), dimensions)
     for key in ("initial_state", "initial_state_halfwidth"):
         require_length(getattr(plant, key), f"plant.{key}", n, "one per state")
     plant.system.check(n, m)
     _check_disturbances(scenario)
-    plant.measurement.check(n, why)
+    plant.measurement.check(n, dimensions)
 
 
 def _check_disturbances(scenario: ScenarioTables) -> None:
     n, m = scenario.model.dimensions
-    for number, one in enumerate(scenario.plant.disturbances):
+    for number, disturbance in enumerate(scenario.plant.disturbances):
         place = f"plant.disturbances.{number}"
-        if one.at == "state" and not scenario.coverage.is_linear:
+        if disturbance.at == "state" and not scenario.coverage.is_linear:
             raise ValueError(
                 f'{place}.at: "state" needs a linear plant; this one can be disturbed at "input"'
             )
-        size, why = (m, "one per input") if one.at == "input" else (n, "one per state")
-        require_length(one.entries, f"{place}.{one.entries_key}", size, f'at = "{one.at}": {why}')
+        size, reason = (m, "one per input") if disturbance.at == "input" else (n, "one per state")
+        key = f"{place}.{disturbance.entries_key}"
+        require_length(disturbance.entries, key, size, f'at = "{disturbance.at}": {reason}')
 
 
 def _check_program(scenario: ScenarioTables) -> None:
@@ -212,9 +213,9 @@ def _check_watchdog(scenario: ScenarioTables) -> None:
         return
     predictive = scenario.message_sizes.is_predictive
     if (predictions := scenario.controller.predictions) > 1:
-        more = f" and {n} of x_c" if predictive else ""
+        state_text = f" and {n} of x_c" if predictive else ""
         raise ValueError(
-            f"controller.predictions: an actuation carries {predictions} x {m} inputs{more}; "
+            f"controller.predictions: an actuation carries {predictions} x {m} inputs{state_text}; "
             f"at most {MAX_DIMENSION} numbers fit"
         )
     raise ValueError(
@@ -230,17 +231,17 @@ def _dimensions(scenario: ScenarioTables) -> str:
 
 def check_changes(scenario: ScenarioTables) -> None:
     """Raise ValueError if a scheduled change is not possible, or the changes are not in order."""
-    for (place, one), (_, other) in pairwise(enumerate(scenario.changes)):
-        if other.at_s < one.at_s:
-            raise ValueError(f"changes.{place + 1}.at_s: earlier than the change before it")
+    for (index, earlier), (_, later) in pairwise(enumerate(scenario.changes)):
+        if later.at_s < earlier.at_s:
+            raise ValueError(f"changes.{index + 1}.at_s: earlier than the change before it")
     changed = scenario
-    for place, change in enumerate(scenario.changes):
+    for index, change in enumerate(scenario.changes):
         if change.at_ns >= scenario.timing.horizon_ns:
-            raise ValueError(f"changes.{place}.at_s: the run ends at {scenario.horizon_s:g} s")
+            raise ValueError(f"changes.{index}.at_s: the run ends at {scenario.horizon_s:g} s")
         try:
             changed = with_settings(changed, change.set)
         except ValueError as error:
-            raise ValueError(f"changes.{place}.set: {str(error).splitlines()[0]}") from None
+            raise ValueError(f"changes.{index}.set: {str(error).splitlines()[0]}") from None
 
 
 def prepare_changes() -> None:
@@ -268,18 +269,18 @@ def with_settings(scenario: S, settings: ReadTable) -> S:
         content["network"] = {"loss": loss} if changes_loss else {}
     put_settings(content, settings)
     try:
-        given = _Change.model_validate_json(json.dumps(content))
+        change = _Change.model_validate_json(json.dumps(content))
     except ValidationError as error:
         lines = (line.removeprefix(": ") for line in explain(error, "", _Change))
         raise ValueError("\n".join(lines)) from None
-    update = {name: getattr(given, name) for name in sections}
-    if given.network is not None:
-        if isinstance(given.network.loss, TraceLoss):
+    update = {name: getattr(change, name) for name in sections}
+    if change.network is not None:
+        if isinstance(change.network.loss, TraceLoss):
             raise ValueError(
                 "network.loss.model: a trace is read before a run begins; give its losses as "
                 '{ model = "scripted", lost = [...] }'
             )
-        keys = {name: getattr(given.network, name) for name in given.network.model_fields_set}
+        keys = {name: getattr(change.network, name) for name in change.network.model_fields_set}
         network = update["network"] = scenario.network.model_copy(update=keys)
         require_consistent(network.mansd, network.constraints)
         require_scores(network.impairments, network.loss)

@@ -47,14 +47,14 @@ def load(path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.
         CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
     """
     content = toml_file.read(path, Scenario, most_bytes)
-    given = [*overrides]
-    keys = [_apply(content, override) for override in given]
+    assignments = [*overrides]
+    keys = [_apply(content, override) for override in assignments]
     try:
         return completed(content, path)
     except CallerError as error:
         lines = str(error)
-        for key, override in zip(keys, given, strict=True):
-            lines = _of_another_kind(lines, path, key, override.partition("=")[2])
+        for key, override in zip(keys, assignments, strict=True):
+            lines = _explain_kind(lines, path, key, override.partition("=")[2])
         raise CallerError(_attributed(lines, path, keys) if keys else lines) from None
 
 
@@ -79,7 +79,7 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     network = scenario.network
     update: dict[str, object] = {}
     for place, section in network.directions.items():
-        read = _read(section, path.parent, f"{source}: {place}")
+        read = _without_files(section, path.parent, f"{source}: {place}")
         _, _, key = place.partition(".")
         update |= {key: section.model_copy(update=read)} if key else read
     scenario = scenario.model_copy(update={"network": network.model_copy(update=update)})
@@ -88,17 +88,17 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     except ValueError as error:
         raise CallerError(f"{source}: {error}") from None
 
-    def tables(within: str, one: Scenario) -> dict[str, FileSettings]:
+    def tables(within: str, loop: Scenario) -> dict[str, FileSettings]:
         return {
             place: located(table, path.parent, f"{source}: {within}{place}")
-            for place, table in file_tables(one)
+            for place, table in file_tables(loop)
         }
 
     scenario = with_tables(scenario, tables("", scenario))
-    return with_loop_tables(scenario, lambda place, one: tables(f"{place}.", one))
+    return with_loop_tables(scenario, lambda place, loop: tables(f"{place}.", loop))
 
 
-def _read(section: DirectionSection, folder: Path, place: str) -> Table:
+def _without_files(section: DirectionSection, folder: Path, place: str) -> Table:
     impairments = tuple(
         impairment.without_files(folder, f"{place}.impairments.{number}")
         for number, impairment in enumerate(section.impairments)
@@ -115,32 +115,32 @@ def with_named_scenarios(content: ReadTable, folder: Path, source: str) -> ReadT
     """
     if not isinstance(loops := content.get("loops"), list):
         return content
-    read = []
-    for place, entry in enumerate(loops):
+    entries = []
+    for index, entry in enumerate(loops):
         tables = {}
         if isinstance(entry, dict) and isinstance(name := entry.get("scenario"), str):
-            named = printable(f'{source}: loops.{place}.scenario = "{name}"')
-            tables = {"scenario": _loop_tables(_path(name, folder, named), named)}
-        read.append(entry | tables if tables else entry)
-    files = [entry["scenario"] for entry in read if isinstance(entry, dict) and "scenario" in entry]
-    if len(files) == len(read) and content.keys().isdisjoint(LOOP_NEEDS):
+            setting = printable(f'{source}: loops.{index}.scenario = "{name}"')
+            tables = {"scenario": _loop_tables(_path(name, folder, setting), setting)}
+        entries.append(entry | tables if tables else entry)
+    files = [entry["scenario"] for entry in entries if isinstance(entry, dict) and "scenario" in entry]
+    if len(files) == len(entries) and content.keys().isdisjoint(LOOP_NEEDS):
         content = {**next(filter(None, files), {}), **content}
-    return {**content, "loops": read}
+    return {**content, "loops": entries}
 
 
-def _loop_tables(path: Path, named: str) -> Table:
-    """Return the tables of a loop's file, which the setting ``named`` names."""
+def _loop_tables(path: Path, setting: str) -> Table:
+    """Return the tables of a loop's file, which the key ``setting`` names."""
     content = toml_file.read(path, Scenario)
     if content.get("loops"):
-        raise CallerError(f"{named}: that file has loops itself; name a file of one loop")
-    whole = with_matrices(content, path.parent, str(path))
-    file = toml_file.validated(parts_model(frozenset(PARTS), others=True), whole, str(path))
-    tables = {where: located(table, path.parent, f"{path}: {where}") for where, table in file_tables(file)}
+        raise CallerError(f"{setting}: that file has loops itself; name a file of one loop")
+    filled = with_matrices(content, path.parent, str(path))
+    file = toml_file.validated(parts_model(frozenset(PARTS), others_optional=True), filled, str(path))
+    tables = {place: located(table, path.parent, f"{path}: {place}") for place, table in file_tables(file)}
     parts = set(PARTS)
     return with_tables(file, tables).model_dump(mode="json", exclude_none=True, include=parts)
 
 
-def _path(name: str, folder: Path, named: str) -> Path:
+def _path(name: str, folder: Path, setting: str) -> Path:
     """Return the path of a file, or of the shipped scenario of that name."""
     shipped = {file.stem: file for file in shipped_folder("scenarios").glob("*.toml")}
     with suppress(OSError, ValueError):  # too long, or with a zero byte
@@ -150,7 +150,7 @@ def _path(name: str, folder: Path, named: str) -> Path:
         return shipped[name]
     names = [*sorted(shipped), *sorted(file.name for file in folder.glob("*.toml"))]
     hint = did_you_mean(name, names) or "`noack scenarios` lists the shipped ones"
-    raise CallerError(f"{named}: no such file, nor a shipped scenario; {hint}")
+    raise CallerError(f"{setting}: no such file, nor a shipped scenario; {hint}")
 
 
 def dumps(scenario: Scenario) -> str:
@@ -164,7 +164,7 @@ def toml_text(content: ReadTable) -> str:
     return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
 
 
-def _of_another_kind(lines: str, path: Path, key: str, value: str) -> str:
+def _explain_kind(lines: str, path: Path, key: str, value: str) -> str:
     """Make one line of all mistakes that arise because only the kind of a table was set."""
     table, _, kind = key.rpartition(".")
     value, start = value.strip().strip("\"'"), re.escape(printable(f"{path}: {table}."))
@@ -172,13 +172,13 @@ def _of_another_kind(lines: str, path: Path, key: str, value: str) -> str:
     if kind not in ("kind", "model", "policy") or not unknown:
         return lines
     missing = re.findall(rf"^{start}(\w+): missing.*", lines, re.MULTILINE)
-    others = re.sub(rf"^{start}\w+(: missing| = .*: unknown key; ).*\n?", "", lines, flags=re.MULTILINE)
-    needed = "".join(f", {one}=..." for one in missing)
+    other_lines = re.sub(rf"^{start}\w+(: missing| = .*: unknown key; ).*\n?", "", lines, flags=re.MULTILINE)
+    assignments = "".join(f", {name}=..." for name in missing)
     line = (
         f"--set {table}.{kind} = {value}: the file has {', '.join(unknown)} of another {kind}; "
-        f"set the table: --set '{table}={{{kind}=\"{value}\"{needed}}}'"
+        f"set the table: --set '{table}={{{kind}=\"{value}\"{assignments}}}'"
     )
-    return "\n".join([line, *others.splitlines()])
+    return "\n".join([line, *other_lines.splitlines()])
 
 
 def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
@@ -190,13 +190,13 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
     names = [shortened(key) for key in keys]
 
     def attributed(line: re.Match[str]) -> str:
-        what, _, hint = line["rest"].rpartition(": unknown key; ")
+        assignment, _, hint = line["rest"].rpartition(": unknown key; ")
         for name in names:  # an unknown section: the whole name may be similar to a key
             section, dot, _ = name.partition(".")
-            if what.startswith(f"{section} = "):
-                near = nearest_key(name, (*SHORT, *known_keys(Scenario)))
-                hint = f"did you mean {near}?" if near else hint
-                return f"--set {name if dot else what}: unknown key; {hint}"
+            if assignment.startswith(f"{section} = "):
+                nearest_name = nearest_key(name, (*SHORT, *known_keys(Scenario)))
+                hint = f"did you mean {nearest_name}?" if nearest_name else hint
+                return f"--set {name if dot else assignment}: unknown key; {hint}"
         if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):
             return f"--set {line['rest']}"
         if not is_valid_alone:
@@ -222,8 +222,8 @@ def setting_of(override: str, example: str = "trigger.beta=0.3") -> tuple[str, o
     """Return key and value of ``--set KEY=VALUE``; raise CallerError if it is written otherwise."""
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
-        shown = shortened(printable(override))
-        raise CallerError(f"--set {shown}: write it as key=value, e.g. {example}")
+        excerpt = shortened(printable(override))
+        raise CallerError(f"--set {excerpt}: write it as key=value, e.g. {example}")
     return key.strip(), value_of(text, f"--set {key}")
 
 
@@ -257,12 +257,12 @@ def put(content: Table, key: str, value: object, source: str) -> None:
         if isinstance(table, dict):
             table = table.setdefault(part, {})
         else:
-            entries, number = _entry(table, part, f"{source}: {'.'.join(path[:depth])}")
+            entries, number = _list_entry(table, part, f"{source}: {'.'.join(path[:depth])}")
             table = entries[number]
     if isinstance(table, dict):
         table[last] = copy.deepcopy(value)
     else:
-        entries, number = _entry(table, last, f"{source}: {'.'.join(path)}")
+        entries, number = _list_entry(table, last, f"{source}: {'.'.join(path)}")
         entries[number] = copy.deepcopy(value)
 
 
@@ -279,7 +279,7 @@ def remove(content: Table, key: str) -> None:
         table.pop(last, None)
 
 
-def _entry(table: object, part: str, source: str) -> tuple[list[object], int]:
+def _list_entry(table: object, part: str, source: str) -> tuple[list[object], int]:
     """Return a list and the number of its entry that a part of a key names."""
     if not isinstance(table, list):
         raise CallerError(printable(f"{source} is not a table"))

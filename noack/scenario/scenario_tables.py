@@ -84,12 +84,15 @@ class ScenarioTables(ScenarioSection):
             ("scenario", self.name + (f": {self.description}" if self.description else "")),
             ("mode", "model-based" if self.mode == "model" else "zero-order hold"),
             ("plant", f"{self.plant.system.kind}, n = {n}, m = {m}, {self.plant.rate_hz:g} Hz"),
-            ("trigger", _said(self.trigger, "policy")),
-            ("network", f"{_said(self.network.loss, 'model')}; M − 1 = {self.network.mansd}"),
+            ("trigger", _section_text(self.trigger, "policy")),
+            ("network", f"{_section_text(self.network.loss, 'model')}; M − 1 = {self.network.mansd}"),
             ("horizon", f"{self.horizon_s:g} s"),
         ]
         if self.loops:
-            loops = (one.name if one.count == 1 else f"{one.count} x {one.name}" for one in self.loops)
+            loops = (
+                section.name if section.count == 1 else f"{section.count} x {section.name}"
+                for section in self.loops
+            )
             rows.append(("loops", ", ".join(loops)))
         return rows
 
@@ -136,10 +139,10 @@ class ScenarioTables(ScenarioSection):
         return PROTOCOLS[self.network.protocol]
 
 
-def _said(section: ScenarioSection, kind: str) -> str:
+def _section_text(section: ScenarioSection, kind: str) -> str:
     """Describe a section by its kind, and its values that differ from the defaults."""
-    given = section.model_dump(mode="json", exclude_defaults=True, exclude={kind})
-    values = (f"{key} = {'…' if isinstance(value, dict | list) else value}" for key, value in given.items())
+    changed = section.model_dump(mode="json", exclude_defaults=True, exclude={kind})
+    values = (f"{key} = {'…' if isinstance(value, dict | list) else value}" for key, value in changed.items())
     return ", ".join((getattr(section, kind), *values))
 
 
@@ -361,12 +364,12 @@ class TheoryCoverage:
     def _beyond_linear(self) -> str | None:
         """The first setting besides the trigger with which the loop is not ẋ = A x + B K x_c."""
         scenario = self.scenario
-        if (why := self._beyond_certificates) is not None:
-            return why
+        if (reason := self._beyond_certificates) is not None:
+            return reason
         if scenario.network.actuation is not None:
             return "network.actuation: actuations may be lost or late"
         if scenario.plant.disturbances:
-            kinds = ", ".join(one.kind for one in scenario.plant.disturbances)
+            kinds = ", ".join(disturbance.kind for disturbance in scenario.plant.disturbances)
             return f"plant.disturbances ({kinds}): the plant is disturbed"
         if scenario.observer is not None:
             return f'observer.kind = "{scenario.observer.kind}": the state is estimated'
@@ -398,15 +401,15 @@ class TheoryCoverage:
 
     def require_certifiable(self) -> None:
         """Raise CallerError if no certificate covers the scenario."""
-        if (why := self.beyond_theory) is not None:
-            raise CallerError(f"{why}; no certificate covers this")
+        if (reason := self.beyond_theory) is not None:
+            raise CallerError(f"{reason}; no certificate covers this")
 
     def require_exact(self) -> None:
         """Raise CallerError if exact simulation does not cover the scenario."""
-        if (why := self._beyond_linear) is not None:
+        if (reason := self._beyond_linear) is not None:
             raise CallerError(
-                f"{why}; this needs a linear plant with u = K x_c, without acknowledgements, "
+                f"{reason}; this needs a linear plant with u = K x_c, without acknowledgements, "
                 "lost actuations, disturbances, noise and observer"
             )
-        if (why := self.scenario.trigger.beyond_exact) is not None:
-            raise CallerError(why)
+        if (reason := self.scenario.trigger.beyond_exact) is not None:
+            raise CallerError(reason)

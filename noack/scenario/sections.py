@@ -111,23 +111,23 @@ class ModelSection(ScenarioSection):
         return self
 
     def _require_stable(self) -> None:
-        (A, B), own = self.matrices, self.gain is None  # a named model's own gain
-        K = self.named.K if own else np.array(self.gain)
-        key = "parameters" if own else "gain"
+        (A, B), uses_named_gain = self.matrices, self.gain is None  # a named model's own gain
+        K = self.named.K if uses_named_gain else np.array(self.gain)
+        key = "parameters" if uses_named_gain else "gain"
         if not np.isfinite(_closed_loop(A, B, K)).all():
             raise ValueError(f"{key}: A + BK has infinite entries; check the units of A, B and K")
-        if not self.allow_unstable and (why := instability(A, B, K)) is not None:
+        if not self.allow_unstable and (reason := instability(A, B, K)) is not None:
             raise ValueError(
-                f"{key}: {why}; to run the unstable loop anyway, set model.allow_unstable = true"
+                f"{key}: {reason}; to run the unstable loop anyway, set model.allow_unstable = true"
             )
 
     def _check_named(self, name: str) -> None:
         if self.A is not None or self.B is not None:
             raise ValueError("name: a named model has its own A and B; give one or the other")
-        known = parameters_of(name)
+        names = parameters_of(name)
         for key in self.parameters:
-            if key not in known:
-                raise ValueError(f"parameters.{key}: {name} has no such parameter; it has {', '.join(known)}")
+            if key not in names:
+                raise ValueError(f"parameters.{key}: {name} has no such parameter; it has {', '.join(names)}")
         if not all(np.isfinite(matrix).all() for matrix in self.named[:3]):
             raise ValueError("parameters: these give matrices with infinite entries")
 
@@ -235,8 +235,8 @@ class MeasurementSection(ScenarioSection):
 
     def noise(self, n: int) -> tuple[Vector, Vector]:
         """Standard deviations of the normal part of v, bounds of the uniform part, (p,) each."""
-        p, given = self.outputs(n), (self.noise_std, self.noise_bound)
-        std, bound = (np.zeros(p) if row is None else np.array(row) for row in given)
+        p, rows = self.outputs(n), (self.noise_std, self.noise_bound)
+        std, bound = (np.zeros(p) if row is None else np.array(row) for row in rows)
         return std, bound
 
     def variance(self, n: int) -> Vector:
@@ -244,10 +244,10 @@ class MeasurementSection(ScenarioSection):
         std, bound = self.noise(n)
         return std**2 + bound**2 / 3
 
-    def check(self, n: int, why: str) -> None:
+    def check(self, n: int, reason: str) -> None:
         """Raise ValueError, with the key, unless the shapes fit a model of n states."""
         place, p = "plant.measurement", self.outputs(n)
-        require_shape(self.C, f"{place}.C", (p, n), f"{why}; one row per output")
+        require_shape(self.C, f"{place}.C", (p, n), f"{reason}; one row per output")
         for key in ("noise_std", "noise_bound"):
             require_length(getattr(self, key), f"{place}.{key}", p, "one per measured output")
 
@@ -318,11 +318,11 @@ class PlantSection(ScenarioSection):
     def noise_variances(self, n: int, m: int) -> NoiseVariances:
         """Variances of the random disturbances and of the measurement noise."""
 
-        def at(place: Place, size: int) -> Vector:
-            variances = [one.variance for one in self.disturbances if one.at == place]
+        def variance_at(place: Place, size: int) -> Vector:
+            variances = [disturbance.variance for disturbance in self.disturbances if disturbance.at == place]
             return np.asarray(np.sum([np.zeros(size), *variances], axis=0))
 
-        return NoiseVariances(at("state", n), at("input", m), self.measurement.variance(n))
+        return NoiseVariances(variance_at("state", n), variance_at("input", m), self.measurement.variance(n))
 
 
 class DirectionSection(ScenarioSection):
@@ -408,8 +408,8 @@ class NetworkSection(DirectionSection):
         for name in ("acknowledgements", "actuation"):
             direction: DirectionSection | None = getattr(self, name)
             if direction is not None and direction.link.reads_errors:
-                why = "only updates report the error that maximum_error needs; take another discipline"
-                raise ValueError(f"{name}.impairments: {why}")
+                reason = "only updates report the error that maximum_error needs; take another discipline"
+                raise ValueError(f"{name}.impairments: {reason}")
         return self
 
     @property
@@ -435,8 +435,8 @@ class NetworkSection(DirectionSection):
     @property
     def directions(self) -> Mapping[str, DirectionSection]:
         """The tables of the directions that are given, by their keys in the scenario."""
-        given = {"": self, ".acknowledgements": self.acknowledgements, ".actuation": self.actuation}
-        return {f"network{key}": one for key, one in given.items() if one is not None}
+        sections = {"": self, ".acknowledgements": self.acknowledgements, ".actuation": self.actuation}
+        return {f"network{key}": section for key, section in sections.items() if section is not None}
 
     @property
     def reverse(self) -> AcknowledgementSection:

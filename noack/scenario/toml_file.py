@@ -78,8 +78,8 @@ def parsed(text: str, source: str) -> Table:
     Raises:
         CallerError: the text is not TOML, or a key in it has too many parts.
     """
-    bare = _STRING.sub(lambda found: "" if found["comment"] else "_", text)
-    if _LONG_KEY.search(bare):
+    masked = _STRING.sub(lambda match: "" if match["comment"] else "_", text)
+    if _LONG_KEY.search(masked):
         raise CallerError(f"{source}: a key has more than {MOST_LEVELS} parts")
     try:
         return tomllib.loads(text)
@@ -118,53 +118,53 @@ def _is_deeper(value: object, levels: int) -> bool:
     if not isinstance(value, dict | list | tuple):
         return False
     inner = value.values() if isinstance(value, dict) else value
-    return levels == 0 or any(_is_deeper(one, levels - 1) for one in inner)
+    return levels == 0 or any(_is_deeper(entry, levels - 1) for entry in inner)
 
 
 def _missing(path: Path, model: type[ScenarioSection]) -> str:
-    needed = {name for name, field in model.model_fields.items() if field.is_required()}
-    others = []
-    for other in sorted(path.parent.glob("*.toml"))[:_MOST_LOOKED_AT]:
+    required_keys = {name for name, field in model.model_fields.items() if field.is_required()}
+    candidates = []
+    for file in sorted(path.parent.glob("*.toml"))[:_MOST_LOOKED_AT]:
         with suppress(CallerError):
-            if needed <= read(other).keys():
-                others.append(str(other))
-    near = did_you_mean(str(path), others)
-    return f"{path}: no such file" + (f"; {near}" if near else "")
+            if required_keys <= read(file).keys():
+                candidates.append(str(file))
+    hint = did_you_mean(str(path), candidates)
+    return f"{path}: no such file" + (f"; {hint}" if hint else "")
 
 
 def _defined_twice(text: str, error: str) -> str | None:
     """Return which key is defined twice, and in which lines; None if the error is another one."""
-    found = _TWICE.match(error)
-    if found is None:
+    match = _TWICE.match(error)
+    if match is None:
         return None
-    keys = _keys_of_lines(text, int(found["line"] or text.count("\n") + 1))
+    keys = _keys_of_lines(text, int(match["line"] or text.count("\n") + 1))
     line, key = keys.pop()
-    if (inner := found["inner"]) is not None:
+    if (inner := match["inner"]) is not None:
         return f"line {line}: {shortened(f'{key}.{inner}')} is defined twice"
-    before = [one for one, other in keys if other == key] or [
-        one for one, other in keys if key.startswith(f"{other}.") or other.startswith(f"{key}.")
+    earlier = [number for number, other in keys if other == key] or [
+        number for number, other in keys if key.startswith(f"{other}.") or other.startswith(f"{key}.")
     ]
-    where = f"already defined in line {before[-1]}" if before else "a table with a key twice"
-    return f"line {line}: {shortened(key)} is {where}"
+    status = f"already defined in line {earlier[-1]}" if earlier else "a table with a key twice"
+    return f"line {line}: {shortened(key)} is {status}"
 
 
 def _keys_of_lines(text: str, last: int) -> list[tuple[int, str]]:
     """Return line and full key of each key and table that begins in the lines up to the last."""
 
-    def hidden(found: re.Match[str]) -> str:
-        return re.sub(r"[^\n]", " " if found["comment"] else "_", found[0])
+    def hidden(match: re.Match[str]) -> str:
+        return re.sub(r"[^\n]", " " if match["comment"] else "_", match[0])
 
     keys, table, depth = list[tuple[int, str]](), "", 0
     lines = zip(text.split("\n"), _STRING.sub(hidden, text).split("\n"), strict=True)
-    for number, (line, bare) in enumerate(list(lines)[:last], 1):
-        header = _TABLE.match(bare) if depth == 0 else None
+    for number, (line, masked) in enumerate(list(lines)[:last], 1):
+        header = _TABLE.match(masked) if depth == 0 else None
         if header is not None:
             table = _plain(line[slice(*header.span(1))])
             keys.append((number, table))
-        elif depth == 0 and "=" in bare:
-            key = _plain(line[: bare.index("=")])
+        elif depth == 0 and "=" in masked:
+            key = _plain(line[: masked.index("=")])
             keys.append((number, f"{table}.{key}" if table else key))
-        depth += sum(map(bare.count, "[{")) - sum(map(bare.count, "]}"))
+        depth += sum(map(masked.count, "[{")) - sum(map(masked.count, "]}"))
     return keys
 
 
@@ -210,24 +210,24 @@ def explain(error: ValidationError, source: str, root: type[ScenarioSection]) ->
     """
     mistakes = error.errors(include_url=False)
     places = [mistake["loc"] for mistake in mistakes]
-    shown = [
+    lines = [
         printable(f"{source}: {_explain(mistake, root)}")
         for mistake in mistakes[:_MOST_LINES]
         if not (mistake["type"] == "too_short" and _has_inner(mistake["loc"], places))
     ]
-    more = len(mistakes) - _MOST_LINES
-    return [*shown, printable(f"{source}: {more} more mistakes")] if more > 0 else shown
+    surplus = len(mistakes) - _MOST_LINES
+    return [*lines, printable(f"{source}: {surplus} more mistakes")] if surplus > 0 else lines
 
 
-def nearest_key(key: str, known: Iterable[str]) -> str | None:
+def nearest_key(key: str, known_keys: Iterable[str]) -> str | None:
     """Return the known key most similar to a key, as a whole or in its last part, if one is."""
 
-    def similarity(one: str) -> tuple[float, float]:
-        pairs = (key, one), (key.rpartition(".")[2], one.rpartition(".")[2])
-        whole, last = (difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
-        return max(whole, last), whole
+    def similarity(known_key: str) -> tuple[float, float]:
+        pairs = (key, known_key), (key.rpartition(".")[2], known_key.rpartition(".")[2])
+        whole_ratio, last_ratio = (difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+        return max(whole_ratio, last_ratio), whole_ratio
 
-    best = max(known, key=similarity, default="")
+    best = max(known_keys, key=similarity, default="")
     return best if similarity(best)[0] >= _SIMILAR else None
 
 
@@ -238,9 +238,9 @@ def keys(section: type[BaseModel]) -> list[str]:
 
 def _keys(section: type[BaseModel], prefix: str, within: tuple[type[BaseModel], ...]) -> Iterator[str]:
     for name, field in section.model_fields.items():
-        inner = [one for one in sections_of(field.annotation) if one not in within]
-        for one in inner:  # a trigger may contain another
-            yield from _keys(one, f"{prefix}{name}.", (*within, *inner))
+        inner = [table for table in sections_of(field.annotation) if table not in within]
+        for table in inner:  # a trigger may contain another
+            yield from _keys(table, f"{prefix}{name}.", (*within, *inner))
         if not inner:
             yield f"{prefix}{name}"
 
@@ -255,34 +255,34 @@ def brief(error: ValidationError) -> str:
 
 def _has_inner(place: Sequence[str | int], places: Iterable[Sequence[str | int]]) -> bool:
     """Whether an entry of this list is itself wrong, so that the list seems too short."""
-    return any(len(other) > len(place) and other[: len(place)] == place for other in places)
+    return any(len(other_place) > len(place) and other_place[: len(place)] == place for other_place in places)
 
 
 def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
-    at = _locate(mistake["loc"], root)
-    key = shortened(".".join(map(str, at.path)))
+    place = _locate(mistake["loc"], root)
+    key = shortened(".".join(map(str, place.path)))
     value, kind = mistake["input"], mistake["type"]
-    shown = f"{key} = {show_value(value)}"
+    assignment = f"{key} = {show_value(value)}"
     if kind == "missing":
-        return f"{key}: missing{_purpose(at.section, str(at.path[-1]))}"
+        return f"{key}: missing{_purpose(place.section, str(place.path[-1]))}"
     if kind == "extra_forbidden":
-        return f"{shown}: unknown key; {_nearest(str(at.path[-1]), at.section)}"
+        return f"{assignment}: unknown key; {_nearest(str(place.path[-1]), place.section)}"
     if kind == "value_error":
         return _own_check(key, value, str(mistake["ctx"]["error"]))
     chosen = kind in ("union_tag_invalid", "union_tag_not_found")
     if chosen and isinstance(value, Mapping):
-        return _choice(key, value, at)
+        return _choice(key, value, place)
     if chosen or kind in ("model_type", "model_attributes_type", "dict_type"):
-        return f"{shown}: should be a table{_table_example(value, at)}"
+        return f"{assignment}: should be a table{_table_example(value, place)}"
     if kind == "too_short":
         least = mistake["ctx"]["min_length"]
-        return f"{shown}: needs at least {'one entry' if least == 1 else f'{least} entries'}"
+        return f"{assignment}: needs at least {'one entry' if least == 1 else f'{least} entries'}"
     if kind == "string_pattern_mismatch" and mistake["ctx"]["pattern"] in _PATTERNS:
-        return f"{shown}: {_PATTERNS[mistake['ctx']['pattern']]}"
+        return f"{assignment}: {_PATTERNS[mistake['ctx']['pattern']]}"
     if kind == "tuple_type":
-        return f"{shown}: {_LISTS.get(_entry_of(at), 'should be a list of tables')}"
+        return f"{assignment}: {_LISTS.get(_entry_of(place), 'should be a list of tables')}"
     message = mistake["msg"].replace("Input should", "should")
-    return f"{shown}: {message[0].lower() + message[1:]}{_share(value, at)}"
+    return f"{assignment}: {message[0].lower() + message[1:]}{_share(value, place)}"
 
 
 class _Place(NamedTuple):
@@ -307,12 +307,12 @@ def _locate(place: Sequence[str | int], root: type[ScenarioSection]) -> _Place:
             kind = choices[str(part)]
             continue
         path.append(part)
-        kind, section = _within(kind, part)
+        kind, section = _entry_kind(kind, part)
         alternatives = _choices(kind)
     return _Place(path, section, *alternatives, kind)
 
 
-def _within(kind: Kind, part: str | int) -> tuple[Kind, type[ScenarioSection] | None]:
+def _entry_kind(kind: Kind, part: str | int) -> tuple[Kind, type[ScenarioSection] | None]:
     """Return the annotation of an entry of ``kind``, and the section that contains the entry."""
     section = _section_of(kind)
     if section is not None:
@@ -322,20 +322,20 @@ def _within(kind: Kind, part: str | int) -> tuple[Kind, type[ScenarioSection] | 
     return (entries[0] if isinstance(part, int) and entries else None), None
 
 
-def _entry_of(at: _Place) -> Kind:
+def _entry_of(place: _Place) -> Kind:
     """Return the entry type of the expected list; for an entry of a row, ``tuple``."""
-    lists = [one for one in _alternatives(at.kind) if get_origin(one) is tuple]
-    if isinstance(at.path[-1], int) or not lists:
+    lists = [alternative for alternative in _alternatives(place.kind) if get_origin(alternative) is tuple]
+    if isinstance(place.path[-1], int) or not lists:
         return tuple
     entry = _alternatives(get_args(lists[0])[0])[0]
     return get_origin(entry) or entry
 
 
-def _share(value: object, at: _Place) -> str:
+def _share(value: object, place: _Place) -> str:
     """Suggest a share if a percentage was given for a number that is at most 1."""
-    field = at.section.model_fields.get(str(at.path[-1])) if at.section and at.path else None
+    field = place.section.model_fields.get(str(place.path[-1])) if place.section and place.path else None
     limits = [] if field is None else [*field.metadata, *_metadata(field.annotation)]
-    if not any(1 in (getattr(one, "le", None), getattr(one, "lt", None)) for one in limits):
+    if not any(1 in (getattr(limit, "le", None), getattr(limit, "lt", None)) for limit in limits):
         return ""
     percent = _PERCENT.fullmatch(value) if isinstance(value, str) else None
     if percent is not None:
@@ -347,8 +347,8 @@ def _share(value: object, at: _Place) -> str:
 
 def _metadata(kind: Kind) -> list[Kind]:
     """Return the metadata of an annotation's alternatives, e.g. that they are at most 1."""
-    found = [one for inner in get_args(kind) for one in getattr(inner, "__metadata__", ())]
-    return [one for entry in found for one in getattr(entry, "metadata", (entry,))]
+    metadata = [extra for inner in get_args(kind) for extra in getattr(inner, "__metadata__", ())]
+    return [constraint for entry in metadata for constraint in getattr(entry, "metadata", (entry,))]
 
 
 def _alternatives(kind: Kind) -> list[Kind]:
@@ -356,14 +356,14 @@ def _alternatives(kind: Kind) -> list[Kind]:
     if get_origin(kind) is Annotated:
         return _alternatives(get_args(kind)[0])
     if get_origin(kind) in (Union, UnionType):
-        return [inner for one in get_args(kind) for inner in _alternatives(one)]
+        return [inner for member in get_args(kind) for inner in _alternatives(member)]
     return [kind]
 
 
 def sections_of(kind: Kind) -> list[type[ScenarioSection]]:
     """Return the tables that a value of an annotation may be."""
-    types = [one for one in _alternatives(kind) if isinstance(one, type)]
-    return [one for one in types if issubclass(one, ScenarioSection)]
+    types = [alternative for alternative in _alternatives(kind) if isinstance(alternative, type)]
+    return [candidate for candidate in types if issubclass(candidate, ScenarioSection)]
 
 
 def _section_of(kind: Kind) -> type[ScenarioSection] | None:
@@ -379,15 +379,15 @@ def _choices(kind: Kind) -> tuple[Mapping[str, type[ScenarioSection]], str]:
     key = next(
         name for name, field in sections[0].model_fields.items() if get_origin(field.annotation) is Literal
     )
-    return {get_args(one.model_fields[key].annotation)[0]: one for one in sections}, key
+    return {get_args(section.model_fields[key].annotation)[0]: section for section in sections}, key
 
 
 def _own_check(key: str, value: object, message: str) -> str:
     """Add key and value to the message of a section's check, ``inner key: what is wrong``."""
-    inner, colon, rest = message.partition(": ")
+    inner, colon, problem = message.partition(": ")
     if not colon or not isinstance(value, Mapping):
-        shown = "" if isinstance(value, Mapping) else f" = {show_value(value)}"
-        return f"{key}{shown}: {message}" if key else message
+        value_text = "" if isinstance(value, Mapping) else f" = {show_value(value)}"
+        return f"{key}{value_text}: {message}" if key else message
     path = f"{key}.{inner}" if key else inner
     for part in inner.split("."):
         if isinstance(value, list) and part.isdecimal() and int(part) < len(value):
@@ -395,42 +395,42 @@ def _own_check(key: str, value: object, message: str) -> str:
         elif isinstance(value, Mapping) and part in value:
             value = value[part]
         else:
-            return f"{path}: {rest}"
-    return f"{path} = {show_value(value)}: {rest}"
+            return f"{path}: {problem}"
+    return f"{path} = {show_value(value)}: {problem}"
 
 
-def _choice(key: str, value: object, at: _Place) -> str:
-    known = ", ".join(at.choices)
-    key = f"{key}.{at.discriminator}"
-    if not isinstance(value, Mapping) or at.discriminator not in value:
-        return f"{key}: missing; one of {known}"
-    chosen = value[at.discriminator]
-    close = difflib.get_close_matches(str(chosen), at.choices, n=1)
+def _choice(key: str, value: object, place: _Place) -> str:
+    choices_text = ", ".join(place.choices)
+    key = f"{key}.{place.discriminator}"
+    if not isinstance(value, Mapping) or place.discriminator not in value:
+        return f"{key}: missing; one of {choices_text}"
+    chosen = value[place.discriminator]
+    close = difflib.get_close_matches(str(chosen), place.choices, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
-    return f"{key} = {show_value(chosen)}: must be one of {known}{hint}"
+    return f"{key} = {show_value(chosen)}: must be one of {choices_text}{hint}"
 
 
-def _table_example(value: object, at: _Place) -> str:
+def _table_example(value: object, place: _Place) -> str:
     """Return an example of the table: of the kind that the value names, or for a user's class."""
-    known = isinstance(value, str) and value in at.choices
-    if not known and "python" in at.choices and str(value).isidentifier():
-        file = f"my_{at.path[0]}.py"
-        return f', e.g. {{ {at.discriminator} = "python", file = "{file}", name = "{value}" }}'
-    if at.choices:
-        needed = {
+    names_kind = isinstance(value, str) and value in place.choices
+    if not names_kind and "python" in place.choices and str(value).isidentifier():
+        file = f"my_{place.path[0]}.py"
+        return f', e.g. {{ {place.discriminator} = "python", file = "{file}", name = "{value}" }}'
+    if place.choices:
+        required = {
             choice: [
                 name
                 for name, field in settings.model_fields.items()
-                if field.is_required() and name != at.discriminator
+                if field.is_required() and name != place.discriminator
             ]
-            for choice, settings in at.choices.items()
+            for choice, settings in place.choices.items()
         }
         # The simplest that has settings shows how they are written.
-        chosen = str(value) if known else min(needed, key=lambda one: len(needed[one]) or 99)
-        keys = "".join(f", {name} = ..." for name in needed[chosen])
-        return f', e.g. {{ {at.discriminator} = "{chosen}"{keys} }}'
-    in_list = any(isinstance(part, int) for part in at.path)
-    return "" if in_list else f", [{'.'.join(map(str, at.path))}]"
+        chosen = str(value) if names_kind else min(required, key=lambda choice: len(required[choice]) or 99)
+        keys = "".join(f", {name} = ..." for name in required[chosen])
+        return f', e.g. {{ {place.discriminator} = "{chosen}"{keys} }}'
+    in_list = any(isinstance(part, int) for part in place.path)
+    return "" if in_list else f", [{'.'.join(map(str, place.path))}]"
 
 
 def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
@@ -447,9 +447,9 @@ def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
 
 
 def _nearest(key: str, section: type[ScenarioSection] | None) -> str:
-    known = sorted(section.model_fields) if section is not None else []
-    close = difflib.get_close_matches(key, known, n=1)
-    return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(known)}"
+    section_keys = sorted(section.model_fields) if section is not None else []
+    close = difflib.get_close_matches(key, section_keys, n=1)
+    return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(section_keys)}"
 
 
 def show_value(value: object) -> str:

@@ -61,10 +61,10 @@ class ScenarioSection(BaseModel):
         They are parsed from the source only when a schema or a message needs them: pydantic's
         ``use_attribute_docstrings`` parses all of them at import, which takes 0.2 s.
         """
-        found: dict[str, str] = {}
+        descriptions: dict[str, str] = {}
         for section in reversed(cls.__mro__[: cls.__mro__.index(ScenarioSection)]):
-            found |= _docstrings(section.__module__).get(section.__name__, {})
-        return found
+            descriptions |= _docstrings(section.__module__).get(section.__name__, {})
+        return descriptions
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler, /) -> Table:
@@ -80,20 +80,17 @@ class ScenarioSection(BaseModel):
 @cache
 def _docstrings(module: str) -> dict[str, dict[str, str]]:
     """Return the docstrings of the attributes of a module's classes, by class."""
-    found: dict[str, dict[str, str]] = {}
+    docstrings: dict[str, dict[str, str]] = {}
     try:
         statements = ast.parse(inspect.getsource(sys.modules[module])).body
     except OSError:  # installed without sources
-        return found
-    for section in [one for one in statements if isinstance(one, ast.ClassDef)]:
+        return docstrings
+    for section in [statement for statement in statements if isinstance(statement, ast.ClassDef)]:
         for pair in pairwise(section.body):
             match pair:
-                case (
-                    ast.AnnAssign(target=ast.Name(id=key)),
-                    ast.Expr(value=ast.Constant(value=str(text))),
-                ):
-                    found.setdefault(section.name, {})[key] = inspect.cleandoc(text)
-    return found
+                case (ast.AnnAssign(target=ast.Name(id=key)), ast.Expr(value=ast.Constant(value=str(text)))):
+                    docstrings.setdefault(section.name, {})[key] = inspect.cleandoc(text)
+    return docstrings
 
 
 def period_ns(rate_hz: float) -> int:
@@ -122,14 +119,14 @@ Rows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 _LONGEST_SHOWN = 60
 
 
-def _not_negative(what: str, most: float = math.inf) -> AfterValidator:
+def _not_negative(title: str, most: float = math.inf) -> AfterValidator:
     """Require entries from 0 to ``most``; the squares of larger ones might overflow."""
 
     def check(row: tuple[float, ...]) -> tuple[float, ...]:
         if any(entry < 0 for entry in row):
-            raise ValueError(f"{what} cannot be negative")
+            raise ValueError(f"{title} cannot be negative")
         if any(entry > most for entry in row):
-            raise ValueError(f"{what} can be {most:g} at most")
+            raise ValueError(f"{title} can be {most:g} at most")
         return row
 
     return AfterValidator(check)
@@ -158,28 +155,28 @@ def shape(rows: tuple[tuple[float, ...], ...], key: str) -> tuple[int, int]:
 
 
 def require_shape(
-    rows: tuple[tuple[float, ...], ...] | None, key: str, expected: tuple[int, int], why: str
+    rows: tuple[tuple[float, ...], ...] | None, key: str, expected: tuple[int, int], reason: str
 ) -> None:
     """Raise ValueError if a matrix is given and does not have the expected shape."""
     if rows is None:
         return
-    found = shape(rows, key)
-    if found != expected:
+    actual = shape(rows, key)
+    if actual != expected:
         raise ValueError(
-            f"{key}: expected {expected[0]} x {expected[1]} ({why}), found {found[0]} x {found[1]}"
-            + (_transposed(rows) if found == expected[::-1] else "")
+            f"{key}: expected {expected[0]} x {expected[1]} ({reason}), found {actual[0]} x {actual[1]}"
+            + (_transposed(rows) if actual == expected[::-1] else "")
         )
 
 
 def _transposed(rows: Iterable[Iterable[float]]) -> str:
-    other = json.dumps([list(column) for column in zip(*rows, strict=True)])
-    return "; looks transposed" + (f": try {other}" if len(other) <= _LONGEST_SHOWN else "")
+    transposed = json.dumps([list(column) for column in zip(*rows, strict=True)])
+    return "; looks transposed" + (f": try {transposed}" if len(transposed) <= _LONGEST_SHOWN else "")
 
 
-def require_length(row: tuple[object, ...] | None, key: str, expected: int, why: str) -> None:
+def require_length(row: tuple[object, ...] | None, key: str, expected: int, reason: str) -> None:
     """Raise ValueError if a vector or list of names is given and has another length."""
     if row is not None and len(row) != expected:
-        raise ValueError(f"{key}: expected {expected} entries ({why}), found {len(row)}")
+        raise ValueError(f"{key}: expected {expected} entries ({reason}), found {len(row)}")
 
 
 Settings = TypeVar("Settings", bound=ScenarioSection)
@@ -191,15 +188,15 @@ def kinds_in(package: str, base: type[Settings], key: str = "kind") -> Mapping[s
     They are subclasses of ``base``. The field ``key``, a ``Literal`` of one value, names the kind.
     Subpackages are not searched.
     """
-    found: dict[str, type[Settings]] = {}
+    kinds: dict[str, type[Settings]] = {}
     for entry in iter_modules(import_module(package).__path__, f"{package}."):
         if entry.ispkg:
             continue
-        for one in vars(import_module(entry.name)).values():
-            if isinstance(one, type) and issubclass(one, base) and one.__module__ == entry.name:
-                names = get_args(one.model_fields[key].annotation)  # empty for a base class
-                found |= dict.fromkeys(names, one)
-    return found
+        for member in vars(import_module(entry.name)).values():
+            if isinstance(member, type) and issubclass(member, base) and member.__module__ == entry.name:
+                names = get_args(member.model_fields[key].annotation)  # empty for a base class
+                kinds |= dict.fromkeys(names, member)
+    return kinds
 
 
 def union_of(
@@ -212,8 +209,8 @@ def union_of(
     if default is None:
         return Annotated[reduce(or_, kinds.values()), Discriminator(key)]
 
-    def kind(given: object) -> str:
-        value = given.get(key, default) if isinstance(given, dict) else getattr(given, key, default)
+    def kind(table: object) -> str:
+        value = table.get(key, default) if isinstance(table, dict) else getattr(table, key, default)
         return str(value)
 
     tagged = [Annotated[settings, Tag(name)] for name, settings in kinds.items()]

@@ -104,9 +104,9 @@ def with_tables(section: Table, tables: Mapping[str, BaseModel]) -> Table:
     """Return a scenario or section with other tables at the given places."""
     update: dict[str, BaseModel] = {}
     for place, table in tables.items():
-        part, _, rest = place.partition(".")
+        part, _, inner_place = place.partition(".")
         inner: BaseModel = update.get(part, getattr(section, part))
-        update[part] = with_tables(inner, {rest: table}) if rest else table
+        update[part] = with_tables(inner, {inner_place: table}) if inner_place else table
     return section.model_copy(update=update)
 
 
@@ -127,9 +127,9 @@ def located(settings: Settings, folder: Path, place: str) -> Settings:
 def unchanged(settings: FileSettings, place: str) -> Path:
     """Return the path of a loaded setting's file; raise CallerError if missing or changed."""
     file = NamedFile(settings.file or "", Path(), place)
-    if (found := file.sha256()) != settings.sha256:
+    if (actual := file.sha256()) != settings.sha256:
         file.wrong(
-            f"has changed: its SHA-256 is {found[:16]}..., "
+            f"has changed: its SHA-256 is {actual[:16]}..., "
             f"that of the run is {(settings.sha256 or 'not given')[:16]}..."
         )
     return file.path
@@ -167,9 +167,9 @@ def new_instance(settings: ClassSettings, place: str) -> tuple[UserCode, str]:
         CallerError: the file has changed, or is missing; ``place`` names the table.
         Exception: anything that the user's code raises; :func:`user_code` describes it.
     """
-    made, description = _class(settings, place)
+    user_class, description = _class(settings, place)
     parameters = {key: _as_list(value) for key, value in settings.parameters.items()}
-    return made(**parameters), description
+    return user_class(**parameters), description
 
 
 @contextmanager
@@ -185,9 +185,9 @@ def user_code(settings: ClassSettings, place: str, failure: type[NoackError]) ->
 
 def _failure_text(settings: ClassSettings, place: str, error: BaseException) -> str:
     """Return one line about an error in the user's code: the class, the error, the source line."""
-    frames = [one for one in traceback.extract_tb(error.__traceback__) if not _is_ours(one)]
-    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    return f'{place}.name = "{settings.name}": {type(error).__name__}: {one_line(error)}{where}'
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_ours(frame)]
+    source_place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f'{place}.name = "{settings.name}": {type(error).__name__}: {one_line(error)}{source_place}'
 
 
 def read_only(values: Vector) -> Vector:
@@ -197,20 +197,20 @@ def read_only(values: Vector) -> Vector:
     return copy
 
 
-def real_vector(what: str, value: UserCode, size: int) -> Vector:
+def real_vector(title: str, value: UserCode, size: int) -> Vector:
     """Return a copy of a return value of the user's code, shape (size,).
 
     Raises:
         TypeError: its entries are not real numbers.
         ValueError: it has another shape.
     """
-    given = np.array(value)
-    if given.dtype.kind not in "biuf":
-        raise TypeError(f"{what} is not of real numbers")
-    found = given.astype(np.float64)
-    if found.shape != (size,):
-        raise ValueError(f"{what} has shape {found.shape}, expected ({size},)")
-    return found
+    array = np.array(value)
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"{title} is not of real numbers")
+    vector = array.astype(np.float64)
+    if vector.shape != (size,):
+        raise ValueError(f"{title} has shape {vector.shape}, expected ({size},)")
+    return vector
 
 
 def _class(settings: ClassSettings, place: str) -> tuple[UserCode, str]:
@@ -222,14 +222,14 @@ def _class(settings: ClassSettings, place: str) -> tuple[UserCode, str]:
         return _attribute(import_module(module), name), f"class {settings.name}"
     from importlib import metadata  # slow to import
 
-    known = metadata.entry_points(group=settings.group)
-    if settings.name not in known.names:
-        there = ", ".join(sorted(known.names)) or "none"
+    entry_points = metadata.entry_points(group=settings.group)
+    if settings.name not in entry_points.names:
+        names = ", ".join(sorted(entry_points.names)) or "none"
         raise LookupError(
             f"no installed package has an entry point of this name in the group {settings.group} "
-            f"(there are: {there}); write package.module:Class, or name a file, too"
+            f"(there are: {names}); write package.module:Class, or name a file, too"
         )
-    entry = known[settings.name]
+    entry = entry_points[settings.name]
     version = f", {entry.dist.name} {entry.dist.version}" if entry.dist else ""
     return entry.load(), f"class {entry.value}{version}"
 
@@ -255,4 +255,4 @@ def _is_ours(frame: traceback.FrameSummary) -> bool:
 
 
 def _as_list(value: object) -> object:
-    return [_as_list(one) for one in value] if isinstance(value, tuple) else value
+    return [_as_list(entry) for entry in value] if isinstance(value, tuple) else value

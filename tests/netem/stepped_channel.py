@@ -21,7 +21,7 @@ def send(channel: Channel, flow: int, number: int, size_bytes: int, now_ns: int,
         "flow": flow, "size_bytes": size_bytes, "arrival_ns": now_ns, "bit": -1, "head": head,
         "message": {"sequence": number},
     })  # fmt: skip
-    channel._left(lambda: int(core.noack_channel_handle(channel.core, datagram, now_ns)))
+    channel._departures(lambda: int(core.noack_channel_handle(channel.core, datagram, now_ns)))
 
 
 class SteppedChannel:

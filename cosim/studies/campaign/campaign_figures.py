@@ -42,21 +42,21 @@ _LONGEST_LABEL = 28
 
 def figures(summary: CampaignSummary, store: Store) -> Iterator[FigureDescription]:
     """Describe the figures that the campaign asks for."""
-    for i, wanted in enumerate(summary.campaign.figures):
-        places = set(summary.campaign.selected(wanted.where))
+    for i, spec in enumerate(summary.campaign.figures):
+        places = set(summary.campaign.selected(spec.where))
         results = [result for result in summary.results if result.point.place in places]
-        match wanted:
+        match spec:
             case campaign_file.Pareto():
-                figure, caption = _pareto(summary, results, wanted)
+                figure, caption = _pareto(summary, results, spec)
             case campaign_file.Curve():
-                figure, caption = _curve(summary, results, wanted)
+                figure, caption = _curve(summary, results, spec)
             case campaign_file.HeatMap():
-                figure, caption = _heat_map(summary, results, wanted)
+                figure, caption = _heat_map(summary, results, spec)
             case campaign_file.Distribution():
-                figure, caption = _distribution(summary, results, wanted, store)
-        where = [f"{axis} = {campaign_file.label_of(v)}" for axis, v in wanted.where.items()]
-        name = f"{wanted.kind.replace('_', '-')}-{i + 1}"
-        yield replace(figure, name=name, caption=f"{', '.join([caption, *where])}.")
+                figure, caption = _distribution(summary, results, spec, store)
+        conditions = [f"{axis} = {campaign_file.label_of(v)}" for axis, v in spec.where.items()]
+        name = f"{spec.kind.replace('_', '-')}-{i + 1}"
+        yield replace(figure, name=name, caption=f"{', '.join([caption, *conditions])}.")
 
 
 def pareto_figure(
@@ -68,7 +68,7 @@ def pareto_figure(
         (xs, dx), (ys, dy) = map(_means, pair)
         finite = np.isfinite(xs) & np.isfinite(ys)
         front = np.flatnonzero(finite)[undominated(xs[finite], ys[finite])]
-        colour, marker, dash = _look(i)
+        colour, marker, dash = _style(i)
         items += [
             Marks(x=xs, y=ys, x_error=dx, y_error=dy, colour=colour, reduced=False, marker=marker,
                   label=_name(name)),
@@ -99,17 +99,17 @@ def curve_figure(
     The axis has k values ``x`` (None if they are not numbers) with k labels, and is logarithmic if
     they grow by factors; each series has k estimates, or None where there is no estimate.
     """
-    at = np.arange(len(labels), dtype=np.float64) if x is None else x
-    order = np.argsort(at)
+    xs = np.arange(len(labels), dtype=np.float64) if x is None else x
+    order = np.argsort(xs)
     items: list[Item] = []
     for i, (name, estimates) in enumerate(series.items()):
         mean, half = (values[order] for values in _means(estimates))
-        colour, marker, dash = _look(i)
+        colour, marker, dash = _style(i)
         items += [
-            Line(x=at[order], y=mean, label=_name(name), colour=colour, size=4, marker=marker, dash=dash),
-            Band(x=at[order], low=mean - half, high=mean + half, colour=colour),
+            Line(x=xs[order], y=mean, label=_name(name), colour=colour, size=4, marker=marker, dash=dash),
+            Band(x=xs[order], low=mean - half, high=mean + half, colour=colour),
         ]
-    ticks = dict(zip(at.tolist(), map(plain, labels), strict=True)) if x is None else None
+    ticks = dict(zip(xs.tolist(), map(plain, labels), strict=True)) if x is None else None
     means = [e.mean for estimates in series.values() for e in estimates if e]
     x_axis = Axis(label=_name(axis), ticks=ticks, logarithmic=x is not None and _is_geometric(x))
     panel = Panel(items=items, x=x_axis, y=_axis(metric, means))
@@ -127,15 +127,15 @@ def heat_map_figure(
     Each map has the shape (values of y, values of x); NaN is a missing value. x and y are title and
     labels of the axes.
     """
-    known = np.stack(list(maps.values()))
-    known = known[np.isfinite(known)]
+    finite = np.stack(list(maps.values()))
+    finite = finite[np.isfinite(finite)]
     scale = None
-    if len(known):
+    if len(finite):
         scale = ColourScale(
-            low=known.min(),
-            high=known.max(),
+            low=finite.min(),
+            high=finite.max(),
             label=METRICS[metric].label,
-            logarithmic=METRICS[metric].logarithmic and _far(known),
+            logarithmic=METRICS[metric].logarithmic and _is_wide(finite),
         )
     axes = [
         Axis(label=_name(name), ticks=dict(enumerate(map(plain, labels))), grid=False)
@@ -165,11 +165,11 @@ def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> FigureD
     share = np.linspace(0.0, 1.0, _QUANTILES + 1)
     items = []
     for i, (name, values) in enumerate(series.items()):
-        at = np.quantile(values, share, method="inverted_cdf")
-        is_known = np.isfinite(at)
-        colour, _, dash = _look(i)
+        xs = np.quantile(values, share, method="inverted_cdf")
+        is_known = np.isfinite(xs)
+        colour, _, dash = _style(i)
         items.append(
-            Line(x=at[is_known], y=share[is_known], label=_name(name), colour=colour, dash=dash, steps="post")
+            Line(x=xs[is_known], y=share[is_known], label=_name(name), colour=colour, dash=dash, steps="post")
         )
     x = _axis(metric, np.concatenate(list(series.values())))
     panel = Panel(items=items, x=x, y=Axis(label="share of runs", ends=(0, 1.02)))
@@ -177,68 +177,68 @@ def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> FigureD
 
 
 def _pareto(
-    summary: CampaignSummary, results: Sequence[GridPointResult], wanted: campaign_file.Pareto
+    summary: CampaignSummary, results: Sequence[GridPointResult], spec: campaign_file.Pareto
 ) -> tuple[FigureDescription, str]:
     series: dict[str, tuple[list[Estimate], list[Estimate]]] = {}
     for result in results:
-        if wanted.x in result.estimates and wanted.y in result.estimates:
-            xs, ys = series.setdefault(result.point.labels[wanted.series], ([], []))
-            xs.append(result.estimates[wanted.x])
-            ys.append(result.estimates[wanted.y])
-    called = summary.campaign.by_name[wanted.series].called
-    return pareto_figure(series, wanted.x, wanted.y), (
-        f"{_title(wanted.y)} against {METRICS[wanted.x].title}, means with 95 % confidence "
-        f"intervals; for each {called} the points that none of its own dominates are joined"
+        if spec.x in result.estimates and spec.y in result.estimates:
+            xs, ys = series.setdefault(result.point.labels[spec.series], ([], []))
+            xs.append(result.estimates[spec.x])
+            ys.append(result.estimates[spec.y])
+    series_name = summary.campaign.by_name[spec.series].called
+    return pareto_figure(series, spec.x, spec.y), (
+        f"{_title(spec.y)} against {METRICS[spec.x].title}, means with 95 % confidence "
+        f"intervals; for each {series_name} the points that none of its own dominates are joined"
     )
 
 
 def _curve(
-    summary: CampaignSummary, results: Sequence[GridPointResult], wanted: campaign_file.Curve
+    summary: CampaignSummary, results: Sequence[GridPointResult], spec: campaign_file.Curve
 ) -> tuple[FigureDescription, str]:
-    axis = summary.campaign.by_name[wanted.x]
-    known = {
-        name: {result.point.labels[axis.name]: result.estimates.get(wanted.metric) for result in group}
-        for name, group in _series(summary, results, (wanted.x, *wanted.where)).items()
+    axis = summary.campaign.by_name[spec.x]
+    curves = {
+        name: {result.point.labels[axis.name]: result.estimates.get(spec.metric) for result in group}
+        for name, group in _series(summary, results, (spec.x, *spec.where)).items()
     }
-    places = [i for i, x in enumerate(axis.labels) if any(curve.get(x) for curve in known.values())]
+    places = [i for i, x in enumerate(axis.labels) if any(curve.get(x) for curve in curves.values())]
     labels = [axis.labels[i] for i in places]
-    series = {name: [curve.get(x) for x in labels] for name, curve in known.items() if any(curve.values())}
+    series = {name: [curve.get(x) for x in labels] for name, curve in curves.items() if any(curve.values())}
     numbers = None if axis.numbers is None else np.array(axis.numbers)[places]
-    return curve_figure(numbers, labels, series, axis.heading, wanted.metric), (
-        f"{_title(wanted.metric)} over {axis.called}: means and 95 % confidence intervals"
+    return curve_figure(numbers, labels, series, axis.heading, spec.metric), (
+        f"{_title(spec.metric)} over {axis.called}: means and 95 % confidence intervals"
     )
 
 
 def _heat_map(
-    summary: CampaignSummary, results: Sequence[GridPointResult], wanted: campaign_file.HeatMap
+    summary: CampaignSummary, results: Sequence[GridPointResult], spec: campaign_file.HeatMap
 ) -> tuple[FigureDescription, str]:
-    x, y = (summary.campaign.by_name[name] for name in (wanted.x, wanted.y))
+    x, y = (summary.campaign.by_name[name] for name in (spec.x, spec.y))
     maps = {}
-    spanned = (wanted.x, wanted.y, *wanted.where)
+    spanned = (spec.x, spec.y, *spec.where)
     for label, group in _series(summary, results, spanned).items():
         maps[label] = np.full((len(y.labels), len(x.labels)), np.nan)
         for result in group:
-            if wanted.metric in result.estimates:
+            if spec.metric in result.estimates:
                 row, column = (axis.labels.index(result.point.labels[axis.name]) for axis in (y, x))
-                maps[label][row, column] = result.estimates[wanted.metric].mean
-    figure = heat_map_figure(maps, (x.heading, x.labels), (y.heading, y.labels), wanted.metric)
-    return figure, f"{_title(wanted.metric)} over {x.called} and {y.called}: means"
+                maps[label][row, column] = result.estimates[spec.metric].mean
+    figure = heat_map_figure(maps, (x.heading, x.labels), (y.heading, y.labels), spec.metric)
+    return figure, f"{_title(spec.metric)} over {x.called} and {y.called}: means"
 
 
 def _distribution(
     summary: CampaignSummary,
     results: Sequence[GridPointResult],
-    wanted: campaign_file.Distribution,
+    spec: campaign_file.Distribution,
     store: Store,
 ) -> tuple[FigureDescription, str]:
     series = {
-        label: runs_at(result.point, store)[0][wanted.metric]
-        for label, group in _series(summary, results, tuple(wanted.where)).items()
+        label: runs_at(result.point, store)[0][spec.metric]
+        for label, group in _series(summary, results, tuple(spec.where)).items()
         for result in group
-        if wanted.metric in result.estimates
+        if spec.metric in result.estimates
     }
-    return distribution_figure(series, wanted.metric), (
-        f"{_title(wanted.metric)}: the share of runs in which it is at most so much"
+    return distribution_figure(series, spec.metric), (
+        f"{_title(spec.metric)}: the share of runs in which it is at most so much"
     )
 
 
@@ -246,20 +246,20 @@ def _series(
     summary: CampaignSummary, results: Sequence[GridPointResult], spanned: tuple[str, ...]
 ) -> dict[str, list[GridPointResult]]:
     """Group grid points by the values of the axes that the figure does not show as coordinates."""
-    rest = [axis for axis in summary.campaign.axes if axis.name not in spanned]
+    other_axes = [axis for axis in summary.campaign.axes if axis.name not in spanned]
     groups: dict[str, list[GridPointResult]] = {}
     for result in results:
         label = ", ".join(
             result.point.labels[axis.name]
             if axis.numbers is None
             else f"{axis.called} = {result.point.labels[axis.name]}"
-            for axis in rest
+            for axis in other_axes
         )
         groups.setdefault(label, []).append(result)
     return groups
 
 
-def _look(i: int) -> tuple[Colour, str, Dash]:
+def _style(i: int) -> tuple[Colour, str, Dash]:
     """Return colour, marker and dashes of the i-th series."""
     return series_colour(i), MARKERS[i % len(MARKERS)], DASHES[i % len(DASHES)]
 
@@ -282,16 +282,16 @@ def _title(metric: Metric) -> str:
 
 def _axis(metric: Metric, values: Sequence[float] | Vector) -> Axis:
     """Return a metric's axis: logarithmic if the finite values are positive and far apart."""
-    known = np.asarray(values)
-    is_log = METRICS[metric].logarithmic and _far(known[np.isfinite(known)])
+    array = np.asarray(values)
+    is_log = METRICS[metric].logarithmic and _is_wide(array[np.isfinite(array)])
     return Axis(label=METRICS[metric].label, logarithmic=is_log)
 
 
 def _is_geometric(values: Vector) -> bool:
     """Whether values are far apart, and their middle is nearer to the geometric mean of the ends."""
     middle, ends = float(np.median(values)), (values.min(), values.max())
-    return _far(values) and middle - math.sqrt(ends[0] * ends[1]) < sum(ends) / 2 - middle
+    return _is_wide(values) and middle - math.sqrt(ends[0] * ends[1]) < sum(ends) / 2 - middle
 
 
-def _far(values: Vector) -> bool:
+def _is_wide(values: Vector) -> bool:
     return bool(len(values) and values.min() > 0 and values.max() >= _FAR * values.min())

@@ -31,13 +31,13 @@ Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 Settings = Annotated[dict[str, JsonValue], Field(min_length=1)]
 
 
-def _require_scalar(given: object) -> object:
-    if isinstance(given, list | dict):
+def _require_scalar(value: object) -> object:
+    if isinstance(value, list | dict):
         raise ValueError(
             "should be a number, a text, true or false; for matrices and tables use variants, "
             'e.g. variants = { "small" = { "trigger.weight" = [[1, 0], [0, 1]] } }'
         )
-    return given
+    return value
 
 
 Value = Annotated[str | int | float | bool, BeforeValidator(_require_scalar)]
@@ -58,9 +58,9 @@ def _repeated(names: Sequence[str]) -> int | None:
     return next((i for i, name in enumerate(names) if name in names[:i]), None)
 
 
-def replaced(before: Iterable[str], after: Iterable[str]) -> tuple[str, str] | None:
+def replaced(earlier_keys: Iterable[str], later_keys: Iterable[str]) -> tuple[str, str] | None:
     """Return a key and a later key that replaces its value or its table; None if there is none."""
-    pairs = itertools.product(before, after)
+    pairs = itertools.product(earlier_keys, later_keys)
     return next(((old, new) for old, new in pairs if f"{old}.".startswith(f"{new}.")), None)
 
 
@@ -140,8 +140,8 @@ class Axis(ScenarioSection):
     @property
     def replaced_keys(self) -> tuple[str, ...]:
         """The keys whose value or table the axis replaces."""
-        given = (item for settings in self.settings for item in settings.items())
-        return tuple({key: None for key, value in given if not scales_loops(key, value)})
+        items = (item for settings in self.settings for item in settings.items())
+        return tuple({key: None for key, value in items if not scales_loops(key, value)})
 
     @property
     def numbers(self) -> list[float] | None:
@@ -257,14 +257,14 @@ class Term(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> Self:
         """Read ``METRIC``, ``METRIC @ VALUE`` or a number; ValueError if it is none of them."""
-        name, at, label = (part.strip() for part in text.partition("@"))
+        name, separator, label = (part.strip() for part in text.partition("@"))
         if name in METRICS:
-            return cls(cast(Metric, name), label if at else None)
+            return cls(cast(Metric, name), label if separator else None)
         try:
             return cls(None, None, float(text))
         except ValueError:
-            known = ", ".join(METRICS)
-            raise ValueError(f"holds: {text.strip()}: should be a number or one of {known}") from None
+            names = ", ".join(METRICS)
+            raise ValueError(f"holds: {text.strip()}: should be a number or one of {names}") from None
 
 
 class Claim(ScenarioSection):
@@ -293,8 +293,8 @@ class Claim(ScenarioSection):
             sides = re.split("([<>])", text)
             if len(sides) != 3:
                 raise ValueError(f"holds: {text}: write a condition as A < B or A > B")
-            left, right = Term.parse(sides[0]), Term.parse(sides[2])
-            conditions.append((left, right) if sides[1] == "<" else (right, left))
+            left_side, right_side = Term.parse(sides[0]), Term.parse(sides[2])
+            conditions.append((left_side, right_side) if sides[1] == "<" else (right_side, left_side))
         return conditions
 
     @model_validator(mode="after")
@@ -357,10 +357,10 @@ class Campaign(ScenarioSection):
         if (twice := _repeated([axis.name for axis in self.axes])) is not None:
             raise ValueError(f"axes.{twice}.name: another axis has this name")
         for i, axis in enumerate(self.axes):
-            for other in self.axes[:i]:
-                if (lost := replaced(other.replaced_keys, axis.replaced_keys)) is not None:
+            for earlier_axis in self.axes[:i]:
+                if (lost := replaced(earlier_axis.replaced_keys, axis.replaced_keys)) is not None:
                     raise ValueError(
-                        f"axes.{i}.name: {lost[1]} would replace {lost[0]} of axis {other.name}; "
+                        f"axes.{i}.name: {lost[1]} would replace {lost[0]} of axis {earlier_axis.name}; "
                         "an axis that sets a whole table comes first, "
                         "and two axes cannot set the same key"
                     )
@@ -383,16 +383,16 @@ class Campaign(ScenarioSection):
         return self
 
     def _check_figure(self, place: str, figure: AnyFigure) -> None:
-        own = [getattr(figure, key) for key in figure.spanned]
-        for key, name in zip(figure.spanned, own, strict=True):
+        axis_names = [getattr(figure, key) for key in figure.spanned]
+        for key, name in zip(figure.spanned, axis_names, strict=True):
             self._require_axis(f"{place}.{key}", name)
         self._require_values(f"{place}.where", figure.where.items())
-        if len(set(own)) < len(own):
+        if len(set(axis_names)) < len(axis_names):
             raise ValueError(f"{place}.y: a map needs two different axes")
         if isinstance(figure, Pareto):
             series = [self.by_name[figure.series]]
         else:
-            series = [axis for axis in self.axes if axis.name not in {*own, *figure.where}]
+            series = [axis for axis in self.axes if axis.name not in {*axis_names, *figure.where}]
         count = math.prod(len(axis.labels) for axis in series)
         if count > MOST_SERIES:
             raise ValueError(
@@ -414,13 +414,13 @@ class Campaign(ScenarioSection):
         if label_of(value) not in labels:
             raise ValueError(f"{place}: no such value; {axis} has {', '.join(labels)}")
 
-    def selected(self, where: Mapping[str, Value]) -> Iterator[tuple[int, ...]]:
+    def selected(self, conditions: Mapping[str, Value]) -> Iterator[tuple[int, ...]]:
         """Return the places in the grid, one index per axis, of the points with these values."""
         ranges = [
             [
                 i
                 for i, label in enumerate(axis.labels)
-                if axis.name not in where or label == label_of(where[axis.name])
+                if axis.name not in conditions or label == label_of(conditions[axis.name])
             ]
             for axis in self.axes
         ]

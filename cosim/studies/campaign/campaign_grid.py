@@ -97,11 +97,11 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
         labels = {axis.name: axis.labels[i] for axis, i in chosen}
         values = {axis.name: (axis.numbers or axis.labels)[i] for axis, i in chosen}
         source = f"{path}: at {', '.join(f'{name} = {label}' for name, label in labels.items())}"
-        given = [item for axis, i in chosen for item in axis.settings[i].items()]
-        scaled = [value for key, value in given if key == LOOPS and isinstance(value, int)]
+        settings = [item for axis, i in chosen for item in axis.settings[i].items()]
+        scaled = [value for key, value in settings if key == LOOPS and isinstance(value, int)]
         if scaled:
             content.setdefault(LOOPS, [{"name": "loop"}])
-        for key, value in given:
+        for key, value in settings:
             if not scales_loops(key, value):
                 put(content, key, value, source)
         for value in scaled:
@@ -144,8 +144,8 @@ def _scaled(entries: object, value: int, source: str) -> list[Table]:
         return entries  # the scenario's validation says what is wrong
     least = sum(counts) // math.gcd(*counts)
     if value < 1 or value % least:
-        given = zip(entries, counts, strict=True)
-        names = ", ".join(f"{count} {entry.get('name')}" for entry, count in given)
+        pairs = zip(entries, counts, strict=True)
+        names = ", ".join(f"{count} {entry.get('name')}" for entry, count in pairs)
         raise CallerError(
             f"{source}: loops = {value}: should be a multiple of {least}, to keep the proportions "
             f"of [[loops]]: {names}"
@@ -164,10 +164,10 @@ def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) ->
     for i, axis in enumerate(campaign.axes):
         contents: dict[bytes, str] = {}
         for value, label in enumerate(axis.labels):
-            same = b"".join(content for indices, content in runs.items() if indices[i] == value)
-            if (other := contents.setdefault(same, label)) != label:
+            value_runs = b"".join(content for indices, content in runs.items() if indices[i] == value)
+            if (other_label := contents.setdefault(value_runs, label)) != label:
                 raise CallerError(
-                    f"{path}: axes.{i}: {axis.name} = {other} and {axis.name} = {label} are the "
+                    f"{path}: axes.{i}: {axis.name} = {other_label} and {axis.name} = {label} are the "
                     f"same runs: {', '.join(axis.keys)} has no effect on them"
                 )
 
@@ -187,12 +187,7 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     n, m = scenario.model.dimensions
     Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
     R = _weight(metrics.R, "metrics.R", m, "one row per input")
-    measured: _Measured = {
-        "Q": Q,
-        "R": R,
-        "settle": metrics.settle,
-        "most_events": metrics.most_events,
-    }
+    measured: _Measured = {"Q": Q, "R": R, "settle": metrics.settle, "most_events": metrics.most_events}
     if scenario.loops:
         if campaign.time != "sampled":
             raise CallerError('loops: a network that loops share needs time = "sampled"')
@@ -208,8 +203,8 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
             'network.protocol: continuous time needs the loop without acknowledgements, "none"; '
             'time = "sampled" takes both'
         )
-    kept = timeless(resolved.network.link).impairments
-    taking_time = [stage.kind for stage in resolved.network.link.impairments if stage not in kept]
+    allowed = timeless(resolved.network.link).impairments
+    taking_time = [stage.kind for stage in resolved.network.link.impairments if stage not in allowed]
     if taking_time:
         raise CallerError(
             f"network.impairments: {', '.join(taking_time)}: in continuous time the "
@@ -223,8 +218,8 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     return ContinuousWork(setting, box_of(scenario), campaign.seed), certified_error(resolved)
 
 
-def _weight(rows: Rows | None, key: str, size: int, why: str) -> Matrix | None:
-    require_shape(rows, key, (size, size), why)
+def _weight(rows: Rows | None, key: str, size: int, reason: str) -> Matrix | None:
+    require_shape(rows, key, (size, size), reason)
     if rows is None:
         return None
     weight = np.array(rows)

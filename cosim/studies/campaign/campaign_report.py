@@ -60,13 +60,10 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
 
     With ``shares``, the differences have the share of draws in which a metric is smaller, too.
     """
-    campaign, shown = summary.campaign, summary.campaign.metrics.shown
-    headings = [
-        *(axis.called for axis in campaign.axes),
-        *(METRICS[name].heading for name in shown),
-    ]
+    campaign, metric_names = summary.campaign, summary.campaign.metrics.shown
+    headings = [*(axis.called for axis in campaign.axes), *(METRICS[name].heading for name in metric_names)]
     means = [
-        (*result.point.labels.values(), *(written(result.estimates.get(name)) for name in shown))
+        (*result.point.labels.values(), *(written(result.estimates.get(name)) for name in metric_names))
         for result in summary.results
     ]
     title = f"{campaign.name}: {summary.draws:,} draws; mean ± half-width"
@@ -75,7 +72,7 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
         differences = []
         for compared in summary.compared:
             cells = []
-            for paired in map(compared.differences.get, shown):
+            for paired in map(compared.differences.get, metric_names):
                 cells.append(written(paired.estimate if paired and paired.estimate.finite else None))
                 if paired and shares:
                     cells[-1] += f", smaller in {100 * paired.smaller:.3g} %"
@@ -126,15 +123,15 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, object]) -> 
 def print_summary(console: Console, summary: CampaignSummary) -> None:
     """Print the tables of a summary."""
     campaign = summary.campaign
-    for whole in campaign_tables(summary):
-        if whole.name == "claims":
-            console.print(terminal_table(whole, left=range(3)))
+    for full_table in campaign_tables(summary):
+        if full_table.name == "claims":
+            console.print(terminal_table(full_table, left=range(3)))
             continue
-        table = whole._replace(rows=whole.rows[:_MOST_ROWS])
+        table = full_table._replace(rows=full_table.rows[:_MOST_ROWS])
         for part in split_table(table, len(campaign.axes), console.width):
             console.print(part)
-        if (more := len(whole.rows) - _MOST_ROWS) > 0:
-            console.print(f"and {more} more grid points: see the page")
+        if (surplus := len(full_table.rows) - _MOST_ROWS) > 0:
+            console.print(f"and {surplus} more grid points: see the page")
     if campaign.time == "continuous":
         console.print(
             "continuous time: the trigger acts at once and the network has no delay; with "
@@ -163,7 +160,7 @@ def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
         end = begin + 1
         while end < len(columns) and sum(widths[:names]) + sum(widths[begin : end + 1]) <= width:
             end += 1
-        shown = Table(
+        part = Table(
             title=escape(table.caption) if begin == names else None,
             title_justify="left",
             box=SIMPLE_HEAD,
@@ -173,7 +170,7 @@ def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
         places = [*range(names), *range(begin, end)]
         unbroken = sum(max(len(table.headings[i]) + _APART, widths[i]) for i in places)
         for i in places:
-            shown.add_column(
+            part.add_column(
                 escape(table.headings[i]),
                 justify="left" if i < names else "right",
                 overflow="fold",
@@ -181,8 +178,8 @@ def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
                 max_width=widths[i] - _APART if unbroken > width else None,
             )
         for row in table.rows:
-            shown.add_row(*(escape(row[i]) for i in places))
-        yield shown
+            part.add_row(*(escape(row[i]) for i in places))
+        yield part
         begin = end
 
 
@@ -196,8 +193,8 @@ def _verdict(summary: CampaignSummary) -> str:
             f"{runs:,} runs; no grid point has a certified bound "
             "(a hold, a floor and other policies have none)."
         )
-    where = "all" if certified == len(summary.results) else f"{certified} of {len(summary.results)}"
-    return f"{runs:,} runs; {where} grid points have a certified bound; none was exceeded."
+    extent = "all" if certified == len(summary.results) else f"{certified} of {len(summary.results)}"
+    return f"{runs:,} runs; {extent} grid points have a certified bound; none was exceeded."
 
 
 def _reference(summary: CampaignSummary) -> str | None:
@@ -222,20 +219,20 @@ def written(estimate: Estimate | None) -> str:
 def _unfinished(summary: CampaignSummary) -> Iterator[str]:
     """Return a note for each grid point at which a run did not reach the horizon."""
     for result in summary.results:
-        unfinished = {how: count for how, count in result.ended.items() if how != "finished"}
+        unfinished = {ending: count for ending, count in result.ended.items() if ending != "finished"}
         if unfinished:
-            counts = ", ".join(f"{n:,} {how.replace('_', ' ')}" for how, n in unfinished.items())
-            yield f"{_at(result.point.labels)} not all runs reached the horizon: {counts}"
+            counts = ", ".join(f"{n:,} {ending.replace('_', ' ')}" for ending, n in unfinished.items())
+            yield f"{_place_text(result.point.labels)} not all runs reached the horizon: {counts}"
 
 
 def _bursts(summary: CampaignSummary) -> Iterator[str]:
     """Return, for each grid point without an enforced guarantee, how often it was exceeded."""
     for result in summary.results:
         if result.bursts is not None:
-            yield f"{_at(result.point.labels)} {result.bursts.text}"
+            yield f"{_place_text(result.point.labels)} {result.bursts.text}"
 
 
-def _at(labels: Mapping[str, str]) -> str:
+def _place_text(labels: Mapping[str, str]) -> str:
     return "At " + ", ".join(f"{axis} {label}" for axis, label in labels.items())
 
 
@@ -289,8 +286,8 @@ def finish_campaign(
     store = Store(folder, points, draws or plan.draws, plan.chunk)
     with stop_requests_raised(), opened(plan, base, store):
         with workers() as runner, bar or nullcontext() as progress:
-            made = run_campaign(store, runner, progress)
+            new_runs = run_campaign(store, runner, progress)
         with show("summarising"):
             summary = summarise(plan, store)
             files = write_report(summary, store, base, figure_files)
-    return FinishedCampaign(summary, store, base, made, files)
+    return FinishedCampaign(summary, store, base, new_runs, files)

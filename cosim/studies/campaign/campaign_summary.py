@@ -61,8 +61,8 @@ class JudgedClaim(NamedTuple):
     def reason(self) -> str:
         """The shares and medians in words."""
         least = f" (least: {share_text(self.least)}, {self.least_at})"
-        where = f"in {share_text(self.share)} of the draws{'' if self.least == self.share else least}"
-        return f"{where}; medians: {self.medians}"
+        share = f"in {share_text(self.share)} of the draws{'' if self.least == self.share else least}"
+        return f"{share}; medians: {self.medians}"
 
 
 def share_text(share: float) -> str:
@@ -76,19 +76,19 @@ def judge_claims(campaign: Campaign, points: Sequence[Point], values: Values) ->
     """Yield the claims of a campaign with their verdicts."""
     by_number = {point.number: point for point in points}
     cached = lru_cache(_POINTS_AT_ONCE)(lambda number: values(by_number[number]))
-    at = {axis: {label_of(value) for value in given} for axis, given in campaign.claims_at.items()}
+    common = {axis: {label_of(value) for value in chosen} for axis, chosen in campaign.claims_at.items()}
     for claim in campaign.claims:
-        named = {axis: {label_of(value)} for axis, value in claim.where.items()}
+        fixed = {axis: {label_of(value)} for axis, value in claim.where.items()}
         groups: dict[str, list[Point]] = {}
         for point in points:
-            allowed = at | named | ({} if claim.axis is None else {claim.axis: point.labels.values()})
-            if all(point.labels[axis] in known for axis, known in allowed.items()):
-                rest = (
+            allowed = common | fixed | ({} if claim.axis is None else {claim.axis: point.labels.values()})
+            if all(point.labels[axis] in labels for axis, labels in allowed.items()):
+                other_labels = (
                     f"{axis} {label}"
                     for axis, label in point.labels.items()
-                    if axis != claim.axis and axis not in named
+                    if axis != claim.axis and axis not in fixed
                 )
-                groups.setdefault(", ".join(rest), []).append(point)
+                groups.setdefault(", ".join(other_labels), []).append(point)
         yield _judged(claim, groups, lambda point: cached(point.number))
 
 
@@ -203,13 +203,13 @@ class CampaignSummary(NamedTuple):
 
 def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
     """Estimate all metrics and judge the claims; the runs of a few grid points are in memory."""
-    results = [_result(point, store) for point in store.points]
+    results = [_point_result(point, store) for point in store.points]
 
     def values(point: Point) -> Mapping[Metric, Vector]:
         return runs_at(point, store)[0]
 
     claims = list(judge_claims(campaign, store.points, values))
-    return CampaignSummary(campaign, store.draws, results, list(_compared(campaign, store)), claims)
+    return CampaignSummary(campaign, store.draws, results, list(_comparisons(campaign, store)), claims)
 
 
 def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], NDArray[np.generic]]:
@@ -218,34 +218,34 @@ def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], NDArray[n
     return measured(columns, point.certified_error), columns["status"]
 
 
-def _result(point: Point, store: Store) -> GridPointResult:
+def _point_result(point: Point, store: Store) -> GridPointResult:
     metrics, status = runs_at(point, store)
-    used = metrics.get("certificate_used", np.zeros(0))
+    bound_shares = metrics.get("certificate_used", np.zeros(0))
     return GridPointResult(
         point,
-        {how: int((status == code).sum()) for code, how in _ENDED.items() if code in status},
+        {ending: int((status == code).sum()) for code, ending in _ENDED.items() if code in status},
         {name: estimate(values) for name, values in metrics.items()},
-        int((used[np.isfinite(used)] > 1 + _ROUNDING).sum()),
+        int((bound_shares[np.isfinite(bound_shares)] > 1 + _ROUNDING).sum()),
         burst_frequency(point.scenario, metrics),
     )
 
 
-def _compared(campaign: Campaign, store: Store) -> Iterator[ComparedResult]:
+def _comparisons(campaign: Campaign, store: Store) -> Iterator[ComparedResult]:
     if campaign.compare is None:
         return
-    axis, wanted = campaign.compare.axis, label_of(campaign.compare.reference)
+    axis, reference_label = campaign.compare.axis, label_of(campaign.compare.reference)
     groups: dict[tuple[str, ...], list[Point]] = {}
     for point in store.points:
         labels = tuple(label for name, label in point.labels.items() if name != axis)
         groups.setdefault(labels, []).append(point)
     for group in groups.values():
-        reference = next(point for point in group if point.labels[axis] == wanted)
-        own, _ = runs_at(reference, store)
+        reference = next(point for point in group if point.labels[axis] == reference_label)
+        reference_runs, _ = runs_at(reference, store)
         for point in group:
             if point is not reference:
                 differences = {
-                    name: difference(values, own[name])
+                    name: difference(values, reference_runs[name])
                     for name, values in runs_at(point, store)[0].items()
-                    if name in own
+                    if name in reference_runs
                 }
                 yield ComparedResult(point, reference, differences)

@@ -53,11 +53,11 @@ def arithmetic() -> Mapping[str, str]:
     }
 
 
-def difference(stored: Mapping[str, str], here: Mapping[str, str]) -> str | None:
+def difference(stored: Mapping[str, str], running: Mapping[str, str]) -> str | None:
     """Return the first difference as text; None if there is none."""
-    for name in here:
-        if stored.get(name) != here[name]:
-            return f"{name} is {stored.get(name, 'unknown')} there, {here[name]} here"
+    for name in running:
+        if stored.get(name) != running[name]:
+            return f"{name} is {stored.get(name, 'unknown')} there, {running[name]} here"
     return None
 
 
@@ -161,10 +161,10 @@ def _require_address(address: str) -> None:
     """Check an address first: Dask's client takes long to report a wrong one."""
     try:
         parts = urlsplit(address if "://" in address else f"tcp://{address}")
-        known = parts.scheme in ("tcp", "tls") and parts.hostname and parts.port
+        is_complete = parts.scheme in ("tcp", "tls") and parts.hostname and parts.port
     except ValueError:
-        known = False
-    if not known:
+        is_complete = False
+    if not is_complete:
         raise CallerError(f"--scheduler {address}: write it as tcp://HOST:PORT")
 
 
@@ -176,14 +176,14 @@ def _client(connect: Any, address: str) -> Any:
     raise PeerError(f"--scheduler {address}: Dask's client does not start; the machine is too busy")
 
 
-def run_alike(work: Work, draws: range, wanted: Mapping[str, str] | None) -> NDArray[np.void]:
+def run_alike(work: Work, draws: range, expected: Mapping[str, str] | None) -> NDArray[np.void]:
     """Compute consecutive draws in another process, or on another machine.
 
     Raises:
         OtherArithmeticError: its results would differ from those of the caller.
     """
-    if wanted is not None and (other := difference(arithmetic(), wanted)) is not None:
-        raise OtherArithmeticError(f"a worker on {socket.gethostname()} would compute other results: {other}")
+    if expected is not None and (cause := difference(arithmetic(), expected)) is not None:
+        raise OtherArithmeticError(f"a worker on {socket.gethostname()} would compute other results: {cause}")
     return work.run(draws)
 
 
@@ -275,18 +275,18 @@ def _windowed(
     works: Sequence[Work],
     chunks: Iterable[Chunk],
     most: Callable[[], int],
-    wanted: Mapping[str, str] | None = None,
+    expected: Mapping[str, str] | None = None,
 ) -> Iterator[Finished]:
     """Keep a limited number of chunks in flight, so that memory use stays bounded."""
-    rest = iter(chunks)
+    waiting = iter(chunks)
     in_flight: dict[Future[NDArray[np.void]], Chunk] = {}
     while True:
-        for chunk in islice(rest, max(most() - len(in_flight), 0)):
+        for chunk in islice(waiting, max(most() - len(in_flight), 0)):
             with process_starts():
-                future = executor.submit(run_alike, works[chunk.point], chunk.draws, wanted)
+                future = executor.submit(run_alike, works[chunk.point], chunk.draws, expected)
             in_flight[future] = chunk
         if not in_flight:
             return
-        done, _ = wait(in_flight, _LOOK_EVERY_S, FIRST_COMPLETED)
-        for future in done:
+        finished, _ = wait(in_flight, _LOOK_EVERY_S, FIRST_COMPLETED)
+        for future in finished:
             yield in_flight.pop(future), future.result()

@@ -159,11 +159,11 @@ def opened(campaign: Campaign, base: Mapping[str, object], store: Store) -> Iter
                 scratch.unlink(missing_ok=True)
         except OSError as error:
             raise MachineError(f"{folder}: cannot be written: {why(error)}") from None
-        other = difference(made_by, arithmetic())
-        if other is not None and next(store.missing(), None) is not None:
+        deviation = difference(made_by, arithmetic())
+        if deviation is not None and next(store.missing(), None) is not None:
             raise CallerError(
                 f"{folder}: cannot be continued, new results would differ from the existing ones "
-                f"({other}); give another --out, or remove the folder"
+                f"({deviation}); give another --out, or remove the folder"
             )
         yield
 
@@ -203,18 +203,18 @@ def _identity(campaign: Campaign) -> dict[str, object]:
     return content
 
 
-def _difference(stored: object, here: object, key: str = "") -> str | None:
+def _difference(stored: object, running: object, key: str = "") -> str | None:
     """Return the first difference as text; None if there is none."""
-    if isinstance(stored, dict) and isinstance(here, dict):
-        names: list[object] = sorted(stored.keys() | here.keys())
-        pairs = [(stored.get(name), here.get(name)) for name in names]
-    elif isinstance(stored, list) and isinstance(here, list):
-        if len(stored) != len(here):
-            return f"{key} has {len(stored)} entries there, {len(here)} here"
-        names, pairs = list(range(len(here))), list(zip(stored, here, strict=True))
+    if isinstance(stored, dict) and isinstance(running, dict):
+        names: list[object] = sorted(stored.keys() | running.keys())
+        pairs = [(stored.get(name), running.get(name)) for name in names]
+    elif isinstance(stored, list) and isinstance(running, list):
+        if len(stored) != len(running):
+            return f"{key} has {len(stored)} entries there, {len(running)} here"
+        names, pairs = list(range(len(running))), list(zip(stored, running, strict=True))
     else:
-        texts = [shortened(json.dumps(value, ensure_ascii=False), 60) for value in (stored, here)]
-        return None if stored == here else f"{key} is {texts[0]} there, {texts[1]} here"
+        texts = [shortened(json.dumps(value, ensure_ascii=False), 60) for value in (stored, running)]
+        return None if stored == running else f"{key} is {texts[0]} there, {texts[1]} here"
     places = (f"{key}.{name}".removeprefix(".") for name in names)
     differences = (_difference(*pair, inner_key) for pair, inner_key in zip(pairs, places, strict=True))
     return next(filter(None, differences), None)
@@ -245,25 +245,25 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
     def stored() -> int:
         return total - sum(len(chunk.draws) for chunk in store.missing())
 
-    before = done = stored()
-    report = progress or (lambda done, total: None)
-    report(done, total)
+    stored_before = runs_done = stored()
+    report = progress or (lambda runs_done, total: None)
+    report(runs_done, total)
 
     def message(ending: object) -> str:
         return (
-            f"{ending}; {done:,} of {total:,} runs are in {store.folder}; "
+            f"{ending}; {runs_done:,} of {total:,} runs are in {store.folder}; "
             "the same command continues the campaign"
         )
 
     try:
         for chunk, rows in runner([point.work for point in store.points], list(store.missing())):
             store.write(chunk, rows)
-            done += len(chunk.draws)
-            report(done, total)
+            runs_done += len(chunk.draws)
+            report(runs_done, total)
     except KeyboardInterrupt as error:
         status = getattr(error, "exit_status", ExitStatus.INTERRUPTED)
-        done = stored()  # it may have come after a chunk was written, and before it was counted
+        runs_done = stored()  # it may have come after a chunk was written, and before it was counted
         raise InterruptedCampaignError(message(str(error) or "interrupted"), status) from None
     except (LostWorkersError, OtherArithmeticError, MachineError) as error:
         raise type(error)(message(error)) from None
-    return total - before
+    return total - stored_before

@@ -209,9 +209,9 @@ def difference(values: Vector, reference: Vector) -> PairedDifference:
     If both are infinite, the quantiles use a difference of 0, and the mean omits the draw.
     """
     differences = paired(values, reference)
-    both = np.isfinite(values) & np.isfinite(reference)
+    are_finite = np.isfinite(values) & np.isfinite(reference)
     return PairedDifference(
-        estimate(differences, differences[both]),
+        estimate(differences, differences[are_finite]),
         float((values > reference).mean()),
         float((values < reference).mean()),
     )
@@ -289,9 +289,9 @@ def burst_frequency(scenario: Scenario, metrics: Mapping[Metric, Vector]) -> Bur
     interval = binomtest(longer, runs).proportion_ci(CONFIDENCE)
     most = int(packets[finished].max())
     try:
-        kept = loss_process(network.link).keeps(LossGuarantee((LongestBurst(network.mansd),)), most)
+        chance = loss_process(network.link).keeps(LossGuarantee((LongestBurst(network.mansd),)), most)
     except NotPredictableError:
         return None
     return BurstFrequency(
-        network.mansd, runs, longer, float(interval.low), float(interval.high), most, 1 - kept
+        network.mansd, runs, longer, float(interval.low), float(interval.high), most, 1 - chance
     )

@@ -60,8 +60,8 @@ def box_of(scenario: Scenario) -> Box:
     loop = loop_of(resolve(scenario.model_copy(update={"plant": centre})))
     drawn = plant.draw in ("uniform", "vertex")
 
-    def half(given: tuple[object, ...] | None, like: Matrix) -> Matrix:
-        return np.zeros_like(like) if given is None else np.array(given, dtype=np.float64)
+    def half(halfwidth: tuple[object, ...] | None, centre_value: Matrix) -> Matrix:
+        return np.zeros_like(centre_value) if halfwidth is None else np.array(halfwidth, dtype=np.float64)
 
     return Box(
         loop.A,

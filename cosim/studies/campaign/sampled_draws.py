@@ -218,10 +218,10 @@ class SharedNetworkWork(SampledWork):
         """Fill a row from the records of the loops of a run."""
         loops = np.zeros(len(records), ROW)
         with np.errstate(all="ignore"):  # loops may diverge
-            for own, record in zip(loops, records, strict=True):
-                self._measure(record, own)
+            for loop_row, record in zip(loops, records, strict=True):
+                self._measure(record, loop_row)
             if self.judges:
-                held = [
+                have_held = [
                     all(claim.verdict == ClaimVerdict.HELD for claim in RunClaims(record).judge())
                     for record in records
                 ]
@@ -238,7 +238,7 @@ class SharedNetworkWork(SampledWork):
             for section, costs in zip(sections, np.split(loops["cost"], ends), strict=True):
                 row[cost_of(section.name)] = np.mean(costs)
         row["loops_failed"] = np.mean(loops["status"] != OK)
-        row["loops_claims_held"] = np.mean(held) if self.judges else np.nan
+        row["loops_claims_held"] = np.mean(have_held) if self.judges else np.nan
         self._measure_network(records, row)
 
     def _measure_network(self, records: Sequence[RunRecord], row: np.void) -> None:

@@ -70,7 +70,7 @@ class CapacityResult(NamedTuple):
             "deadline_s": plan.deadline_s,
             "periodic_loops_by_rate": plan.periodic_loops,
             "mixture": [
-                {"name": kind.name, "count": kind.given, "period_s": kind.period_s} for kind in plan.kinds
+                {"name": kind.name, "count": kind.loops, "period_s": kind.period_s} for kind in plan.kinds
             ],
             "loops": list(plan.counts),
             "draws": plan.draws,
@@ -90,10 +90,7 @@ def write(result: CapacityResult, folder: Path, figure_files: FigureFiles | None
         MachineError: they cannot be written.
     """
     document = to_json(result.document(), indent=1, inf_nan_mode="null")
-    written = [
-        write_whole(folder / PAGE, page(result)),
-        write_whole(folder / RESULTS, document + b"\n"),
-    ]
+    written = [write_whole(folder / PAGE, page(result)), write_whole(folder / RESULTS, document + b"\n")]
     files = figure_files or FigureFiles(FigureFormat.SVG, SCREEN_IN)
     for figure in figures(result):
         written.append(folder / f"{figure.name}.{files.kind}")
@@ -131,8 +128,9 @@ def rows(result: CapacityResult) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of capacities."""
     last = result.plan.counts[-1]
     for case in result.capacities:
-        limits = [_shown(case.limits[limit], last) for limit in LIMITS]
-        yield (case.policy, case.disturbance, _shown(case.any_limit, last), case.limited_by or "–", *limits)
+        limits = [_limit_text(case.limits[limit], last) for limit in LIMITS]
+        carried = _limit_text(case.any_limit, last)
+        yield case.policy, case.disturbance, carried, case.limited_by or "–", *limits
 
 
 def by_rate(plan: CapacityPlan) -> str:
@@ -178,9 +176,9 @@ def waiting(result: CapacityResult) -> Iterator[str]:
     """Yield the bounds of each policy that has one."""
     for policy, bounds_s in delay_bounds_s(result).items():
         if any(map(math.isfinite, bounds_s)):
-            shown = ", ".join(f"{t_s:.4g}" if math.isfinite(t_s) else "∞" for t_s in bounds_s)
+            times_text = ", ".join(f"{t_s:.4g}" if math.isfinite(t_s) else "∞" for t_s in bounds_s)
             counts = ", ".join(map(str, result.plan.counts))
-            yield f"{policy}: updates of {counts} loops wait at most {shown} s in virtual time"
+            yield f"{policy}: updates of {counts} loops wait at most {times_text} s in virtual time"
 
 
 def caveats(plan: CapacityPlan) -> Iterator[str]:
@@ -203,19 +201,19 @@ def comparisons(result: CapacityResult) -> Iterator[str]:
     """Yield for each event-triggered policy whether it carries more loops than the periodic one."""
     limits = {(capacity.policy, capacity.disturbance): capacity.any_limit for capacity in result.capacities}
     last = result.plan.counts[-1]
-    for (policy, disturbance), own in limits.items():
-        other = limits[PERIODIC, disturbance]
+    for (policy, disturbance), limit in limits.items():
+        periodic_limit = limits[PERIODIC, disturbance]
         if policy == PERIODIC:
             continue
-        how = "undecided, the intervals overlap"
-        if own.low > other.high or (own.low == math.inf > other.high):
-            how = "wins"
-        elif own.high < other.low:
-            how = "loses"
-        where = "with a common disturbance" if disturbance == COMMON else "as in the scenario"
+        outcome = "undecided, the intervals overlap"
+        if limit.low > periodic_limit.high or (limit.low == math.inf > periodic_limit.high):
+            outcome = "wins"
+        elif limit.high < periodic_limit.low:
+            outcome = "loses"
+        setting = "with a common disturbance" if disturbance == COMMON else "as in the scenario"
         yield (
-            f"{policy} against {PERIODIC}, {where}: {how} ({_shown(own, last)} and "
-            f"{_shown(other, last)} loops)"
+            f"{policy} against {PERIODIC}, {setting}: {outcome} ({_limit_text(limit, last)} and "
+            f"{_limit_text(periodic_limit, last)} loops)"
         )
 
 
@@ -281,7 +279,7 @@ def live_row(point: LivePoint) -> tuple[str, ...]:
     return (point.policy, str(point.loops), *cells, str(point.unintended_losses), verdict)
 
 
-def _shown(capacity: Capacity, last: int) -> str:
+def _limit_text(capacity: Capacity, last: int) -> str:
     def text(count: float) -> str:
         return f"≥ {last}" if math.isinf(count) else f"{count:g}"
 
@@ -292,8 +290,8 @@ def print_result(console: Console, result: CapacityResult) -> None:
     """Print the capacities, the comparisons and the live runs."""
     plan, columns = result.plan, slice(4)  # the table must fit into 80 columns
     title = f"{plan.scenario.name}: loops on {plan.link}"
-    shown = [row[columns] for row in rows(result)]
-    table = ResultTable("capacity", title, HEADINGS[columns], shown)
+    table_rows = [row[columns] for row in rows(result)]
+    table = ResultTable("capacity", title, HEADINGS[columns], table_rows)
     console.print(terminal_table(table, left=range(4)))
     lines = [
         f"loops carried: median [95 % interval] of {', '.join(map(str, plan.counts))} loops",

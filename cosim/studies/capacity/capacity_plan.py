@@ -45,7 +45,7 @@ class Kind(NamedTuple):
     """A kind of loop."""
 
     name: str
-    given: int
+    loops: int
     """Number of these loops in the scenario."""
     scenario: Scenario
     """The loop; not resolved."""
@@ -68,8 +68,8 @@ class Kind(NamedTuple):
 
     def disturbed(self, pulse: Entry, amplitude: float) -> list[Entry]:
         """Return its disturbances, and with an amplitude a pulse on all its inputs."""
-        own = self.scenario.plant.disturbances
-        disturbances = [disturbance.model_dump(mode="json", exclude_none=True) for disturbance in own]
+        sections = self.scenario.plant.disturbances
+        disturbances = [disturbance.model_dump(mode="json", exclude_none=True) for disturbance in sections]
         if amplitude:
             disturbances.append({**pulse, "amplitude": [amplitude] * self.scenario.model.dimensions[1]})
         return disturbances
@@ -104,7 +104,7 @@ def kinds_of(scenario: Scenario, period_s: float | None) -> tuple[Kind, ...]:
 
 def smallest_mixture(kinds: Sequence[Kind]) -> int:
     """Return the number of loops of the smallest mixture with the proportions of the scenario."""
-    counts = [kind.given for kind in kinds]
+    counts = [kind.loops for kind in kinds]
     return sum(counts) // math.gcd(*counts)
 
 
@@ -120,11 +120,7 @@ def policies_of(kinds: Sequence[Kind]) -> dict[str, Entry]:
             loops.append(kind.under(change))
         return {"mode": mode, "loops": loops}
 
-    return {
-        PERIODIC: settings("zoh", periodic=True),
-        ZOH: settings("zoh"),
-        MODEL: settings("model"),
-    }
+    return {PERIODIC: settings("zoh", periodic=True), ZOH: settings("zoh"), MODEL: settings("model")}
 
 
 def sampling_period_s(loop: Scenario) -> float:
@@ -246,11 +242,11 @@ class CapacityPlan:
 
     def factor(self, loops: float) -> float:
         """Return a number of loops as a multiple of the mixture that the scenario has."""
-        return loops / sum(kind.given for kind in self.kinds)
+        return loops / sum(kind.loops for kind in self.kinds)
 
     def composition(self, loops: float) -> dict[str, int]:
         """Return how many loops of each kind a finite number of loops has."""
-        return {kind.name: round(self.factor(loops) * kind.given) for kind in self.kinds}
+        return {kind.name: round(self.factor(loops) * kind.loops) for kind in self.kinds}
 
     @property
     def counted_from_s(self) -> float:
@@ -311,8 +307,8 @@ class CapacityPlan:
     def _network(self, loops: int, factor: int) -> Entry:
         """Return the settings of loops on bottlenecks so many times as fast, with longer queues."""
         settings: Entry = {"loops": loops}
-        for place, impairment in enumerate(self.scenario.network.impairments):
-            key = f"network.impairments.{place}"
+        for index, impairment in enumerate(self.scenario.network.impairments):
+            key = f"network.impairments.{index}"
             if isinstance(impairment, Schedule):
                 settings[f"{key}.order"] = [*range(loops)]
                 settings[f"{key}.slot_s"] = max(impairment.slot_s / factor, 1e-6)
@@ -353,9 +349,9 @@ def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
     queue = bottleneck(scenario)
     if isinstance(queue, Schedule):
         return min(kind.period_s for kind in kinds) / queue.slot_s
-    loops = sum(kind.given for kind in kinds)
+    loops = sum(kind.loops for kind in kinds)
     needed_bps = sum(
-        kind.given * int(queue.line_bits(datagram_bytes(kind.scenario.model.dimensions[0]))) / kind.period_s
+        kind.loops * int(queue.line_bits(datagram_bytes(kind.scenario.model.dimensions[0]))) / kind.period_s
         for kind in kinds
     )
     return queue.rate_bps * loops / needed_bps

@@ -89,15 +89,15 @@ class PolicyCapacity(NamedTuple):
     def document(self, plan: CapacityPlan) -> dict[str, object]:
         """Return the capacity for JSON, also as a multiple of the given mixture if it is finite."""
         median = self.any_limit.median
-        known = math.isfinite(median)
+        is_finite = math.isfinite(median)
         return {
             "policy": self.policy,
             "disturbance": self.disturbance,
             **self.any_limit._asdict(),
             "limited_by": self.limited_by,
             "limits": {name: capacity._asdict() for name, capacity in self.limits.items()},
-            "factor": plan.factor(median) if known else None,
-            "loops_by_kind": plan.composition(median) if known else None,
+            "factor": plan.factor(median) if is_finite else None,
+            "loops_by_kind": plan.composition(median) if is_finite else None,
         }
 
 
@@ -110,7 +110,7 @@ def capacities(plan: CapacityPlan, summary: CampaignSummary, store: Store) -> li
         for name, costs in store.columns(result.point.number, plan.cost_columns).items():
             runs[name] = np.where(np.isnan(costs), np.inf, costs)
         groups.setdefault((labels[POLICY], labels.get(DISTURBANCE, OWN)), {})[labels[LOOPS]] = runs
-    return [capacity_of(plan, policy, how, runs) for (policy, how), runs in groups.items()]
+    return [capacity_of(plan, policy, disturbance, runs) for (policy, disturbance), runs in groups.items()]
 
 
 def capacity_of(
@@ -154,8 +154,8 @@ def carried(counts: Sequence[int], reached: NDArray[np.bool_]) -> Vector:
         counts: ascending numbers of loops, (c,).
         reached: whether a run reaches the limit, (c, draws).
     """
-    before = np.array([0, *counts[:-1]], dtype=np.float64)
-    return np.where(reached.any(axis=0), before[np.argmax(reached, axis=0)], np.inf)
+    earlier_counts = np.array([0, *counts[:-1]], dtype=np.float64)
+    return np.where(reached.any(axis=0), earlier_counts[np.argmax(reached, axis=0)], np.inf)
 
 
 class LivePoint(NamedTuple):
@@ -203,8 +203,8 @@ def live_point(chosen: tuple[str, int], results: Sequence[GridPointResult], fold
         NoackError: the run could not be started or completed.
     """
     policy, count = chosen
-    wanted = {POLICY: policy, LOOPS: str(count), DISTURBANCE: OWN}
-    simulated = next(result for result in results if {DISTURBANCE: OWN, **result.point.labels} == wanted)
+    labels = {POLICY: policy, LOOPS: str(count), DISTURBANCE: OWN}
+    simulated = next(result for result in results if {DISTURBANCE: OWN, **result.point.labels} == labels)
     point, work = simulated.point, simulated.point.work
     assert isinstance(work, SharedNetworkWork)
     changes = {"seeds": seeds_of(work.seed, 0), "name": f"{policy}-{count}"}

@@ -88,12 +88,12 @@ def trade_off(result: DesignResult) -> FigureDescription:
     """Describe all tried candidates, the trade-off curve, the limit and the chosen candidate."""
     items: list[Item] = []
     for i, family in enumerate(result.space.families):
-        own = [t.measured for t in result.trials if t.candidate.family == i]
-        own = [m for m in own if np.isfinite(m.settling_s)]
+        family_measures = [t.measured for t in result.trials if t.candidate.family == i]
+        family_measures = [m for m in family_measures if np.isfinite(m.settling_s)]
         items.append(
             Marks(
-                x=np.array([m.transmissions for m in own]),
-                y=np.array([m.settling_s for m in own]),
+                x=np.array([m.transmissions for m in family_measures]),
+                y=np.array([m.settling_s for m in family_measures]),
                 label=plain(f"W {family.name}", 24),
                 colour=series_colour(i),
                 marker=MARKERS[i % len(MARKERS)],
@@ -143,11 +143,11 @@ def rows(result: DesignResult) -> list[tuple[str, ...]]:
 def print_found(console: Console, result: DesignResult) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
     title = f"{result.name}: trade-off of transmissions and settling time"
-    every = rows(result)
-    shown = every[:: -(-len(every) // _MOST_ROWS) or 1]
-    if every:
+    all_rows = rows(result)
+    table_rows = all_rows[:: -(-len(all_rows) // _MOST_ROWS) or 1]
+    if all_rows:
         words = range(len(HEADINGS) - 2, len(HEADINGS))
-        console.print(terminal_table(ResultTable("design", title, HEADINGS, shown), left=words))
+        console.print(terminal_table(ResultTable("design", title, HEADINGS, table_rows), left=words))
     lines = []
     if result.feasible:
         lines = [
@@ -181,7 +181,7 @@ class DesignOutcome:
     """Whether it is another loop than the given one."""
     document: dict[str, object]
     """The limits and the size of the search, as JSON."""
-    given: dict[str, object]
+    original: dict[str, object]
     """The given loop as JSON."""
     best: dict[str, object]
     figure: FigureDescription
@@ -196,16 +196,16 @@ class DesignOutcome:
             "trigger": ("policy", "period_s", "alpha_per_s", "beta"),
         }
         tables = {
-            table: {key: document[table][key] for key in some if document[table].get(key, []) != []}
-            for table, some in keys.items()
+            table: {key: document[table][key] for key in table_keys if document[table].get(key, []) != []}
+            for table, table_keys in keys.items()
         }
         return toml_text({"mode": document["mode"], **tables})
 
     @property
     def rows(self) -> list[tuple[str, str, str]]:
         """The comparison of both loops."""
-        given, best = self.cells
-        return [(heading, given[heading], best[heading]) for heading in given]
+        original, best = self.cells
+        return [(heading, original[heading], best[heading]) for heading in original]
 
     def to_json(self) -> dict[str, object]:
         """Return the result and the lines for the scenario."""
@@ -214,15 +214,15 @@ class DesignOutcome:
             "verdict": self.verdict,
             "lines": self.lines,
             **self.document,
-            "given": self.given,
+            "given": self.original,
             "best": self.best,
         }
 
     def written(self) -> str:
         """Return the scenario of the best loop as TOML, under a new name."""
         name = f"{self.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}"
-        about = f"{self.name} with another gain: {self.verdict}."
-        return dumps(self.scenario.model_copy(update={"name": name, "description": about}))
+        description = f"{self.name} with another gain: {self.verdict}."
+        return dumps(self.scenario.model_copy(update={"name": name, "description": description}))
 
 
 def gain_text(K: Rows) -> str:

@@ -85,11 +85,11 @@ class CandidateMeasures(NamedTuple):
     @property
     def settling(self) -> str:
         """The quantile of the settling times with its interval, as text."""
-        low, at, high = (
+        low, value_text, high = (
             f"{value:.4g}" if math.isfinite(value) else "∞"
             for value in (self.settling_low_s, self.settling_s, self.settling_high_s)
         )
-        return f"{at} s [{low}, {high}]"
+        return f"{value_text} s [{low}, {high}]"
 
 
 @dataclass
@@ -213,14 +213,14 @@ class Search:
         """
         while True:
             limits = self.limits.bounds.items()
-            known = [
+            within_bounds = [
                 trial
                 for trial in self.trials
                 if all(trial.bounds.get(name, 0.0) <= limit for name, limit in limits)
             ]
-            sent = np.array([t.measured.transmissions for t in known])
-            settling_s = np.array([t.measured.settling_s for t in known])
-            front = [known[i] for i in undominated(sent, settling_s)]
+            sent = np.array([t.measured.transmissions for t in within_bounds])
+            settling_s = np.array([t.measured.settling_s for t in within_bounds])
+            front = [within_bounds[i] for i in undominated(sent, settling_s)]
             front = [t for t in front if np.isfinite(t.measured.settling_s)]
             rough = [t for t in front if not self._is_exact(t)]
             if not rough:
@@ -241,8 +241,8 @@ class Search:
         share, rounds, best = 0.5, 0, best_of_family()
         while share > _SMALLEST_STEP and rounds < _MOST_ROUNDS:
             self._try(self.space.around(best.candidate, share))
-            before, best = best, best_of_family()
-            if best is before:
+            previous, best = best, best_of_family()
+            if best is previous:
                 share /= 2
             rounds += 1
 
@@ -332,23 +332,23 @@ class DesignResult:
         limits, share = self.limits, f"in {100 * self.limits.quantile:g} % of draws"
         candidate = self.best.candidate
         weight = self.space.families[candidate.family].name
-        at = f"α = {candidate.alpha_per_s:.4g} /s, β = {candidate.beta:.4g}, weight {weight}"
+        settings_text = f"α = {candidate.alpha_per_s:.4g} /s, β = {candidate.beta:.4g}, weight {weight}"
         if self.confirmed:
             sent = plus_minus(self.fresh.transmissions, self.fresh.halfwidth)
-            return f"{sent} transmissions, settled after {self.fresh.settling} {share}: {at}"
+            return f"{sent} transmissions, settled after {self.fresh.settling} {share}: {settings_text}"
         if self.feasible:
             return (
                 f"not confirmed: on fresh draws it takes {self.fresh.settling} {share}, "
                 f"{limits.settling_s:g} s are allowed; take more --draws"
             )
-        measured, missed = self.best.measured, []
+        measured, shortfalls = self.best.measured, []
         if measured.settling_high_s > limits.settling_s:
             allowed = f"({limits.settling_s:g} s allowed)"
-            missed.append(f"a settling time of {measured.settling} {share} {allowed}")
+            shortfalls.append(f"a settling time of {measured.settling} {share} {allowed}")
         for name, limit in limits.bounds.items():
             if self.best.bounds[name] > limit:
-                missed.append(f"{certified(name, self.best.bounds[name])} ({limit:g} allowed)")
-        return f"no design meets the limits; the closest has {' and '.join(missed)}, at {at}"
+                shortfalls.append(f"{certified(name, self.best.bounds[name])} ({limit:g} allowed)")
+        return f"no design meets the limits; the closest has {' and '.join(shortfalls)}, at {settings_text}"
 
     def document(self) -> dict[str, object]:
         """Return the result as JSON."""

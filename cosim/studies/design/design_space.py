@@ -158,8 +158,8 @@ def families_of(
     scenarios = {}
     for i, (gain, regulated) in enumerate(gains.items()):
 
-        def report(share: float, done: int = i) -> None:
-            progress((done + share) / len(gains))
+        def report(share: float, finished: int = i) -> None:
+            progress((finished + share) / len(gains))
 
         for norm in norms:
             scenarios[gain, norm] = _normed(regulated, norm, report)

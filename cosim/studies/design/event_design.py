@@ -87,16 +87,16 @@ class EventSearch:
         n, m = self.plant.n, self.plant.m
         self.weights = wish.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
-        self.given = EventLoop(rows_of(self.plant.K), trigger.alpha_per_s, trigger.beta)
+        self.original = EventLoop(rows_of(self.plant.K), trigger.alpha_per_s, trigger.beta)
         self.tried = self.judged = self._likely = 0
         self.most = wish.most or _MOST_M
         box = box_of(scenario)
         self._draws = box.population(seed, range(draws))
         self._fresh = box.population(seed, range(draws, 2 * draws))
         self.of_box = False
-        certificate = self.certificate(self.given, 1, of_box=True)
+        certificate = self.certificate(self.original, 1, of_box=True)
         self.of_box = certificate is not None and certificate.constants is not None
-        base = self.measured(self.given, self._draws)
+        base = self.measured(self.original, self._draws)
         self.limits = Measured(wish.cost * base.cost, wish.transmissions * base.transmissions)
 
     def scenario_of(self, loop: EventLoop, m: int | None = None) -> Scenario:
@@ -183,12 +183,12 @@ class EventSearch:
     def run(self, progress: Progress = lambda share: None) -> tuple[Certified, Certified]:
         """Return the given loop and the best one found."""
         plant, (Q, R) = self.plant, self.weights
-        starts = [self.given]
+        starts = [self.original]
         for factor in COSTS_OF_INPUT:
             K = lqr_gain(plant.A_model, plant.B_model, Q, factor * R).ravel()
             for scale in _ALPHAS:
-                alpha_per_s = scale * self.given.alpha_per_s
-                starts.append(_rounded(K, self.given, alpha_per_s, self.given.beta))
+                alpha_per_s = scale * self.original.alpha_per_s
+                starts.append(_rounded(K, self.original, alpha_per_s, self.original.beta))
         values = []
         for number, start in enumerate(starts):
             values.append(self.excess(start))
@@ -201,12 +201,12 @@ class EventSearch:
                 best, value = improved, reached
             progress(0.3 + 0.6 * (number + 1) / len(order))
         if value >= min(values[0], 0.0):  # no better than the given loop, or beyond a limit
-            best = self.given
-        given, chosen = (
+            best = self.original
+        original, chosen = (
             Certified(loop, self.largest_m(loop), self.measured(loop, self._fresh))
-            for loop in (self.given, best)
+            for loop in (self.original, best)
         )
-        return given, chosen
+        return original, chosen
 
     def _improve(self, start: EventLoop, most: int) -> tuple[EventLoop, float]:
         from scipy.optimize import minimize  # slow to import
@@ -236,15 +236,15 @@ class EventSearch:
         return best, value
 
 
-def _rounded(entries: Vector, like: EventLoop, alpha_per_s: float, beta: float) -> EventLoop:
+def _rounded(entries: Vector, template: EventLoop, alpha_per_s: float, beta: float) -> EventLoop:
     """Return a loop with six digits: what is judged is what is printed."""
-    width = len(like.K[0])
+    width = len(template.K[0])
     *numbers, alpha_per_s, beta = (float(f"{entry:.6g}") for entry in (*entries, alpha_per_s, beta))
     K = tuple(tuple(numbers[i : i + width]) for i in range(0, len(numbers), width))
     return EventLoop(K, alpha_per_s, beta)
 
 
-def event_outcome(search: EventSearch, given: Certified, best: Certified) -> DesignOutcome:
+def event_outcome(search: EventSearch, original: Certified, best: Certified) -> DesignOutcome:
     """Return what is shown of a search."""
     limits = search.limits
     is_network = search.wish.goal == "network"
@@ -253,11 +253,11 @@ def event_outcome(search: EventSearch, given: Certified, best: Certified) -> Des
         return {"certified": certified.m or None, **certified.loop._asdict(), **certified.measured._asdict()}
 
     plants = "for the whole box" if search.of_box else "for the scenario's own plant"
-    sent = f"{given.measured.transmissions:.4g} to {best.measured.transmissions:.4g}"
-    before, after = (_reach(search, certified) for certified in (given, best))
-    verdict = f"certified {plants}: {before} before, {after} after; transmissions {sent}"
-    if best.loop == given.loop:
-        verdict = f"{after} for the given loop; no better one was found"
+    sent = f"{original.measured.transmissions:.4g} to {best.measured.transmissions:.4g}"
+    reach_before, reach_after = (_reach(search, certified) for certified in (original, best))
+    verdict = f"certified {plants}: {reach_before} before, {reach_after} after; transmissions {sent}"
+    if best.loop == original.loop:
+        verdict = f"{reach_after} for the given loop; no better one was found"
     limit = f"a mean cost of at most {limits.cost:.4g}"
     limit += f", at most {limits.transmissions:.4g} transmissions" if is_network else ""
     for name, most in search.wish.bounds.items():
@@ -278,14 +278,14 @@ def event_outcome(search: EventSearch, given: Certified, best: Certified) -> Des
         search.scenario.name,
         verdict,
         notes,
-        (_cells(search, given), _cells(search, best)),
+        (_cells(search, original), _cells(search, best)),
         search.scenario_of(best.loop, best.m if is_network and best.m else None),
         best.m > 0,
-        best.loop != given.loop,
+        best.loop != original.loop,
         document,
-        entry(given),
+        entry(original),
         entry(best),
-        _figure(search, given, best),
+        _figure(search, original, best),
     )
 
 
@@ -299,11 +299,11 @@ def _cells(search: EventSearch, certified: Certified) -> dict[str, str]:
         value = search.state_bound(certified.loop, m) if m else math.inf
         return f"{value:.4g}" if value < math.inf else NONE
 
-    own = search.scenario.network.mansd + 1
+    own_m = search.scenario.network.mansd + 1
     return {
         "certified for": _reach(search, certified),
         "sup‖x‖ there at most": bound(certified.m),
-        f"sup‖x‖ with M = {own} at most": bound(own),
+        f"sup‖x‖ with M = {own_m} at most": bound(own_m),
         "cost, mean": f"{certified.measured.cost:.4g}",
         "transmissions, mean": f"{certified.measured.transmissions:.4g}",
         "α [1/s]": f"{certified.loop.alpha_per_s:.4g}",
@@ -312,11 +312,11 @@ def _cells(search: EventSearch, certified: Certified) -> dict[str, str]:
     }
 
 
-def _figure(search: EventSearch, given: Certified, best: Certified) -> FigureDescription:
+def _figure(search: EventSearch, original: Certified, best: Certified) -> FigureDescription:
     """Describe the certified bounds of ‖x‖ over M, which end where the certificate does."""
-    numbers = np.unique(np.geomspace(1, max(given.m, best.m, 2), 30).round().astype(int))
+    numbers = np.unique(np.geomspace(1, max(original.m, best.m, 2), 30).round().astype(int))
     items = []
-    for certified, label, colour in ((given, "given", NETWORK), (best, "designed", LOST)):
+    for certified, label, colour in ((original, "given", NETWORK), (best, "designed", LOST)):
         bounds = np.array([search.state_bound(certified.loop, int(m)) for m in numbers])
         items.append(Line(x=numbers.astype(float), y=bounds, colour=colour, label=label, marker="o"))
     x, y = Axis(label="M", logarithmic=True), Axis(label="certified sup‖x‖", logarithmic=True)

@@ -73,23 +73,23 @@ class QuickLoop:
         times = self._times
         cycle_ns = int(np.lcm(times.step_ns, times.tick_ns))
         cycles, rest_ns = divmod(until_ns - from_ns, cycle_ns)
-        whole = self._occurrences(from_ns, from_ns + rest_ns)
+        remainder = self._occurrences(from_ns, from_ns + rest_ns)
         square = self._occurrences(from_ns + rest_ns, from_ns + rest_ns + cycle_ns)
         while cycles:
             if cycles & 1:
-                whole = square.after(whole)
+                remainder = square.after(remainder)
             cycles, square = cycles >> 1, square.after(square)
-        return whole
+        return remainder
 
     def _occurrences(self, from_ns: int, until_ns: int) -> _Map:
         times = self._times
         first = -(-(from_ns - times.phase_ns) // times.tick_ns) * times.tick_ns + times.phase_ns
-        both = [(t_ns, 1, self._tick) for t_ns in range(first, until_ns, times.tick_ns)]
+        occurrences = [(t_ns, 1, self._tick) for t_ns in range(first, until_ns, times.tick_ns)]
         steps = range((from_ns // times.step_ns + 1) * times.step_ns, until_ns + 1, times.step_ns)
-        both += [(t_ns, 0, self._latch) for t_ns in steps]
+        occurrences += [(t_ns, 0, self._latch) for t_ns in steps]
         none = np.zeros_like(self._generator)
         passed, now_ns = _Map(np.eye(len(none)), none), from_ns
-        for t_ns, _, matrix in sorted(both, key=lambda occurrence: occurrence[:2]):
+        for t_ns, _, matrix in sorted(occurrences, key=lambda occurrence: occurrence[:2]):
             passed = _Map(matrix, none).after(self._flow(t_ns - now_ns).after(passed))
             now_ns = t_ns
         return self._flow(until_ns - now_ns).after(passed)
@@ -98,23 +98,23 @@ class QuickLoop:
         """Return the maps of a period whose update is lost, and of one whose update is not."""
         from_ns = slot * self._times.period_ns
         until_ns, arrival_ns = from_ns + self._times.period_ns, from_ns + self._times.delay_ns
-        first, rest = self._between(from_ns, arrival_ns), self._between(arrival_ns, until_ns)
+        first, second = self._between(from_ns, arrival_ns), self._between(arrival_ns, until_ns)
         arrived = first.M.copy()
         arrived[self._x_c] = self._arrived
-        return rest.after(first), rest.after(_Map(arrived, first.C))
+        return second.after(first), second.after(_Map(arrived, first.C))
 
     def cost(self, x0: Vector) -> float:
         """Return ∫ xᵀQx + uᵀRu dt from x(0) with every update delivered; infinite if unstable.
 
         The controller knows x(0), and the input is 0 until its first tick.
         """
-        whole = self._periods[0][1]
+        round_map = self._periods[0][1]
         for _, delivered in self._periods[1:]:
-            whole = delivered.after(whole)
-        if not np.isfinite([whole.M, whole.C]).all() or not _radius(whole.M) < 1 - 1e-9:
+            round_map = delivered.after(round_map)
+        if not np.isfinite([round_map.M, round_map.C]).all() or not _radius(round_map.M) < 1 - 1e-9:
             return np.inf
         z0 = np.concatenate([x0, x0, np.zeros(2 * self._m)])
-        return float(z0 @ solve_discrete_lyapunov(whole.M.T, whole.C) @ z0)
+        return float(z0 @ solve_discrete_lyapunov(round_map.M.T, round_map.C) @ z0)
 
     def maps(self, bursts: Sequence[Burst]) -> Matrix:
         """Return the maps of bursts between two deliveries, (k, d, d)."""
@@ -186,12 +186,12 @@ class PatternGraph:
                     cycle = tuple(paths[closed[fastest]].tolist())
                     best = QuickGrowth(float(growths[fastest]), cycle)
             rank = durations * (norms - max(best.logarithm, -50.0))
-            kept = np.argsort(-rank, kind="stable")[:_BEAM]
-            steps = [self._leaving[self._targets[paths[index, -1]]] for index in kept]
-            before, step = np.repeat(kept, [len(edges) for edges in steps]), np.concatenate(steps)
-            paths = np.concatenate([paths[before], step[:, None]], axis=1)
-            products = maps[step] @ products[before]
-            durations = durations[before] + self._durations[step]
+            best_paths = np.argsort(-rank, kind="stable")[:_BEAM]
+            steps = [self._leaving[self._targets[paths[index, -1]]] for index in best_paths]
+            extended, step = np.repeat(best_paths, [len(edges) for edges in steps]), np.concatenate(steps)
+            paths = np.concatenate([paths[extended], step[:, None]], axis=1)
+            products = maps[step] @ products[extended]
+            durations = durations[extended] + self._durations[step]
         return best
 
 

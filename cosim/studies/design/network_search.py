@@ -122,15 +122,15 @@ def time_triggered(scenario: Scenario, period_s: float | None) -> Scenario:
     Raises:
         CallerError: no period is given, neither here nor in the scenario.
     """
-    given = scenario.trigger
+    present = scenario.trigger
     if period_s is None:
-        if isinstance(given, PeriodicSettings):
+        if isinstance(present, PeriodicSettings):
             return scenario
         raise CallerError(
-            f'--period: trigger.policy = "{given.policy}" has no period; give the time between '
+            f'--period: trigger.policy = "{present.policy}" has no period; give the time between '
             "two updates in seconds, e.g. --period 0.5"
         )
-    trigger = PeriodicSettings(policy="periodic", period_s=period_s, weight=given.weight)
+    trigger = PeriodicSettings(policy="periodic", period_s=period_s, weight=present.weight)
     return scenario.model_copy(update={"trigger": trigger})
 
 
@@ -203,8 +203,8 @@ class NetworkSearch:
         n, m = self.plant.n, self.plant.m
         self.weights = wish.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
-        self.given = Candidate(resolved.mode, rows_of(self.plant.K))
-        base = self.quick_loop(self.given, margin.longest_ns).cost(self.plant.x0)
+        self.original = Candidate(resolved.mode, rows_of(self.plant.K))
+        base = self.quick_loop(self.original, margin.longest_ns).cost(self.plant.x0)
         self.limit = wish.cost * base
         """Largest cost; infinite if the given loop is unstable without losses."""
         self.tried = self.judged = 0
@@ -230,8 +230,8 @@ class NetworkSearch:
     def growth(self, candidate: Candidate, rung: int) -> float:
         """Return a lower bound of the logarithm of the growth per period."""
         self.tried += 1
-        at = self.ladder[rung]
-        loop, graph = self.quick_loop(candidate, at.period_ns), self.graph(at)
+        setting = self.ladder[rung]
+        loop, graph = self.quick_loop(candidate, setting.period_ns), self.graph(setting)
         return graph.growth(loop.maps(graph.bursts)).logarithm
 
     def cost(self, candidate: Candidate, rung: int) -> float:
@@ -263,14 +263,14 @@ class NetworkSearch:
 
     def scenario_of(self, candidate: Candidate, rung: int) -> Scenario:
         """Return the scenario of a loop on a rung, not resolved."""
-        at, scenario = self.ladder[max(rung, 0)], self.scenario
-        trigger = scenario.trigger.model_copy(update={"period_s": at.period_ns / NS_PER_S})
+        setting, scenario = self.ladder[max(rung, 0)], self.scenario
+        trigger = scenario.trigger.model_copy(update={"period_s": setting.period_ns / NS_PER_S})
         return scenario.model_copy(
             update={
                 "model": scenario.model.model_copy(update={"gain": candidate.K}),
                 "mode": candidate.mode,
                 "trigger": trigger,
-                "network": scenario.network.model_copy(update=at.network),
+                "network": scenario.network.model_copy(update=setting.network),
             }
         )
 
@@ -294,10 +294,10 @@ class NetworkSearch:
         if self.wish.goal == "transmissions":
             period_ns = self._times.period_ns
             start = max(i for i, rung in enumerate(self.ladder) if rung.period_ns <= period_ns)
-        top, _ = self.climb(self.given, start)
+        top, _ = self.climb(self.original, start)
         if top < start:
-            top = next((i for i in range(start, -1, -1) if self.climb(self.given, i)[0] >= i), -1)
-        return self.completed(self.given, top)
+            top = next((i for i in range(start, -1, -1) if self.climb(self.original, i)[0] >= i), -1)
+        return self.completed(self.original, top)
 
     def completed(self, candidate: Candidate, most: int) -> Reached:
         """Return a loop with refined bounds on its rung and on the next one.
@@ -308,13 +308,13 @@ class NetworkSearch:
         stability = None
         while rung >= 0 and (stability := self.judge(candidate, rung)).verdict != "stable":
             rung, stability = rung - 1, None
-        beyond, limit = None, math.inf if candidate == self.given else self.limit
+        following, limit = None, math.inf if candidate == self.original else self.limit
         while rung + 1 < len(self.ladder) and self.cost(candidate, rung + 1) <= limit:
-            beyond = self.judge(candidate, rung + 1)
-            if beyond.verdict != "stable":
+            following = self.judge(candidate, rung + 1)
+            if following.verdict != "stable":
                 break
-            rung, stability, beyond = rung + 1, beyond, None
-        return Reached(candidate, rung, stability, beyond, self.cost(candidate, rung))
+            rung, stability, following = rung + 1, following, None
+        return Reached(candidate, rung, stability, following, self.cost(candidate, rung))
 
     def regulators(self) -> list[Candidate]:
         """Return LQR gains of the model with all hold strategies."""
@@ -324,10 +324,10 @@ class NetworkSearch:
 
     def run(self, progress: Progress = lambda share: None) -> tuple[Reached, Reached]:
         """Return what the given loop reaches, and the best loop found."""
-        given = self.first()
-        self.tried, best, rung = 0, given.candidate, given.rung
+        original = self.first()
+        self.tried, best, rung = 0, original.candidate, original.rung
         progress(0.1)
-        starts = [Candidate(mode, given.candidate.K) for mode in self.wish.modes]
+        starts = [Candidate(mode, original.candidate.K) for mode in self.wish.modes]
         starts += self.regulators()
         ranked = sorted(
             ((*self.climb(start, max(rung, 0)), start) for start in starts),
@@ -343,11 +343,11 @@ class NetworkSearch:
         share = max(self.wish.effort // len(pool), 1)
         for number, start in enumerate(pool):
             candidate = start
-            left = share
-            while left > 0 and rung + 1 < len(self.ladder):
-                before = self.tried
-                improved = self._improve(candidate, rung + 1, left)
-                left -= max(self.tried - before, 1)
+            tries_left = share
+            while tries_left > 0 and rung + 1 < len(self.ladder):
+                tried_before = self.tried
+                improved = self._improve(candidate, rung + 1, tries_left)
+                tries_left -= max(self.tried - tried_before, 1)
                 if improved is None:
                     break
                 candidate = improved
@@ -357,7 +357,7 @@ class NetworkSearch:
                     break
                 best, rung = candidate, reached
             progress(0.3 + 0.6 * (number + 1) / len(pool))
-        return given, given if best == given.candidate else self.completed(best, rung)
+        return original, original if best == original.candidate else self.completed(best, rung)
 
     def _improve(self, start: Candidate, rung: int, most: int) -> Candidate | None:
         """Return a loop near ``start`` whose lower bound is below 1 on a rung; None: none found."""
@@ -387,8 +387,8 @@ class NetworkSearch:
                     "fatol": 1e-5,
                 },
             )
-        except _FoundError as found:
-            return found.candidate
+        except _FoundError as success:
+            return success.candidate
         return None
 
 
@@ -410,7 +410,7 @@ class _FoundError(Exception):
         self.candidate = candidate
 
 
-def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> DesignOutcome:
+def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) -> DesignOutcome:
     """Return what is shown of a search."""
     ladder, wish = search.ladder, search.wish
 
@@ -437,12 +437,12 @@ def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> De
 
     def entry(reached: Reached) -> dict[str, object]:
         certified = None if reached.rung < 0 else ladder[reached.rung].number
-        known = {"certified": certified, "cost": reached.cost, "transmitted": sent(reached)}
+        figures = {"certified": certified, "cost": reached.cost, "transmitted": sent(reached)}
         bounds = {"stability": _document(reached.stability), "beyond": _document(reached.beyond)}
-        return {**known, **reached.candidate._asdict(), **bounds}
+        return {**figures, **reached.candidate._asdict(), **bounds}
 
-    verdict = f"stable for every loss pattern: {reach(given)} before, {reach(best)} after"
-    if best.candidate == given.candidate:
+    verdict = f"stable for every loss pattern: {reach(original)} before, {reach(best)} after"
+    if best.candidate == original.candidate:
         verdict = f"{reach(best)} for the given loop; no better one was found"
     limit = f"{search.limit:.4g}" if math.isfinite(search.limit) else "any size"
     note = (
@@ -460,14 +460,14 @@ def periodic_outcome(search: NetworkSearch, given: Reached, best: Reached) -> De
         search.scenario.name,
         verdict,
         [note],
-        (cells(given), cells(best)),
+        (cells(original), cells(best)),
         search.scenario_of(best.candidate, best.rung),
         best.rung >= 0,
-        best.candidate != given.candidate,
+        best.candidate != original.candidate,
         document,
-        entry(given),
+        entry(original),
         entry(best),
-        _figure(search, given, best),
+        _figure(search, original, best),
     )
 
 
@@ -485,23 +485,23 @@ def _document(stability: Stability | None) -> dict[str, object] | None:
     return stability and stability_document(stability)
 
 
-def _figure(search: NetworkSearch, given: Reached, best: Reached) -> FigureDescription:
+def _figure(search: NetworkSearch, original: Reached, best: Reached) -> FigureDescription:
     """Describe the growth of both loops over the ladder."""
     ladder, wish = search.ladder, search.wish
-    top = min(max(best.rung, given.rung) + 4, len(ladder))
+    top = min(max(best.rung, original.rung) + 4, len(ladder))
     rungs = np.unique(np.linspace(0, top - 1, min(top, _MOST_POINTS)).astype(int))
     numbers = np.array([rung.number for rung in ladder])
     items: list[Item] = [Rule(at=1.0, colour=palette.CERTIFIED, label="stable below")]
-    for reached, label, colour in ((given, "given", palette.NETWORK), (best, "designed", palette.LOST)):
+    for reached, label, colour in ((original, "given", palette.NETWORK), (best, "designed", palette.LOST)):
         growth = np.exp(np.minimum([search.growth(reached.candidate, int(i)) for i in rungs], 1.1))
         items.append(Line(x=numbers[rungs], y=growth, colour=colour, label=label, marker="o"))
         if reached.stability is not None:
             x, y = numbers[[reached.rung]], np.array([reached.stability.upper])
-            about = f"{label}: proven"
-            items.append(Marks(x=x, y=y, colour=colour, marker="*", size=12, label=about))
-    along = "M" if wish.window is None else f"losses in {wish.window} updates"
+            mark_label = f"{label}: proven"
+            items.append(Marks(x=x, y=y, colour=colour, marker="*", size=12, label=mark_label))
+    x_label = "M" if wish.window is None else f"losses in {wish.window} updates"
     if wish.goal == "transmissions":
-        along = "time between updates [s]"
-    x_axis = Axis(label=along, whole=wish.goal == "network")
+        x_label = "time between updates [s]"
+    x_axis = Axis(label=x_label, whole=wish.goal == "network")
     panel = Panel(items=items, x=x_axis, y=Axis(label="growth per period"))
     return figure_of("growth", panel, _CAPTION)

@@ -70,8 +70,8 @@ class LinearModel:
     @property
     def uncontrollable(self) -> Complex:
         """The eigenvalues that no input changes, per second."""
-        rest = np.linalg.svd(np.hstack([self.controllable, 0 * self.A]))[0][:, self.rank :]
-        return eigenvalues(rest.T @ self.A @ rest)
+        complement = np.linalg.svd(np.hstack([self.controllable, 0 * self.A]))[0][:, self.rank :]
+        return eigenvalues(complement.T @ self.A @ complement)
 
     @property
     def rests(self) -> bool:
@@ -82,7 +82,7 @@ class LinearModel:
     def to_json(self) -> Table:
         """Return the document of ``noack linearise --json``."""
         arrays = {key: getattr(self, key).tolist() for key in ("at", "input", "A", "B", "drift")}
-        errors = [{"within": within, "of_states": of.tolist()} for within, of in self.errors]
+        errors = [{"within": within, "of_states": by_state.tolist()} for within, by_state in self.errors]
         return (
             {"plant": self.plant.label, "settings": self.plant.settings}
             | arrays
@@ -100,8 +100,8 @@ class LinearModel:
 
     def __repr__(self) -> str:
         states, inputs = self.plant.state_names, self.plant.input_names
-        both = np.hstack([self.A, self.B])
-        return "\n".join([_matrix("Â, B̂", both, states, states + inputs), *self._sentences()])
+        matrices = np.hstack([self.A, self.B])
+        return "\n".join([_matrix("Â, B̂", matrices, states, states + inputs), *self._sentences()])
 
     @property
     def origin(self) -> str:
@@ -113,15 +113,15 @@ class LinearModel:
             "motion": f"the matrix logarithm of the plant's motion over {self.plant.step_ns * 1e-9:g} s",
             "exact": "the plant's own matrices",
         }[self.source]
-        return f"{source}, at x = {_shown(self.at)}, u = {_shown(self.input)}"
+        return f"{source}, at x = {_vector_text(self.at)}, u = {_vector_text(self.input)}"
 
     def _sentences(self) -> Iterator[str]:
         yield f"computed from {self.origin}"
         if not self.rests:
             move, *_ = np.linalg.lstsq(np.hstack([self.A, self.B]), -self.drift, rcond=None)
             x, u = np.split(np.concatenate([self.at, self.input]) + move, [len(self.A)])
-            yield f"no equilibrium: ẋ = {_shown(self.drift)} there"
-            yield f"the linear model rests at x = {_shown(x)}, u = {_shown(u)}"
+            yield f"no equilibrium: ẋ = {_vector_text(self.drift)} there"
+            yield f"the linear model rests at x = {_vector_text(x)}, u = {_vector_text(u)}"
         for within, error in self.errors:
             worst = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
             name = self.plant.state_names[worst]
@@ -130,13 +130,13 @@ class LinearModel:
             yield "the error does not shrink with the neighbourhood: the plant is not smooth there"
         yield f"eigenvalues: {eigenvalue_text(self.eigenvalues)} /s"
         yield f"controllable: {self.rank} of {len(self.A)} states (tolerance {TOLERANCE:g})"
-        if len(rest := self.uncontrollable):
-            effect = "stable" if rest[0].real < 0 else "no gain stabilises the plant"
-            yield f"not controllable: the eigenvalues {eigenvalue_text(rest)} /s: {effect}"
+        if len(uncontrollable := self.uncontrollable):
+            effect = "stable" if uncontrollable[0].real < 0 else "no gain stabilises the plant"
+            yield f"not controllable: the eigenvalues {eigenvalue_text(uncontrollable)} /s: {effect}"
 
     @staticmethod
-    def _is_rough(wide: Vector, near: Vector) -> bool:
-        return bool((near > np.maximum(_ROUGH * wide, _ROUGH_LEAST)).any())
+    def _is_rough(wide: Vector, narrow: Vector) -> bool:
+        return bool((narrow > np.maximum(_ROUGH * wide, _ROUGH_LEAST)).any())
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def linearise(
     sizes = (None if at is None else len(at), None if input is None else len(input))
     reference = plant_reference(plant, settings or {}, sizes)
     x, u = vector("at", at, reference.n, "states"), vector("input", input, reference.m, "inputs")
-    point = {"at": x, "held": u, "step_ns": reference.step_ns, "settling_s": reference.system.settling_s}
+    point = {"x0": x, "u0": u, "step_ns": reference.step_ns, "settling_s": reference.system.settling_s}
     with np.errstate(all="ignore"):
         exact = reference.matrices or reference.system.linearisation()
         if exact is None:
@@ -261,9 +261,9 @@ def gain(
         NoackError: an unstable eigenvalue is not controllable, or a value is wrong.
     """
     model = linearise(plant, settings=settings) if isinstance(plant, str) else plant
-    label, rest = model.plant.label, model.uncontrollable
-    if len(rest) and rest[0].real >= 0:
-        worst = eigenvalue_text(rest[:1])
+    label, uncontrollable = model.plant.label, model.uncontrollable
+    if len(uncontrollable) and uncontrollable[0].real >= 0:
+        worst = eigenvalue_text(uncontrollable[:1])
         raise CallerError(f"{label}: no gain stabilises it: the eigenvalue {worst} /s is not controllable")
     if poles is None:
         Q, R = (_diagonal(*weight) for weight in (("q", q, model.A), ("r", r, model.B.T)))
@@ -272,11 +272,11 @@ def gain(
     elif q is not None or r is not None:
         raise CallerError("poles: give either these or the weights q and r")
     else:
-        wanted = np.array(poles, dtype=np.complex128)
-        K, method = _placed(model, wanted), f"poles {eigenvalue_text(wanted)} /s"
+        pole_values = np.array(poles, dtype=np.complex128)
+        K, method = _placed(model, pole_values), f"poles {eigenvalue_text(pole_values)} /s"
     K = np.array([[rounded(value, _DIGITS) for value in row] for row in K])
-    if (why := instability(model.A, model.B, K)) is not None:
-        raise CallerError(f"{label}: {why}")
+    if (reason := instability(model.A, model.B, K)) is not None:
+        raise CallerError(f"{label}: {reason}")
     return LoopGain(model, K, method)
 
 
@@ -307,9 +307,9 @@ def _placed(model: LinearModel, poles: Complex) -> Matrix:
     return np.asarray(-placed.gain_matrix @ basis.T, dtype=np.float64)
 
 
-def _diagonal(key: str, given: ArrayLike | None, shaped: Matrix) -> Matrix:
+def _diagonal(key: str, weights: ArrayLike | None, shaped: Matrix) -> Matrix:
     """Return a diagonal weight with an entry for each row of ``shaped``."""
-    size, values = len(shaped), np.atleast_1d(np.array(1.0 if given is None else given, np.float64))
+    size, values = len(shaped), np.atleast_1d(np.array(1.0 if weights is None else weights, np.float64))
     if values.shape not in ((1,), (size,)):
         raise CallerError(f"{key}: {values.size} numbers; give 1 or {size}")
     if not (np.isfinite(values).all() and (values >= 0).all() and (key == "q" or values.all())):
@@ -351,21 +351,21 @@ def eigenvalues(matrix: Matrix) -> Complex:
 
 def eigenvalue_text(values: Complex) -> str:
     """Return eigenvalues as text, conjugate pairs as one: "-0.81±0.5j, -5.8"."""
-    scale, shown = max(1.0, float(np.abs(values).max(initial=0.0))), list[str]()
+    scale, texts = max(1.0, float(np.abs(values).max(initial=0.0))), list[str]()
     for value in values:
         if value.imag > _REAL * scale:
-            shown.append(f"{value.real:.4g}±{value.imag:.4g}j")
+            texts.append(f"{value.real:.4g}±{value.imag:.4g}j")
         elif value.imag >= -_REAL * scale:
-            shown.append(f"{value.real if abs(value.real) > _ZERO * scale else 0.0:.4g}")
-    return ", ".join(shown)
+            texts.append(f"{value.real if abs(value.real) > _ZERO * scale else 0.0:.4g}")
+    return ", ".join(texts)
 
 
-def vector(key: str, given: object, size: int, meaning: str) -> Vector:
+def vector(key: str, entries: object, size: int, meaning: str) -> Vector:
     """Return a given vector, (size,); None is 0. Raise CallerError if it is not one."""
     try:
-        values = np.zeros(size) if given is None else np.array(given, dtype=np.float64)
+        values = np.zeros(size) if entries is None else np.array(entries, dtype=np.float64)
     except (TypeError, ValueError):
-        raise CallerError(f"{key}: {given!r} is no list of numbers") from None
+        raise CallerError(f"{key}: {entries!r} is no list of numbers") from None
     if values.shape != (size,):
         raise CallerError(f"{key}: {values.size} numbers; the plant has {size} {meaning}")
     if not np.isfinite(values).all():
@@ -381,10 +381,10 @@ def read_document(path: Path) -> dict[str, UserCode]:
         raise CallerError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError:
         document = None
-    wanted = {"plant": str, "settings": dict, "at": list, "input": list}
+    kinds = {"plant": str, "settings": dict, "at": list, "input": list}
     if (
         not isinstance(document, dict)
-        or not all(isinstance(document.get(key), kind) for key, kind in wanted.items())
+        or not all(isinstance(document.get(key), kind) for key, kind in kinds.items())
         or document["plant"].endswith(".json")
     ):
         raise CallerError(f"{path}: not written by `noack linearise` or `noack gain`")
@@ -396,28 +396,25 @@ def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:
     model = linearise(plant, settings=settings)
     if not plant.endswith(".json") or "gain" not in (document := read_document(Path(plant))):
         return model
-    given = document["gain"]
-    if not isinstance(given, list) or not all(isinstance(row, list) for row in given):
+    gain_rows = document["gain"]
+    if not isinstance(gain_rows, list) or not all(isinstance(row, list) for row in gain_rows):
         raise CallerError(f"{plant}: gain: should be a list of rows")
-    rows = [vector("gain", row, len(model.A), "states") for row in given]
+    rows = [vector("gain", row, len(model.A), "states") for row in gain_rows]
     if len(rows) != model.plant.m:
         raise CallerError(f"{plant}: gain: {len(rows)} rows; the plant has {model.plant.m} inputs")
     K = np.array(rows)
-    if (why := instability(model.A, model.B, K)) is not None:
-        raise CallerError(f"{plant}: gain: {why}")
+    if (reason := instability(model.A, model.B, K)) is not None:
+        raise CallerError(f"{plant}: gain: {reason}")
     return LoopGain(model, K, str(document.get("method", "given")))
 
 
 def _matrix(name: str, matrix: Matrix, rows: Sequence[str], columns: Sequence[str]) -> str:
     entries = ([f"{value:.6g}" for value in row] for row in matrix)
-    table: Rows = [
-        [name, *columns],
-        *([row, *cells] for row, cells in zip(rows, entries, strict=True)),
-    ]
+    table: Rows = [[name, *columns], *([row, *cells] for row, cells in zip(rows, entries, strict=True))]
     return as_text(table)
 
 
-def _shown(values: Vector) -> str:
+def _vector_text(values: Vector) -> str:
     return f"({', '.join(f'{value:.4g}' for value in values)})"
 
 

@@ -87,11 +87,7 @@ class NewScenario:
     def to_json(self) -> Table:
         """Return the document of ``noack new --json``."""
         certificate = self.certificate and self.certificate.to_json()
-        return self.gain.to_json() | {
-            "toml": self.text,
-            "notes": self.notes,
-            "certificate": certificate,
-        }
+        return self.gain.to_json() | {"toml": self.text, "notes": self.notes, "certificate": certificate}
 
     def __repr__(self) -> str:
         return self.text
@@ -131,14 +127,14 @@ def new(
     """
     plant_model = model_or_gain(plant, settings or {}) if isinstance(plant, str) else plant
     fixed = {key: value for key, value in (settings or {}).items() if not key.startswith("plant.system")}
-    given = fixed.pop("plant.initial_state", initial_state)
+    fixed_state = fixed.pop("plant.initial_state", initial_state)
     model = plant_model.model if isinstance(plant_model, LoopGain) else plant_model
     _require_rest(model)
     build = _Builder(model, Path(path), fixed)
-    best = build.search(list(_trials(plant_model, _initial_state(model, given))), report)
+    best = build.search(list(_trials(plant_model, _initial_state(model, fixed_state))), report)
     report("simulating")
     for _ in range(_FEWEST):
-        if (returns := build.returns(best)) or given is not None:
+        if (returns := build.returns(best)) or fixed_state is not None:
             break
         best = replace(best, x0=best.x0 * _SMALLER)
     certificate, _ = build.certified(best)
@@ -163,12 +159,12 @@ def _require_rest(model: LinearModel) -> None:
         )
 
 
-def _initial_state(model: LinearModel, given: object) -> Vector:
+def _initial_state(model: LinearModel, fixed_state: object) -> Vector:
     """Return x(0): as given, the plant's own, or 0.1 for each state that is no other's rate."""
     n, unit = model.plant.n, np.eye(model.plant.n)
-    if given is not None or model.plant.initial_state is not None:
-        given = model.plant.initial_state if given is None else given
-        return vector("x0", given, n, "states")
+    if fixed_state is not None or model.plant.initial_state is not None:
+        fixed_state = model.plant.initial_state if fixed_state is None else fixed_state
+        return vector("x0", fixed_state, n, "states")
     is_rate = [any((model.A[i] == unit[j]).all() for i in range(n) if i != j) for j in range(n)]
     return np.where(is_rate, 0.0, _START) if not all(is_rate) else np.full(n, _START)
 
@@ -178,8 +174,8 @@ def _trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
     gains = [model] if isinstance(model, LoopGain) else [gain(model, r=weight) for weight in _INPUT_WEIGHTS]
     for loop_gain in gains:
         fastest = max((size for size in np.abs(loop_gain.eigenvalues) if size < _FASTEST_PER_S), default=1)
-        wanted = _STEPS_PER_TIME_CONSTANT * fastest
-        base = next((rate for rate in _RATES_HZ if rate >= wanted), _RATES_HZ[-1])
+        least_rate_hz = _STEPS_PER_TIME_CONSTANT * fastest
+        base = next((rate for rate in _RATES_HZ if rate >= least_rate_hz), _RATES_HZ[-1])
         base = loop_gain.model.plant.rates.get("rate_hz", base)
         is_fixed = loop_gain.model.plant.system.has_own_step
         for rate in (base,) if is_fixed else (base, 2 * base):
@@ -271,12 +267,12 @@ class _Builder:
     def search(self, trials: Sequence[_Trial], report: Callable[[str], None]) -> _Trial:
         """Return the trial that is used."""
         certified: list[tuple[float, _Trial]] = []
-        closest, known = (math.inf, trials[0]), set[str]()
+        closest, contents = (math.inf, trials[0]), set[str]()
         for number, trial in enumerate(trials):
             report(f"certifying: {number + 1} of {len(trials)}")
-            if (content := str(self.content(trial))) in known:  # the given settings exclude it
+            if (content := str(self.content(trial))) in contents:  # the given settings exclude it
                 continue
-            known.add(content)
+            contents.add(content)
             certificate, loop_gain = self.certified(trial)
             if certificate.constants is None:
                 closest = min(closest, (loop_gain, trial), key=lambda entry: entry[0])
@@ -320,7 +316,7 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
         bound = envelope_formula("‖x‖", certificate, "state").format(certificate.constants.state)
         yield f"Certified for {plant}, for every pattern of losses: {bound}."
     if not is_linear:
-        errors = ", ".join(f"{of.max():.2g} within ±{w:g}" for w, of in trial.gain.model.errors)
+        errors = ", ".join(f"{by_state.max():.2g} within ±{w:g}" for w, by_state in trial.gain.model.errors)
         yield (
             "The plant itself is not linear: no certificate covers it, and a run checks only what "
             "holds for every plant; with --set 'plant.system={kind=\"linear\"}' a run has the "

@@ -28,7 +28,7 @@ from noack.settings.user_files import located
 _GYMNASIUM = "gymnasium:"
 _MOST_TRIED = 16
 """Largest number of states and of inputs that is tried with a class that names neither."""
-_KINDS = sorted(kind for kind, one in PLANTS.items() if one.scenario and one is not LinearSettings)
+_KINDS = sorted(kind for kind, plant in PLANTS.items() if plant.scenario and plant is not LinearSettings)
 _FORMS = (
     f"PLANT is FILE.py:Class, FILE.fmu, gymnasium:ID, a kind of plant ({', '.join(_KINDS)}), a "
     "scenario, or a file that `noack linearise` or `noack gain` wrote"
@@ -113,10 +113,10 @@ def plant_reference(
     if isinstance(system, PythonPlantSettings):
         n, m = _sizes_of_class(system, label, sizes)
         return PlantReference(label, settings, system, n, m, (None, None), rates)
-    known = _of_scenario(str(system.scenario), {})
-    initial = known.initial_state
+    base = _of_scenario(str(system.scenario), {})
+    initial = base.initial_state
     return PlantReference(
-        label, settings, system, known.n, known.m, known.names, {**known.rates, **rates}, initial
+        label, settings, system, base.n, base.m, base.names, {**base.rates, **rates}, initial
     )
 
 
@@ -218,8 +218,8 @@ def _sizes_of_class(
             refusals.setdefault(str(error), (n, m))
         else:
             return n, m
-    first, *more = refusals
-    if not more:
+    first, *further_refusals = refusals
+    if not further_refusals:
         raise CallerError(first)
     raise CallerError(
         f"{label}: no number of states and inputs up to {_MOST_TRIED} is accepted at x = 0, u = 0; "

@@ -127,10 +127,7 @@ def _growth(scenario: Scenario, draws: int) -> Numbers:
         runs = [run_continuous(resolved_draw(scenario, draw, mode)) for draw in range(draws)]
         norms = [np.linalg.norm([state.x for state in run.before], axis=1) for run in runs]
         rises = [np.diff(n[run.delivered]) > 0 for n, run in zip(norms, runs, strict=True)]
-        growth[mode] = {
-            "stretches": sum(map(len, rises)),
-            "growing": sum(int(rise.sum()) for rise in rises),
-        }
+        growth[mode] = {"stretches": sum(map(len, rises)), "growing": sum(int(rise.sum()) for rise in rises)}
     return growth
 
 
@@ -146,8 +143,8 @@ def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
         samples = run.at(np.linspace(0.0, run.reached_s, 4001))
         growth = np.exp(trigger.alpha_per_s * samples.t_s)
         # e_c jumps at a delivery, so its largest value may come just before.
-        before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, run.system.loop.n)
-        at_events = run.system.norms(before) * np.exp(trigger.alpha_per_s * run.event_s[1:])
+        e_c_before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, run.system.loop.n)
+        at_events = run.system.norms(e_c_before) * np.exp(trigger.alpha_per_s * run.event_s[1:])
         error = max((run.e_c_norm(samples) * growth).max(), at_events.max(initial=0.0))
         rows.append(
             {
@@ -200,11 +197,7 @@ def _loss(M: int) -> Numbers:
     """
     roots = np.roots([*[1.0] * (M - 1), -1.0])
     (half,) = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
-    return {
-        "half": float(half),
-        "at_0.8": 1 - 1 / sum(0.8**k for k in range(M)),
-        "most": (M - 1) / M,
-    }
+    return {"half": float(half), "at_0.8": 1 - 1 / sum(0.8**k for k in range(M)), "most": (M - 1) / M}
 
 
 def _exact_model(scenario: Scenario) -> Numbers:
@@ -214,7 +207,7 @@ def _exact_model(scenario: Scenario) -> Numbers:
     loop = loop_of(resolved)
     eigenvalues, vectors = np.linalg.eig(loop.H)
     BK, identity = loop.B @ loop.K, np.eye(loop.n)
-    apart = [
+    deviations = [
         float(np.linalg.norm(np.linalg.solve(value * identity - loop.A, BK @ chi) - chi))
         for value, chi in zip(eigenvalues, vectors.T, strict=True)
     ]
@@ -224,7 +217,7 @@ def _exact_model(scenario: Scenario) -> Numbers:
         "events": len(run.event_s),
         "times_s": times_s,
         "norms": np.linalg.norm(run.at(times_s).x, axis=1).tolist(),
-        "apart": max(*apart, _ROUNDING),
+        "apart": max(*deviations, _ROUNDING),
     }
 
 
@@ -392,14 +385,14 @@ def _sampled(scenario: Scenario, representative: int) -> Numbers:
     record = simulate(resolved)
     joined = align_tables(record)
     tested = record[SENSOR_MEASUREMENT]["event"] > 0  # event 0 happens without a test
-    beyond = joined.e_s_norm[tested] / joined.threshold[tested]
+    ratios = joined.e_s_norm[tested] / joined.threshold[tested]
     exact = continuous.at(joined.t_ns / NS_PER_S)
     return {
         "horizon_s": _SAMPLED_S,
         "period_s": resolved.timing.measurement_period_ns / NS_PER_S,
         "events": int(tested.sum()) + 1,
         "events_continuous": len(continuous.event_s),
-        "beyond": float(beyond.max()),
+        "beyond": float(ratios.max()),
         "rms": math.sqrt(float(((joined.x - exact.x) ** 2).sum(axis=1).mean())),
     }
 

@@ -71,15 +71,15 @@ def make_folder(folder: Path) -> Path:
     return folder / "figures"
 
 
-def write_page(done: FinishedCampaign, folder: Path) -> tuple[Document, list[Path]]:
+def write_page(campaign: FinishedCampaign, folder: Path) -> tuple[Document, list[Path]]:
     """Write page, figures and numbers; return the numbers and the written files.
 
     Raises:
         MachineError: they cannot be written.
     """
-    document, inner = numbers(done), make_folder(folder)
-    draw, scenario = document["representative"], _base(done)
-    described = {figure.name: figure for figure in figures(done.summary, done.store)}
+    document, inner = numbers(campaign), make_folder(folder)
+    draw, scenario = document["representative"], _base(campaign)
+    described = {figure.name: figure for figure in figures(campaign.summary, campaign.store)}
     described |= {
         policy.lower(): draw_figure(scenario, draw, mode)
         for policy, mode in zip(POLICIES, MODES, strict=True)
@@ -95,30 +95,30 @@ def write_page(done: FinishedCampaign, folder: Path) -> tuple[Document, list[Pat
     return document, written
 
 
-def numbers(done: FinishedCampaign) -> Document:
+def numbers(campaign: FinishedCampaign) -> Document:
     """Return the content of ``paper.json``: rounded, null for infinity."""
-    draws, draw = done.summary.draws, _representative(done)
+    draws, draw = campaign.summary.draws, _representative(campaign)
     document = {
         "representative": draw,
-        "evidence": evidence(_base(done), draws, draw),
-        "summary": done.summary.document(),
+        "evidence": evidence(_base(campaign), draws, draw),
+        "summary": campaign.summary.document(),
     }
     rounded: Document = _rounded(document)
     return rounded
 
 
-def _base(done: FinishedCampaign) -> Scenario:
-    return done.store.points[0].scenario
+def _base(campaign: FinishedCampaign) -> Scenario:
+    return campaign.store.points[0].scenario
 
 
-def _representative(done: FinishedCampaign) -> int:
+def _representative(campaign: FinishedCampaign) -> int:
     """Return the draw nearest to the medians of the base, with both policies.
 
     Distance is the sum of squares of (value − median) / (upper − lower quartile).
     """
-    distance = np.zeros(done.summary.draws)
-    for point in (drawn for drawn in done.store.points if drawn.labels["variation"] == BASE):
-        metrics, _ = runs_at(point, done.store)
+    distance = np.zeros(campaign.summary.draws)
+    for point in (drawn for drawn in campaign.store.points if drawn.labels["variation"] == BASE):
+        metrics, _ = runs_at(point, campaign.store)
         for name in _REPRESENTED:
             low, middle, high = quartiles(metrics[name])
             if math.isfinite(high) and high > low:
@@ -160,7 +160,7 @@ def render(document: Document) -> str:
     """Return the page in Markdown, from the content of ``paper.json``."""
     summary = document["summary"]
     point = {tuple(point["axes"].values()): point["metrics"] for point in summary["points"]}
-    apart = {difference["axes"]["variation"]: difference["metrics"] for difference in summary["differences"]}
+    gaps = {difference["axes"]["variation"]: difference["metrics"] for difference in summary["differences"]}
     templates = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         undefined=StrictUndefined,
@@ -178,25 +178,25 @@ def render(document: Document) -> str:
             claims=summary["claims"],
             model=point[BASE, POLICIES[0]],
             zoh=point[BASE, POLICIES[1]],
-            apart=apart[BASE],
-            compared=list(_compared(point, apart[BASE])),
-            varied=list(_varied(point, apart)),
+            apart=gaps[BASE],
+            compared=list(_metric_rows(point, gaps[BASE])),
+            varied=list(_varied(point, gaps)),
             **document["evidence"],
         )
     )
 
 
-def _compared(point: Mapping[Any, Any], apart: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _metric_rows(point: Mapping[Any, Any], differences: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the main table: a metric of both loops."""
-    for name, difference in apart.items():
-        both = (_spread(point[BASE, policy][name]) for policy in POLICIES)
+    for name, difference in differences.items():
+        spreads = (_spread(point[BASE, policy][name]) for policy in POLICIES)
         larger = share_text(difference["larger"])
-        yield METRICS[name].label, *both, _spread(difference), larger  # type: ignore[index]
+        yield METRICS[name].label, *spreads, _spread(difference), larger  # type: ignore[index]
 
 
-def _varied(point: Mapping[Any, Any], apart: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _varied(point: Mapping[Any, Any], gaps: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of variations: medians of both loops."""
-    for name, differences in apart.items():
+    for name, differences in gaps.items():
         medians = (
             " / ".join(number(point[name, policy][metric]["median"]) for policy in POLICIES)
             for metric in ("transmissions", "lost_share", "inter_event_min_s", "settling_s")
@@ -234,19 +234,19 @@ def _wrapped(text: str) -> str:
     for line in text.splitlines():
         start = line.lstrip()
         fence = start.startswith("```")
-        kept = code or fence or not start or start[0] in "|#!<"
+        is_verbatim = code or fence or not start or start[0] in "|#!<"
         code ^= fence
-        if paragraph and (kept or _ITEM.match(start)):
-            lines += _filled(paragraph)
+        if paragraph and (is_verbatim or _ITEM.match(start)):
+            lines += _wrapped_lines(paragraph)
             paragraph = ""
-        if kept:
+        if is_verbatim:
             lines.append(line)
         else:
             paragraph = f"{paragraph} {start}" if paragraph else line
-    return "\n".join([*lines, *_filled(paragraph), ""])
+    return "\n".join([*lines, *_wrapped_lines(paragraph), ""])
 
 
-def _filled(paragraph: str) -> list[str]:
+def _wrapped_lines(paragraph: str) -> list[str]:
     start = paragraph.lstrip()
     item = _ITEM.match(start)
     begin = len(paragraph) - len(start) + (item.end() if item else 0)

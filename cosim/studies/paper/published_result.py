@@ -84,14 +84,14 @@ class Reproduction(NamedTuple):
     def remarks(self) -> list[str]:
         """Return how the rows are computed, known deviations, and what is not given."""
         hows = dict.fromkeys(f"computed: {row.how}" for row in self.rows)
-        known = (f"{row.quantity}: {row.deviation}" for row in self.rows if row.deviation)
-        return [*hows, *known, *self.result.notes]
+        deviations = (f"{row.quantity}: {row.deviation}" for row in self.rows if row.deviation)
+        return [*hows, *deviations, *self.result.notes]
 
     def document(self) -> Mapping[str, object]:
         """Return the document of ``--json``."""
         rows = [row._asdict() | {"verdict": row.verdict} for row in self.rows]
-        known = {"about": self.result.about, "reference": self.result.reference}
-        return {"name": self.name, **known, "rows": rows, "notes": list(self.result.notes)}
+        source = {"about": self.result.about, "reference": self.result.reference}
+        return {"name": self.name, **source, "rows": rows, "notes": list(self.result.notes)}
 
 
 def print_rows(console: "Console", reproduction: Reproduction) -> None:
@@ -103,18 +103,18 @@ def print_rows(console: "Console", reproduction: Reproduction) -> None:
     console.print(verdict, style="bold" if reproduction.as_expected else "bold red", highlight=False)
 
 
-def number(quantity: str, where: str, published: float, computed: float, how: str, *, digits: int) -> Row:
+def number(quantity: str, place: str, published: float, computed: float, method: str, *, digits: int) -> Row:
     """Return the row of a number that is published with so many digits after the point."""
     agrees = abs(computed - published) <= 0.5000001 * 10.0**-digits
     texts = f"{published:.{digits}f}", f"{computed:.{digits + 1}f}"
-    return Row(quantity, where, "=", *texts, how, agrees)
+    return Row(quantity, place, "=", *texts, method, agrees)
 
 
 def stored(name: str) -> dict[str, dict[str, Matrix]]:
     """Return the tables of numbers, published or found, beside the result in NAME.toml."""
     path = Path(__file__).parent / "results" / f"{name}.toml"
     tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    return {key: {one: np.array(two) for one, two in table.items()} for key, table in tables.items()}
+    return {key: {entry: np.array(rows) for entry, rows in table.items()} for key, table in tables.items()}
 
 
 def shipped_loop(name: str, settings: Iterable[str] = ()) -> ContinuousLoop:

@@ -39,13 +39,13 @@ def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) 
     Raises:
         ValueError: they cannot; the message begins with the key.
     """
-    seen: set[str] = set()
+    scopes: set[str] = set()
     for number, constraint in enumerate(constraints):
-        if constraint.scope in seen:
+        if constraint.scope in scopes:
             raise ValueError(
                 f"constraints.{number}: {constraint.text()}: there is a {constraint.scope} already"
             )
-        seen.add(constraint.scope)
+        scopes.add(constraint.scope)
     if constraints and find_longest_burst(mansd, constraints) is None:
         raise ValueError(
             f"constraints: {constraints[0].text()}: needs a maximum of losses, too: mansd or at_most (atmost)"

@@ -35,8 +35,8 @@ class EarliestDeadline(Scheduler):
     def numbers(self) -> tuple[int, ...]:
         return tuple(round(deadline_s * NS_PER_S) for deadline_s in self.deadlines_s)
 
-    def yields_ns(self, flow: int, other: int) -> float:
-        return self.number(flow) - self.number(other)
+    def yields_ns(self, number: int, other_number: int) -> float:
+        return number - other_number
 
     def meaning(self) -> str:
         times = numbers_text([time_text(deadline_s) for deadline_s in self.deadlines_s])

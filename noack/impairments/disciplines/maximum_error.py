@@ -25,7 +25,7 @@ class MaximumError(Scheduler):
     tc_missing: ClassVar = "the discipline maximum_error"
     numbers: ClassVar = (0,)
 
-    def yields_ns(self, flow: int, other: int) -> float:
+    def yields_ns(self, number: int, other_number: int) -> float:
         return math.inf
 
     def meaning(self) -> str:

@@ -35,8 +35,8 @@ class Priority(Scheduler):
     def numbers(self) -> tuple[int, ...]:
         return self.levels
 
-    def yields_ns(self, flow: int, other: int) -> float:
-        below = self.number(flow) - self.number(other)
+    def yields_ns(self, number: int, other_number: int) -> float:
+        below = number - other_number
         return math.copysign(math.inf, below) if below else 0.0
 
     def meaning(self) -> str:

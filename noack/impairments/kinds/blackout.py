@@ -73,12 +73,12 @@ class Blackout(FileFeature, Impairment):
         return self
 
     def meaning(self) -> str:
-        every = "" if self.every_s is None else f", every {time_text(self.every_s)}"
+        period = "" if self.every_s is None else f", every {time_text(self.every_s)}"
         if self.intervals_s is None:
-            return f"loses every packet in the intervals of {self.file}{every}"
+            return f"loses every packet in the intervals of {self.file}{period}"
         parts = [f"{time_text(begin)} to {time_text(end)}" for begin, end in self.intervals_s[:4]]
-        more = ", ..." if len(self.intervals_s) > 4 else ""
-        return f"loses every packet from {', '.join(parts)}{more} after the start{every}"
+        ending = ", ..." if len(self.intervals_s) > 4 else ""
+        return f"loses every packet from {', '.join(parts)}{ending} after the start{period}"
 
     def stage(self, tables: StageTables) -> Stage:
         self.require_content()
@@ -97,8 +97,8 @@ class Blackout(FileFeature, Impairment):
             try:
                 begin_s, end_s = map(OWN_TIME_S.read, line.split())
             except ValueError:
-                shown = shortened(line, 40)
-                file.wrong(f"line {number}: {shown!r}: expected begin and end with units, e.g. 2s 3500ms")
+                excerpt = shortened(line, 40)
+                file.wrong(f"line {number}: {excerpt!r}: expected begin and end with units, e.g. 2s 3500ms")
             intervals_s.append((begin_s, end_s))
             try:
                 _require_order(intervals_s[-2:], self.every_s)

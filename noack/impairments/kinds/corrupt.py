@@ -21,5 +21,5 @@ class Corrupt(CorrelatedChance, Impairment):
     flips_bits: ClassVar = True
 
     def meaning(self) -> str:
-        how = self.correlation_meaning
-        return f"flips one bit in {brief_percent(self.probability)} of the packets{how}"
+        correlation = self.correlation_meaning
+        return f"flips one bit in {brief_percent(self.probability)} of the packets{correlation}"

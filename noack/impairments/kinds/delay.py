@@ -56,8 +56,8 @@ class _JitterPart(Part):
         assert isinstance(settings, Delay)
         return super().is_default(settings) and settings.distribution in ("uniform", "empirical")
 
-    def described(self, after: str) -> Iterator[Word]:
-        yield Word("jitter", "delay 10ms 2ms", after)
+    def described(self, preceding: str) -> Iterator[Word]:
+        yield Word("jitter", "delay 10ms 2ms", preceding)
 
 
 @dataclass(frozen=True)
@@ -138,13 +138,7 @@ class Delay(FileFeature, Impairment):
                 "delay 0s samples 1ms,2ms,10ms",
                 {"distribution": "empirical"},
             ),
-            Part(
-                "loss_correlation",
-                SIGNED_PERCENT,
-                "P",
-                "lossrel",
-                "loss 5% delay 10ms 2ms lossrel 50%",
-            ),
+            Part("loss_correlation", SIGNED_PERCENT, "P", "lossrel", "loss 5% delay 10ms 2ms lossrel 50%"),
             synonyms=("latency",),
         ),
     )
@@ -152,10 +146,10 @@ class Delay(FileFeature, Impairment):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        given = (self.samples_s is not None) + (self.file is not None)
-        if self.distribution == "empirical" and given != 1:
+        sources = (self.samples_s is not None) + (self.file is not None)
+        if self.distribution == "empirical" and sources != 1:
             raise ValueError("samples_s: an empirical distribution needs samples_s, or a file")
-        if self.distribution != "empirical" and given:
+        if self.distribution != "empirical" and sources:
             raise ValueError('samples_s: goes with distribution = "empirical"')
         return self
 
@@ -246,7 +240,7 @@ class Delay(FileFeature, Impairment):
             return f"delay {time_text(self.delay_s)}"
         return without.text()
 
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+    def tc_lacks(self, earlier: Sequence[Impairment]) -> str:
         if self.distribution not in SHAPES:
             return "such a table of delays"
         if self.distribution != "uniform" and not (self.delay_s and self.jitter_s):

@@ -21,5 +21,5 @@ class Duplicate(CorrelatedChance, Impairment):
     copies: ClassVar = True
 
     def meaning(self) -> str:
-        how = self.correlation_meaning
-        return f"sends {brief_percent(self.probability)} of the packets twice{how}"
+        correlation = self.correlation_meaning
+        return f"sends {brief_percent(self.probability)} of the packets twice{correlation}"

@@ -26,8 +26,8 @@ class _LossClause(Clause):
             name = reader.word(f"a percentage, e.g. 5%, or one of {', '.join(LOSS_WORDS)}")
         if name not in _MODELS:
             for model in LOSS_MODELS:
-                called = model.model_fields["model"].default
-                if name.startswith(called.partition("_")[0]):
+                model_name = model.model_fields["model"].default
+                if name.startswith(model_name.partition("_")[0]):
                     reader.wrong(f"no such word; here it is {model.clauses[0].example}")
             reader.unknown(name, LOSS_WORDS)
         model, clause = _MODELS[name]
@@ -36,8 +36,8 @@ class _LossClause(Clause):
             reader.wrong("this emulator cannot mark packets: it sees payloads, not IP headers")
         return {"loss": loss}
 
-    def described(self, before: str = "") -> Iterator[Word]:
-        yield from (Word(name, self.example, before) for name in (self.word, *self.synonyms))
+    def described(self, preceding: str = "") -> Iterator[Word]:
+        yield from (Word(name, self.example, preceding) for name in (self.word, *self.synonyms))
         for _, clause in _MODELS.values():
             yield from clause.described(self.word)
 
@@ -71,8 +71,8 @@ class LossOf(Impairment):
         words = self.loss.tc_text()
         return f"loss {words}" if words else ""
 
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        return self.loss.tc_lacks(before)
+    def tc_lacks(self, earlier: Sequence[Impairment]) -> str:
+        return self.loss.tc_lacks(earlier)
 
     def tc_notes(self) -> Sequence[str]:
         return self.loss.tc_notes()

@@ -67,13 +67,7 @@ class Opportunities(FileFeature, Impairment):
                 "opportunities at 0,1,5",
                 expected="a file with delivery opportunities, in ms",
             ),
-            Part(
-                "overhead_bytes",
-                SIGNED_COUNT,
-                "N",
-                "overhead",
-                "opportunities trace.up overhead 28",
-            ),
+            Part("overhead_bytes", SIGNED_COUNT, "N", "overhead", "opportunities trace.up overhead 28"),
             Part("queue", COUNT, "N", "queue", "opportunities trace.up queue 20"),
             Part("queue_bytes", COUNT, "N", "bytes", "opportunities trace.up bytes 30000"),
             Part("offset_s", OFFSET, "T|random", "from", "opportunities trace.up from random"),
@@ -114,9 +108,9 @@ class Opportunities(FileFeature, Impairment):
         """Longest time until a full queue of packets of one opportunity each has been delivered."""
         if self.times_ms is None:
             return 0.0
-        cycles, rest = divmod(self.queue + 1, len(self.times_ms))
+        cycles, remainder = divmod(self.queue + 1, len(self.times_ms))
         times_ms = np.array(self.times_ms)
-        later_ms = np.concatenate((times_ms, times_ms + times_ms[-1]))[rest:][: len(times_ms)]
+        later_ms = np.concatenate((times_ms, times_ms + times_ms[-1]))[remainder:][: len(times_ms)]
         longest_ms = cycles * int(times_ms[-1]) + int((later_ms - times_ms).max())
         return longest_ms * _NS_PER_MS / NS_PER_S
 
@@ -132,17 +126,17 @@ class Opportunities(FileFeature, Impairment):
         return True, False  # it serves in the order of arrival
 
     def meaning(self) -> str:
-        what = self.file
+        recording = self.file
         if self.times_ms is not None:
             length_s = self.length_ns / NS_PER_S
-            what = (
+            recording = (
                 f"{len(self.times_ms)} times in {brief_number(length_s)} s, "
                 f"{brief_number(self.rate_bps / 1e6)} Mbit/s on average"
             )
         most = "" if self.queue_bytes is None else f" or {self.queue_bytes} bytes"
         return (
             f"delivers up to {OPPORTUNITY_BYTES} bytes at each recorded time, each packet with "
-            f"{self.overhead_bytes} bytes beside its payload: {what}"
+            f"{self.overhead_bytes} bytes beside its payload: {recording}"
             f"{offset_meaning(self.offset_s)}, repeated; {self.queue} packets{most} may wait, "
             "more are dropped"
         )
@@ -169,8 +163,8 @@ def _times_ms(file: NamedFile) -> tuple[int, ...]:
     times_ms: list[int] = []
     for number, line in file.lines():
         if not (line.isascii() and line.isdigit() and len(line) <= 16):
-            shown = shortened(line, 20)
-            file.wrong(f"line {number}: {shown!r}: expected a time in whole ms, e.g. 12")
+            excerpt = shortened(line, 20)
+            file.wrong(f"line {number}: {excerpt!r}: expected a time in whole ms, e.g. 12")
         if int(line) > _LONGEST_MS:
             file.wrong(f"line {number}: {line}: more than 31 years")
         if times_ms and int(line) < times_ms[-1]:

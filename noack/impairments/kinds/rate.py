@@ -42,8 +42,8 @@ class _DisciplinePart(Part):
         assert isinstance(settings, Rate)
         return settings.discipline.text()
 
-    def described(self, after: str) -> Iterator[Word]:
-        yield from (word._replace(grammar="") for word in self._clause.described(after))
+    def described(self, preceding: str) -> Iterator[Word]:
+        yield from (word._replace(grammar="") for word in self._clause.described(preceding))
 
 
 class Rate(Impairment):
@@ -144,8 +144,8 @@ class Rate(Impairment):
         numbers = (self.overhead_bytes - _TC_HEADERS_BYTES, *(cells if any(cells) else ()))
         return " ".join(["rate", rate_text(self.rate_bps), *map(str, numbers)])
 
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        return self.discipline.tc_lacks(before)
+    def tc_lacks(self, earlier: Sequence[Impairment]) -> str:
+        return self.discipline.tc_lacks(earlier)
 
     def tc_notes(self) -> Sequence[str]:
         return ("its queue is the limit; its overhead is for an Ethernet device, with IPv4",)

@@ -38,18 +38,18 @@ class Reorder(CorrelatedChance, Impairment):
         return 0.0, largest_s
 
     def meaning(self) -> str:
-        which = f"{brief_percent(self.probability)} of the packets"
+        packets = f"{brief_percent(self.probability)} of the packets"
         if self.gap != 1:
-            which = f"every {self.gap}th packet"
+            packets = f"every {self.gap}th packet"
             if self.probability < 1:
-                which += f", with probability {brief_percent(self.probability)},"
-        how = self.correlation_meaning
-        return f"sends {which} at once, before those that are delayed{how}"
+                packets += f", with probability {brief_percent(self.probability)},"
+        correlation = self.correlation_meaning
+        return f"sends {packets} at once, before those that are delayed{correlation}"
 
     def stage(self, tables: StageTables) -> Stage:
         stage = super().stage(tables)
         return stage._replace(numbers={**stage.numbers, "gap": self.gap})
 
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        delayed = any(getattr(impairment, "delay_s", 0) for impairment in before)
+    def tc_lacks(self, earlier: Sequence[Impairment]) -> str:
+        delayed = any(getattr(impairment, "delay_s", 0) for impairment in earlier)
         return "" if delayed else "reordering without a delay before it"

@@ -146,19 +146,19 @@ class Replay(FileFeature, Impairment):
         return True, reordered or varies
 
     def meaning(self) -> str:
-        what = self.file
+        recording = self.file
         if self.delays_ns is not None:
             lost = sum(delay < 0 for delay in self.delays_ns) / len(self.delays_ns)
-            what = (
+            recording = (
                 f"{len(self.delays_ns)} packets in {brief_number(self.length_ns / NS_PER_S)} s, "
                 f"{brief_percent(lost)} lost, delays up to {brief_number(self.longest_s)} s"
             )
-        which = "at its time since the start" if self.by == "time" else "by its number in its flow"
-        again = ", repeated" if self.repeat else ", once"
+        matching = "at its time since the start" if self.by == "time" else "by its number in its flow"
+        repetition = ", repeated" if self.repeat else ", once"
         share = "" if self.delay_share == 1 else f", with {brief_percent(self.delay_share)} of the delay"
         return (
-            f"loses or delays each packet as recorded {which}{share}: "
-            f"{what}{offset_meaning(self.offset_s)}{again}"
+            f"loses or delays each packet as recorded {matching}{share}: "
+            f"{recording}{offset_meaning(self.offset_s)}{repetition}"
         )
 
     def stage(self, tables: StageTables) -> Stage:

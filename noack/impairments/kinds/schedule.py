@@ -53,11 +53,11 @@ class Schedule(Impairment):
     @property
     def slots(self) -> list[list[int]]:
         """The numbers of the slots in a round, of each flow that has some."""
-        found: list[list[int]] = [[] for _ in range(max(self.order) + 1)]
-        for place, flow in enumerate(self.order):
+        by_flow: list[list[int]] = [[] for _ in range(max(self.order) + 1)]
+        for slot, flow in enumerate(self.order):
             if flow >= 0:
-                found[flow].append(place)
-        return found
+                by_flow[flow].append(slot)
+        return by_flow
 
     @property
     def slot_ns(self) -> int:
@@ -66,15 +66,15 @@ class Schedule(Impairment):
 
     def wait_ns(self, slots: Sequence[int], count: int) -> int:
         """Return the longest time until so many of these slots have begun."""
-        rounds, rest = divmod(count, len(slots))
+        rounds, remainder = divmod(count, len(slots))
         begins = np.array(slots)
-        ends = np.concatenate((begins, begins + len(self.order)))[rest:][: len(slots)]
+        ends = np.concatenate((begins, begins + len(self.order)))[remainder:][: len(slots)]
         return (rounds * len(self.order) + int((ends - begins).max())) * self.slot_ns
 
     @property
     def longest_s(self) -> float:
         """Longest time until a full queue has left; packets that must pass may take longer."""
-        return max(self.wait_ns(one, self.queue) for one in self.slots) / NS_PER_S
+        return max(self.wait_ns(slots, self.queue) for slots in self.slots) / NS_PER_S
 
     @property
     def is_bounded(self) -> bool:

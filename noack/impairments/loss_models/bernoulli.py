@@ -35,15 +35,15 @@ class BernoulliLoss(CorrelatedChance, LossModel):
     gives_score: ClassVar = True
 
     def meaning(self) -> str:
-        how = self.correlation_meaning or ", each independently"
+        correlation = self.correlation_meaning or ", each independently"
         if self.keep:
             return (
                 f"loses packets{self.correlation_meaning}, with the probability for which "
                 f"{brief_percent(self.probability)} are lost after the guarantee"
             )
-        return f"loses {brief_percent(self.probability)} of the packets{how}"
+        return f"loses {brief_percent(self.probability)} of the packets{correlation}"
 
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+    def tc_lacks(self, earlier: Sequence[Impairment]) -> str:
         return "a loss rate that is kept" if self.keep else ""
 
     def tc_text(self) -> str:

@@ -152,7 +152,7 @@ class GilbertElliottLoss(LossModel):
         moves = np.array([[1 - p, p], [r, 1 - r]])
         return (Chain(np.array([1.0, 0.0]), moves, np.array([self.loss_in_good, self.loss_in_bad])),)
 
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+    def tc_lacks(self, earlier: Sequence[Impairment]) -> str:
         return "" if self.step_s is None else "a state that all flows share"
 
     def tc_text(self) -> str:

@@ -49,8 +49,8 @@ class ScriptedLoss(LossModel):
 
     def meaning(self) -> str:
         numbers = ", ".join(map(str, self.lost[:8])) + (", ..." if len(self.lost) > 8 else "")
-        again = f", and again every {self.repeat_every}" if self.repeat_every else ""
-        return f"loses the packets {numbers or '(none)'} of each flow{again}"
+        repetition = f", and again every {self.repeat_every}" if self.repeat_every else ""
+        return f"loses the packets {numbers or '(none)'} of each flow{repetition}"
 
     def stage(self, tables: StageTables) -> Stage:
         begin, end = add_numbers(tables.integers, self.lost)

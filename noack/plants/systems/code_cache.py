@@ -96,17 +96,17 @@ def is_kept(folder: Path | None, function: Function) -> bool:
     return folder is not None and any(folder.rglob(f"*.{function.__name__}-*.nbi"))
 
 
-def while_compiling(what: str, kept: bool) -> str:
+def while_compiling(title: str, is_cached: bool) -> str:
     """Return the line that explains the wait for a compilation."""
-    once = "once" if kept else "as the user's cache (XDG_CACHE_HOME) cannot be used"
-    return f"compiling {what} for this machine, {once} ..."
+    once = "once" if is_cached else "as the user's cache (XDG_CACHE_HOME) cannot be used"
+    return f"compiling {title} for this machine, {once} ..."
 
 
 def _forget_old(folder: Path, name: str) -> None:
     os.utime(folder)
-    for other in folder.parent.glob(f"{name}-*"):
-        if other.stat().st_mtime < time.time() - _KEPT_S:
-            shutil.rmtree(other, ignore_errors=True)
+    for cached in folder.parent.glob(f"{name}-*"):
+        if cached.stat().st_mtime < time.time() - _KEPT_S:
+            shutil.rmtree(cached, ignore_errors=True)
 
 
 def compiler(folder: Path | None, **options: str | bool) -> Callable[[Function], Function]:
@@ -135,27 +135,27 @@ def _one_at_a_time(compiling: Function, lock: Path) -> Function:
         with ExitStack() as stack:
             with suppress(OSError):  # without file locks every process compiles
                 stack.enter_context(locked(lock, wait=True))
-            stack.enter_context(_to_the_end())
+            stack.enter_context(_signals_delayed())
             return compiling(signature)
 
     return compile_alone
 
 
 @contextmanager
-def _to_the_end() -> Iterator[None]:
+def _signals_delayed() -> Iterator[None]:
     """Delay handled signals: an exception in a Python callback of LLVM would crash the process."""
-    came: list[int] = []
+    received: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.getsignal(number) for number in numbers}
-    delayed = {number: found for number, found in before.items() if callable(found)}
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    delayed = {number: handler for number, handler in handlers.items() if callable(handler)}
     if threading.current_thread() is not threading.main_thread():
         delayed = {}
     for number in delayed:
-        signal.signal(number, lambda number, _: came.append(number))
+        signal.signal(number, lambda number, _: received.append(number))
     try:
         yield
     finally:
         for number, handler in delayed.items():
             signal.signal(number, handler)
-        if came:
-            signal.raise_signal(came[0])
+        if received:
+            signal.raise_signal(received[0])

@@ -174,7 +174,7 @@ class Enclosed:
 
     def _mapped(self, value: "arb", slope: "arb | float") -> "Enclosed":
         """Return the value of a function here, by the chain rule."""
-        return Enclosed(value, [slope * own for own in self.slopes])
+        return Enclosed(value, [slope * own_slope for own_slope in self.slopes])
 
     def _decided(
         self,
@@ -244,60 +244,60 @@ class EnclosedMotion:
             NotEnclosedError: there is no enclosure, or the plant does not rest at x = 0, u = 0.
         """
         n, size = self.n, self.n + self.m
-        whole = self._values(halfwidths, range(size))
-        bent = [j for j in range(size) if any(_is_wide(one.slopes[j]) for one in whole)]
+        rates = self._values(halfwidths, range(size))
+        bent = [j for j in range(size) if any(_is_wide(rate.slopes[j]) for rate in rates)]
 
         @cache
-        def column(j: int, before: frozenset[int]) -> "list[arb]":
+        def column(j: int, moved: frozenset[int]) -> "list[arb]":
             if j not in bent:
-                return [one.slopes[j] for one in whole]
-            return self._mean_slope(halfwidths, j, before)
+                return [rate.slopes[j] for rate in rates]
+            return self._mean_slope(halfwidths, j, moved)
 
         best, centre, halves = np.full(n, np.inf), np.zeros((n, size)), np.zeros((n, size))
         for order in _orders(size, bent):
-            places = [(j, frozenset(order[: order.index(j)])) for j in range(size)]
-            middle, half = _box([column(*place) for place in places])
+            columns = [(j, frozenset(order[: order.index(j)])) for j in range(size)]
+            middle, half = _box([column(*column_key) for column_key in columns])
             missed = half @ halfwidths
             rows = (missed < best)[:, None]
             centre, halves = np.where(rows, middle, centre), np.where(rows, half, halves)
             best = np.minimum(best, missed)
-        at_rest = [_size(one.value) for one in self._values(0 * halfwidths, range(0))]
+        at_rest = [_size(rate.value) for rate in self._values(0 * halfwidths, range(0))]
         if (at_rest > _AT_REST * np.abs(centre).max(axis=1)).any():
             raise NotEnclosedError(
                 f"it does not rest at x = 0, u = 0: an entry of ẋ is {max(at_rest):.3g} there"
             )
         return Inclusion(centre[:, :n], centre[:, n:], halves[:, :n], halves[:, n:])
 
-    def _mean_slope(self, halfwidths: Vector, j: int, before: frozenset[int]) -> "list[arb]":
-        """Enclose ∫₀¹ ∂f/∂z_j ds at s z_j, with the coordinates ``before`` and the others 0."""
-        box = np.array([h if i in before else 0.0 for i, h in enumerate(halfwidths.tolist())])
+    def _mean_slope(self, halfwidths: Vector, j: int, moved: frozenset[int]) -> "list[arb]":
+        """Enclose ∫₀¹ ∂f/∂z_j ds at s z_j, with the coordinates ``moved`` and the others 0."""
+        box = np.array([h if i in moved else 0.0 for i, h in enumerate(halfwidths.tolist())])
         total = [_ball(0.0)] * self.n
         for number in range(1, _SLICES + 1):
             box[j] = halfwidths[j] * (number / _SLICES) * (1 + 1e-15)
-            found = self._values(box, [j])
-            total = [sum_ + one.slopes[0] for sum_, one in zip(total, found, strict=True)]
+            rates = self._values(box, [j])
+            total = [sum_ + rate.slopes[0] for sum_, rate in zip(total, rates, strict=True)]
         return [entry / _SLICES for entry in total]
 
-    def _values(self, halfwidths: Vector, by: Sequence[int]) -> list[Enclosed]:
+    def _values(self, halfwidths: Vector, coordinates: Sequence[int]) -> list[Enclosed]:
         """Return f over a region, with its derivatives by some coordinates."""
-        constant = [_ball(0.0)] * len(by)
-        each = [
-            Enclosed(_ball(0.0, width), [_ball(float(place == j)) for j in by])
-            for place, width in enumerate(halfwidths.tolist())
+        constant = [_ball(0.0)] * len(coordinates)
+        enclosed = [
+            Enclosed(_ball(0.0, width), [_ball(float(index == j)) for j in coordinates])
+            for index, width in enumerate(halfwidths.tolist())
         ]
-        x, u = np.split(np.array(each, dtype=object), [self.n])
+        x, u = np.split(np.array(enclosed, dtype=object), [self.n])
         time = Enclosed(_ball(_LONGEST_S / 2, _LONGEST_S / 2), constant)
-        found = self.system.expressions(time, x, u)  # type: ignore[attr-defined]
-        if found is None:
+        expressions = self.system.expressions(time, x, u)  # type: ignore[attr-defined]
+        if expressions is None:
             raise NotEnclosedError("x is neither its state nor its state minus a constant")
-        rates, shown = (
-            [one if isinstance(one, Enclosed) else Enclosed(_ball(float(one)), constant) for one in part]
-            for part in found
+        rates, states = (
+            [term if isinstance(term, Enclosed) else Enclosed(_ball(float(term)), constant) for term in part]
+            for part in expressions
         )
-        for one, own in zip(shown, each[: self.n], strict=True):
-            if not all((a - b).is_zero() for a, b in zip(one.slopes, own.slopes, strict=True)):
+        for state, coordinate in zip(states, enclosed[: self.n], strict=True):
+            if not all((a - b).is_zero() for a, b in zip(state.slopes, coordinate.slopes, strict=True)):
                 raise NotEnclosedError("x is not its state minus a constant")
-        if not all(ball.is_finite() for one in rates for ball in (one.value, *one.slopes)):
+        if not all(ball.is_finite() for rate in rates for ball in (rate.value, *rate.slopes)):
             raise NotEnclosedError("its equations are not defined and smooth in all of the region")
         return rates
 
@@ -305,9 +305,9 @@ class EnclosedMotion:
 def _orders(size: int, bent: Sequence[int]) -> Iterator[list[int]]:
     """Yield the orders of the coordinates that are tried: each first, and each last."""
     for k in bent or [0]:
-        rest = [j for j in range(size) if j != k]
-        yield [k, *rest]
-        yield [*rest, k]
+        other_coordinates = [j for j in range(size) if j != k]
+        yield [k, *other_coordinates]
+        yield [*other_coordinates, k]
 
 
 def _box(columns: "Sequence[Sequence[arb]]") -> tuple[Matrix, Matrix]:

@@ -195,12 +195,12 @@ def locate(
         if at_high >= 0.0:
             break
         part = (low * at_high - high * at_low) / (at_high - at_low)
-        rest = 1.0 - part
+        remaining = 1.0 - part
         for n in range(len(z)):
             work.between[n] = (
-                z[n] * (1.0 + 2.0 * part) * rest * rest
-                + work.point[n] * (1.0 + 2.0 * rest) * part * part
-                + step_s * part * rest * (rest * work.slopes[0, n] - part * work.slopes[6, n])
+                z[n] * (1.0 + 2.0 * part) * remaining * remaining
+                + work.point[n] * (1.0 + 2.0 * remaining) * part * part
+                + step_s * part * remaining * (remaining * work.slopes[0, n] - part * work.slopes[6, n])
             )
         rates(model, work.between, v, parameters, work.signs, work.values, work.slopes[1])
         now = margin(work.changing, work.values) + beyond

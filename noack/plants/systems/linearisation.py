@@ -65,8 +65,8 @@ def linearise(
     m: int,
     *,
     settling_s: float = 0.0,
-    at: Vector | None = None,
-    held: Vector | None = None,
+    x0: Vector | None = None,
+    u0: Vector | None = None,
     step_ns: int = STEP_NS,
 ) -> LinearMotion:
     """Linearise a system.
@@ -76,19 +76,19 @@ def linearise(
         n: number of states.
         m: number of inputs.
         settling_s: time after which x and u determine the whole state.
-        at: x₀, (n,); by default 0.
-        held: u₀, (m,); by default 0.
+        x0: x₀, (n,); by default 0.
+        u0: u₀, (m,); by default 0.
         step_ns: step of a system that is moved.
     """
-    at, held = np.zeros(n) if at is None else at, np.zeros(m) if held is None else held
-    rates = getattr(system_at(at), "rates", None)
-    if rates is None or rates(at, held) is None:
-        return _by_motion(system_at, at, held, settling_s, step_ns)
+    x0, u0 = np.zeros(n) if x0 is None else x0, np.zeros(m) if u0 is None else u0
+    rates = getattr(system_at(x0), "rates", None)
+    if rates is None or rates(x0, u0) is None:
+        return _by_motion(system_at, x0, u0, settling_s, step_ns)
 
     def f(point: Vector) -> Vector:
         return np.asarray(rates(point[:n], point[n:]))
 
-    point = np.concatenate([at, held])
+    point = np.concatenate([x0, u0])
     jacobian, drift = _differences(f, point), f(point)
     void = None if np.isfinite(jacobian).all() and np.isfinite(drift).all() else NOT_FINITE
     if void is None and not np.array_equal(f(point), drift):
@@ -126,44 +126,42 @@ def _rounded(values: Matrix) -> Matrix:
 
 def _followed(system_at: SystemAt, x0: Vector, u: Vector, settling: int, ahead: int, step_ns: int) -> Matrix:
     """Return x after the settling, a step later, and at the end, (3, n)."""
-    system, met = system_at(x0), []
+    system, states = system_at(x0), []
     for step in range(settling + ahead):
-        met.append(system.x)
+        states.append(system.x)
         system.advance(u, step * step_ns, step_ns)
-    return np.array([*met, system.x])[[settling, settling + 1, -1]]
+    return np.array([*states, system.x])[[settling, settling + 1, -1]]
 
 
-def _by_motion(
-    system_at: SystemAt, at: Vector, held: Vector, settling_s: float, step_ns: int
-) -> LinearMotion:
+def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, step_ns: int) -> LinearMotion:
     """Return the linear model of a system that is only moved."""
-    n, m, settling = len(at), len(held), round(settling_s * 1e9 / step_ns)
+    n, m, settling = len(x0), len(u0), round(settling_s * 1e9 / step_ns)
     ahead = _AHEAD if settling else 1
-    rest = _followed(system_at, at, held, settling, ahead, step_ns)
-    drift = (rest[1] - rest[0]) / (step_ns * 1e-9)
+    resting = _followed(system_at, x0, u0, settling, ahead, step_ns)
+    drift = (resting[1] - resting[0]) / (step_ns * 1e-9)
 
-    def without(why: str) -> LinearMotion:
-        return LinearMotion(np.full((n, n), np.nan), np.full((n, m), np.nan), drift, "motion", why)
+    def without(reason: str) -> LinearMotion:
+        return LinearMotion(np.full((n, n), np.nan), np.full((n, m), np.nan), drift, "motion", reason)
 
-    before, after, later = (np.eye(n + m) for _ in range(3))
-    for i, value in enumerate(np.concatenate([at, held])):
+    start_offs, step_offs, ahead_offs = (np.eye(n + m) for _ in range(3))
+    for i, value in enumerate(np.concatenate([x0, u0])):
         off = np.zeros(n + m)
         off[i] = _OFF * max(1.0, abs(value))
         plus, minus = (
-            _followed(system_at, at + sign * off[:n], held + sign * off[n:], settling, ahead, step_ns)
+            _followed(system_at, x0 + sign * off[:n], u0 + sign * off[n:], settling, ahead, step_ns)
             for sign in (1.0, -1.0)
         )
-        before[:n, i], after[:n, i], later[:n, i] = (plus - minus) / (2 * off[i])
-    if not (np.isfinite(before).all() and np.isfinite(later).all()):
+        start_offs[:n, i], step_offs[:n, i], ahead_offs[:n, i] = (plus - minus) / (2 * off[i])
+    if not (np.isfinite(start_offs).all() and np.isfinite(ahead_offs).all()):
         return without(NOT_FINITE)
-    if not np.array_equal(rest, _followed(system_at, at, held, settling, ahead, step_ns)):
+    if not np.array_equal(resting, _followed(system_at, x0, u0, settling, ahead, step_ns)):
         return without(NOT_REPEATED)
-    if np.linalg.svd(before, compute_uv=False)[-1] < _SINGULAR:
+    if np.linalg.svd(start_offs, compute_uv=False)[-1] < _SINGULAR:
         return without(NO_STATE)
-    step = after @ np.linalg.inv(before)
-    missed = np.linalg.matrix_power(step, ahead) @ before - later
-    sizes = np.maximum(*(np.linalg.norm(deviations[:n], axis=0) for deviations in (before, later)))
-    if (np.linalg.norm(missed, axis=0) > _MISSED * sizes).any():
+    step = step_offs @ np.linalg.inv(start_offs)
+    errors = np.linalg.matrix_power(step, ahead) @ start_offs - ahead_offs
+    sizes = np.maximum(*(np.linalg.norm(deviations[:n], axis=0) for deviations in (start_offs, ahead_offs)))
+    if (np.linalg.norm(errors, axis=0) > _MISSED * sizes).any():
         return without(NO_STATE)
     if np.abs(np.linalg.eigvals(step)).min() < _FORGOTTEN:
         return without(NO_LOGARITHM)
@@ -185,8 +183,8 @@ def largest_errors(
     halfwidths: Vector,
     *,
     settling_s: float = 0.0,
-    at: Vector,
-    held: Vector,
+    x0: Vector,
+    u0: Vector,
     step_ns: int = STEP_NS,
 ) -> Vector:
     """Return by how much the linear model misses the plant near the point, per state, (n,).
@@ -202,12 +200,12 @@ def largest_errors(
         motion: its linear model.
         halfwidths: of the box, (n + m,).
         settling_s: as for :func:`linearise`.
-        at: the point x₀, (n,).
-        held: u₀, (m,).
+        x0: the point x₀, (n,).
+        u0: u₀, (m,).
         step_ns: step of a system that is moved.
     """
-    n, settling = len(at), round(settling_s * 1e9 / step_ns)
-    rates = getattr(system_at(at), "rates", None) if motion.source == "derivative" else None
+    n, settling = len(x0), round(settling_s * 1e9 / step_ns)
+    rates = getattr(system_at(x0), "rates", None) if motion.source == "derivative" else None
 
     def change(x: Vector, u: Vector) -> tuple[Vector, Vector]:
         if rates is not None:
@@ -222,14 +220,14 @@ def largest_errors(
     random = np.random.default_rng(0)
     offs = random.uniform(-1.0, 1.0, size=(_SAMPLES[motion.source], len(halfwidths)))
     offs[::2] = np.sign(offs[::2])
-    rest, still = change(at, held)
-    missed, largest = np.zeros(n), np.zeros(n)
+    resting, resting_change = change(x0, u0)
+    errors, largest = np.zeros(n), np.zeros(n)
     with np.errstate(all="ignore"):
         for off in offs * halfwidths:
-            x, moved = change(at + off[:n], held + off[n:])
-            expected = linear @ np.concatenate([x - rest, off[n:]])
-            missed = np.maximum(missed, np.abs(moved - still - expected))
+            x, moved = change(x0 + off[:n], u0 + off[n:])
+            expected = linear @ np.concatenate([x - resting, off[n:]])
+            errors = np.maximum(errors, np.abs(moved - resting_change - expected))
             largest = np.maximum(largest, np.abs(expected))
         # A state that does not move has no error but rounding.
-        rounding = _ROUNDING * (norm(largest) + norm(still) + norm(rest))
-        return np.where(missed <= rounding, 0.0, missed / largest)
+        rounding = _ROUNDING * (norm(largest) + norm(resting_change) + norm(resting))
+        return np.where(errors <= rounding, 0.0, errors / largest)

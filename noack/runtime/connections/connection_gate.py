@@ -152,12 +152,12 @@ class _Gate:
         loop.remove_reader(self._descriptor)
         for waiting in list(self._waiting.values()):
             self._end(waiting)
-        left = asyncio.all_tasks(loop)
-        if left and self._linger_s:
-            loop.run_until_complete(asyncio.wait(left, timeout=self._linger_s))
-        for task in left:
+        unfinished = asyncio.all_tasks(loop)
+        if unfinished and self._linger_s:
+            loop.run_until_complete(asyncio.wait(unfinished, timeout=self._linger_s))
+        for task in unfinished:
             task.cancel()
-        loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
+        loop.run_until_complete(asyncio.gather(*unfinished, return_exceptions=True))
         loop.run_until_complete(asyncio.sleep(0))  # aborted transports close now
         loop.close()
 

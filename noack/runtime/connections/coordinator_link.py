@@ -96,17 +96,17 @@ class InvitationProof:
         # A key of its own: the tags of datagrams are made with the run's key itself.
         self._tag = Tagger(hashlib.blake2b(_PURPOSE, key=key, digest_size=KEY_BYTES).digest())
 
-    def make(self, own: tuple[str, int], coordinator: tuple[str, int]) -> bytes:
+    def make(self, own_address: tuple[str, int], coordinator: tuple[str, int]) -> bytes:
         """Return the proof for a connection; addresses are numeric."""
-        return _HEAD + self._tag(_HEAD + _packed(own) + _packed(coordinator))
+        return _HEAD + self._tag(_HEAD + _packed(own_address) + _packed(coordinator))
 
-    def check(self, found: bytes, other: tuple[str, int], own: tuple[str, int]) -> bool | None:
+    def check(self, data: bytes, peer: tuple[str, int], own_address: tuple[str, int]) -> bool | None:
         """Whether bytes are the proof of the other end; None: a part of one may be there."""
-        if not _HEAD.startswith(found[: len(_HEAD)]):
+        if not _HEAD.startswith(data[: len(_HEAD)]):
             return False
-        if len(found) < PROOF_BYTES:
+        if len(data) < PROOF_BYTES:
             return None
-        return hmac.compare_digest(found, self.make(other, own))
+        return hmac.compare_digest(data, self.make(peer, own_address))
 
 
 def _packed(address: tuple[str, int]) -> bytes:
@@ -115,7 +115,7 @@ def _packed(address: tuple[str, int]) -> bytes:
     return host.packed.ljust(_ADDRESS_BYTES, b"\0") + address[1].to_bytes(2, "big")
 
 
-def tls_context(other: str, certificate: str, private_key: str, *, server: bool) -> ssl.SSLContext:
+def tls_context(peer_certificate: str, certificate: str, private_key: str, *, server: bool) -> ssl.SSLContext:
     """Return the settings of one end, which accepts only the other end's certificate.
 
     Certificates and key are PEM text. ``server`` says whether this end is the coordinator.
@@ -123,7 +123,7 @@ def tls_context(other: str, certificate: str, private_key: str, *, server: bool)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.verify_mode = ssl.CERT_REQUIRED
-    context.load_verify_locations(cadata=other)
+    context.load_verify_locations(cadata=peer_certificate)
     with _file_in_memory(private_key + certificate) as path:
         context.load_cert_chain(path)
     return context
@@ -169,9 +169,9 @@ def forwarding(
     forwarder = _Forwarder(target, protection)
     first = None
     if protection is not None:
-        proof, own = protection.proof, listening.getsockname()
+        proof, own_address = protection.proof, listening.getsockname()
         first = FirstBytes(
-            accept=lambda data, other: proof.check(data, other, own),
+            accept=lambda data, peer: proof.check(data, peer, own_address),
             most=PROOF_BYTES,
             within_s=_PROOF_S,
             refused=Answer.REFUSED.value,
@@ -288,11 +288,11 @@ def coordinator_link(destination: Destination) -> Iterator[str]:
                 with suppress(BrokenPipeError):
                     program.stdin.write(json.dumps(destination).encode() + b"\n")
                     program.stdin.flush()
-                said = program.stdout.readline()
-                if not said:
+                answer = program.stdout.readline()
+                if not answer:
                     raise MachineError("the link to the coordinator did not start")
-                if said != _READY:
-                    raise NoAnswerError(said.decode().strip())
+                if answer != _READY:
+                    raise NoAnswerError(answer.decode().strip())
                 yield path
             finally:
                 with suppress(BrokenPipeError):

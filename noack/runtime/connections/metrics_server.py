@@ -46,11 +46,11 @@ def require_package() -> None:
 
 
 @contextmanager
-def metrics_server(where: str, collect: "Callable[[], Iterable[Metric]]") -> Iterator[Address]:
+def metrics_server(host_port: str, collect: "Callable[[], Iterable[Metric]]") -> Iterator[Address]:
     """Serve metrics within the context, at every path; yield the address.
 
     Args:
-        where: ``HOST:PORT``; without a host it is the loopback, port 0 is any free one.
+        host_port: ``HOST:PORT``; without a host it is the loopback, port 0 is any free one.
         collect: returns the metrics; called in the server's thread.
 
     Raises:
@@ -61,7 +61,7 @@ def metrics_server(where: str, collect: "Callable[[], Iterable[Metric]]") -> Ite
     from prometheus_client import CollectorRegistry  # an optional package
     from prometheus_client.exposition import make_wsgi_app  # an optional package
 
-    address = parse_address(where, OPTION)
+    address = parse_address(host_port, OPTION)
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Collector(collect))
     app = make_wsgi_app(registry)
@@ -103,10 +103,10 @@ def _is_complete(request: bytes, _: object) -> bool | None:
 
 def _answer(app: Callable[..., Iterable[bytes]], request: bytes) -> bytes:
     """Return the answer of a WSGI application to a request."""
-    line, _, rest = request.partition(b"\n")
+    line, _, header_lines = request.partition(b"\n")
     words = line.decode("latin-1").split()
     try:
-        headers = http.client.parse_headers(io.BytesIO(rest))
+        headers = http.client.parse_headers(io.BytesIO(header_lines))
         method, target, version = words
     except (ValueError, http.client.HTTPException):
         return _WRONG

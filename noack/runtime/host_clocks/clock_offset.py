@@ -164,10 +164,10 @@ class ClockOffset:
         return width >= 0
 
 
-def _intersection(one: _Limits, other: _Limits) -> _Limits:
+def _intersection(first: _Limits, second: _Limits) -> _Limits:
     """Return the stricter limits; of equal ones the newer."""
-    upper = min((one.upper, -one.upper_since_ns), (other.upper, -other.upper_since_ns))
-    lower = max((one.lower, one.lower_since_ns), (other.lower, other.lower_since_ns))
+    upper = min((first.upper, -first.upper_since_ns), (second.upper, -second.upper_since_ns))
+    lower = max((first.lower, first.lower_since_ns), (second.lower, second.lower_since_ns))
     return _Limits(upper[0], -upper[1], lower[0], lower[1])
 
 

@@ -104,13 +104,13 @@ class ReferenceClock:
                 self._accepted = self._client.accepted
                 return
             if give_up() or now_ns > until_ns:
-                found = (
+                state = (
                     f"no answer from {self._where}; do firewalls pass UDP to this port?"
                     if interval is None
                     else f"known within {interval.error_ns / _NS_PER_US:.0f} µs, "
                     f"{self._largest_ns / _NS_PER_US:g} µs allowed"
                 )
-                raise PeerError(f"cannot compare this host's clock with the coordinator's: {found}")
+                raise PeerError(f"cannot compare this host's clock with the coordinator's: {state}")
             select.select([self._client], (), (), _POLL_S)
 
     @property

@@ -104,10 +104,10 @@ class TimeFormat:
         """Return the content of a datagram of this kind, or why it is rejected."""
         if len(datagram) != TIME_BYTES:
             return Rejection.LENGTH
-        magic, version, found, reserved, nonce, clock, received_ns, sent_ns = _CONTENT.unpack_from(datagram)
+        magic, version, actual, reserved, nonce, clock, received_ns, sent_ns = _CONTENT.unpack_from(datagram)
         if magic != MAGIC or version != VERSION:
             return Rejection.VERSION
-        if found != kind:
+        if actual != kind:
             return Rejection.FLOW
         if not hmac.compare_digest(self._tag(datagram[:-TAG_BYTES]), datagram[-TAG_BYTES:]):
             return Rejection.TAG
@@ -210,14 +210,14 @@ class ArrivalSocket:
 
     def receive(self, most: int) -> list[Arrival]:
         """Return the datagrams that wait, at most ``most``."""
-        before, known = read_difference(self._clocks), self._known
-        self._known = known and known.joined(before)
+        earlier, previous = read_difference(self._clocks), self._known
+        self._known = previous and previous.joined(earlier)
         waiting: list[tuple[bytes, Address, int | None, int]] = []
         for _ in range(most):
             try:
                 data, ancillary, _, source = self._endpoint.recvmsg(self._most_bytes + 1, _ANCILLARY_BYTES)
             except BlockingIOError:
-                self._known = before
+                self._known = earlier
                 break
             except OSError:
                 self.errors += 1
@@ -226,11 +226,11 @@ class ArrivalSocket:
             waiting.append((data, source[:2], self._stamp_ns(ancillary), read_ns))
         if not waiting:
             return []
-        after = read_difference(self._clocks)
-        self._known = self._known and self._known.joined(after)
-        if known is None:  # nothing was read before these arrivals
+        later = read_difference(self._clocks)
+        self._known = self._known and self._known.joined(later)
+        if previous is None:  # nothing was read before these arrivals
             return [Arrival(data, source, read_ns) for data, source, _, read_ns in waiting]
-        difference = known.joined(before).joined(after)
+        difference = previous.joined(earlier).joined(later)
         self.clock_sets += difference.was_set
         return [
             Arrival(
@@ -252,13 +252,13 @@ class ArrivalSocket:
 _HOST_CLOCKS = HostClocks()
 
 
-def _open_socket(address: Address, use: Callable[[socket.socket, Address], None], what: str) -> socket.socket:
+def _open_socket(address: Address, use: Callable[[socket.socket, Address], None], verb: str) -> socket.socket:
     endpoint = socket.socket(family_of(address), socket.SOCK_DGRAM)
     try:
         use(endpoint, address)
     except OSError as error:
         endpoint.close()
-        raise CallerError(f"cannot {what} {address_text(address)}: {why(error)}") from None
+        raise CallerError(f"cannot {verb} {address_text(address)}: {why(error)}") from None
     return endpoint
 
 
@@ -382,12 +382,12 @@ class TimeClient:
         if received_ns < sent_ns:  # the real-time clock was set, and set back
             received_ns = self._clocks.monotonic_ns()
         self.accepted += 1
-        other = None
+        clock_restart = None
         if self._clock not in (None, reply.clock):
-            other = self._offset.begin_again(received_ns)
+            clock_restart = self._offset.begin_again(received_ns)
         self._clock = reply.clock
         exchange = Exchange(sent_ns, reply.received_ns, reply.sent_ns, received_ns)
-        return [restart for restart in (other, self._offset.add(exchange)) if restart is not None]
+        return [restart for restart in (clock_restart, self._offset.add(exchange)) if restart is not None]
 
     def _send(self) -> None:
         nonce = secrets.token_bytes(NONCE_BYTES)

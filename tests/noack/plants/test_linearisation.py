@@ -43,7 +43,7 @@ class Moved:
 
 @pytest.mark.parametrize("angle", [0.0, 1.0, math.pi])
 def test_a_pendulum_has_its_jacobian_at_any_point(angle: float) -> None:
-    found = linearise(system, 2, 1, at=np.array([angle, 0.2]), held=np.array([0.3]))
+    found = linearise(system, 2, 1, x0=np.array([angle, 0.2]), u0=np.array([0.3]))
     sine, cosine = math.sin(angle), math.cos(angle)
     np.testing.assert_allclose(found.A, [[0, 1], [9.81 * cosine - 0.3 * sine, -0.1]], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found.B, [[0], [cosine]], rtol=1e-9)
@@ -59,7 +59,7 @@ def test_units_of_any_size_do_not_change_the_relative_accuracy(scale: float) -> 
         return rate, acceleration
 
     at = np.zeros(2)
-    found = linearise(lambda x0: OdeSystem(PlantEquations(scaled), x0), 2, 1, at=at)
+    found = linearise(lambda x0: OdeSystem(PlantEquations(scaled), x0), 2, 1, x0=at)
     np.testing.assert_allclose(found.B, [[0.0], [scale]], rtol=1e-9)
     np.testing.assert_allclose(found.A, [[0.0, 1.0], [9.81, -0.1]], rtol=1e-9)
 
@@ -77,10 +77,9 @@ def test_the_motion_and_the_derivative_give_the_same_model() -> None:
 def test_the_remainder_is_of_the_second_order() -> None:
     """At θ₀ = 1 it is −g sin θ₀ δ²/2 and smaller terms, relative to the largest linear part."""
     at, held = np.array([1.0, 0.0]), np.zeros(1)
-    found = linearise(system, 2, 1, at=at)
+    found = linearise(system, 2, 1, x0=at)
     sizes = [
-        largest_errors(system, found, np.array([width, width, 0.0]), at=at, held=held)
-        for width in (0.1, 0.01)
+        largest_errors(system, found, np.array([width, width, 0.0]), x0=at, u0=held) for width in (0.1, 0.01)
     ]
     expected = 9.81 * math.sin(1.0) * 0.01**2 / 2 / (0.01 * (9.81 * math.cos(1.0) + 0.1))
     assert sizes[1][0] == 0.0  # ẋ₁ = x₂ is linear
@@ -96,7 +95,7 @@ def test_a_linear_system_that_is_moved_has_no_error() -> None:
 
     found = linearise(at, 2, 1)
     np.testing.assert_allclose(found.A, A, atol=1e-8)
-    errors = largest_errors(at, found, np.ones(3), at=np.zeros(2), held=np.zeros(1))
+    errors = largest_errors(at, found, np.ones(3), x0=np.zeros(2), u0=np.zeros(1))
     assert errors.max() < 1e-8
 
 
@@ -129,9 +128,9 @@ def test_dry_friction_is_found_by_the_error() -> None:
         return OdeSystem(PlantEquations(dry), x0)
 
     x, u = np.array([0.2]), np.zeros(1)
-    found = linearise(at, 1, 1, at=x)
-    assert largest_errors(at, found, np.full(2, 0.1), at=x, held=u)[0] == 0.0
-    assert largest_errors(at, found, np.full(2, 0.5), at=x, held=u)[0] > 0.1
+    found = linearise(at, 1, 1, x0=x)
+    assert largest_errors(at, found, np.full(2, 0.1), x0=x, u0=u)[0] == 0.0
+    assert largest_errors(at, found, np.full(2, 0.5), x0=x, u0=u)[0] > 0.1
 
 
 def start(n: int = 2, m: int = 1, step_ns: int = 50_000_000) -> PlantStart:

@@ -52,7 +52,7 @@ def test_lines_become_objects(monkeypatch: pytest.MonkeyPatch) -> None:
         print_to_stderr("noack: warning: no disk")
         print_to_stderr("noack netem: ready")
         print("a plain", "\x1b[31mline\x1b[0m\n\nand one\tmore", file=sys.stderr)
-        failed("wrong\ntwice", ExitStatus.CALLER, who="noack netem", as_json=False)
+        failed("wrong\ntwice", ExitStatus.CALLER, source="noack netem", as_json=False)
     print_to_stderr("text again")
     *lines, last = error.getvalue().splitlines()
     assert last == "text again"

@@ -119,7 +119,7 @@ def test_a_file_of_very_many_arrays_is_refused_before_any_is_read(
     with zipfile.ZipFile(tmp_path / "m.npz", "w") as archive:
         for number in range(1_001):
             archive.writestr(f"a{number}.npy", b"")
-    monkeypatch.setattr(matrix_files, "_of_npz", lambda content: pytest.fail("it was read"))
+    monkeypatch.setattr(matrix_files, "_npz_arrays", lambda content: pytest.fail("it was read"))
     with pytest.raises(CallerError, match=r"has 1,001 arrays; at most 1,000 are read"):
         scenario(tmp_path, 'file = "m.npz"')
 

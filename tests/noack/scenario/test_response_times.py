@@ -74,7 +74,8 @@ def bounds_ns(scheduler: Scheduler, sizes: Any, least_us: Any) -> list[float]:
     for flow in flows:
         kinds: dict[Sender, int] = {}
         for one in flows:
-            kind = Sender(least_us[one] * US, sizes[one] * US, scheduler.yields_ns(flow, one))
+            yields_ns = scheduler.yields_ns(scheduler.number(flow), scheduler.number(one))
+            kind = Sender(least_us[one] * US, sizes[one] * US, yields_ns)
             kinds[kind] = kinds.get(kind, 0) + (one != flow)
         others = {kind: count for kind, count in kinds.items() if count}
         found.append(response_ns(Sender(least_us[flow] * US, sizes[flow] * US), others))

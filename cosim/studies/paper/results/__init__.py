@@ -22,8 +22,8 @@ NAMES = tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
 def named(name: str) -> "PublishedResult":
     """Return a result; raise CallerError if there is none of this name."""
     if name not in NAMES:
-        near = did_you_mean(name, NAMES) or f"there are {', '.join(NAMES)}"
-        raise CallerError(f"{name}: no published result of this name; {near}")
+        hint = did_you_mean(name, NAMES) or f"there are {', '.join(NAMES)}"
+        raise CallerError(f"{name}: no published result of this name; {hint}")
     result: PublishedResult = import_module(f"{__name__}.{name}").RESULT
     return result
 

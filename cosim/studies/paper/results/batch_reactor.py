@@ -31,8 +31,8 @@ def _periods(loop: ContinuousLoop, states: Matrix) -> NDArray[np.int64]:
 def _held(loop: ContinuousLoop, periods: int) -> Matrix:
     """Return M of x(t) = M x(0), t so many periods after an event."""
     A, BK = loop.loop.A, loop.loop.B @ loop.loop.K
-    both = expm(np.block([[A, BK], [np.zeros((4, 8))]]) * _PERIOD_S * periods)
-    return np.asarray(both[:4, :4] + both[:4, 4:])
+    transition = expm(np.block([[A, BK], [np.zeros((4, 8))]]) * _PERIOD_S * periods)
+    return np.asarray(transition[:4, :4] + transition[:4, 4:])
 
 
 def _latest(loop: ContinuousLoop, periods: int) -> tuple[float, Matrix]:
@@ -55,13 +55,13 @@ def _rows() -> list[Row]:
     following = set(_periods(loop, states[periods == 1] @ _held(loop, 1).T).tolist())
     forms = stored("batch_reactor")["region_2"].values()
     stays, leaves = (np.einsum("ki,ij,kj->k", states, form, states) for form in forms)
-    inside, two = (stays <= 0) & (leaves > 0), periods == 2
-    counts, same = (f"{inside.sum()}", f"{two.sum()}"), bool((inside == two).all())
-    few, after_one = following <= _AFTER_ONE, (_listed(_AFTER_ONE), _listed(following))
+    inside, has_two = (stays <= 0) & (leaves > 0), periods == 2
+    counts, agree = (f"{inside.sum()}", f"{has_two.sum()}"), bool((inside == has_two).all())
+    are_listed, after_one = following <= _AFTER_ONE, (_listed(_AFTER_ONE), _listed(following))
     return [
         Row("intervals, periods", _WHERE, "=", _listed(_REGIONS), _listed(proven), _HOW, complete),
-        Row("intervals after one of 1 period", _WHERE, "among", *after_one, _HOW, few),
-        Row("states whose interval is 2 periods", _WHERE, "=", *counts, _HOW, same),
+        Row("intervals after one of 1 period", _WHERE, "among", *after_one, _HOW, are_listed),
+        Row("states whose interval is 2 periods", _WHERE, "=", *counts, _HOW, agree),
     ]
 
 

@@ -88,7 +88,7 @@ def _rows() -> list[Row]:
     drawn, rows = list(zip("123", loops(), strict=True)), []
     for schedule, published in stored("demirel")["losses"].items():
         turns = schedule.split(",")
-        total = sum(loop.loss([turn == own for turn in turns]) for own, loop in drawn)
+        total = sum(loop.loss([turn == name for turn in turns]) for name, loop in drawn)
         row = number(f"loss of {', '.join(turns)}", _WHERE, float(published), total, _HOW, digits=4)
         rows.append(row._replace(deviation=_DEVIATION if len(turns) == 7 else ""))
     return rows

@@ -31,8 +31,8 @@ def _rows() -> list[Row]:
     radius = joint_spectral_radius(edges(), accuracy=1e-11)
     modes = [_EDGES[number] % 10 for number in radius.cycle]
     rotated = [tuple(modes[i:] + modes[:i]) for i in range(len(modes))]
-    shown = _CYCLE if _CYCLE in rotated else rotated[0]
-    published, computed = (",".join(map(str, cycle)) for cycle in (_CYCLE, shown))
+    computed_cycle = _CYCLE if _CYCLE in rotated else rotated[0]
+    published, computed = (",".join(map(str, cycle)) for cycle in (_CYCLE, computed_cycle))
     return [
         number("growth, lower bound", _WHERE, _RADIUS, radius.lower, _HOW, digits=12),
         number("growth, upper bound", _WHERE, _RADIUS, radius.upper, _HOW, digits=10),

@@ -67,26 +67,26 @@ def output_feedback(v: Solution, h: float, epsilon: float, *, waits: bool) -> li
     A, C, BK, d = np.array([[0, 1], [0, -3.0]]), np.array([[1.0, 0]]), np.array([[0], [3.0]]), DELTA
     P, U, X, X1, P2, P3 = (v[name] for name in ("P", "U", "X", "X1", "P2", "P3"))
     Y1, Y2, Y3, omega = (v[name] for name in ("Y1", "Y2", "Y3", "Omega"))
-    both, event, closed = X + X.T, epsilon * C.T @ omega @ C, A - BK @ C
+    symmetric_X, event, closed = X + X.T, epsilon * C.T @ omega @ C, A - BK @ C
     first = A.T @ P2 + P2.T @ A + 2 * d * P - Y1 - Y1.T + (0 if waits else event)
-    second, corner = P - P2.T + A.T @ P3 - Y2, both - 2 * X1 - 2 * X1.T
+    second, corner = P - P2.T + A.T @ P3 - Y2, symmetric_X - 2 * X1 - 2 * X1.T
     cross, tail = Y1.T - P2.T @ BK @ C - Y3, Y2.T - P3.T @ BK @ C
-    start = {(1, 1): first - (0.5 - d * h) * both, (1, 2): second + h * both / 2}
+    start = {(1, 1): first - (0.5 - d * h) * symmetric_X, (1, 2): second + h * symmetric_X / 2}
     start |= {(1, 3): cross + (1 - 2 * d * h) * (X - X1), (2, 2): h * U - P3 - P3.T}
     start |= {(2, 3): tail - h * (X - X1), (3, 3): Y3 + Y3.T - (0.5 - d * h) * corner}
-    end = {(1, 1): first - both / 2, (1, 2): second, (1, 3): cross + X - X1, (1, 4): h * Y1.T}
+    end = {(1, 1): first - symmetric_X / 2, (1, 2): second, (1, 3): cross + X - X1, (1, 4): h * Y1.T}
     end |= {(2, 2): -P3 - P3.T, (2, 3): tail, (2, 4): h * Y2.T, (3, 4): h * Y3.T}
     end |= {(3, 3): Y3 + Y3.T - corner / 2, (4, 4): -h * math.exp(-2 * d * h) * U}
-    functional = {(1, 1): P + h * both / 2, (1, 2): h * (X1 - X), (2, 2): h * corner / 2}
+    functional = {(1, 1): P + h * symmetric_X / 2, (1, 2): h * (X1 - X), (2, 2): h * corner / 2}
     positive = [P, U, omega, symmetric(functional)]
     if not waits:  # the error acts all the time
         start |= {(1, 4): -P2.T @ BK, (2, 4): -P3.T @ BK, (4, 4): -omega}
         end |= {(1, 5): -P2.T @ BK, (2, 5): -P3.T @ BK, (5, 5): -omega}
         return [*positive, -symmetric(start), -symmetric(end)]
-    after = {(1, 1): P2.T @ closed + closed.T @ P2 + event + 2 * d * P, (1, 3): -P2.T @ BK}
-    after |= {(1, 2): P + closed.T @ P3 - P2.T, (2, 2): -P3 - P3.T, (2, 3): -P3.T @ BK}
-    after |= {(3, 3): -omega}
-    return [*positive, -symmetric(start), -symmetric(end), -symmetric(after)]
+    event_phase = {(1, 1): P2.T @ closed + closed.T @ P2 + event + 2 * d * P, (1, 3): -P2.T @ BK}
+    event_phase |= {(1, 2): P + closed.T @ P3 - P2.T, (2, 2): -P3 - P3.T, (2, 3): -P3.T @ BK}
+    event_phase |= {(3, 3): -omega}
+    return [*positive, -symmetric(start), -symmetric(end), -symmetric(event_phase)]
 
 
 def cart_pole(v: Solution, h: float, epsilon: float, *, waits: bool) -> list[Matrix]:
@@ -134,11 +134,11 @@ def _rows() -> list[Row]:
     for name, statement, loop in loops:
         grown, mean = _run(loop, solved[statement]["P"], directions(100, 2))
         means.append(mean)
-        quantity, where = f"growth of V, {name}", f"follows from {statement}"
-        rows.append(Row(quantity, where, "≤", "1", f"{grown:.3f}", _RUN, grown <= 1))
+        quantity, place = f"growth of V, {name}", f"follows from {statement}"
+        rows.append(Row(quantity, place, "≤", "1", f"{grown:.3f}", _RUN, grown <= 1))
     share = means[0] / means[1]
-    quantity, how = "transmissions, switching / periodic", _SENT.format(*means)
-    return [*rows, Row(quantity, "abstract", "<", "1", f"{share:.3f}", how, share < 1)]
+    quantity, method = "transmissions, switching / periodic", _SENT.format(*means)
+    return [*rows, Row(quantity, "abstract", "<", "1", f"{share:.3f}", method, share < 1)]
 
 
 def _switching() -> ContinuousLoop:

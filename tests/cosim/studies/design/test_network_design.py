@@ -175,7 +175,7 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         search = NetworkSearch(given, Wish(period_s=0.31, most=5))
         exact = LossMargin(resolve(search.scenario))
         bursts = list_bursts(search.ladder[4].guarantee, exact.loop.times.slots)
-        quick = search.quick_loop(search.given, exact.longest_ns).maps(bursts)
+        quick = search.quick_loop(search.original, exact.longest_ns).maps(bursts)
         maps = np.array([exact.maps(one.slot, one.losses).middle for one in bursts])
         if not more:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
@@ -194,7 +194,7 @@ def test_the_cost_is_that_of_a_run_without_losses() -> None:
     x, u = np.asarray(run["x"]), np.asarray(run["u"])
     rates = np.einsum("ki,ij,kj->k", x, weights[0], x) + np.einsum("ki,ij,kj->k", u, weights[1], u)
     expected = float(rates.sum()) * 1e-3
-    assert search.cost(search.given, 0) == pytest.approx(expected, rel=2e-3)
+    assert search.cost(search.original, 0) == pytest.approx(expected, rel=2e-3)
     unstable = Candidate("zoh", rows_of(-loop_of(resolved).K))
     assert search.cost(unstable, 0) == np.inf
 
