@@ -326,7 +326,7 @@ def _status_of(call: Callable[[], int | None], *, as_json: bool) -> int:
         if reason is None:
             raise
         line, status = reason, ExitStatus.FAILED
-    return int(failed(line, status, who=NAME, as_json=as_json))
+    return int(failed(line, status, source=NAME, as_json=as_json))
 
 
 def _describe_options(described: Any) -> tuple[str, list[tuple[str, str]]]:
