@@ -5,6 +5,7 @@ Runs are observed from outside, by their output and by samples of their processe
 
 import contextlib
 import json
+import math
 import os
 import re
 import shutil
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,10 +22,10 @@ from typing import Any, NamedTuple
 import psutil
 
 from benchmarks.report import MeasurementError
-from noack.protocol.topology import ROLES
+from cosim.record.run_directory import LATEST
+from noack.protocol.topology import LOOP_ROLES, ROLES
+from noack.runtime.spool import SPOOL
 
-PACKAGES: Mapping[str, str] = {"cc": "gcc libc6-dev", "cyclictest": "rt-tests", "socat": "socat"}
-"""Debian packages by program."""
 PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
 """A progress line of a run; the group is the time in the run, s."""
 _ROUNDING_S = 0.05
@@ -34,38 +36,26 @@ FREE_PORTS = ("--set", "ports={}")
 """A benchmark can run at the same time as a demo, whose ports are fixed."""
 NOACK = (sys.executable, "-m", "cosim.cli")
 LAUNCHER = "launcher"
+_LOOK_S = 0.1
+_START_PATIENCE_S, _EXIT_PATIENCE_S = 300.0, 10.0
+_END_PATIENCE = 6.0
+"""A run and its end may take this multiple of the run's length."""
 PRIORITY = 50
 """SCHED_FIFO priority of a run's processes, by default."""
 
 
-def provide() -> None:
-    """Install missing programs, where root has apt-get.
-
-    The rows of a missing program have no value: standard error names the packages first.
-    """
-    missing = [program for program in PACKAGES if shutil.which(program) is None]
-    wanted = [word for program in missing for word in PACKAGES[program].split()]
-    if wanted and shutil.which("apt-get") and os.geteuid() == 0:
-        print(f"installing {', '.join(wanted)} ...", file=sys.stderr)
-        install = ["apt-get", "install", "-y", "-qq", "--no-install-recommends", *wanted]
-        for command in (["apt-get", "update", "-qq"], install):
-            subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
-        missing = [program for program in missing if shutil.which(program) is None]
-    if missing:
-        names = " ".join(PACKAGES[program] for program in missing)
-        print(
-            f"not installed: {', '.join(missing)}; without them some goals are not measured "
-            f"(Debian: sudo apt-get install {names})",
-            file=sys.stderr,
-        )
+def program_path(name: str, package: str) -> str:
+    """Return the path of a program that a package of Debian has."""
+    if (path := shutil.which(name)) is None:
+        raise MeasurementError(f"{name} is not installed (Debian: apt-get install {package})")
+    return path
 
 
 def compiled(source: str, into: Path, *options: str) -> Path:
     """Compile a C file of this folder into another folder; return the path."""
     target = into / Path(source).stem
-    if shutil.which("cc") is None:
-        raise MeasurementError(f"{source} is written in C and cc is not installed")
-    command = ["cc", "-O2", *options, "-o", str(target), str(Path(__file__).with_name(source))]
+    path = Path(__file__).with_name(source)
+    command = [program_path("cc", "gcc"), "-O2", *options, "-o", str(target), str(path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise MeasurementError(f"cc {source}: {done.stderr.strip()[:200]}")
@@ -151,8 +141,9 @@ def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:
 class Sample(NamedTuple):
     """The system's data about a process."""
 
+    at_s: float
+    """Monotonic clock."""
     rss_kib: float
-    pss_kib: float
     uss_kib: float
     """Private memory, which is judged; shared memory is no leak of this process."""
     fds: int
@@ -166,8 +157,8 @@ class Sample(NamedTuple):
         with process.oneshot():
             memory, cpu = process.memory_full_info(), process.cpu_times()
             return cls(
+                time.monotonic(),
                 memory.rss / 1024,
-                getattr(memory, "pss", memory.uss) / 1024,
                 memory.uss / 1024,
                 process.num_fds(),
                 len(process.net_connections("all")),
@@ -212,6 +203,89 @@ class Processes:
         for process in reversed(self._known.values()):
             with contextlib.suppress(psutil.Error):
                 process.kill()
+
+
+class Observed(NamedTuple):
+    """A run of noack that has ended, observed from outside; times are of the monotonic clock."""
+
+    summary: dict[str, Any]
+    run_dir: Path
+    samples: Mapping[str, list[Sample]]
+    """By process, from the loops' start to the end of the command."""
+    begun_s: float
+    """The loops' start, up to the start of the recording."""
+    ended_s: float
+    """The loops' end."""
+    horizon_s: float
+    """Then or before: the loops had reached their horizon."""
+    closed_s: float
+    """The end of the command."""
+    left_behind: list[str]
+    """Processes that were alive 10 s later."""
+
+    def in_loops(self, role: str) -> list[Sample]:
+        """The samples of a process while the loops ran, without their first and last second."""
+        return [
+            sample
+            for sample in self.samples.get(role, ())
+            if self.begun_s + 1 <= sample.at_s <= self.horizon_s - 1
+        ]
+
+
+def observed_run(arguments: Sequence[str], runs: Path, length_s: float, pause_s: float) -> Observed:
+    """Run ``noack run ARGUMENTS`` as a user does, and sample its processes.
+
+    Args:
+        arguments: scenario and options.
+        runs: the folder for the run directory, and for what the command prints.
+        length_s: wall time of the loops.
+        pause_s: time between two samples.
+
+    Raises:
+        MeasurementError: the run did not begin, or did not end in time.
+    """
+    latest, printed, messages = runs / LATEST, runs / "summary.json", runs / "messages.txt"
+    command = [*NOACK, "run", *arguments, "--json", "--runs", str(runs)]
+    samples = defaultdict[str, list[Sample]](list)
+    with (
+        printed.open("w") as stdout,
+        messages.open("w") as stderr,
+        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr) as process,
+    ):
+        processes = Processes(process.pid)
+        begun_s = ended_s = sampled_s = math.inf
+        limit_s = time.monotonic() + _START_PATIENCE_S
+        while process.poll() is None:
+            now_s = time.monotonic()
+            if begun_s == math.inf and (latest / SPOOL).is_dir():
+                begun_s = sampled_s = now_s
+                limit_s = now_s + _END_PATIENCE * length_s + _START_PATIENCE_S
+            if now_s >= sampled_s:
+                sampled_s = now_s + pause_s
+                for role, sample in processes.sample().items():
+                    samples[role].append(sample)
+            if processes.are_alive(LOOP_ROLES):
+                ended_s = now_s
+            if now_s > limit_s:
+                processes.kill()
+                raise MeasurementError("the run did not begin, or did not end in time")
+            time.sleep(_LOOK_S)
+        closed_s = time.monotonic()
+    if ended_s == math.inf or not printed.stat().st_size:
+        lines = messages.read_text(errors="replace").strip().splitlines() or ["no message"]
+        raise MeasurementError(f"the run has no summary: {lines[-1]}")
+    left_behind = processes.left_behind(_EXIT_PATIENCE_S)
+    processes.kill()
+    return Observed(
+        json.loads(printed.read_text()),
+        latest.resolve(),
+        samples,
+        begun_s,
+        ended_s,
+        min(ended_s, begun_s + length_s),
+        closed_s,
+        left_behind,
+    )
 
 
 def processes_of(launcher: psutil.Process) -> dict[str, psutil.Process]:

@@ -2,6 +2,7 @@
 
 import argparse
 import ctypes
+import json
 import operator
 import resource
 import statistics
@@ -10,10 +11,13 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
+from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 BUSY_SHARE, STEAL_SHARE = 0.1, 0.01
@@ -294,8 +298,11 @@ def say(text: str) -> None:
     print(f"  {text} ...", file=sys.stderr, flush=True)
 
 
-def table_of(title: str, rows: Sequence[Row]) -> Table:
-    """Return the rows as a table."""
+def print_table(title: str, rows: Sequence[Row]) -> None:
+    """Print the rows as a table, and below it their notes."""
+    console = Console()
+    if not console.is_terminal:
+        console.width = 130
     table = Table(title=title, title_justify="left")
     for heading in ("figure", "value", "alternative", "its value", "ratio", "goal", "holds"):
         right = heading in ("value", "its value", "ratio", "goal")
@@ -303,8 +310,16 @@ def table_of(title: str, rows: Sequence[Row]) -> Table:
     colours = {"yes": "[green]yes[/]", "no": "[bold red]no[/]"}
     for row in rows:
         *cells, verdict = row.cells
-        table.add_row(*cells, colours.get(verdict, verdict))
-    return table
+        table.add_row(*map(escape, cells), colours.get(verdict, verdict))
+    console.print(table)
+    for row in rows:
+        if row.notes:
+            console.print(f"{row.name}: {row.notes}", highlight=False, markup=False)
+
+
+def write_json(path: Path, rows: Iterable[dict[str, object]]) -> None:
+    """Write rows into a file."""
+    path.write_text(json.dumps(list(rows), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def number_text(value: float) -> str:
