@@ -22,6 +22,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from benchmarks import cases
 from benchmarks.report import BENCHMARKS, Benchmark, Load, MeasurementError, Row, print_table, write_json
+from noack.core.errors import NoackError
 
 GOALS = "goals"
 BEGIN, END = "<!-- goals: written by `python -m benchmarks goals --docs` -->", "<!-- goals: end -->"
@@ -114,7 +115,7 @@ def _measured(benchmark: Benchmark, options: argparse.Namespace) -> tuple[list[R
     load, begun_s, failed = Load(), time.monotonic(), False
     try:
         rows = [*benchmark.measure(options)]
-    except MeasurementError as error:
+    except (MeasurementError, NoackError, AssertionError) as error:  # assertions of the tests' helpers
         failed = True
         rows = [Row(benchmark.name, None, "", unjudged=f"could not be measured: {error}")]
     rows += load.rows()

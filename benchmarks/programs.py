@@ -3,7 +3,6 @@
 Runs are observed from outside, by their output and by samples of their processes.
 """
 
-import contextlib
 import json
 import math
 import os
@@ -12,19 +11,19 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import psutil
 
 from benchmarks.report import MeasurementError
-from cosim.record.run_directory import LATEST
-from noack.protocol.topology import LOOP_ROLES, ROLES
-from noack.runtime.spool import SPOOL
+from noack.protocol.topology import LOOP_ROLES
+from tests.integration.conftest import PATIENCE_S, begun, is_over, processes_of
 
 PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
 """A progress line of a run; the group is the time in the run, s."""
@@ -37,7 +36,6 @@ FREE_PORTS = ("--set", "ports={}")
 NOACK = (sys.executable, "-m", "cosim.cli")
 LAUNCHER = "launcher"
 _LOOK_S = 0.1
-_START_PATIENCE_S, _EXIT_PATIENCE_S = 300.0, 10.0
 _END_PATIENCE = 6.0
 """A run and its end may take this multiple of the run's length."""
 PRIORITY = 50
@@ -167,145 +165,73 @@ class Sample(NamedTuple):
             )
 
 
-class Processes:
-    """The launcher of a run, by its process id, and the run's processes."""
-
-    def __init__(self, launcher: int) -> None:
-        self._known = {LAUNCHER: psutil.Process(launcher)}
-
-    def sample(self) -> dict[str, Sample]:
-        """Sample every process that is alive."""
-        if len(self._known) <= len(ROLES):
-            with contextlib.suppress(psutil.Error):
-                self._known = processes_of(self._known[LAUNCHER]) | self._known
-        samples = {}
-        for role, process in self._known.items():
-            with contextlib.suppress(psutil.Error):
-                samples[role] = Sample.of(process)
-        return samples
-
-    def are_alive(self, roles: Sequence[str]) -> bool:
-        """Whether a process of these roles, once seen by :meth:`sample`, has not ended."""
-        ended = (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
-        for role in roles:
-            with contextlib.suppress(KeyError, psutil.Error):
-                if self._known[role].status() not in ended:
-                    return True
-        return False
-
-    def left_behind(self, patience_s: float) -> list[str]:
-        """Return the roles of processes that are alive although the run is over."""
-        _, alive = psutil.wait_procs(list(self._known.values()), timeout=patience_s)
-        return sorted(role for role, process in self._known.items() if process in alive)
-
-    def kill(self) -> None:
-        """Kill all processes, the launcher last."""
-        for process in reversed(self._known.values()):
-            with contextlib.suppress(psutil.Error):
-                process.kill()
-
-
 class Observed(NamedTuple):
     """A run of noack that has ended, observed from outside; times are of the monotonic clock."""
 
     summary: dict[str, Any]
     run_dir: Path
     samples: Mapping[str, list[Sample]]
-    """By process, from the loops' start to the end of the command."""
+    """By process, from the first rows of the loops to the end of the command."""
     begun_s: float
-    """The loops' start, up to the start of the recording."""
-    ended_s: float
-    """The loops' end."""
+    """The loops' first rows are recorded."""
     horizon_s: float
-    """Then or before: the loops had reached their horizon."""
+    """The loops have reached their horizon, or have ended before."""
+    ended_s: float
+    """The loops' processes have ended."""
     closed_s: float
-    """The end of the command."""
+    """The command has ended."""
     left_behind: list[str]
-    """Processes that were alive 10 s later."""
+    """Processes that did not end with it."""
 
     def in_loops(self, role: str) -> list[Sample]:
         """The samples of a process while the loops ran, without their first and last second."""
-        return [
-            sample
-            for sample in self.samples.get(role, ())
-            if self.begun_s + 1 <= sample.at_s <= self.horizon_s - 1
-        ]
+        begin_s, end_s = self.begun_s + 1, self.horizon_s - 1
+        return [sample for sample in self.samples.get(role, ()) if begin_s <= sample.at_s <= end_s]
 
 
-def observed_run(arguments: Sequence[str], runs: Path, length_s: float, pause_s: float) -> Observed:
-    """Run ``noack run ARGUMENTS`` as a user does, and sample its processes.
+def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_s: float) -> Observed:
+    """Run ``noack run ARGUMENTS`` to its end, and sample its processes.
 
     Args:
         arguments: scenario and options.
-        runs: the folder for the run directory, and for what the command prints.
+        folder: for the run directory.
         length_s: wall time of the loops.
         pause_s: time between two samples.
-
-    Raises:
-        MeasurementError: the run did not begin, or did not end in time.
     """
-    latest, printed, messages = runs / LATEST, runs / "summary.json", runs / "messages.txt"
-    command = [*NOACK, "run", *arguments, "--json", "--runs", str(runs)]
-    samples = defaultdict[str, list[Sample]](list)
-    with (
-        printed.open("w") as stdout,
-        messages.open("w") as stderr,
-        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr) as process,
-    ):
-        processes = Processes(process.pid)
-        begun_s = ended_s = sampled_s = math.inf
-        limit_s = time.monotonic() + _START_PATIENCE_S
-        while process.poll() is None:
+    samples, closed = defaultdict[str, list[Sample]](list), threading.Event()
+    begun_s = ended_s = math.inf
+
+    def observe() -> None:
+        nonlocal ended_s
+        sampled_s = -math.inf
+        while not closed.wait(_LOOK_S):
             now_s = time.monotonic()
-            if begun_s == math.inf and (latest / SPOOL).is_dir():
-                begun_s = sampled_s = now_s
-                limit_s = now_s + _END_PATIENCE * length_s + _START_PATIENCE_S
-            if now_s >= sampled_s:
-                sampled_s = now_s + pause_s
-                for role, sample in processes.sample().items():
-                    samples[role].append(sample)
-            if processes.are_alive(LOOP_ROLES):
+            if not all(is_over(processes[role]) for role in LOOP_ROLES):
                 ended_s = now_s
-            if now_s > limit_s:
-                processes.kill()
-                raise MeasurementError("the run did not begin, or did not end in time")
-            time.sleep(_LOOK_S)
-        closed_s = time.monotonic()
-    if ended_s == math.inf or not printed.stat().st_size:
-        lines = messages.read_text(errors="replace").strip().splitlines() or ["no message"]
-        raise MeasurementError(f"the run has no summary: {lines[-1]}")
-    left_behind = processes.left_behind(_EXIT_PATIENCE_S)
-    processes.kill()
+            if now_s > sampled_s + pause_s:
+                sampled_s = now_s
+                for role, process in processes.items():
+                    with suppress(psutil.Error):
+                        samples[role].append(Sample.of(process))
+
+    with begun(folder) as begin:
+        run = begin(command=("run", *arguments), viewer=True)
+        run.wait_recording()
+        begun_s = time.monotonic()
+        launcher = psutil.Process(run.process.pid)
+        processes = processes_of(launcher) | {LAUNCHER: launcher}
+        observer = threading.Thread(target=observe)
+        observer.start()
+        try:
+            finished = run.finish(_END_PATIENCE * length_s + PATIENCE_S)
+        finally:
+            closed.set()
+            observer.join()
+        left = [role for role in processes if processes[role] in run.left_behind()]
+    horizon_s = min(ended_s, begun_s + length_s)
     return Observed(
-        json.loads(printed.read_text()),
-        latest.resolve(),
-        samples,
-        begun_s,
-        ended_s,
-        min(ended_s, begun_s + length_s),
-        closed_s,
-        left_behind,
+        finished.summary, finished.run_dir, samples, begun_s, horizon_s, ended_s, time.monotonic(), left
     )
-
-
-def processes_of(launcher: psutil.Process) -> dict[str, psutil.Process]:
-    """Return the processes of a run by role."""
-    children = launcher.children()
-    return {role: child for child in children for role in ROLES if is_of(role, child)}
-
-
-def is_of(role: str, process: psutil.Process) -> bool:
-    """Whether a process has a role in a run, by its title; not if it has ended."""
-    try:
-        return bool(process.cmdline()[:1] == [f"noack {role}"])
-    except psutil.NoSuchProcess:
-        return False
-
-
-def udp_port(process: psutil.Process) -> int:
-    """Return the port of a process in the loop."""
-    (port,) = {udp.laddr.port for udp in process.net_connections("udp4") if not udp.raddr}
-    return int(port)
 
 
 _CORES = sorted(os.sched_getaffinity(0))
@@ -343,45 +269,3 @@ def scheduled(priority: int) -> Iterator[bool]:
         yield True
     finally:
         os.sched_setscheduler(0, policy, parameters)
-
-
-class TwoHosts(NamedTuple):
-    """Two network namespaces that a veth link connects: their names, addresses IPv4 and IPv6."""
-
-    names: tuple[str, str]
-    addresses: tuple[tuple[str, str], tuple[str, str]]
-
-    def inside(self, host: int, *command: str, monotonic_s: int = 0) -> list[str]:
-        """Return a command that runs on a host, whose monotonic clock is ahead by some seconds."""
-        clock = ["unshare", "--time", f"--monotonic={monotonic_s}", "--fork", "--kill-child"]
-        return ["ip", "netns", "exec", self.names[host], *(clock if monotonic_s else ()), *command]
-
-
-def _run(command: Sequence[str]) -> None:
-    try:
-        subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
-    except subprocess.CalledProcessError as error:
-        raise MeasurementError(f"{' '.join(command)}: {error.stderr.strip()}") from None
-
-
-@contextmanager
-def two_hosts() -> Iterator[TwoHosts]:
-    """Make the namespaces, and delete them at the end."""
-    if shutil.which("ip") is None or shutil.which("unshare") is None:
-        raise MeasurementError("ip (iproute2) and unshare (util-linux) are not installed")
-    names = (f"noack-{os.getpid()}-reference", f"noack-{os.getpid()}-client")
-    hosts = TwoHosts(names, (("10.83.3.1", "fd83:3::1"), ("10.83.3.2", "fd83:3::2")))
-    try:
-        for name in names:
-            _run(["ip", "netns", "add", name])
-            _run(["ip", "-n", name, "link", "set", "lo", "up"])
-        _run(["ip", "-n", names[0], "link", "add", "line", "type", "veth", "peer", "line", "netns", names[1]])
-        for name, (four, six) in zip(names, hosts.addresses, strict=True):
-            _run(["ip", "-n", name, "address", "add", f"{four}/24", "dev", "line"])
-            _run(["ip", "-n", name, "address", "add", f"{six}/64", "dev", "line", "nodad"])
-            _run(["ip", "-n", name, "link", "set", "line", "up"])
-        _run(hosts.inside(1, "true", monotonic_s=1))
-        yield hosts
-    finally:
-        for name in names:
-            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import psutil
 
-from benchmarks.programs import imported_s, processes_of, udp_port
+from benchmarks.programs import imported_s
 from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from cosim.analysis.summary.loop_statistics import lateness_us
 from cosim.analysis.summary.run_summary import summarise
@@ -37,6 +37,7 @@ from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario_file import load
+from tests.integration.conftest import processes_of, udp_port
 
 STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
 """Table of each process's steps."""
