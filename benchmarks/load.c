@@ -171,17 +171,6 @@ int load_burst(int out, int sink, int relay, int64_t first, int64_t count, int64
     return failed;
 }
 
-/* The same without a relay: send directly to the sink; cpu_ns is the calling thread's CPU time. */
-int load_direct(int out, int sink, int64_t first, int64_t count, int64_t size, int64_t patience_ns,
-                struct burst *found, int64_t *cpu_ns)
-{
-    int64_t begun_ns = now_ns(CLOCK_REALTIME), begun_cpu_ns = now_ns(CLOCK_THREAD_CPUTIME_ID);
-    int failed = send_all(out, first, count, (size_t)size, NULL, 0);
-    *cpu_ns = now_ns(CLOCK_THREAD_CPUTIME_ID) - begun_cpu_ns;
-    gather(sink, first, count, 0, begun_ns, patience_ns, found);
-    return failed;
-}
-
 /* Send datagrams one by one, each after the previous one has arrived or timed out (the sink's
  * SO_RCVTIMEO); delay_ns[k] is -1 after a timeout. */
 int load_ping(int out, int sink, int64_t first, int64_t count, int64_t size, int64_t *delay_ns)

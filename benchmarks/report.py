@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -191,6 +192,12 @@ def own_cpu_s(*, children: bool = False) -> float:
 
 Figures = Mapping[str, float]
 """The figures of one side in one round, by quantity."""
+
+
+def quantiles_us(values_ns: Sequence[float] | NDArray[Any]) -> Figures:
+    """Return ``p50``, ``p99`` and ``max`` of values in ns, in µs."""
+    p50_us, p99_us, max_us = (np.quantile(values_ns, (0.5, 0.99, 1)) / 1e3).tolist()
+    return {"p50": p50_us, "p99": p99_us, "max": max_us}
 
 
 class Rounds:

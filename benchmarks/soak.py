@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import theilslopes
 
-from benchmarks.programs import FREE_PORTS, LAUNCHER, Observed, Sample, observed_run
+from benchmarks.programs import LAUNCHER, Observed, Sample, observed_run
 from benchmarks.report import Goal, MeasurementError, Row, print_table, write_json
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import Axis, FigureDescription, Line, Panel, time_axis
@@ -210,7 +210,7 @@ def soak(path: Path, settings: Sequence[str], runs: Path) -> list[Row]:
     folder = Path(tempfile.mkdtemp(prefix="soak-", dir=runs))
     changes = [word for setting in settings for word in ("--set", setting)]
     pause_s = min(length_s / _LEAST_LOOKS, _LONGEST_PAUSE_S)
-    run = observed_run([str(path), *FREE_PORTS, *changes], folder, length_s, pause_s)
+    run = observed_run([str(path), "--report", *changes], folder, length_s, pause_s)
     rows = [*run_rows(run)]
     content = {
         "rows": [row.as_json() for row in rows],

@@ -19,18 +19,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from benchmarks.programs import FREE_PORTS
-from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, say
+from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, quantiles_us, say
 from noack.runtime.address import Address
-from noack.runtime.host_clocks.clock_offset import ClockOffset, Restart
+from noack.runtime.host_clocks.clock_offset import ClockOffset
 from noack.runtime.host_clocks.time_exchange import TimeClient, TimeReference, answering
 from noack.runtime.real_time_loop import realtime
 from tests.driven_clocks import DrivenClocks
@@ -45,28 +43,14 @@ _START_NS = 500_000_000
 _PACKET = struct.Struct("<qqq24x")  # 48 bytes, as NTP's
 
 
-class Bare:
-    """An end of a plain NTP exchange; the client takes the newest midpoint for the offset."""
+class BareReference:
+    """The answering end of a plain NTP exchange."""
 
-    def __init__(self, at: Address, clocks: DrivenClocks | None = None) -> None:
-        self._clocks = clocks
-        self._endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.midpoint_ns: int | None = None
-        if clocks is None:  # the reference
-            self._endpoint.bind(at)
-        else:
-            self._endpoint.connect(at)
-            self._endpoint.setblocking(False)
-
-    @property
-    def address(self) -> Address:
-        """Its own address."""
-        name: Address = self._endpoint.getsockname()
-        return name
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait for."""
-        return self._endpoint.fileno()
+    def __init__(self, at: Address) -> None:
+        self._endpoint = socket.socket(type=socket.SOCK_DGRAM)
+        self._endpoint.bind(at)
+        self.address: Address = self._endpoint.getsockname()
+        self.fileno, self.close = self._endpoint.fileno, self._endpoint.close
 
     def answer_all(self) -> None:
         """Answer the waiting request."""
@@ -75,22 +59,28 @@ class Bare:
         sent_ns = _PACKET.unpack(data)[0]
         self._endpoint.sendto(_PACKET.pack(sent_ns, received_ns, time.monotonic_ns()), source)
 
-    def poll(self) -> list[Restart]:
+
+class BareClient:
+    """The asking end of a plain NTP exchange, which takes the newest midpoint for the offset."""
+
+    def __init__(self, to: Address, clocks: DrivenClocks) -> None:
+        self._clocks = clocks
+        self._endpoint = socket.socket(type=socket.SOCK_DGRAM)
+        self._endpoint.connect(to)
+        self._endpoint.setblocking(False)
+        self.midpoint_ns: int | None = None
+        self.fileno, self.close = self._endpoint.fileno, self._endpoint.close
+
+    def poll(self) -> None:
         """Take the answer, or send a request if there is none."""
-        assert self._clocks is not None
         try:
             data = self._endpoint.recv(100)
         except BlockingIOError:
             self._endpoint.send(_PACKET.pack(self._clocks.monotonic_ns(), 0, 0))
-            return []
+            return
         now_ns = self._clocks.monotonic_ns()
         sent_ns, there_ns, answered_ns = _PACKET.unpack(data)
         self.midpoint_ns = (there_ns - sent_ns + answered_ns - now_ns) // 2
-        return []
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._endpoint.close()
 
 
 class Exchange(NamedTuple):
@@ -115,7 +105,7 @@ class Exchange(NamedTuple):
 def run_reference(options: Exchange) -> None:
     """Answer until the standard input closes."""
     listen = (options.host, 0)
-    end = Bare(listen) if options.bare else TimeReference(listen, KEY)
+    end = BareReference(listen) if options.bare else TimeReference(listen, KEY)
     with closing(end):
         print(end.address[1], flush=True)
         if isinstance(end, TimeReference) and not options.answer_every_s:
@@ -129,24 +119,21 @@ def run_reference(options: Exchange) -> None:
 
 def run_client(options: Exchange) -> None:
     """Check the bound against the true offset for a time; print the figures."""
-    clocks = DrivenClocks(0, options.drift_ppb)
-    address = (options.host, options.port)
-    offset = ClockOffset(options.rate_ppb)
-    period_ns = round(options.period_s * 1e9)
-    bare = Bare(address, clocks) if options.bare else None
+    clocks, address = DrivenClocks(0, options.drift_ppb), (options.host, options.port)
+    offset, period_ns = ClockOffset(options.rate_ppb), round(options.period_s * 1e9)
+    bare = BareClient(address, clocks) if options.bare else None
     client = bare or TimeClient(address, KEY, offset, period_ns=period_ns, clocks=clocks)
     errors_ns, estimates_ns = list[int](), list[int]()
-    checks = outside = restarts = 0
+    checks = outside = turns = cpu_ns = due_ns = 0
     steady_ns = time.monotonic_ns() + _START_NS
     end_ns = steady_ns + round(options.seconds * 1e9)
-    due_ns, turns, cpu_ns = 0, 0, 0
     with closing(client):
         while (now_ns := time.monotonic_ns()) < end_ns:
             is_due = now_ns >= due_ns
             readable, _, _ = select.select([client], (), (), 0 if is_due else _WAKE_S)
             if is_due or (readable and not options.late):
                 begin_ns = time.thread_time_ns()
-                restarts += len(client.poll())
+                client.poll()
                 cpu_ns += time.thread_time_ns() - begin_ns
             if is_due:
                 due_ns, turns = max(due_ns, now_ns - period_ns) + period_ns, turns + 1
@@ -155,30 +142,19 @@ def run_client(options: Exchange) -> None:
                 added_ns = clocks.added_ns(true_ns)
                 truth_ns = options.ahead_ns - added_ns
                 bounds = offset.interval(true_ns + added_ns)
-                estimate_ns = bare.midpoint_ns if bare else bounds and bounds.midpoint_ns
                 if bounds is not None:
                     checks += 1
                     outside += not bounds.lower_ns <= truth_ns <= bounds.upper_ns
+                    if true_ns > steady_ns:
+                        errors_ns.append(bounds.error_ns)
+                estimate_ns = bare.midpoint_ns if bare else bounds and bounds.midpoint_ns
                 if estimate_ns is not None and true_ns > steady_ns:
                     estimates_ns.append(abs(estimate_ns - truth_ns))
-                    if bounds is not None:
-                        errors_ns.append(bounds.error_ns)
-    figures = {
-        "checks": checks,
-        "outside": outside,
-        "restarts": restarts,
-        "turns": turns,
-        "exchanges": offset.exchanges,
-        "cpu_us": cpu_ns / 1e3 / max(turns, 1),
-    }
-    print(json.dumps(figures | _quantiles("error", errors_ns) | _quantiles("estimate", estimates_ns)))
-
-
-def _quantiles(name: str, values_ns: Sequence[int]) -> dict[str, float]:
-    if not values_ns:
-        return {}
-    p50, p99, most = np.quantile(np.array(values_ns), (0.5, 0.99, 1)) / 1e3
-    return {f"{name}_p50_us": p50, f"{name}_p99_us": p99, f"{name}_max_us": most}
+    figures = {"checks": checks, "outside": outside, "cpu_us": cpu_ns / 1e3 / max(turns, 1)}
+    for name, values_ns in (("error", errors_ns), ("estimate", estimates_ns)):
+        if values_ns:
+            figures |= {f"{name}_{quantile}": us for quantile, us in quantiles_us(values_ns).items()}
+    print(json.dumps(figures))
 
 
 def main() -> None:
@@ -263,13 +239,13 @@ def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
     yield Row("checks of the bound against the true offset", checks, "", goal=Goal(">=", 1e5))
     yield Row("true offset outside the bound", outside, "", goal=Goal("==", 0))
     for case, own in cases:
-        note = f"largest: {max(own.of(OURS, 'error_max_us')):.0f} µs"
+        note = f"largest: {max(own.of(OURS, 'error_max')):.0f} µs"
         for q in ("p50", "p99"):
             name = f"error bound, {q}, {case.name}"
-            yield own.row(name, "µs", f"error_{q}_us", OURS, goal=case.goal, note=note)
+            yield own.row(name, "µs", f"error_{q}", OURS, goal=case.goal, note=note)
     for quantity, name in (
-        ("estimate_p50_us", "error of the estimate, p50"),
-        ("estimate_p99_us", "error of the estimate, p99"),
+        ("estimate_p50", "error of the estimate, p50"),
+        ("estimate_p99", "error of the estimate, p99"),
         ("cpu_us", "client's CPU per 20 ms"),
     ):
         yield rounds.row(name, "µs", quantity, OURS, BARE)

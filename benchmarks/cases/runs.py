@@ -108,7 +108,7 @@ def run(load: Load, folder: Path) -> Observed:
     """Run the loops as a user does."""
     path = folder / "fleet.toml"
     path.write_text(load.scenario)
-    observed = observed_run([str(path), "--no-report"], folder, load.horizon_s, _POLL_S)
+    observed = observed_run([str(path)], folder, load.horizon_s, _POLL_S)
     if (ending := observed.summary["exit"])["status"]:
         raise MeasurementError(f"{load}: {ending['reason']}")
     return observed
