@@ -1,6 +1,6 @@
 """The soak test: a real run of several hours, observed from outside.
 
-``python -m benchmarks.soak [hour] [day] [--minutes M] [--json FILE] [--runs DIR]`` runs one hour at
+``python -m benchmarks.soak [hour] [day] [--minutes M] [--runs DIR]`` runs one hour at
 speed 1 (``soak_hour.toml``), then a day of simulated time at speed 48 (``soak_day.toml``), as a
 user starts them, and samples the processes every few seconds. Memory, descriptors and threads must
 stay flat, every claim must hold.
@@ -32,7 +32,7 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from benchmarks.programs import LAUNCHER, Observed, Sample, observed_run
-from benchmarks.report import Goal, MeasurementError, Row, print_table, write_json
+from benchmarks.report import Goal, MeasurementError, Row, print_table
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import Axis, FigureDescription, Line, Panel, time_axis
 from cosim.output.figures.figure_description import Row as FigureRow
@@ -232,11 +232,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("kinds", nargs="*", metavar="KIND", choices=[[], *KINDS], help=f"of {', '.join(KINDS)}")
     add("--minutes", type=_minutes, metavar="M", help="a shorter one; of the first kind only")
-    add("--json", type=Path, metavar="FILE", help="write the rows to FILE")
     add("--runs", type=Path, default=Path("runs"), help="where runs are kept")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a value")
     options = parser.parse_args(arguments)
-    every: list[Row] = []
+    status = 0
     for kind in options.kinds or (KINDS if options.minutes is None else KINDS[:1]):
         path, settings = Path(__file__).with_name(f"soak_{kind}.toml"), list(options.set)
         try:
@@ -247,10 +246,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"soak: {error}", file=sys.stderr)
             return 2
         print_table(f"soak_{kind}", rows)
-        every += rows
-    if options.json is not None:
-        write_json(options.json, (row.as_json() for row in every))
-    return int(any(row.holds is False for row in every))
+        status |= any(row.holds is False for row in rows)
+    return status
 
 
 def _minutes(text: str) -> float:

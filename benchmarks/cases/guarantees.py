@@ -1,15 +1,14 @@
 """What is guaranteed: losses over very many decisions, and certificates beside attacks."""
 
 import argparse
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import Goal, Row, benchmark, compared, say
+from benchmarks.report import Goal, Row, benchmark, say
 from cosim.analysis.adversary import Objective, Worst, conditions_of, find_worst
 from cosim.cli import find_scenario
 from netem.link_state import LinkState
@@ -39,8 +38,6 @@ EXPECTED = (
     "loss 20% keep atmost 3 in 10 recover 2",
     "loss 20% 50% keep mansd 3 atmost 3 in 10 corrupt 5%",
 )
-COST_ROUNDS = 30
-_COSTED = 200_000
 CAP = 3
 _LOSS, _DELAY = "loss 30%", "delay 10ms 10ms distribution normal reorder 10% limit 1000000"
 _SPACING_NS = 2_000_000
@@ -51,30 +48,18 @@ class Decider:
 
     def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
         self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
-        columns = np.zeros(_BATCH, np.int64), np.full(_BATCH, 72), np.arange(_BATCH) * spacing_ns
-        self._columns = columns
+        self._columns = np.zeros(_BATCH, np.int64), np.full(_BATCH, 72), np.arange(_BATCH) * spacing_ns
 
-    def decide(self, count: int = _BATCH) -> NDArray[Any]:
-        """Return the decisions for the first datagrams of the next flow."""
+    def decide(self) -> NDArray[Any]:
+        """Return the decisions for the datagrams of the next flow."""
         self._link.start_flow(0, self._flow)
         self._link.core.in_flight = 0
         self._flow += 1
-        return self._link.decide_many(*(column[:count] for column in self._columns))
+        return self._link.decide_many(*self._columns)
 
     def outcomes(self, count: int) -> list[Outcomes]:
         """Return which datagrams are lost, of several flows."""
         return [outcomes_of(self.decide()) for _ in range(count // _BATCH)]
-
-    def cost(self) -> Callable[[], float]:
-        """Return what measures nanoseconds per decision."""
-
-        def measured() -> float:
-            begun_ns = time.perf_counter_ns()
-            self.decide(_COSTED)
-            return (time.perf_counter_ns() - begun_ns) / _COSTED
-
-        measured()
-        return measured
 
 
 def check_row(words: str, limits: Limits, count: int) -> Row:
@@ -121,31 +106,17 @@ def network_rows() -> Iterator[Row]:
 
 @benchmark("guarantee", "Emulator: the guarantee over many decisions")
 def guarantee(options: argparse.Namespace) -> Iterator[Row]:
-    """Measure costs and networks, then violations, then loss rates, over very many decisions.
+    """Measure networks, then violations, then loss rates, over very many decisions.
 
     Each combination is decided by the core, a million datagrams per flow. A check that uses nothing
     of netem counts violations at the receiver: outcomes come from the times at which intact
-    datagrams leave. Costs alternate with those of the plain cap that allows as many consecutive
-    losses.
+    datagrams leave.
 
     A reordering network is compared without a cap, with a cap on drops only, and with the
     guarantee. A cap on drops only forces a datagram after m drops, and leaves the delays as they
     are, as the loss models of quic-network-simulator and Rattan do. A datagram counts as lost if it
     is dropped, or if a later one arrives before it.
     """
-    for before in ("loss 50%", f"loss 50% {REORDERING}"):
-        for words in COMBINATIONS:
-            cap = f"mansd {settings_of(words).longest_burst}"
-            if words != cap:
-                ours, plain = (Decider(f"{before} {text} limit 1000000").cost() for text in (words, cap))
-                yield compared(
-                    f"{before} {words}: decision",
-                    "ns",
-                    ours,
-                    (f"{before} {cap}", plain),
-                    Goal("<=", 1.3),
-                    rounds=COST_ROUNDS,
-                )
     yield from network_rows()
     for words, limits in COMBINATIONS.items():
         for before in ("loss 50%", f"loss 30% {REORDERING}"):
