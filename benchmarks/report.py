@@ -133,6 +133,11 @@ class Benchmark(NamedTuple):
     """The arguments of ``add_argument`` by the option's name."""
 
 
+def option(default: object, text: str, **more: Any) -> dict[str, Any]:
+    """Return an option with a default value, whose type is that of the option."""
+    return {"type": type(default), "default": default, "help": f"{text} (%(default)s)", **more}
+
+
 BENCHMARKS: dict[str, Benchmark] = {}
 
 

@@ -119,14 +119,7 @@ def rows_of(ends: Mapping[float, End]) -> Iterator[Row]:
 @benchmark(
     "long_run",
     "The end of a long run",
-    {
-        "--long-run": {
-            "type": float,
-            "nargs": "+",
-            "metavar": "SECONDS",
-            "help": "long_run: lengths of the runs (default: 120 600)",
-        }
-    },
+    {"--long-run": {"type": float, "nargs": "+", "metavar": "SECONDS", "help": "lengths of long_run"}},
 )
 def long_run(options: argparse.Namespace) -> Iterator[Row]:
     """Complete runs of several lengths, by ``noack summary``.

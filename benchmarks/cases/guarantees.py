@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import Goal, Row, benchmark, say
+from benchmarks.report import Goal, Row, benchmark, option, say
 from cosim.analysis.adversary import Objective, Worst, conditions_of, find_worst
 from cosim.cli import find_scenario
 from netem.link_state import LinkState
@@ -214,8 +214,8 @@ def row_of(name: str, worst: Worst) -> Row:
     {
         "--loop": {"action": "append", "choices": LOOPS, "help": "tightness: only this loop"},
         "--policy": {"action": "append", "help": "tightness: only this policy"},
-        "--search-s": {"type": float, "default": 5.0, "help": "tightness: horizon in s"},
-        "--norm": {"choices": ("chosen", "identity"), "default": "chosen", "help": "tightness: the norm"},
+        "--search-s": option(5.0, "tightness: horizon in s"),
+        "--norm": option("chosen", "tightness: the norm", choices=("chosen", "identity")),
     },
 )
 def tightness(options: argparse.Namespace) -> Iterator[Row]:

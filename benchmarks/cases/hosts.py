@@ -19,20 +19,20 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.programs import FREE_PORTS
 from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, quantiles_us, say
 from noack.runtime.address import Address
 from noack.runtime.host_clocks.clock_offset import ClockOffset
 from noack.runtime.host_clocks.time_exchange import TimeClient, TimeReference, answering
 from noack.runtime.real_time_loop import realtime
+from tests.attacks.attacked import Run
 from tests.driven_clocks import DrivenClocks
-from tests.integration.conftest import starting
 from tests.two_hosts import TwoHosts, two_hosts
 
 KEY = bytes(range(32))
@@ -253,30 +253,17 @@ def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
 
 ROUNDS = 3
 ACROSS, ON_LOOPBACK = "noack across a veth link", "noack on loopback"
-_PATIENCE_S = 120.0
 _CHANGES = ("horizon_s=10", "trigger.beta=1e-9", 'network.loss={model="lossless"}')
-_SETTINGS = (*FREE_PORTS, *(word for change in _CHANGES for word in ("--set", change)), "--no-report")
 
 
 def run_by_hand(hosts: TwoHosts | None) -> Figures:
     """Return the latency of a run with the controller on the second host, or all on this one."""
-    with tempfile.TemporaryDirectory() as name, starting() as begin:
-
-        def start(host: int, *arguments: str) -> subprocess.Popen[str]:
-            before = () if hosts is None else hosts.inside(host)
-            return begin(*arguments, before=before, runtime=Path(name), cwd=Path(name))
-
-        listen = () if hosts is None else ("--listen", hosts.addresses[0][0])
-        invited = () if hosts is None else ("--invitation", "invitation.json")
-        recording = start(0, "record", "lane_following", "--json", *listen, *_SETTINGS)
-        joining = [start(0, role) for role in ("plant", "sensor", "netem")]
-        joining.append(start(1, "controller", *invited))
-        stdout, stderr = recording.communicate(timeout=_PATIENCE_S)
-        for process in joining:
-            stderr += process.communicate(timeout=_PATIENCE_S)[1]
-        if any(process.returncode for process in (recording, *joining)):
-            raise MeasurementError(stderr.strip().splitlines()[-1])
-    latency_us = json.loads(stdout)["loops"][0]["latency_us"]
+    settings = (word for change in _CHANGES for word in ("--set", change))
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        run = Run(stack, Path(folder), hosts, *settings).finish(Counter())
+    if run.status:
+        raise MeasurementError(run.stderr.strip().splitlines()[-1])
+    latency_us = run.summary["loops"][0]["latency_us"]
     return {key: latency_us[key] for key in ("p50", "p99", "updates")}
 
 

@@ -38,23 +38,7 @@ _BOX = f"""(slider => {{
   const r = slider.getBoundingClientRect();
   return [r.x, r.y + r.height / 2, r.width];
 }})({_DRAGGED})"""
-_NOTE_STROKES = """
-window.STROKES = [];
-let movedAt = 0;
-addEventListener("pointermove", event => { movedAt = event.timeStamp; }, true);
-const notePainted = at => requestAnimationFrame(() => {
-  const painted = new MessageChannel();  // a message follows when the frame has been painted
-  painted.port1.onmessage = () => STROKES.push(performance.now() - at);
-  painted.port2.postMessage(0);
-});
-const show = LabFigure.prototype.show;
-LabFigure.prototype.show = function (content) {
-  show.call(this, content);
-  if (movedAt) notePainted(movedAt);
-  movedAt = 0;
-};
-0
-"""
+_NOTE_STROKES = Path(__file__).parents[1] / "strokes.js"
 
 
 @contextmanager
@@ -94,7 +78,7 @@ def _moving(page: Page) -> Iterator[None]:
 def _strokes_ms(page: Page) -> list[float]:
     """Drag a slider; return the times from each move to its curve on the screen."""
     x, y, width = page.js(_BOX)
-    page.js(_NOTE_STROKES)
+    page.js(_NOTE_STROKES.read_text())
 
     def mouse(kind: str, share: float) -> None:
         at = x + share * width

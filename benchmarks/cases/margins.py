@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag, solve_continuous_are
 
-from benchmarks.report import Goal, Row, benchmark, median, say
+from benchmarks.report import Goal, Row, benchmark, median, option, say
 from cosim.cli import find_scenario
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import (
@@ -108,8 +108,8 @@ def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:
     "margins",
     "Random time-triggered loops: decided margins",
     {
-        "--margin-loops": {"type": int, "default": 200, "help": "margins: number of loops"},
-        "--margin-first": {"type": int, "default": 0, "help": "margins: number of the first loop"},
+        "--margin-loops": option(200, "margins: number of loops"),
+        "--margin-first": option(0, "margins: number of the first loop"),
     },
 )
 def margins(options: argparse.Namespace) -> Iterator[Row]:

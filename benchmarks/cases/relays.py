@@ -58,6 +58,7 @@ from benchmarks.report import (
     Row,
     benchmark,
     median,
+    option,
     quantiles_us,
     say,
 )
@@ -233,23 +234,10 @@ _LAST_S = 0.1
 _STARVED = 0.01
 
 
-def _seconds(text: str) -> int:
-    if (seconds := int(text)) < 4:
-        raise argparse.ArgumentTypeError("must be 4 or more")
-    return seconds
-
-
 @benchmark(
     "relay_soak",
     "Our relay under a steady load",
-    {
-        "--soak-s": {
-            "type": _seconds,
-            "default": 20,
-            "metavar": "S",
-            "help": "length of relay_soak (%(default)s)",
-        }
-    },
+    {"--soak-s": option(20, "length of relay_soak, at least 4 s")},
 )
 def steady_load(options: argparse.Namespace) -> Iterator[Row]:
     """Load our relay with half its maximum rate: no unintended loss, constant memory.
@@ -282,7 +270,7 @@ def _soak_rows(relay: Relay, seconds: int, maximum_per_s: float) -> Iterator[Row
     cpu, waited = (np.subtract(relay.scheduled_s(), before_s) / elapsed_s).tolist()
     # Empty groups: receive the datagrams still in flight.
     relay.ends.soak(counts, round(_LAST_S / _GROUP_S), 0, period_ns)
-    totals, none, quarter = relay.totals(), Goal("==", 0), seconds // 4
+    totals, none, quarter = relay.totals(), Goal("==", 0), max(seconds // 4, 1)
     growth_kib = median(resident_kib[-quarter:]) - median(resident_kib[quarter : 2 * quarter])
     peer, note = Peer("drained maximum", maximum_per_s), f"for {elapsed_s:.0f} s"
     yield Row("load", counts.sent / elapsed_s, "datagrams/s", peer, note=note)

@@ -1,7 +1,6 @@
 """Live runs as a user starts them: start, many loops, the demo; the installation."""
 
 import argparse
-import os
 import re
 import shutil
 import subprocess
@@ -27,6 +26,7 @@ from benchmarks.report import (
     benchmark,
     compared,
     median,
+    option,
     own_cpu_s,
     say,
 )
@@ -34,38 +34,7 @@ from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
 
 ROOT = Path(__file__).parents[2]
 CAP = 2
-_SCENARIO = """
-name = "fleet"
-horizon_s = {horizon_s}
-recovery = {{ rejoin_within_s = 0 }}
-
-[model]
-name = "double_integrator"
-
-[plant]
-initial_state = [1.0, 0.0]
-initial_state_halfwidth = [0.5, 0.5]
-draw = "uniform"
-uncertainty_A = [[0.0, 0.0], [0.2, 0.2]]
-rate_hz = {rate_hz}
-
-[controller]
-rate_hz = {rate_hz}
-
-[trigger]
-beta = 0.5
-alpha_per_s = 0.25
-floor = 0.02
-
-[network]
-mansd = {cap}
-loss = {{ model = "bernoulli", probability = 0.3 }}
-impairments = [{{ kind = "rate", rate_bps = {rate_bps}, queue = 1000 }}]
-
-[[loops]]
-name = "loop"
-count = {loops}
-"""
+_SCENARIO = Path(__file__).parents[1] / "fleet.toml"
 _KIBI = 1024
 _POLL_S = 2.0
 _SINGLE_S = 60.0
@@ -92,8 +61,8 @@ class Load(NamedTuple):
         return f"{self.loops:,} loop{plural} at {self.rate_hz:g} Hz, {self.horizon_s:g} s"
 
     @property
-    def scenario(self) -> str:
-        """The scenario.
+    def arguments(self) -> Sequence[str]:
+        """Scenario and settings.
 
         The bottleneck carries what the guarantee demands even if every sample is an event. A slower
         one would stay congested after a stall of the computer: late updates cause events, events
@@ -101,14 +70,19 @@ class Load(NamedTuple):
         """
         bits = 92 * 8  # an update of two states with its UDP and IP header
         rate_bps = int(self.loops * self.rate_hz * bits / (CAP + 1))
-        return _SCENARIO.format(**self._asdict(), cap=CAP, rate_bps=rate_bps)
+        settings = (
+            f"horizon_s={self.horizon_s}",
+            f"plant.rate_hz={self.rate_hz}",
+            f"controller.rate_hz={self.rate_hz}",
+            f'network.impairments=[{{ kind = "rate", rate_bps = {rate_bps}, queue = 1000 }}]',
+            f'loops=[{{ name = "loop", count = {self.loops} }}]',
+        )
+        return [str(_SCENARIO), *(word for setting in settings for word in ("--set", setting))]
 
 
 def run(load: Load, folder: Path) -> Observed:
     """Run the loops as a user does."""
-    path = folder / "fleet.toml"
-    path.write_text(load.scenario)
-    observed = observed_run([str(path)], folder, load.horizon_s, _POLL_S)
+    observed = observed_run(load.arguments, folder, load.horizon_s, _POLL_S)
     if (ending := observed.summary["exit"])["status"]:
         raise MeasurementError(f"{load}: {ending['reason']}")
     return observed
@@ -183,9 +157,8 @@ def libraries_mib(count: int) -> float:
     "fleet",
     "Many loops on one network",
     {
-        "--fleet-s": {"type": float, "default": 60.0, "help": "length of the runs, seconds"},
-        "--fleet-loops": {"type": int, "default": 1000, "help": "loops at 50 Hz"},
-        "--fleet-dir": {"type": Path, "help": "where the runs are kept meanwhile"},
+        "--fleet-s": option(60.0, "length of the runs, seconds"),
+        "--fleet-loops": option(1000, "loops at 50 Hz"),
     },
 )
 def fleet(options: argparse.Namespace) -> Iterator[Row]:
@@ -199,7 +172,7 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
 
     def measured(load: Load) -> Observed:
         say(str(load))
-        with tempfile.TemporaryDirectory(dir=options.fleet_dir) as folder:
+        with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
             return run(load, Path(folder))
 
     for loops, rate_hz in ((options.fleet_loops, 50.0), (20, 500.0)):
@@ -326,28 +299,14 @@ def size(options: argparse.Namespace) -> Iterator[Row]:
     yield Row("C", lines("native/*.c", "native/*.h"), "lines", goal=Goal("<=", 5_000))
 
 
-_CLONE_PATIENCE_S = 900.0
-
-
 @benchmark("clone", "The demo from a clean clone")
 def clone(options: argparse.Namespace) -> Iterator[Row]:
     """Clone the last commit, install, and run the demo to its verdict; 20 s of it are the run."""
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         say("make demo from a clean clone")
-        target = Path(folder) / "noack"
-        subprocess.run(["git", "clone", "-q", str(ROOT), str(target)], check=True)
+        subprocess.run(["git", "clone", "-q", str(ROOT), folder], check=True)
         begun_s = time.monotonic()
-        done = subprocess.run(
-            ["make", "demo"],
-            cwd=target,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=_CLONE_PATIENCE_S,
-            env=os.environ | {"VIRTUAL_ENV": ""},
-        )
+        execute(["env", "--unset=VIRTUAL_ENV", "make", "-C", folder, "demo"])
         spent_s = time.monotonic() - begun_s
-    if done.returncode:
-        raise MeasurementError(f"make demo: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
     compiler = "gcc present" if shutil.which("cc") else "no C compiler"
     yield Row(f"make demo from a clean clone to its verdict, {compiler}", spent_s, "s", goal=Goal("<=", 60))

@@ -31,6 +31,7 @@ from benchmarks.report import (
     compared,
     cpu_ms,
     median,
+    option,
     per_cpu_s,
     say,
 )
@@ -325,16 +326,7 @@ def campaign_figures(draws: int, *options: str) -> Figures:
 
 
 @benchmark(
-    "campaign",
-    "A million runs",
-    {
-        "--campaign-draws": {
-            "type": int,
-            "default": 100_000,
-            "metavar": "N",
-            "help": "draws of the whole campaign at each of its grid points (100000: a million runs)",
-        }
-    },
+    "campaign", "A million runs", {"--campaign-draws": option(100_000, "draws at each of ten grid points")}
 )
 def campaign(options: argparse.Namespace) -> Iterator[Row]:
     """Measure the speed-up of a shipped campaign by a second worker, then a million runs.
