@@ -118,7 +118,7 @@ def _measured(benchmark: Benchmark, options: argparse.Namespace) -> tuple[list[R
     except (MeasurementError, NoackError, AssertionError) as error:  # assertions of the tests' helpers
         failed = True
         rows = [Row(benchmark.name, None, "", unjudged=f"could not be measured: {error}")]
-    rows += load.rows()
+    rows += [*load.rows()]
     print_table(f"{benchmark.title} ({time.monotonic() - begun_s:.0f} s)", rows)
     return rows, failed
 

@@ -236,9 +236,6 @@ def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_
 
 _CORES = sorted(os.sched_getaffinity(0))
 RELAY_CORE, LOAD_CORE = _CORES[0], _CORES[-1]
-BEFORE_OTHERS = 1
-"""The lowest SCHED_FIFO priority. If permitted, the load and all relays have it, so that other
-programs of the machine do not affect their comparison."""
 
 
 @contextmanager
@@ -253,8 +250,10 @@ def on_core(core: int) -> Iterator[None]:
 
 
 @contextmanager
-def scheduled(priority: int) -> Iterator[bool]:
+def scheduled(priority: int = 1) -> Iterator[bool]:
     """Apply SCHED_FIFO to the calling thread and the processes that it starts, if permitted.
+
+    With the lowest priority other programs of the machine do not affect a comparison of relays.
 
     Yields:
         Whether it was permitted.

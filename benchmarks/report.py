@@ -8,7 +8,8 @@ import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,6 +122,8 @@ class Row:
 
 
 Measure = Callable[[argparse.Namespace], Iterable[Row]]
+Options = Mapping[str, Mapping[str, Any]]
+"""The arguments of ``add_argument`` by the option's name."""
 
 
 class Benchmark(NamedTuple):
@@ -129,8 +132,7 @@ class Benchmark(NamedTuple):
     name: str
     title: str
     measure: Measure
-    options: Mapping[str, Mapping[str, Any]] = {}
-    """The arguments of ``add_argument`` by the option's name."""
+    options: Options
 
 
 def option(default: object, text: str, **more: Any) -> dict[str, Any]:
@@ -141,9 +143,7 @@ def option(default: object, text: str, **more: Any) -> dict[str, Any]:
 BENCHMARKS: dict[str, Benchmark] = {}
 
 
-def benchmark(
-    name: str, title: str, options: Mapping[str, Mapping[str, Any]] | None = None
-) -> Callable[[Measure], Measure]:
+def benchmark(name: str, title: str, options: Options | None = None) -> Callable[[Measure], Measure]:
     """Declare a function that measures a benchmark."""
 
     def declare(measure: Measure) -> Measure:
@@ -161,32 +161,27 @@ class Load:
         ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER: it adopts orphans
         self._before = self._read()
 
-    def rows(self) -> list[Row]:
-        """Return the shares of all cores used by other programs and by the hypervisor."""
-        total_s, busy_s, steal_s, own_s = np.subtract(self._read(), self._before).tolist()
-        rows = []
-        for name, used_s, doubtful in (
-            ("other programs", max(busy_s - own_s, 0.0), BUSY_SHARE),
-            ("steal", steal_s, STEAL_SHARE),
+    def rows(self) -> Iterator[Row]:
+        """Yield the shares of all cores used by other programs and by the hypervisor."""
+        total_s, *used_s = np.subtract(self._read(), self._before).tolist()
+        for name, seconds, doubtful in zip(
+            ("other programs", "steal"), used_s, (BUSY_SHARE, STEAL_SHARE), strict=True
         ):
-            share = used_s / max(total_s, 1e-9)
+            share = max(seconds, 0.0) / max(total_s, 1e-9)
             doubt = "the machine was busy: figures are doubtful" if share > doubtful else None
-            rows.append(Row(f"machine: {name}", 100 * share, "% of all cores", note=doubt))
-        return rows
+            yield Row(f"machine: {name}", 100 * share, "% of all cores", note=doubt)
 
     @staticmethod
-    def _read() -> tuple[float, ...]:
-        """CPU seconds: of all cores, used, taken by the hypervisor; used by this benchmark."""
-        times = psutil.cpu_times()._asdict()
-        for part in ("guest", "guest_nice"):  # included in the users' time
-            times.pop(part, None)
-        total_s, steal_s = sum(times.values()), times.get("steal", 0.0)
-        busy_s = total_s - steal_s - times["idle"] - times.get("iowait", 0.0)
-        own_s = own_cpu_s() + own_cpu_s(children=True)
+    def _read() -> tuple[float, float, float]:
+        """CPU seconds: of all cores, used by other programs, taken by the hypervisor."""
+        times = psutil.cpu_times()
+        total_s = sum(times) - times.guest - times.guest_nice  # included in the users' time
+        others_s = total_s - times.steal - times.idle - times.iowait
+        others_s -= own_cpu_s() + own_cpu_s(children=True)
         for process in psutil.Process().children(recursive=True):  # not waited for
             with suppress(psutil.NoSuchProcess):
-                own_s += sum(process.cpu_times()[:4])  # its own, and of those it waited for
-        return total_s, busy_s, steal_s, own_s
+                others_s -= sum(process.cpu_times()[:4])  # its own, and of those it waited for
+        return total_s, others_s, times.steal
 
 
 def own_cpu_s(*, children: bool = False) -> float:
@@ -211,14 +206,14 @@ class Rounds:
     def __init__(self) -> None:
         self.missing: dict[str, str] = {}
         """For each side without valid figures, the reason."""
-        self._figures: dict[str, list[Figures]] = {}
+        self._figures = defaultdict[str, list[Figures]](list)
 
     def add(self, side: str, figures: Figures | str) -> None:
         """Add a side's figures of a round, or the reason why there are none."""
         if isinstance(figures, str):
             self.missing[side] = figures
         else:
-            self._figures.setdefault(side, []).append(figures)
+            self._figures[side].append(figures)
 
     def in_turn(self, count: int, sides: Mapping[str, Callable[[], Figures | str]], head: str = "") -> None:
         """Measure the sides in turn, in some rounds; one that fails is missing from then on."""
@@ -232,7 +227,7 @@ class Rounds:
 
     def of(self, side: str, quantity: str) -> list[float]:
         """Return the rounds of a quantity; empty if the side was not measured."""
-        return [figures[quantity] for figures in self._figures.get(side, ())]
+        return [figures[quantity] for figures in self._figures[side]]
 
     def row(
         self, name: str, unit: str, quantity: str, ours: str, peer: str | None = None,
@@ -243,12 +238,11 @@ class Rounds:
         With ``paired``, the ratio is the median of the rounds' ratios, since a disturbance affects
         both sides of a round; else it is the ratio of the medians.
         """
-        sides = [side for side in (ours, peer) if side is not None]
-        reasons = [f"{side}: {self.missing[side]}" for side in sides if side in self.missing]
+        reasons = [f"{side}: {self.missing[side]}" for side in (ours, peer or "") if side in self.missing]
         value, alternative = self.of(ours, quantity), self.of(peer or "", quantity)
-        ratios = []
+        ratio = None
         if paired and not reasons:
-            ratios = [own / other for own, other in zip(value, alternative, strict=True)]
+            ratio = median(own / other for own, other in zip(value, alternative, strict=True))
         return Row(
             name,
             median(value) if value else None,
@@ -257,7 +251,7 @@ class Rounds:
             goal,
             note,
             "; ".join(reasons) or None,
-            median(ratios) if ratios else None,
+            ratio,
         )
 
 
@@ -319,10 +313,9 @@ def print_table(title: str, rows: Sequence[Row]) -> None:
     for heading in ("figure", "value", "alternative", "its value", "ratio", "goal", "holds"):
         right = heading in ("value", "its value", "ratio", "goal")
         table.add_column(heading, justify="right" if right else "left")
-    colours = {"yes": "[green]yes[/]", "no": "[bold red]no[/]"}
     for row in rows:
-        *cells, verdict = row.cells
-        table.add_row(*map(escape, cells), colours.get(verdict, verdict))
+        style = "bold red" if row.holds is False else None
+        table.add_row(*map(escape, row.cells), style=style)
     console.print(table)
     for row in rows:
         if row.notes:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import psutil
@@ -21,7 +21,7 @@ import psutil
 from benchmarks.programs import imported_s
 from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from cosim.analysis.summary.loop_statistics import lateness_us
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.summary_model import LoopSummary
 from cosim.cli import find_scenario
 from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
@@ -54,13 +54,11 @@ class FaultedRun(NamedTuple):
     """A run with a fault that has completed; its times are those of the run."""
 
     record: RunRecord
-    summary: Mapping[str, Any]
+    summary: LoopSummary
     begun_s: float
     """The fault's begin."""
     ended_s: float
     """The fault's end."""
-    back_s: float | None
-    """When the launcher reported the process as restarted."""
 
 
 def faulted_run(name: str, settings: Sequence[str], act: Act) -> FaultedRun:
@@ -73,7 +71,7 @@ def faulted_run(name: str, settings: Sequence[str], act: Act) -> FaultedRun:
     """
     say(name)
     scenario = load(find_scenario("lane_following"), ["ports={}", *settings])
-    threads, fault_s, backs_s = list[threading.Thread](), list[float](), list[float]()
+    threads, fault_s = list[threading.Thread](), list[float]()
 
     def fault() -> None:
         fault_s.append(time.monotonic())
@@ -85,19 +83,18 @@ def faulted_run(name: str, settings: Sequence[str], act: Act) -> FaultedRun:
             threads.append(threading.Thread(target=fault))
             threads[0].start()
 
-    watcher = Watcher(progress=progress, restarted=lambda _, t_s: backs_s.append(t_s))
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
         launched_s = time.monotonic()
-        ending = launch(scenario, Path(runs), watcher=watcher)
+        ending = launch(scenario, Path(runs), watcher=Watcher(progress=progress))
         for thread in threads:
             thread.join()
         if ending.status != ExitStatus.OK or ending.startup_s is None or len(fault_s) < 2:
             raise MeasurementError(f"{name}: the run ended: {ending.reason}")
-        finalize(ending, report=False, view=False)
+        (summary,) = finalize(ending, report=False, view=False).summary.loops
         record = load_record(ending.run_dir)
-        summary = summarise(record, ending.status, ending.reason).to_json()
-    begun_s, ended_s = (at_s - launched_s - ending.startup_s for at_s in fault_s)
-    return FaultedRun(record, summary, begun_s, ended_s, next(iter(backs_s), None))
+        for table in (*STEPS.values(), CONTROLLER_DELIVERY):  # they are kept in memory
+            record[table]
+    return FaultedRun(record, summary, *(at_s - launched_s - ending.startup_s for at_s in fault_s))
 
 
 def recovery_s(late_at_s: Vector, end_s: float) -> float:
@@ -156,19 +153,19 @@ def killed(role: str) -> Figures:
         killed process at its death.
     """
     run = kill(role)
-    before, after = run.record.lives(role)
-    if before.last_ns is None or after.first_ns is None:
+    (restart,) = run.summary.restarts
+    if restart.first_s is None or restart.last_s is None:
         raise MeasurementError(f"{role}: has no rows before or after")
     deliveries = run.record[CONTROLLER_DELIVERY]
-    fresh = deliveries["now_ns"] >= after.first_ns
+    fresh = deliveries["now_ns"] * 1e-9 >= restart.first_s
     if role == "sensor":
         fresh &= deliveries["sequence"] >= GENERATION
     if not fresh.any():
         raise MeasurementError(f"{role}: no update was delivered afterwards")
     return {
-        "acted_s": after.first_ns * 1e-9 - run.ended_s,
+        "acted_s": restart.first_s - run.ended_s,
         "updated_s": float(deliveries["now_ns"][fresh][0]) * 1e-9 - run.ended_s,
-        "unwritten_ms": 1e3 * (run.ended_s - before.last_ns * 1e-9),
+        "unwritten_ms": 1e3 * (run.ended_s - restart.last_s),
     }
 
 
@@ -196,10 +193,11 @@ def recovery(options: argparse.Namespace) -> Iterator[Row]:
         yield from killed_rows(role)
     run = kill("recorder")
     steps = run.record[PLANT_STEP]["sequence"]
-    if run.back_s is None or len(steps) != steps[-1] + 1:
+    back_s = [restart.first_s for restart in run.summary.restarts if restart.first_s is not None]
+    if not back_s or len(steps) != steps[-1] + 1:
         raise MeasurementError("recorder: it was not restarted, or rows are missing")
     peer, note = Peer(IMPORT, imported_s(MODULES["recorder"])), "nothing is missing from the record"
-    yield Row("recorder killed: until another records", run.back_s - run.ended_s, "s", peer, note=note)
+    yield Row("recorder killed: until another records", back_s[0] - run.ended_s, "s", peer, note=note)
     for role in ("plant", "sensor", "netem", "controller", "recorder"):
         late_ms = median(run_recovery_ms(stop(role)) for _ in range(ROUNDS))
         yield Row(f"{role} stopped for {STOPPED_S:g} s: last late step", late_ms, "ms")
@@ -279,7 +277,7 @@ def flood_rows(case: Case) -> Iterator[Row]:
     missed = np.setdiff1d(measured, run.record[SENSOR_MEASUREMENT]["sequence"]).size
     yield Row(f"{case.name}: the flood", sent / (run.ended_s - run.begun_s), "datagrams/s")
     yield Row(f"{case.name}: measurements missed", missed, "")
-    yield Row(f"{case.name}: the loop's datagrams lost", run.summary["unintended_losses"], "")
+    yield Row(f"{case.name}: the loop's datagrams lost", run.summary.unintended_losses, "")
     yield Row(f"{case.name}: lateness before, p99", max(before), "µs")
     yield Row(f"{case.name}: lateness during, p99", max(during), "µs")
     yield Row(f"{case.name}: last late step after the end", run_recovery_ms(run), "ms")

@@ -22,33 +22,11 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import psutil
 
+from benchmarks import relay_load
 from benchmarks.cases.latency import KERNEL, cyclictest
-from benchmarks.programs import (
-    BEFORE_OTHERS,
-    LOAD_CORE,
-    RELAY_CORE,
-    compiled,
-    on_core,
-    program_path,
-    scheduled,
-)
-from benchmarks.relay_load import (
-    Built,
-    Nanoseconds,
-    Relay,
-    built,
-    c_relay,
-    direct_ends,
-    new_soak,
-    our_relay,
-    running,
-    socat,
-    sources,
-    started,
-)
+from benchmarks.programs import LOAD_CORE, RELAY_CORE, compiled, on_core, program_path, scheduled
 from benchmarks.report import (
     Figures,
     Goal,
@@ -84,10 +62,10 @@ RATES = (
 @benchmark("relays", "Relays: drained datagrams")
 def drained(options: argparse.Namespace) -> Iterator[Row]:
     """Send bursts to each relay in turn; yield rates and costs."""
-    with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
-        ours = our_relay(PLAIN, WORDS), our_relay(SEGMENTS, WORDS, "--segment")
-        kinds = socat(), *(c_relay(tools, *modes) for modes in C_MODES), *ours
-        with started(kinds, tools) as (rounds, relays):
+    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+        ours = relay_load.our_relay(PLAIN, WORDS), relay_load.our_relay(SEGMENTS, WORDS, "--segment")
+        kinds = relay_load.socat(), *(relay_load.c_relay(tools, *modes) for modes in C_MODES), *ours
+        with relay_load.started(kinds, tools) as (rounds, relays):
             rounds.in_turn(ROUNDS, {relay.name: relay.burst for relay in relays})
     for side, peer, goal in RATES:
         yield rounds.row(f"{side}: drained", "datagrams/s", "per_s", side, peer, goal, paired=True)
@@ -108,10 +86,15 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
     does what our relay with the reverse direction does: it also waits for answers at all sockets
     and returns them. (To wait for a socket by epoll costs when sending, too.)
     """
-    single, many = sources(1), sources(FLOWS)
-    with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
-        ours = our_relay(PLAIN, WORDS), our_relay(REVERSE, WORDS, reverse=True)
-        with started((c_relay(tools), c_relay(tools, "paths"), *ours), tools) as (rounds, relays):
+    single, many = relay_load.sources(1), relay_load.sources(FLOWS)
+    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+        kinds = (
+            relay_load.c_relay(tools),
+            relay_load.c_relay(tools, "paths"),
+            relay_load.our_relay(PLAIN, WORDS),
+            relay_load.our_relay(REVERSE, WORDS, reverse=True),
+        )
+        with relay_load.started(kinds, tools) as (rounds, relays):
             for relay in relays:
                 relay.burst(many)  # makes the states of the flows; not counted
             loads = (_single, single), (_many, many)
@@ -161,7 +144,7 @@ def delay(options: argparse.Namespace) -> Iterator[Row]:
     at the sink (same clock), which excludes the sink's wake-up. Compared with cyclictest on the
     relay's core.
     """
-    with built() as tools:
+    with relay_load.built() as tools:
         added, late = _added(tools), _late(tools)
     yield added.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT)
     for peer in ("socat", "C relay"):
@@ -173,18 +156,18 @@ def delay(options: argparse.Namespace) -> Iterator[Row]:
         yield late.row(name, "µs", quantile, PLAIN, KERNEL, goal, paired=True)
 
 
-def quantiles_of(name: str, delays_ns: Nanoseconds, base_us: float = 0.0) -> Figures:
+def quantiles_of(name: str, delays_ns: relay_load.Nanoseconds, base_us: float = 0.0) -> Figures:
     """Return quantiles of the delays minus ``base_us``, in µs."""
     if lost := int((delays_ns < 0).sum()):
         raise MeasurementError(f"{name}: {lost} of {len(delays_ns)} datagrams did not arrive")
     return quantiles_us(delays_ns - 1e3 * base_us)
 
 
-def _added(tools: Built) -> Rounds:
-    ours = our_relay(PLAIN, "loss 5% mansd 0 seed 7", lossy=False)
+def _added(tools: relay_load.Built) -> Rounds:
+    ours = relay_load.our_relay(PLAIN, "loss 5% mansd 0 seed 7", lossy=False)
     base_us = 0.0
 
-    def added(relay: Relay) -> Figures:
+    def added(relay: relay_load.Relay) -> Figures:
         return quantiles_of(relay.name, relay.ends.ping(PINGS), base_us)
 
     def base() -> Figures:
@@ -194,31 +177,31 @@ def _added(tools: Built) -> Rounds:
         return delays
 
     with (
-        scheduled(BEFORE_OTHERS),
+        scheduled(),
         on_core(RELAY_CORE),
-        direct_ends(tools) as direct,
-        started((socat(), c_relay(tools), ours), tools) as (rounds, relays),
+        relay_load.direct_ends(tools) as direct,
+        relay_load.started((relay_load.socat(), relay_load.c_relay(tools), ours), tools) as (rounds, relays),
     ):
         sides = {DIRECT: base} | {relay.name: partial(added, relay) for relay in relays}
         rounds.in_turn(PING_ROUNDS, sides, "added delay, ")
     return rounds
 
 
-def _late(tools: Built) -> Rounds:
+def _late(tools: relay_load.Built) -> Rounds:
     def kernel() -> Figures:
         if not os.access(_LATENCY, os.W_OK):
             raise MeasurementError(f"{_LATENCY} cannot be written")
         return cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE)
 
-    def late(relay: Relay) -> Figures:
+    def late(relay: relay_load.Relay) -> Figures:
         with scheduled(FIFO_PRIORITY) as permitted:
             if not permitted:
                 rounds.add(KERNEL, "SCHED_FIFO is refused")
             delays_ns = relay.ends.pace(LINE_ROUND_S * 1_000_000_000 // PERIOD_NS, PERIOD_NS)
         return quantiles_of(relay.name, delays_ns, DELAY_MS * 1e3)
 
-    delayed = our_relay(PLAIN, f"delay {DELAY_MS}ms", "--realtime", lossy=False)
-    with on_core(LOAD_CORE), started([delayed], tools) as (rounds, relays):
+    delayed = relay_load.our_relay(PLAIN, f"delay {DELAY_MS}ms", "--realtime", lossy=False)
+    with on_core(LOAD_CORE), relay_load.started([delayed], tools) as (rounds, relays):
         sides = {KERNEL: kernel} | {relay.name: partial(late, relay) for relay in relays}
         rounds.in_turn(LINE_ROUNDS, sides, "lateness, ")
     return rounds
@@ -231,7 +214,6 @@ _BURSTS = 15
 _GROUP_S = 250e-6
 """Approximate time between two groups of datagrams."""
 _LAST_S = 0.1
-_STARVED = 0.01
 
 
 @benchmark(
@@ -246,28 +228,27 @@ def steady_load(options: argparse.Namespace) -> Iterator[Row]:
     datagrams must arrive at the sink, and at most M − 1 consecutive datagrams may be missing there.
     ``--soak-s 600`` is the full test.
     """
-    kind = our_relay(PLAIN, f"loss 5% mansd {MANSD} seed 7")
-    with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
-        with running(kind, tools) as relay:
+    kind = relay_load.our_relay(PLAIN, f"loss 5% mansd {MANSD} seed 7")
+    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+        with relay_load.running(kind, tools) as relay:
             maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
-        with running(kind, tools) as relay:
+        with relay_load.running(kind, tools) as relay:
             yield from _soak_rows(relay, options.soak_s, maximum_per_s)
 
 
-def _soak_rows(relay: Relay, seconds: int, maximum_per_s: float) -> Iterator[Row]:
+def _soak_rows(relay: relay_load.Relay, seconds: int, maximum_per_s: float) -> Iterator[Row]:
     """Load a relay with half of its maximum rate, in groups of datagrams; yield the rows."""
     group = max(round(maximum_per_s / 2 * _GROUP_S), 1)
     period_ns = round(group / (maximum_per_s / 2) * 1e9)
     groups_per_s = round(1e9 / period_ns)
-    counts, resident_kib = new_soak(), list[float]()
-    begun_s, before_s = time.monotonic(), relay.scheduled_s()
+    counts, resident_kib = relay_load.new_soak(), list[float]()
+    begun_s = time.monotonic()
     for number in range(seconds):
         if number % 60 == 0:
             say(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
         relay.ends.soak(counts, groups_per_s, group, period_ns)
         resident_kib.append(psutil.Process(relay.pid).memory_info().rss / 1024)
     elapsed_s = time.monotonic() - begun_s
-    cpu, waited = (np.subtract(relay.scheduled_s(), before_s) / elapsed_s).tolist()
     # Empty groups: receive the datagrams still in flight.
     relay.ends.soak(counts, round(_LAST_S / _GROUP_S), 0, period_ns)
     totals, none, quarter = relay.totals(), Goal("==", 0), max(seconds // 4, 1)
@@ -284,9 +265,6 @@ def _soak_rows(relay: Relay, seconds: int, maximum_per_s: float) -> Iterator[Row
     yield Row("longest loss burst", counts.longest_gap, "datagrams", goal=Goal("<=", MANSD))
     note = f"of {resident_kib[-1] / 1024:.0f} MiB"
     yield Row("memory, last quarter beyond second", growth_kib, "KiB", goal=MEMORY_GOAL, note=note)
-    yield Row("CPU of the relay", 100 * cpu, "% of a core")
-    others = "others had its core: a loss may be theirs" if waited > _STARVED else None
-    yield Row("the relay waited for its core", 100 * waited, "% of the time", note=others)
 
 
 _SHELL_ROUNDS = 5

@@ -38,7 +38,6 @@ _SCENARIO = Path(__file__).parents[1] / "fleet.toml"
 _KIBI = 1024
 _POLL_S = 2.0
 _SINGLE_S = 60.0
-_FLAT_MIB = 32.0
 _MEMORY_MIB, _END_SHARE = Goal("<=", 80), Goal("<=", 0.1)
 _STEP_US = {50.0: Goal("<=", 5)}
 """By the rate of the loops, Hz. Not of 20 loops at 500 Hz, of which a step is due every 100 µs:
@@ -116,13 +115,6 @@ def figures(load: Load, run: Observed) -> Iterator[Row]:
     note = ", ".join(f"{role} {used:.2f} µs" for role, used in used_us.items())
     step_us = sum(used_us.values())
     yield row("CPU time per loop and step", step_us, "µs", goal=_STEP_US.get(load.rate_hz), note=note)
-    growth = {
-        role: (of_role[-1].uss_kib - of_role[len(of_role) // 2].uss_kib) / _KIBI
-        for role, of_role in samples.items()
-    }
-    worst = max(growth, key=growth.__getitem__)
-    yield row("growth of memory in the second half, worst process", growth[worst], "MiB",
-              goal=Goal("<", _FLAT_MIB), note=worst)  # fmt: skip
     end_s, peer = run.closed_s - run.ended_s, Peer("the run", load.horizon_s)
     yield row("end of the run", end_s, "s", peer=peer, goal=_END_SHARE)
 
