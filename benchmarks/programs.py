@@ -14,10 +14,12 @@ import tempfile
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import psutil
 
@@ -35,6 +37,7 @@ FREE_PORTS = ("--set", "ports={}")
 """A benchmark can run at the same time as a demo, whose ports are fixed."""
 NOACK = (sys.executable, "-m", "cosim.cli")
 LAUNCHER = "launcher"
+_Result = TypeVar("_Result")
 _LOOK_S = 0.1
 _END_PATIENCE = 6.0
 """A run and its end may take this multiple of the run's length."""
@@ -102,6 +105,12 @@ def imported_s(modules: str) -> float:
     code = f"import {modules}, sys; print('ready', file=sys.stderr)"
     finished = execute([sys.executable, "-c", code])
     return finished.lines[-1].at_s - finished.begun_s
+
+
+def in_new_process(call: Callable[..., _Result], *arguments: object) -> _Result:
+    """Return what a call returns in a process of its own."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(call, *arguments).result()
 
 
 class NoackRun(NamedTuple):

@@ -11,15 +11,13 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.programs import NOACK
+from benchmarks.programs import NOACK, in_new_process
 from benchmarks.report import Goal, MeasurementError, Peer, Row, benchmark, say
 from cosim.analysis.replay.run_replay import stored_verdict
 from cosim.cli import find_scenario
@@ -36,7 +34,6 @@ LENGTHS_S = (120.0, 600.0)
 """Both are replayed in a process of its own; a shorter run is not."""
 _BATCH_NS = 50_000_000
 _SETTINGS = ("trigger.floor=1e-3",)  # without a floor, the threshold vanishes within an hour
-_Result = TypeVar("_Result")
 
 
 def spooled_run(horizon_s: float, folder: Path) -> Path:
@@ -64,12 +61,6 @@ def replay_s(run_dir: Path) -> float:
     begun_s = time.process_time()
     stored_verdict(run_dir)
     return time.process_time() - begun_s
-
-
-def in_new_process(call: Callable[..., _Result], *arguments: object) -> _Result:
-    """Return what a call returns in a process of its own."""
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        return pool.submit(call, *arguments).result()
 
 
 class End(NamedTuple):

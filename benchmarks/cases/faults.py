@@ -32,7 +32,7 @@ from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.topology import LOOP_ROLES, ROLES
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import RunProgress
@@ -73,15 +73,17 @@ def faulted_run(name: str, settings: Sequence[str], act: Act) -> FaultedRun:
     scenario = load(find_scenario("lane_following"), ["ports={}", *settings])
     threads, fault_s = list[threading.Thread](), list[float]()
 
-    def fault() -> None:
+    def fault(processes: Mapping[str, psutil.Process]) -> None:
         fault_s.append(time.monotonic())
-        act(processes_of(psutil.Process()))
+        act(processes)
         fault_s.append(time.monotonic())
 
     def progress(report: RunProgress) -> None:
         if report.t_s >= FAULT_S and not threads:
-            threads.append(threading.Thread(target=fault))
-            threads[0].start()
+            processes = processes_of(psutil.Process())
+            if processes.keys() == set(ROLES):  # else at the next report: a title cannot be read now
+                threads.append(threading.Thread(target=fault, args=(processes,)))
+                threads[0].start()
 
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
         launched_s = time.monotonic()
