@@ -234,13 +234,12 @@ def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_
         try:
             finished = run.finish(_END_PATIENCE * length_s + PATIENCE_S)
         finally:
+            closed_s = time.monotonic()
             closed.set()
             observer.join()
-        left = [role for role in processes if processes[role] in run.left_behind()]
+        left = [process.name() for process in run.left_behind()]
     horizon_s = min(ended_s, begun_s + length_s)
-    return Observed(
-        finished.summary, finished.run_dir, samples, begun_s, horizon_s, ended_s, time.monotonic(), left
-    )
+    return Observed(finished.summary, finished.run_dir, samples, begun_s, horizon_s, ended_s, closed_s, left)
 
 
 _CORES = sorted(os.sched_getaffinity(0))

@@ -118,10 +118,7 @@ def is_over(process: psutil.Process) -> bool:
 
 def is_of(role: str, process: psutil.Process) -> bool:
     """Whether a process has a role in a run, by its title; not if it has ended."""
-    try:
-        return bool(process.cmdline()[:1] == [f"noack {role}"])
-    except psutil.NoSuchProcess:
-        return False
+    return command_of(process)[:1] == [f"noack {role}"]
 
 
 def processes_of(launcher: psutil.Process) -> dict[str, psutil.Process]:
