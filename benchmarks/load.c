@@ -15,6 +15,8 @@
 #include <sys/wait.h>
 #include <time.h>
 
+#include "load.h"
+
 enum { BATCH = 64, MAX_BYTES = 2048, CONTROL_BYTES = 128 };
 static const int64_t SECOND_NS = 1000000000;
 static const int64_t QUIET_NS = 3000000;
@@ -105,12 +107,6 @@ static int send_all(int out, int64_t first, int64_t count, size_t size, const ui
     }
     return 0;
 }
-
-struct burst {
-    int64_t wall_ns;  /* from the relay's continuation to the last arrival */
-    int64_t last;     /* highest number that arrived, -1 if none */
-    int64_t received; /* number of arrivals */
-};
 
 /* Number of bytes that wait at the sink, and its maximum. */
 static int64_t waiting(int sink, int64_t *most)
@@ -228,14 +224,6 @@ int load_collect(int sink, int64_t first, int64_t count, int64_t patience_ns, in
     }
     return 0;
 }
-
-struct soak {
-    int64_t sent;
-    int64_t received;
-    int64_t next;        /* the number that would arrive next without a loss */
-    int64_t longest_gap; /* maximum number of consecutive losses */
-    int64_t disordered;  /* arrivals after a higher number; 0 through a FIFO */
-};
 
 static void count_arrivals(int sink, struct soak *state)
 {

@@ -41,16 +41,7 @@ _PATIENCE_NS = 300_000_000
 """After this time without an arrival, the rest of a burst counts as lost."""
 _PING_TIMEOUT_S = 0.2
 _FFI = FFI()
-_FFI.cdef("""
-struct burst { int64_t wall_ns, last, received; };
-struct soak { int64_t sent, received, next, longest_gap, disordered; };
-int load_burst(int, int, int, int64_t, int64_t, int64_t, const uint32_t *, int64_t, int64_t,
-               int64_t, struct burst *);
-int load_ping(int, int, int64_t, int64_t, int64_t, int64_t *);
-int load_pace(int, int64_t, int64_t, int64_t, int64_t, int64_t *);
-int load_collect(int, int64_t, int64_t, int64_t, int64_t *);
-int load_soak(int, int, int64_t, int64_t, int64_t, int64_t, struct soak *);
-""")
+_FFI.cdef(Path(__file__).with_name("load.h").read_text())
 
 Nanoseconds = npt.NDArray[np.int64]
 Addresses = npt.NDArray[np.uint32]
