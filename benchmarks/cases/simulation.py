@@ -41,7 +41,6 @@ from cosim.simulation.exact_simulation import Population, Setting, run_batch, ru
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
@@ -134,7 +133,6 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
     lane = resolve(load(find_scenario("lane_following"), ()))
     horizon_s, many, loop = lane.horizon_s, many_loops(lane), SampledLoop(lane)
     conditions = ideal_conditions(lane)
-    work = SampledWork(in_virtual_time(lane), 0, None, None, 0.05, 10**6)
     live = Peer("the live run", 1e3 * horizon_s / lane.speed)
     earlier = Peer("the Python machines of b3991367 in virtual time", 1 / _PYTHON_MACHINES_S)
     machines = cpu_ms(lambda: simulate(lane))
@@ -154,8 +152,6 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
         Goal(">=", 100),
         note="the alternative was measured with that version, not in this run",
     )
-    draws = per_cpu_s(4, lambda: work.run(range(4)))
-    yield compared("draws of a campaign in sampled time", "runs/s", draws)
     record = simulate(lane.model_copy(update={"horizon_s": _REPLAYED_S}))
     replayed = replay(record)
     yield compared(
