@@ -165,7 +165,11 @@ def measured(hosts: TwoHosts, clock: Clock, case: Case, *, bare: bool = False) -
     reference.start()
     other.close()
     with own:
-        figures = in_new_process(ask, hosts, case, bare, own.recv(), clock)
+        try:
+            port = own.recv()
+        except EOFError:
+            raise MeasurementError("the reference did not start") from None
+        figures = in_new_process(ask, hosts, case, bare, port, clock)
     reference.join()
     return figures
 
