@@ -193,8 +193,8 @@ class Observed(NamedTuple):
     """Processes that did not end with it."""
 
     def in_loops(self, role: str) -> list[Sample]:
-        """The samples of a process while the loops ran, without their first and last second."""
-        begin_s, end_s = self.begun_s + 1, self.horizon_s - 1
+        """The samples of a process while the loops ran, without their first and last seconds."""
+        begin_s, end_s = self.begun_s + 1, self.horizon_s - 2
         return [sample for sample in self.samples.get(role, ()) if begin_s <= sample.at_s <= end_s]
 
 

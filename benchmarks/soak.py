@@ -166,7 +166,7 @@ def end_rows(summary: Mapping[str, Any], delivered_out_of_order: int) -> Iterato
 
 def run_rows(run: Observed) -> Iterator[Row]:
     """Yield the rows of a finished run."""
-    length_s = run.horizon_s - run.begun_s - 1
+    length_s = run.horizon_s - run.begun_s - 2
     for role in ROLES:
         yield from process_rows(role, run.in_loops(role), run.begun_s, length_s)
     stale = int(load_record(run.run_dir)[NETEM_RELEASE]["stale"].sum())
@@ -185,15 +185,16 @@ def run_rows(run: Observed) -> Iterator[Row]:
 
 def memory_figure(run: Observed) -> FigureDescription:
     """Describe each process's private memory minus its first value, in KiB, over the run."""
-    lines = []
+    rows = []
     for i, role in enumerate(ROLES):
         samples = run.in_loops(role)
         at_s, kib = np.array([(sample.at_s - run.begun_s, sample.uss_kib) for sample in samples]).T
-        colour = palette.PROCESSES.get(role, palette.SERIES[i])
-        lines.append(Line(x=at_s, y=kib - kib[0], colour=colour, label=role))
-    x = time_axis(np.array([0.0, run.ended_s - run.begun_s]), label="wall time [s]")
-    panel = Panel(title="private memory since the start", items=lines, x=x, y=Axis(label="memory [KiB]"))
-    return FigureDescription(name="memory", rows=[FigureRow(panels=[panel], height_in=3.0)])
+        line = Line(x=at_s, y=kib - kib[0], colour=palette.PROCESSES.get(role, palette.SERIES[i]))
+        x = time_axis(at_s, numbers=i == len(ROLES) - 1, label="wall time [s]")
+        title = "" if i else "private memory since the start"
+        panel = Panel(title=title, items=[line], x=x, y=Axis(label=f"{role} [KiB]"))
+        rows.append(FigureRow(panels=[panel], height_in=0.95))
+    return FigureDescription(name="memory", rows=rows)
 
 
 def soak(path: Path, settings: Sequence[str], runs: Path) -> list[Row]:
