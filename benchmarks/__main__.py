@@ -7,7 +7,6 @@ them into the page, between two marks.
 """
 
 import argparse
-import json
 import os
 import pkgutil
 import re
@@ -21,11 +20,9 @@ from typing import NamedTuple
 # Set before numpy is imported, as the command line does: small matrices do not gain from threads.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
-from rich.console import Console
-
 from benchmarks import cases
-from benchmarks.programs import provide
-from benchmarks.report import BENCHMARKS, Benchmark, Load, MeasurementError, Row, table_of
+from benchmarks.report import BENCHMARKS, Benchmark, Load, MeasurementError, Row, print_table, write_json
+from noack.core.errors import NoackError
 
 GOALS = "goals"
 BEGIN, END = "<!-- goals: written by `python -m benchmarks goals --docs` -->", "<!-- goals: end -->"
@@ -93,20 +90,16 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
     chosen = [name for entry in asked for name in (OF_GOALS if entry == GOALS else (entry,))]
     if unknown := [name for name in chosen if name not in benchmarks]:
         parser.error(f"no benchmark {unknown[0]!r}; benchmarks: {', '.join(benchmarks)}")
-    console = Console()
-    if not console.is_terminal:
-        console.width = 130
     rows, failures = list[tuple[str, Row]](), 0
     for benchmark in (benchmark for name, benchmark in benchmarks.items() if name in chosen):
-        rows_of_one, failed = _measured(benchmark, options, console)
+        rows_of_one, failed = _measured(benchmark, options)
         rows += [(benchmark.name, row) for row in rows_of_one]
         failures += failed
     if options.json is not None:
-        content = [row.as_json() | {"benchmark": name} for name, row in rows]
-        options.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        write_json(options.json, (row.as_json() | {"benchmark": name} for name, row in rows))
     figures = rows_of_figures(rows)
     if GOALS in asked:
-        console.print(table_of("The goals", [row for _, row in figures]))
+        print_table("The goals", [row for _, row in figures])
     if options.docs is not None:
         try:
             write_docs(options.docs, figures)
@@ -116,20 +109,17 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
     return 1 if failures else 0
 
 
-def _measured(benchmark: Benchmark, options: argparse.Namespace, console: Console) -> tuple[list[Row], bool]:
+def _measured(benchmark: Benchmark, options: argparse.Namespace) -> tuple[list[Row], bool]:
     """Run a benchmark and print its table; return its rows, and whether it failed."""
     print(f"{benchmark.name}:", file=sys.stderr)
     load, begun_s, failed = Load(), time.monotonic(), False
     try:
         rows = [*benchmark.measure(options)]
-    except MeasurementError as error:
+    except (MeasurementError, NoackError, AssertionError) as error:  # assertions of the tests' helpers
         failed = True
         rows = [Row(benchmark.name, None, "", unjudged=f"could not be measured: {error}")]
-    rows += load.rows()
-    console.print(table_of(f"{benchmark.title} ({time.monotonic() - begun_s:.0f} s)", rows))
-    for row in rows:
-        if row.notes:
-            console.print(f"{row.name}: {row.notes}", highlight=False, markup=False)
+    rows += [*load.rows()]
+    print_table(f"{benchmark.title} ({time.monotonic() - begun_s:.0f} s)", rows)
     return rows, failed
 
 
@@ -162,6 +152,4 @@ def write_docs(page: Path, figures: Iterable[tuple[str, Row]]) -> None:
 
 
 if __name__ == "__main__":
-    if "--list" not in sys.argv:
-        provide()
     sys.exit(run(all_benchmarks()))

@@ -15,6 +15,8 @@
 #include <sys/wait.h>
 #include <time.h>
 
+#include "load.h"
+
 enum { BATCH = 64, MAX_BYTES = 2048, CONTROL_BYTES = 128 };
 static const int64_t SECOND_NS = 1000000000;
 static const int64_t QUIET_NS = 3000000;
@@ -106,12 +108,6 @@ static int send_all(int out, int64_t first, int64_t count, size_t size, const ui
     return 0;
 }
 
-struct burst {
-    int64_t wall_ns;  /* from the relay's continuation to the last arrival */
-    int64_t last;     /* highest number that arrived, -1 if none */
-    int64_t received; /* number of arrivals */
-};
-
 /* Number of bytes that wait at the sink, and its maximum. */
 static int64_t waiting(int sink, int64_t *most)
 {
@@ -168,17 +164,6 @@ int load_burst(int out, int sink, int relay, int64_t first, int64_t count, int64
     if (kill(relay, SIGCONT) != 0)
         return errno;
     gather(sink, first, count, slack, begun_ns, patience_ns, found);
-    return failed;
-}
-
-/* The same without a relay: send directly to the sink; cpu_ns is the calling thread's CPU time. */
-int load_direct(int out, int sink, int64_t first, int64_t count, int64_t size, int64_t patience_ns,
-                struct burst *found, int64_t *cpu_ns)
-{
-    int64_t begun_ns = now_ns(CLOCK_REALTIME), begun_cpu_ns = now_ns(CLOCK_THREAD_CPUTIME_ID);
-    int failed = send_all(out, first, count, (size_t)size, NULL, 0);
-    *cpu_ns = now_ns(CLOCK_THREAD_CPUTIME_ID) - begun_cpu_ns;
-    gather(sink, first, count, 0, begun_ns, patience_ns, found);
     return failed;
 }
 
@@ -239,14 +224,6 @@ int load_collect(int sink, int64_t first, int64_t count, int64_t patience_ns, in
     }
     return 0;
 }
-
-struct soak {
-    int64_t sent;
-    int64_t received;
-    int64_t next;        /* the number that would arrive next without a loss */
-    int64_t longest_gap; /* maximum number of consecutive losses */
-    int64_t disordered;  /* arrivals after a higher number; 0 through a FIFO */
-};
 
 static void count_arrivals(int sink, struct soak *state)
 {

@@ -3,27 +3,30 @@
 Runs are observed from outside, by their output and by samples of their processes.
 """
 
-import contextlib
 import json
+import math
 import os
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import psutil
 
 from benchmarks.report import MeasurementError
-from noack.protocol.topology import ROLES
+from noack.protocol.topology import LOOP_ROLES
+from tests.integration.conftest import PATIENCE_S, begun, is_over, processes_of
 
-PACKAGES: Mapping[str, str] = {"cc": "gcc libc6-dev", "cyclictest": "rt-tests", "socat": "socat"}
-"""Debian packages by program."""
 PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
 """A progress line of a run; the group is the time in the run, s."""
 _ROUNDING_S = 0.05
@@ -34,38 +37,26 @@ FREE_PORTS = ("--set", "ports={}")
 """A benchmark can run at the same time as a demo, whose ports are fixed."""
 NOACK = (sys.executable, "-m", "cosim.cli")
 LAUNCHER = "launcher"
+_Result = TypeVar("_Result")
+_LOOK_S = 0.1
+_END_PATIENCE = 6.0
+"""A run and its end may take this multiple of the run's length."""
 PRIORITY = 50
 """SCHED_FIFO priority of a run's processes, by default."""
 
 
-def provide() -> None:
-    """Install missing programs, where root has apt-get.
-
-    The rows of a missing program have no value: standard error names the packages first.
-    """
-    missing = [program for program in PACKAGES if shutil.which(program) is None]
-    wanted = [word for program in missing for word in PACKAGES[program].split()]
-    if wanted and shutil.which("apt-get") and os.geteuid() == 0:
-        print(f"installing {', '.join(wanted)} ...", file=sys.stderr)
-        install = ["apt-get", "install", "-y", "-qq", "--no-install-recommends", *wanted]
-        for command in (["apt-get", "update", "-qq"], install):
-            subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
-        missing = [program for program in missing if shutil.which(program) is None]
-    if missing:
-        names = " ".join(PACKAGES[program] for program in missing)
-        print(
-            f"not installed: {', '.join(missing)}; without them some goals are not measured "
-            f"(Debian: sudo apt-get install {names})",
-            file=sys.stderr,
-        )
+def program_path(name: str, package: str) -> str:
+    """Return the path of a program that a package of Debian has."""
+    if (path := shutil.which(name)) is None:
+        raise MeasurementError(f"{name} is not installed (Debian: apt-get install {package})")
+    return path
 
 
 def compiled(source: str, into: Path, *options: str) -> Path:
     """Compile a C file of this folder into another folder; return the path."""
     target = into / Path(source).stem
-    if shutil.which("cc") is None:
-        raise MeasurementError(f"{source} is written in C and cc is not installed")
-    command = ["cc", "-O2", *options, "-o", str(target), str(Path(__file__).with_name(source))]
+    path = Path(__file__).with_name(source)
+    command = [program_path("cc", "gcc"), "-O2", *options, "-o", str(target), str(path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise MeasurementError(f"cc {source}: {done.stderr.strip()[:200]}")
@@ -116,6 +107,12 @@ def imported_s(modules: str) -> float:
     return finished.lines[-1].at_s - finished.begun_s
 
 
+def in_new_process(call: Callable[..., _Result], *arguments: object) -> _Result:
+    """Return what a call returns in a process of its own."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(call, *arguments).result()
+
+
 class NoackRun(NamedTuple):
     """A completed run of noack."""
 
@@ -151,8 +148,9 @@ def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:
 class Sample(NamedTuple):
     """The system's data about a process."""
 
+    at_s: float
+    """Monotonic clock."""
     rss_kib: float
-    pss_kib: float
     uss_kib: float
     """Private memory, which is judged; shared memory is no leak of this process."""
     fds: int
@@ -166,8 +164,8 @@ class Sample(NamedTuple):
         with process.oneshot():
             memory, cpu = process.memory_full_info(), process.cpu_times()
             return cls(
+                time.monotonic(),
                 memory.rss / 1024,
-                getattr(memory, "pss", memory.uss) / 1024,
                 memory.uss / 1024,
                 process.num_fds(),
                 len(process.net_connections("all")),
@@ -176,69 +174,76 @@ class Sample(NamedTuple):
             )
 
 
-class Processes:
-    """The launcher of a run, by its process id, and the run's processes."""
+class Observed(NamedTuple):
+    """A run of noack that has ended, observed from outside; times are of the monotonic clock."""
 
-    def __init__(self, launcher: int) -> None:
-        self._known = {LAUNCHER: psutil.Process(launcher)}
+    summary: dict[str, Any]
+    run_dir: Path
+    samples: Mapping[str, list[Sample]]
+    """By process, from the first rows of the loops to the end of the command."""
+    begun_s: float
+    """The loops' first rows are recorded."""
+    horizon_s: float
+    """The loops have reached their horizon, or have ended before."""
+    ended_s: float
+    """The loops' processes have ended."""
+    closed_s: float
+    """The command has ended."""
+    left_behind: list[str]
+    """Processes that did not end with it."""
 
-    def sample(self) -> dict[str, Sample]:
-        """Sample every process that is alive."""
-        if len(self._known) <= len(ROLES):
-            with contextlib.suppress(psutil.Error):
-                self._known = processes_of(self._known[LAUNCHER]) | self._known
-        samples = {}
-        for role, process in self._known.items():
-            with contextlib.suppress(psutil.Error):
-                samples[role] = Sample.of(process)
-        return samples
-
-    def are_alive(self, roles: Sequence[str]) -> bool:
-        """Whether a process of these roles, once seen by :meth:`sample`, has not ended."""
-        ended = (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
-        for role in roles:
-            with contextlib.suppress(KeyError, psutil.Error):
-                if self._known[role].status() not in ended:
-                    return True
-        return False
-
-    def left_behind(self, patience_s: float) -> list[str]:
-        """Return the roles of processes that are alive although the run is over."""
-        _, alive = psutil.wait_procs(list(self._known.values()), timeout=patience_s)
-        return sorted(role for role, process in self._known.items() if process in alive)
-
-    def kill(self) -> None:
-        """Kill all processes, the launcher last."""
-        for process in reversed(self._known.values()):
-            with contextlib.suppress(psutil.Error):
-                process.kill()
+    def in_loops(self, role: str) -> list[Sample]:
+        """The samples of a process while the loops ran, without their first and last seconds."""
+        begin_s, end_s = self.begun_s + 1, self.horizon_s - 2
+        return [sample for sample in self.samples.get(role, ()) if begin_s <= sample.at_s <= end_s]
 
 
-def processes_of(launcher: psutil.Process) -> dict[str, psutil.Process]:
-    """Return the processes of a run by role."""
-    children = launcher.children()
-    return {role: child for child in children for role in ROLES if is_of(role, child)}
+def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_s: float) -> Observed:
+    """Run ``noack run ARGUMENTS`` to its end, and sample its processes.
 
+    Args:
+        arguments: scenario and options.
+        folder: for the run directory.
+        length_s: wall time of the loops.
+        pause_s: time between two samples.
+    """
+    samples, closed = defaultdict[str, list[Sample]](list), threading.Event()
+    begun_s = ended_s = math.inf
 
-def is_of(role: str, process: psutil.Process) -> bool:
-    """Whether a process has a role in a run, by its title; not if it has ended."""
-    try:
-        return bool(process.cmdline()[:1] == [f"noack {role}"])
-    except psutil.NoSuchProcess:
-        return False
+    def observe() -> None:
+        nonlocal ended_s
+        sampled_s = -math.inf
+        while not closed.wait(_LOOK_S):
+            now_s = time.monotonic()
+            if not all(is_over(processes[role]) for role in LOOP_ROLES):
+                ended_s = now_s
+            if now_s > sampled_s + pause_s:
+                sampled_s = now_s
+                for role, process in processes.items():
+                    with suppress(psutil.Error):
+                        samples[role].append(Sample.of(process))
 
-
-def udp_port(process: psutil.Process) -> int:
-    """Return the port of a process in the loop."""
-    (port,) = {udp.laddr.port for udp in process.net_connections("udp4") if not udp.raddr}
-    return int(port)
+    with begun(folder) as begin:
+        run = begin(command=("run", *arguments), viewer=True)
+        run.wait_recording()
+        begun_s = time.monotonic()
+        launcher = psutil.Process(run.process.pid)
+        processes = processes_of(launcher) | {LAUNCHER: launcher}
+        observer = threading.Thread(target=observe)
+        observer.start()
+        try:
+            finished = run.finish(_END_PATIENCE * length_s + PATIENCE_S)
+        finally:
+            closed_s = time.monotonic()
+            closed.set()
+            observer.join()
+        left = [process.name() for process in run.left_behind()]
+    horizon_s = min(ended_s, begun_s + length_s)
+    return Observed(finished.summary, finished.run_dir, samples, begun_s, horizon_s, ended_s, closed_s, left)
 
 
 _CORES = sorted(os.sched_getaffinity(0))
 RELAY_CORE, LOAD_CORE = _CORES[0], _CORES[-1]
-BEFORE_OTHERS = 1
-"""The lowest SCHED_FIFO priority. If permitted, the load and all relays have it, so that other
-programs of the machine do not affect their comparison."""
 
 
 @contextmanager
@@ -253,8 +258,10 @@ def on_core(core: int) -> Iterator[None]:
 
 
 @contextmanager
-def scheduled(priority: int) -> Iterator[bool]:
+def scheduled(priority: int = 1) -> Iterator[bool]:
     """Apply SCHED_FIFO to the calling thread and the processes that it starts, if permitted.
+
+    With the lowest priority other programs of the machine do not affect a comparison of relays.
 
     Yields:
         Whether it was permitted.
@@ -269,45 +276,3 @@ def scheduled(priority: int) -> Iterator[bool]:
         yield True
     finally:
         os.sched_setscheduler(0, policy, parameters)
-
-
-class TwoHosts(NamedTuple):
-    """Two network namespaces that a veth link connects: their names, addresses IPv4 and IPv6."""
-
-    names: tuple[str, str]
-    addresses: tuple[tuple[str, str], tuple[str, str]]
-
-    def inside(self, host: int, *command: str, monotonic_s: int = 0) -> list[str]:
-        """Return a command that runs on a host, whose monotonic clock is ahead by some seconds."""
-        clock = ["unshare", "--time", f"--monotonic={monotonic_s}", "--fork", "--kill-child"]
-        return ["ip", "netns", "exec", self.names[host], *(clock if monotonic_s else ()), *command]
-
-
-def _run(command: Sequence[str]) -> None:
-    try:
-        subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
-    except subprocess.CalledProcessError as error:
-        raise MeasurementError(f"{' '.join(command)}: {error.stderr.strip()}") from None
-
-
-@contextmanager
-def two_hosts() -> Iterator[TwoHosts]:
-    """Make the namespaces, and delete them at the end."""
-    if shutil.which("ip") is None or shutil.which("unshare") is None:
-        raise MeasurementError("ip (iproute2) and unshare (util-linux) are not installed")
-    names = (f"noack-{os.getpid()}-reference", f"noack-{os.getpid()}-client")
-    hosts = TwoHosts(names, (("10.83.3.1", "fd83:3::1"), ("10.83.3.2", "fd83:3::2")))
-    try:
-        for name in names:
-            _run(["ip", "netns", "add", name])
-            _run(["ip", "-n", name, "link", "set", "lo", "up"])
-        _run(["ip", "-n", names[0], "link", "add", "line", "type", "veth", "peer", "line", "netns", names[1]])
-        for name, (four, six) in zip(names, hosts.addresses, strict=True):
-            _run(["ip", "-n", name, "address", "add", f"{four}/24", "dev", "line"])
-            _run(["ip", "-n", name, "address", "add", f"{six}/64", "dev", "line", "nodad"])
-            _run(["ip", "-n", name, "link", "set", "line", "up"])
-        _run(hosts.inside(1, "true", monotonic_s=1))
-        yield hosts
-    finally:
-        for name in names:
-            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)

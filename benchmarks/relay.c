@@ -5,7 +5,7 @@
  * sent as one message, which the kernel segments (UDP_SEGMENT). With "names", it also receives the
  * sources' addresses, and ignores them. With "paths", each source has a connected socket of its
  * own, which the last 16 bits of its address select, and whose answers go back to the source: as in
- * our relay, epoll waits for them. Prints its listening port.
+ * our relay, epoll waits for them.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -143,36 +143,32 @@ int main(int argc, char **argv)
 {
     struct sockaddr_in here = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
     struct sockaddr_in there = here;
-    socklen_t length = sizeof here;
     int in = socket(AF_INET, SOCK_DGRAM, 0), out = socket(AF_INET, SOCK_DGRAM, 0);
     int bytes = BUFFER_BYTES;
     bool segment = false, by_path = false, with_names = false;
     struct rlimit files;
 
-    for (int k = 2; k < argc; k++) {
+    for (int k = 3; k < argc; k++) {
         segment |= strcmp(argv[k], "segment") == 0;
         by_path |= strcmp(argv[k], "paths") == 0;
         with_names |= strcmp(argv[k], "names") == 0;
     }
-    if (argc < 2) {
-        fprintf(stderr, "usage: %s PORT [segment] [names] | PORT paths\n", argv[0]);
+    if (argc < 3) {
+        fprintf(stderr, "usage: %s FROM TO [segment] [names] | FROM TO paths\n", argv[0]);
         return 2;
     }
     if (getrlimit(RLIMIT_NOFILE, &files) == 0) {
         files.rlim_cur = files.rlim_max;
         setrlimit(RLIMIT_NOFILE, &files);
     }
-    there.sin_port = htons((uint16_t)atoi(argv[1]));
+    here.sin_port = htons((uint16_t)atoi(argv[1]));
+    there.sin_port = htons((uint16_t)atoi(argv[2]));
     if (setsockopt(in, SOL_SOCKET, SO_RCVBUFFORCE, &bytes, sizeof bytes) != 0)
         setsockopt(in, SOL_SOCKET, SO_RCVBUF, &bytes, sizeof bytes);
     if (bind(in, (struct sockaddr *)&here, sizeof here) != 0)
         fail("bind");
     if (connect(out, (struct sockaddr *)&there, sizeof there) != 0)
         fail("connect");
-    if (getsockname(in, (struct sockaddr *)&here, &length) != 0)
-        fail("getsockname");
-    printf("%d\n", ntohs(here.sin_port));
-    fflush(stdout);
 
     for (int k = 0; k < BATCH; k++) {
         parts[k].iov_base = data[k];

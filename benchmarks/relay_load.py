@@ -6,31 +6,28 @@ kernel's timestamps, so that they do not depend on the time at which the sink is
 
 import json
 import os
-import re
-import shutil
 import signal
 import socket
 import struct
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from cffi import FFI
 
-from benchmarks.programs import RELAY_CORE, compiled, on_core
+from benchmarks.programs import RELAY_CORE, compiled, on_core, program_path
 from benchmarks.report import Figures, MeasurementError, Rounds
+from noack.runtime.address import LOOPBACK
 
 DATAGRAM_BYTES = 72
-LOOPBACK = "127.0.0.1"
 BURST = 8000
 """Datagrams in a burst, if the relay's receive buffer holds that many."""
 _PROBE = 20_000
@@ -40,40 +37,14 @@ _READY_S, _END_S = 120.0, 30.0
 """Maximum waits for a relay to listen (a busy machine starts it late), and to end."""
 _SO_RCVBUFFORCE, _SO_TIMESTAMPNS = 33, 35
 _SINK_BUFFER_BYTES = 64 * 1024 * 1024
-_KERNEL_BYTES = 1024
-"""Upper bound on the bytes of a receive buffer that a small datagram occupies."""
 _PATIENCE_NS = 300_000_000
 """After this time without an arrival, the rest of a burst counts as lost."""
 _PING_TIMEOUT_S = 0.2
-_PORT = re.compile(r"^(\d+)$")
-_READY = re.compile(r"noack netem: 127\.0\.0\.1:(\d+) →")
-_DECLARATIONS = """
-struct burst { int64_t wall_ns, last, received; };
-struct soak { int64_t sent, received, next, longest_gap, disordered; };
-int load_burst(int, int, int, int64_t, int64_t, int64_t, const uint32_t *, int64_t, int64_t,
-               int64_t, struct burst *);
-int load_direct(int, int, int64_t, int64_t, int64_t, int64_t, struct burst *, int64_t *);
-int load_ping(int, int, int64_t, int64_t, int64_t, int64_t *);
-int load_pace(int, int64_t, int64_t, int64_t, int64_t, int64_t *);
-int load_collect(int, int64_t, int64_t, int64_t, int64_t *);
-int load_soak(int, int, int64_t, int64_t, int64_t, int64_t, struct soak *);
-"""
 _FFI = FFI()
-_FFI.cdef(_DECLARATIONS)
+_FFI.cdef(Path(__file__).with_name("load.h").read_text())
 
 Nanoseconds = npt.NDArray[np.int64]
 Addresses = npt.NDArray[np.uint32]
-
-
-class Burst(NamedTuple):
-    """Result of a burst."""
-
-    wall_s: float
-    """Time from the relay's continuation to the last arrival."""
-    decided: int
-    """Datagrams up to the last one that arrived: the relay has received and decided these."""
-    received: int
-    """Datagrams that arrived."""
 
 
 class Built(NamedTuple):
@@ -109,7 +80,7 @@ class Ends:
 
     def __init__(self, load: Any) -> None:
         self._load = load
-        self.sent = 0
+        self._sent = 0
         self.sink, self.out = (socket.socket(type=socket.SOCK_DGRAM) for _ in range(2))
         self.sink.bind((LOOPBACK, 0))
         option = partial(self.sink.setsockopt, socket.SOL_SOCKET)
@@ -117,27 +88,15 @@ class Ends:
             option(_SO_RCVBUFFORCE, _SINK_BUFFER_BYTES)
         except PermissionError:
             option(socket.SO_RCVBUF, _SINK_BUFFER_BYTES)
-        buffer_bytes = self.sink.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        self.sink_holds = buffer_bytes // _KERNEL_BYTES
-        """Number of datagrams that can wait at the sink."""
         option(_SO_TIMESTAMPNS, 1)
         option(socket.SO_RCVTIMEO, struct.pack("@ll", 0, round(_PING_TIMEOUT_S * 1e6)))
-
-    @property
-    def sink_port(self) -> int:
-        """The port on loopback to which the relay sends."""
-        return int(self.sink.getsockname()[1])
-
-    def connect(self, port: int) -> None:
-        """Send to this port on loopback from now on."""
-        self.out.connect((LOOPBACK, port))
 
     def close(self) -> None:
         """Close both sockets."""
         self.out.close()
         self.sink.close()
 
-    def burst(self, relay: int, count: int, slack: int = 0, addresses: Addresses | None = None) -> Burst:
+    def burst(self, relay: int, count: int, slack: int, addresses: Addresses | None) -> Any:
         """Stop the relay, fill its receive buffer, continue it, and wait until the buffer is empty.
 
         Args:
@@ -145,6 +104,9 @@ class Ends:
             count: datagrams to send.
             slack: the burst may end although this number of last datagrams have not arrived.
             addresses: send from these in turn; see :func:`sources`.
+
+        Returns:
+            A ``struct burst`` of ``load.c``: time, number of the last arrival, number of arrivals.
         """
         result = _FFI.new("struct burst *")
         senders = (_FFI.NULL, 0)
@@ -152,14 +114,7 @@ class Ends:
             senders = (_FFI.from_buffer("uint32_t[]", addresses), len(addresses))
         self._call("burst", self.sink.fileno(), relay, self._first(count), count, DATAGRAM_BYTES,
                    *senders, slack, _PATIENCE_NS, result)  # fmt: skip
-        return Burst(result.wall_ns * 1e-9, result.last + 1, result.received)
-
-    def direct(self, count: int) -> tuple[Burst, float]:
-        """Send directly to the sink; also return the CPU time in seconds."""
-        result, cpu_ns = _FFI.new("struct burst *"), _FFI.new("int64_t *")
-        self._call("direct", self.sink.fileno(), self._first(count), count, DATAGRAM_BYTES,
-                   _PATIENCE_NS, result, cpu_ns)  # fmt: skip
-        return Burst(result.wall_ns * 1e-9, result.last + 1, result.received), cpu_ns[0] * 1e-9
+        return result
 
     def ping(self, count: int) -> Nanoseconds:
         """Return the one-way delays of datagrams sent one by one, ns; -1 for a missing one."""
@@ -180,7 +135,7 @@ class Ends:
         self._call("soak", self.sink.fileno(), groups, group, DATAGRAM_BYTES, period_ns, state)
 
     def _first(self, count: int) -> int:
-        first, self.sent = self.sent, self.sent + count
+        first, self._sent = self._sent, self._sent + count
         return first
 
     def _call(self, function: str, *arguments: object) -> None:
@@ -198,9 +153,7 @@ class Kind(NamedTuple):
 
     name: str
     command: Callable[[int, int], list[str]]
-    """Returns its command line for the sink's port and a free port to listen on."""
-    says: tuple[str, re.Pattern[str]] | None = ("stdout", _PORT)
-    """Where and how it reports its listening port; None if it is the given free port."""
+    """Returns its command line for the ports on loopback from which and to which it relays."""
     lossy: bool = False
     """Whether it may lose datagrams."""
 
@@ -211,46 +164,28 @@ _MODES = {"segment": "segments", "names": "senders' addresses", "paths": "a sock
 def c_relay(built: Built, *words: str) -> Kind:
     """Return ``relay.c`` in one of its modes, ``segment``, ``names`` and ``paths``."""
     name = ", ".join(["C relay", *(_MODES[word] for word in words)])
-    return Kind(name, lambda to, _: [str(built.relay), str(to), *words])
+    return Kind(name, lambda port, to: [str(built.relay), str(port), str(to), *words])
 
 
 def socat() -> Kind:
     """Return socat, forward only."""
 
-    def command(to: int, port: int) -> list[str]:
-        if (program := shutil.which("socat")) is None:
-            raise MeasurementError("socat is not installed (Debian: apt-get install socat)")
+    def command(port: int, to: int) -> list[str]:
         listen = f"UDP4-RECV:{port},rcvbuf={4 * 2**20}"
-        return [program, "-u", "-b", "2048", listen, f"UDP4-SENDTO:{LOOPBACK}:{to}"]
+        return [program_path("socat", "socat"), "-u", "-b", "2048", listen, f"UDP4-SENDTO:{LOOPBACK}:{to}"]
 
-    return Kind("socat", command, says=None)
+    return Kind("socat", command)
 
 
 def our_relay(name: str, words: str, *flags: str, reverse: bool = False, lossy: bool = True) -> Kind:
     """Return ``python -m netem`` with impairments in tc's words, maybe with a reverse direction."""
-    one_way = [] if reverse else ["--one-way"]
+    options = (*words.split(), *flags, *(() if reverse else ("--one-way",)), "--json")
 
-    def command(to: int, _: int) -> list[str]:
-        ends = ("--listen", f"{LOOPBACK}:0", "--to", f"{LOOPBACK}:{to}")
-        return [sys.executable, "-m", "netem", *ends, *words.split(), *flags, *one_way, "--json"]
+    def command(port: int, to: int) -> list[str]:
+        ends = ("--listen", f"{LOOPBACK}:{port}", "--to", f"{LOOPBACK}:{to}")
+        return [sys.executable, "-m", "netem", *ends, *options]
 
-    return Kind(name, command, ("stderr", _READY), lossy)
-
-
-class Totals(NamedTuple):
-    """Our relay's final counts."""
-
-    received: int
-    forwarded: int
-    longest_loss_burst: int
-    lost_in_kernel: int
-
-
-def figures_of(name: str, burst: Burst, cpu_s: float, sent: int, slack: int = 0) -> Figures:
-    """Return ``per_s``, datagrams received and decided per second, and ``cpu_us`` per datagram."""
-    if burst.decided < sent - slack or (slack == 0 and burst.received != sent):
-        raise MeasurementError(f"{name}: of a burst of {sent} only {burst.received} arrived")
-    return {"per_s": burst.decided / burst.wall_s, "cpu_us": cpu_s / sent * 1e6}
+    return Kind(name, command, lossy)
 
 
 class Relay:
@@ -264,38 +199,40 @@ class Relay:
         self._slack = _LOSSY_SLACK if kind.lossy else 0
         self._burst = 0
 
-    def scheduled_s(self) -> tuple[float, float]:
-        """CPU time of all its threads so far, and time in which other threads had their core."""
+    @property
+    def cpu_s(self) -> float:
+        """CPU time of all its threads so far."""
         tasks = Path(f"/proc/{self.pid}/task").glob("*/schedstat")
-        times_ns = [[int(word) for word in task.read_text().split()[:2]] for task in tasks]
-        return sum(run_ns for run_ns, _ in times_ns) * 1e-9, sum(run_ns for _, run_ns in times_ns) * 1e-9
+        return sum(int(task.read_text().split()[0]) for task in tasks) * 1e-9
 
     def burst(self, addresses: Addresses | None = None) -> Figures:
         """Send it one burst, from these addresses in turn if there are any.
 
         The first time, also determine the capacity of its buffer.
+
+        Returns:
+            ``per_s``: datagrams per second, received and decided until the last arrival, from its
+            continuation on; ``cpu_us``: CPU time for each.
         """
         if not self._burst:
-            held = self.ends.burst(self.pid, _PROBE, addresses=addresses).decided
+            held = self.ends.burst(self.pid, _PROBE, 0, addresses).last + 1
             self._burst = min(BURST, held * 9 // 10)
             if not self._burst:
                 raise MeasurementError(f"{self.name} forwards nothing")
-        before_s, _ = self.scheduled_s()
-        result = self.ends.burst(self.pid, self._burst, self._slack, addresses)
-        cpu_s = self.scheduled_s()[0] - before_s
-        return figures_of(self.name, result, cpu_s, self._burst, self._slack)
+        sent, before_s = self._burst, self.cpu_s
+        found = self.ends.burst(self.pid, sent, self._slack, addresses)
+        cpu_s, decided = self.cpu_s - before_s, found.last + 1
+        if decided < sent - self._slack or (self._slack == 0 and found.received != sent):
+            raise MeasurementError(f"{self.name}: of a burst of {sent} only {found.received} arrived")
+        return {"per_s": decided / found.wall_ns * 1e9, "cpu_us": cpu_s / sent * 1e6}
 
-    def totals(self) -> Totals:
-        """End our relay as Ctrl-C does; return its totals."""
+    def totals(self) -> dict[str, int]:
+        """End our relay as Ctrl-C does; return its counts of the datagrams towards the sink."""
         self._process.send_signal(signal.SIGINT)
-        try:
-            stdout, _ = self._process.communicate(timeout=_END_S)
-            _, _, totals = stdout.partition("\n")  # the first line reports that it is ready
-            forward = json.loads(totals)["links"][0]["forward"]
-            values = forward | forward["unintended"]
-            return Totals(*(values[key] for key in Totals._fields))
-        except (subprocess.TimeoutExpired, ValueError, LookupError, TypeError) as error:
-            raise MeasurementError(f"the totals of {self.name} cannot be read: {error!r}") from None
+        stdout, _ = self._process.communicate(timeout=_END_S)
+        _, _, totals = stdout.partition("\n")  # the first line reports that it is ready
+        (link,) = json.loads(totals)["links"]
+        return {**link["forward"], **link["forward"]["unintended"]}
 
 
 @contextmanager
@@ -303,40 +240,27 @@ def running(kind: Kind, built: Built) -> Iterator[Relay]:
     """Run a relay on its core, between sender and sink."""
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         probe.bind((LOOPBACK, 0))
-        chosen = int(probe.getsockname()[1])
-    with closing(Ends(built.load)) as ends:
-        command = kind.command(ends.sink_port, chosen)
+        port = int(probe.getsockname()[1])
+    with closing(Ends(built.load)) as ends, ExitStack() as stack:
+        command = kind.command(port, ends.sink.getsockname()[1])
         with on_core(RELAY_CORE):
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        try:
-            ends.connect(_listening_on(kind, process, chosen))
-            yield Relay(kind, process, ends)
-        finally:
-            process.kill()
-            process.communicate()
+        stack.callback(process.communicate)
+        stack.callback(process.kill)
+        limit_s = time.monotonic() + _READY_S
+        while not _is_bound(port):
+            if process.poll() is not None or time.monotonic() > limit_s:
+                process.kill()
+                raise MeasurementError(f"{kind.name} does not listen: {process.communicate()[1].strip()}")
+            time.sleep(0.01)
+        ends.out.connect((LOOPBACK, port))
+        yield Relay(kind, process, ends)
 
 
-def _listening_on(kind: Kind, process: subprocess.Popen[str], chosen: int) -> int:
-    deadline = threading.Timer(_READY_S, process.kill)
-    deadline.start()
-    try:
-        if kind.says is None:
-            while process.poll() is None:
-                lines = Path("/proc/net/udp").read_text().splitlines()[1:]
-                if chosen in (int(line.split()[1].rpartition(":")[2], 16) for line in lines):
-                    return chosen
-                time.sleep(0.01)
-        else:
-            stream, port = kind.says
-            output: IO[str] = getattr(process, stream)
-            for line in output:
-                if (match := port.search(line)) is not None:
-                    return int(match[1])
-    finally:
-        deadline.cancel()
-    _, stderr = process.communicate()
-    why = (stderr.strip() or "nothing").splitlines()[-1]
-    raise MeasurementError(f"{kind.name} does not begin to listen, said {why!r}")
+def _is_bound(port: int) -> bool:
+    """Whether a UDP socket of this host has a port."""
+    lines = Path("/proc/net/udp").read_text().splitlines()[1:]
+    return any(int(line.split()[1].rpartition(":")[2], 16) == port for line in lines)
 
 
 @contextmanager
@@ -356,5 +280,5 @@ def started(kinds: Iterable[Kind], built: Built) -> Iterator[tuple[Rounds, list[
 def direct_ends(built: Built) -> Iterator[Ends]:
     """Give a sender whose datagrams go directly to the sink."""
     with closing(Ends(built.load)) as ends:
-        ends.connect(ends.sink_port)
+        ends.out.connect(ends.sink.getsockname())
         yield ends

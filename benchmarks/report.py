@@ -2,18 +2,24 @@
 
 import argparse
 import ctypes
+import json
 import operator
 import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 BUSY_SHARE, STEAL_SHARE = 0.1, 0.01
@@ -116,6 +122,8 @@ class Row:
 
 
 Measure = Callable[[argparse.Namespace], Iterable[Row]]
+Options = Mapping[str, Mapping[str, Any]]
+"""The arguments of ``add_argument`` by the option's name."""
 
 
 class Benchmark(NamedTuple):
@@ -124,16 +132,18 @@ class Benchmark(NamedTuple):
     name: str
     title: str
     measure: Measure
-    options: Mapping[str, Mapping[str, Any]] = {}
-    """The arguments of ``add_argument`` by the option's name."""
+    options: Options
+
+
+def option(default: object, text: str, **more: Any) -> dict[str, Any]:
+    """Return an option with a default value, whose type is that of the option."""
+    return {"type": type(default), "default": default, "help": f"{text} (%(default)s)", **more}
 
 
 BENCHMARKS: dict[str, Benchmark] = {}
 
 
-def benchmark(
-    name: str, title: str, options: Mapping[str, Mapping[str, Any]] | None = None
-) -> Callable[[Measure], Measure]:
+def benchmark(name: str, title: str, options: Options | None = None) -> Callable[[Measure], Measure]:
     """Declare a function that measures a benchmark."""
 
     def declare(measure: Measure) -> Measure:
@@ -151,32 +161,27 @@ class Load:
         ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER: it adopts orphans
         self._before = self._read()
 
-    def rows(self) -> list[Row]:
-        """Return the shares of all cores used by other programs and by the hypervisor."""
-        total_s, busy_s, steal_s, own_s = np.subtract(self._read(), self._before).tolist()
-        rows = []
-        for name, used_s, doubtful in (
-            ("other programs", max(busy_s - own_s, 0.0), BUSY_SHARE),
-            ("steal", steal_s, STEAL_SHARE),
+    def rows(self) -> Iterator[Row]:
+        """Yield the shares of all cores used by other programs and by the hypervisor."""
+        total_s, *used_s = np.subtract(self._read(), self._before).tolist()
+        for name, seconds, doubtful in zip(
+            ("other programs", "steal"), used_s, (BUSY_SHARE, STEAL_SHARE), strict=True
         ):
-            share = used_s / max(total_s, 1e-9)
+            share = max(seconds, 0.0) / max(total_s, 1e-9)
             doubt = "the machine was busy: figures are doubtful" if share > doubtful else None
-            rows.append(Row(f"machine: {name}", 100 * share, "% of all cores", note=doubt))
-        return rows
+            yield Row(f"machine: {name}", 100 * share, "% of all cores", note=doubt)
 
     @staticmethod
-    def _read() -> tuple[float, ...]:
-        """CPU seconds: of all cores, used, taken by the hypervisor; used by this benchmark."""
-        times = psutil.cpu_times()._asdict()
-        for part in ("guest", "guest_nice"):  # included in the users' time
-            times.pop(part, None)
-        total_s, steal_s = sum(times.values()), times.get("steal", 0.0)
-        busy_s = total_s - steal_s - times["idle"] - times.get("iowait", 0.0)
-        own_s = own_cpu_s() + own_cpu_s(children=True)
+    def _read() -> tuple[float, float, float]:
+        """CPU seconds: of all cores, used by other programs, taken by the hypervisor."""
+        times = psutil.cpu_times()
+        total_s = sum(times) - times.guest - times.guest_nice  # included in the users' time
+        others_s = total_s - times.steal - times.idle - times.iowait
+        others_s -= own_cpu_s() + own_cpu_s(children=True)
         for process in psutil.Process().children(recursive=True):  # not waited for
             with suppress(psutil.NoSuchProcess):
-                own_s += sum(process.cpu_times()[:4])  # its own, and of those it waited for
-        return total_s, busy_s, steal_s, own_s
+                others_s -= sum(process.cpu_times()[:4])  # its own, and of those it waited for
+        return total_s, others_s, times.steal
 
 
 def own_cpu_s(*, children: bool = False) -> float:
@@ -189,20 +194,26 @@ Figures = Mapping[str, float]
 """The figures of one side in one round, by quantity."""
 
 
+def quantiles_us(values_ns: Sequence[float] | NDArray[Any]) -> Figures:
+    """Return ``p50``, ``p99`` and ``max`` of values in ns, in µs."""
+    p50_us, p99_us, max_us = (np.quantile(values_ns, (0.5, 0.99, 1)) / 1e3).tolist()
+    return {"p50": p50_us, "p99": p99_us, "max": max_us}
+
+
 class Rounds:
     """Figures of several sides that are measured in turn, each once per round."""
 
     def __init__(self) -> None:
         self.missing: dict[str, str] = {}
         """For each side without valid figures, the reason."""
-        self._figures: dict[str, list[Figures]] = {}
+        self._figures = defaultdict[str, list[Figures]](list)
 
     def add(self, side: str, figures: Figures | str) -> None:
         """Add a side's figures of a round, or the reason why there are none."""
         if isinstance(figures, str):
             self.missing[side] = figures
         else:
-            self._figures.setdefault(side, []).append(figures)
+            self._figures[side].append(figures)
 
     def in_turn(self, count: int, sides: Mapping[str, Callable[[], Figures | str]], head: str = "") -> None:
         """Measure the sides in turn, in some rounds; one that fails is missing from then on."""
@@ -216,7 +227,7 @@ class Rounds:
 
     def of(self, side: str, quantity: str) -> list[float]:
         """Return the rounds of a quantity; empty if the side was not measured."""
-        return [figures[quantity] for figures in self._figures.get(side, ())]
+        return [figures[quantity] for figures in self._figures[side]]
 
     def row(
         self, name: str, unit: str, quantity: str, ours: str, peer: str | None = None,
@@ -227,12 +238,11 @@ class Rounds:
         With ``paired``, the ratio is the median of the rounds' ratios, since a disturbance affects
         both sides of a round; else it is the ratio of the medians.
         """
-        sides = [side for side in (ours, peer) if side is not None]
-        reasons = [f"{side}: {self.missing[side]}" for side in sides if side in self.missing]
+        reasons = [f"{side}: {self.missing[side]}" for side in (ours, peer or "") if side in self.missing]
         value, alternative = self.of(ours, quantity), self.of(peer or "", quantity)
-        ratios = []
+        ratio = None
         if paired and not reasons:
-            ratios = [own / other for own, other in zip(value, alternative, strict=True)]
+            ratio = median(own / other for own, other in zip(value, alternative, strict=True))
         return Row(
             name,
             median(value) if value else None,
@@ -241,7 +251,7 @@ class Rounds:
             goal,
             note,
             "; ".join(reasons) or None,
-            median(ratios) if ratios else None,
+            ratio,
         )
 
 
@@ -294,17 +304,27 @@ def say(text: str) -> None:
     print(f"  {text} ...", file=sys.stderr, flush=True)
 
 
-def table_of(title: str, rows: Sequence[Row]) -> Table:
-    """Return the rows as a table."""
+def print_table(title: str, rows: Sequence[Row]) -> None:
+    """Print the rows as a table, and below it their notes."""
+    console = Console()
+    if not console.is_terminal:
+        console.width = 130
     table = Table(title=title, title_justify="left")
     for heading in ("figure", "value", "alternative", "its value", "ratio", "goal", "holds"):
         right = heading in ("value", "its value", "ratio", "goal")
         table.add_column(heading, justify="right" if right else "left")
-    colours = {"yes": "[green]yes[/]", "no": "[bold red]no[/]"}
     for row in rows:
-        *cells, verdict = row.cells
-        table.add_row(*cells, colours.get(verdict, verdict))
-    return table
+        style = "bold red" if row.holds is False else None
+        table.add_row(*map(escape, row.cells), style=style)
+    console.print(table)
+    for row in rows:
+        if row.notes:
+            console.print(f"{row.name}: {row.notes}", highlight=False, markup=False)
+
+
+def write_json(path: Path, rows: Iterable[dict[str, object]]) -> None:
+    """Write rows into a file."""
+    path.write_text(json.dumps(list(rows), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def number_text(value: float) -> str:

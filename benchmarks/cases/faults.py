@@ -1,26 +1,27 @@
 """Live runs with a fault: a process that dies or stops, a flood."""
 
 import argparse
-import json
+import itertools
+import os
 import signal
-import subprocess
-import sys
+import socket
+import struct
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import psutil
 
-from benchmarks.flood_sender import Flood
-from benchmarks.programs import imported_s, processes_of, udp_port
+from benchmarks.programs import imported_s
 from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from cosim.analysis.summary.loop_statistics import lateness_us
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.summary_model import LoopSummary
 from cosim.cli import find_scenario
 from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
@@ -31,9 +32,12 @@ from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.topology import LOOP_ROLES, ROLES
+from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
+from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario_file import load
+from tests.integration.conftest import processes_of, udp_port
 
 STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
 """Table of each process's steps."""
@@ -42,56 +46,57 @@ _QUIET_S = 0.25
 FAULT_S = 2.5
 """Time in the run when a fault begins."""
 
-Outcome = TypeVar("Outcome")
-Processes = Mapping[str, psutil.Process]
+Act = Callable[[Mapping[str, psutil.Process]], object]
+"""Makes a fault, with the processes of a run by role."""
 
 
-class FaultedRun(NamedTuple, Generic[Outcome]):
-    """A run with a fault that has completed."""
+class FaultedRun(NamedTuple):
+    """A run with a fault that has completed; its times are those of the run."""
 
     record: RunRecord
-    summary: Mapping[str, Any]
-    epoch_s: float
-    """Time 0 of the run on the monotonic clock."""
-    outcome: Outcome
-    """What the fault returned."""
-    back_s: float | None
-    """Time in the run at which the launcher reported the process as restarted."""
+    summary: LoopSummary
+    begun_s: float
+    """The fault's begin."""
+    ended_s: float
+    """The fault's end."""
 
 
-def faulted_run(
-    name: str, settings: Sequence[str], fault: Callable[[Processes], Outcome]
-) -> FaultedRun[Outcome]:
+def faulted_run(name: str, settings: Sequence[str], act: Act) -> FaultedRun:
     """Run the lane example at speed 1, with a fault.
 
     Args:
         name: for messages.
         settings: changes to the scenario.
-        fault: called in a thread, with the processes of the run by role.
+        act: called in a thread.
     """
+    say(name)
     scenario = load(find_scenario("lane_following"), ["ports={}", *settings])
-    threads: list[threading.Thread] = []
-    outcomes, backs_s = list[Outcome](), list[float]()
+    threads, fault_s = list[threading.Thread](), list[float]()
+
+    def fault(processes: Mapping[str, psutil.Process]) -> None:
+        fault_s.append(time.monotonic())
+        act(processes)
+        fault_s.append(time.monotonic())
 
     def progress(report: RunProgress) -> None:
         if report.t_s >= FAULT_S and not threads:
             processes = processes_of(psutil.Process())
-            threads.append(threading.Thread(target=lambda: outcomes.append(fault(processes))))
-            threads[0].start()
+            if processes.keys() == set(ROLES):  # else at the next report: a title cannot be read now
+                threads.append(threading.Thread(target=fault, args=(processes,)))
+                threads[0].start()
 
-    watcher = Watcher(progress=progress, restarted=lambda _, t_s: backs_s.append(t_s))
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
-        begun_s = time.monotonic()
-        ending = launch(scenario, Path(runs), watcher=watcher)
+        launched_s = time.monotonic()
+        ending = launch(scenario, Path(runs), watcher=Watcher(progress=progress))
         for thread in threads:
             thread.join()
-        if ending.status != ExitStatus.OK or ending.startup_s is None or not outcomes:
+        if ending.status != ExitStatus.OK or ending.startup_s is None or len(fault_s) < 2:
             raise MeasurementError(f"{name}: the run ended: {ending.reason}")
-        finalize(ending, report=False, view=False)
+        (summary,) = finalize(ending, report=False, view=False).summary.loops
         record = load_record(ending.run_dir)
-        summary = summarise(record, ending.status, ending.reason).to_json()
-    back_s = backs_s[0] if backs_s else None
-    return FaultedRun(record, summary, begun_s + ending.startup_s, outcomes[0], back_s)
+        for table in (*STEPS.values(), CONTROLLER_DELIVERY):  # they are kept in memory
+            record[table]
+    return FaultedRun(record, summary, *(at_s - launched_s - ending.startup_s for at_s in fault_s))
 
 
 def recovery_s(late_at_s: Vector, end_s: float) -> float:
@@ -109,11 +114,12 @@ def recovery_s(late_at_s: Vector, end_s: float) -> float:
     return last_s - end_s
 
 
-def run_recovery_s(record: RunRecord, end_s: float) -> float:
+def run_recovery_ms(run: FaultedRun) -> float:
     """Return the longest :func:`recovery_s` of all processes; late: by more than a period."""
+    record = run.record
     period_us = record.scenario.timing.plant_period_ns * 1e-3
-    return max(
-        recovery_s(record[table]["now_ns"][lateness_us(record, role) > period_us] * 1e-9, end_s)
+    return 1e3 * max(
+        recovery_s(record[table]["now_ns"][lateness_us(record, role) > period_us] * 1e-9, run.ended_s)
         for role, table in STEPS.items()
     )
 
@@ -124,23 +130,20 @@ _RESTARTS = ("horizon_s=9", "recovery.rejoin_within_s=30")
 IMPORT = "Python that imports as much"
 
 
-def faulted(role: str, fault: Callable[[psutil.Process], object]) -> tuple[FaultedRun[float], float]:
-    """Run with a fault of a process; return the run, and the fault's end in time of the run."""
-    say(f"{role}: {fault.__name__}")
-
-    def act(processes: Processes) -> float:
-        fault(processes[role])
-        return time.monotonic()
-
-    run = faulted_run(role, _RESTARTS, act)
-    return run, run.outcome - run.epoch_s
+def kill(role: str) -> FaultedRun:
+    """Kill a process of a run, which is restarted."""
+    return faulted_run(f"{role} killed", _RESTARTS, lambda processes: processes[role].kill())
 
 
-def stop(process: psutil.Process) -> None:
-    """Stop a process, and continue it after 0.7 s."""
-    process.send_signal(signal.SIGSTOP)
-    time.sleep(STOPPED_S)
-    process.send_signal(signal.SIGCONT)
+def stop(role: str) -> FaultedRun:
+    """Stop a process of a run, and continue it after 0.7 s."""
+
+    def act(processes: Mapping[str, psutil.Process]) -> None:
+        processes[role].send_signal(signal.SIGSTOP)
+        time.sleep(STOPPED_S)
+        processes[role].send_signal(signal.SIGCONT)
+
+    return faulted_run(f"{role} stopped", _RESTARTS, act)
 
 
 def killed(role: str) -> Figures:
@@ -151,22 +154,20 @@ def killed(role: str) -> Figures:
         controller had an update again; ``unwritten_ms``: age of the last recorded row of the
         killed process at its death.
     """
-    run, at_s = faulted(role, psutil.Process.kill)
-    before, after = run.record.lives(role)
-    if before.last_ns is None or after.first_ns is None:
+    run = kill(role)
+    (restart,) = run.summary.restarts
+    if restart.first_s is None or restart.last_s is None:
         raise MeasurementError(f"{role}: has no rows before or after")
-    acted_s, wrote_s = after.first_ns * 1e-9, before.last_ns * 1e-9
     deliveries = run.record[CONTROLLER_DELIVERY]
-    fresh = deliveries["now_ns"] * 1e-9 >= acted_s
+    fresh = deliveries["now_ns"] * 1e-9 >= restart.first_s
     if role == "sensor":
         fresh &= deliveries["sequence"] >= GENERATION
     if not fresh.any():
         raise MeasurementError(f"{role}: no update was delivered afterwards")
-    updated_s = float(deliveries["now_ns"][fresh][0]) * 1e-9
     return {
-        "acted_s": acted_s - at_s,
-        "updated_s": updated_s - at_s,
-        "unwritten_ms": 1e3 * (at_s - wrote_s),
+        "acted_s": restart.first_s - run.ended_s,
+        "updated_s": float(deliveries["now_ns"][fresh][0]) * 1e-9 - run.ended_s,
+        "unwritten_ms": 1e3 * (run.ended_s - restart.last_s),
     }
 
 
@@ -192,15 +193,15 @@ def recovery(options: argparse.Namespace) -> Iterator[Row]:
     """
     for role in ("sensor", "controller", "netem"):
         yield from killed_rows(role)
-    run, at_s = faulted("recorder", psutil.Process.kill)
+    run = kill("recorder")
     steps = run.record[PLANT_STEP]["sequence"]
-    if run.back_s is None or len(steps) != steps[-1] + 1:
+    back_s = [restart.first_s for restart in run.summary.restarts if restart.first_s is not None]
+    if not back_s or len(steps) != steps[-1] + 1:
         raise MeasurementError("recorder: it was not restarted, or rows are missing")
     peer, note = Peer(IMPORT, imported_s(MODULES["recorder"])), "nothing is missing from the record"
-    yield Row("recorder killed: until another records", run.back_s - at_s, "s", peer, note=note)
+    yield Row("recorder killed: until another records", back_s[0] - run.ended_s, "s", peer, note=note)
     for role in ("plant", "sensor", "netem", "controller", "recorder"):
-        runs = [faulted(role, stop) for _ in range(ROUNDS)]
-        late_ms = median(1e3 * run_recovery_s(run.record, end_s) for run, end_s in runs)
+        late_ms = median(run_recovery_ms(stop(role)) for _ in range(ROUNDS))
         yield Row(f"{role} stopped for {STOPPED_S:g} s: last late step", late_ms, "ms")
 
 
@@ -208,6 +209,8 @@ FLOOD_S = 2.0
 MARGIN_S = 0.1
 """Omitted at both ends of a flood: its time in the run is known to this accuracy."""
 LOOP_HZ = 500.0
+_SEGMENTS, _SENDERS, _LONGEST_SLEEP_S = 64, 4, 0.01
+_UDP_SEGMENT = 103
 
 
 class Case(NamedTuple):
@@ -227,61 +230,67 @@ CASES = (
     Case("limit, all", LOOP_ROLES, 0),
     Case("limit, all, no real-time", LOOP_ROLES, 0, asked=False),
 )
-_FIGURES = {
-    "the flood": "datagrams/s",
-    "measurements missed": "",
-    "the loop's datagrams lost": "",
-    "lateness before, p99": "µs",
-    "lateness during, p99": "µs",
-    "last late step after the end": "ms",
-}
-"""The figures of a flood with their units."""
 
 
-def figures_of(run: FaultedRun[Flood]) -> Figures:
-    """Return the effects of a flood on a run.
+def flood(ports: Sequence[int], rate_hz: float) -> int:
+    """Send state updates of another run to ports in turn; return their number.
+
+    They are sent from several ports in turn. At a rate of 0 they are sent as fast as possible, up
+    to 64 with one call (UDP_SEGMENT).
+    """
+    encoder = Encoder(int.from_bytes(os.urandom(8), "little"), os.urandom(KEY_BYTES))
+    data = encoder.encode(Message(Flow.UPDATE, 0, 0, np.zeros(4)))
+    count = 1 if rate_hz else _SEGMENTS
+    control = [(socket.IPPROTO_UDP, _UDP_SEGMENT, struct.pack("=H", len(data)))] if count > 1 else []
+    targets, sent, begun_s = itertools.cycle((LOOPBACK, port) for port in ports), 0, time.monotonic()
+    with ExitStack() as stack:
+        senders = [stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(_SENDERS)]
+        for sender, target in zip(itertools.cycle(senders), targets, strict=False):
+            sender.sendmsg([data * count], control, 0, target)
+            sent += count
+            while (passed_s := time.monotonic() - begun_s) < FLOOD_S and sent > rate_hz * passed_s > 0:
+                time.sleep(min(_LONGEST_SLEEP_S, 1 / rate_hz))
+            if passed_s >= FLOOD_S:
+                break
+    return sent
+
+
+def flood_rows(case: Case) -> Iterator[Row]:
+    """Yield the effects of a flood on a run.
 
     Measurements missed did not reach the sensor. Lost are all datagrams of the loop that were lost
     outside the emulator. Lateness is that of the process with the largest value.
     """
-    record, flood = run.record, run.outcome
-    begin_s, end_s = flood.begun_s - run.epoch_s, flood.ended_s - run.epoch_s
+    sent = 0
+
+    def act(processes: Mapping[str, psutil.Process]) -> None:
+        nonlocal sent
+        sent = flood([udp_port(processes[role]) for role in case.roles], case.rate_hz)
+
+    settings = ["horizon_s=8", f"realtime.enabled={str(case.asked).lower()}"]
+    run = faulted_run(case.name, settings, act)
     before, during = [], []
     for role, table in STEPS.items():
-        late_us, now_s = lateness_us(record, role), record[table]["now_ns"] * 1e-9
-        inside = (now_s > begin_s + MARGIN_S) & (now_s < end_s - MARGIN_S)
-        before.append(np.quantile(late_us[now_s < begin_s - MARGIN_S], 0.99))
-        during.append(np.quantile(late_us[inside], 0.99) if inside.any() else np.inf)
-    sent = record[PLANT_STEP]["sequence"] // record.scenario.plant.measure_every
-    missed = np.setdiff1d(sent, record[SENSOR_MEASUREMENT]["sequence"]).size
-    values = (
-        flood.rate_hz,
-        missed,
-        run.summary["unintended_losses"],
-        float(max(before)),
-        float(max(during)),
-        1e3 * run_recovery_s(record, end_s),
-    )
-    return dict(zip(_FIGURES, values, strict=True))
+        late_us, now_s = lateness_us(run.record, role), run.record[table]["now_ns"] * 1e-9
+        inside = (now_s > run.begun_s + MARGIN_S) & (now_s < run.ended_s - MARGIN_S)
+        before.append(float(np.quantile(late_us[now_s < run.begun_s - MARGIN_S], 0.99)))
+        during.append(float(np.quantile(late_us[inside], 0.99)) if inside.any() else np.inf)
+    measured = run.record[PLANT_STEP]["sequence"] // run.record.scenario.plant.measure_every
+    missed = np.setdiff1d(measured, run.record[SENSOR_MEASUREMENT]["sequence"]).size
+    yield Row(f"{case.name}: the flood", sent / (run.ended_s - run.begun_s), "datagrams/s")
+    yield Row(f"{case.name}: measurements missed", missed, "")
+    yield Row(f"{case.name}: the loop's datagrams lost", run.summary.unintended_losses, "")
+    yield Row(f"{case.name}: lateness before, p99", max(before), "µs")
+    yield Row(f"{case.name}: lateness during, p99", max(during), "µs")
+    yield Row(f"{case.name}: last late step after the end", run_recovery_ms(run), "ms")
 
 
 @benchmark("flood", "A run under floods")
 def floods(options: argparse.Namespace) -> Iterator[Row]:
     """Flood runs at speed 1, whose processes have a kernel socket for each peer.
 
-    In the middle of a run of the paper's example, another process sends datagrams of another run to
-    one port or to all: at five times the loop's rate, and as fast as possible.
+    In the middle of a run of the paper's example, the launcher's process sends datagrams of another
+    run to one port or to all: at five times the loop's rate, and as fast as possible.
     """
     for case in CASES:
-        say(case.name)
-
-        def flood(processes: Processes, case: Case = case) -> Flood:
-            ports = [udp_port(processes[role]) for role in case.roles]
-            program = [sys.executable, "-m", "benchmarks.flood_sender"]
-            program += map(str, (FLOOD_S, case.rate_hz, *ports))
-            done = subprocess.run(program, stdout=subprocess.PIPE, text=True, check=True)
-            return Flood(**json.loads(done.stdout))
-
-        settings = ["horizon_s=8", f"realtime.enabled={str(case.asked).lower()}"]
-        for name, value in figures_of(faulted_run(case.name, settings, flood)).items():
-            yield Row(f"{case.name}: {name}", value, _FIGURES[name])
+        yield from flood_rows(case)

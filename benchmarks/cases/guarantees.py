@@ -1,15 +1,14 @@
 """What is guaranteed: losses over very many decisions, and certificates beside attacks."""
 
 import argparse
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import Goal, Row, benchmark, compared, say
+from benchmarks.report import Goal, Peer, Row, benchmark, option, say
 from cosim.analysis.adversary import Objective, Worst, conditions_of, find_worst
 from cosim.cli import find_scenario
 from netem.link_state import LinkState
@@ -21,7 +20,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.certificates.weight import choose_weight
-from tests.oracles.receiver import Limits, Outcomes, longest_burst, outcomes_of, violations
+from tests.oracles.receiver import Limits, longest_burst, outcomes_of, violations
 
 DECISIONS = 100_000_000
 _BATCH = 1_000_000
@@ -33,14 +32,6 @@ COMBINATIONS: Mapping[str, Limits] = {
     "mansd 4 recover 3": Limits(((4, 5),), 3),
     "mansd 2 atmost 3 in 10 recover 2": Limits(((2, 3), (3, 10)), 2),
 }
-EXPECTED = (
-    "loss 50% mansd 4",
-    "loss 30% keep mansd 2",
-    "loss 20% keep atmost 3 in 10 recover 2",
-    "loss 20% 50% keep mansd 3 atmost 3 in 10 corrupt 5%",
-)
-COST_ROUNDS = 30
-_COSTED = 200_000
 CAP = 3
 _LOSS, _DELAY = "loss 30%", "delay 10ms 10ms distribution normal reorder 10% limit 1000000"
 _SPACING_NS = 2_000_000
@@ -51,49 +42,25 @@ class Decider:
 
     def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
         self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
-        columns = np.zeros(_BATCH, np.int64), np.full(_BATCH, 72), np.arange(_BATCH) * spacing_ns
-        self._columns = columns
+        self._columns = np.zeros(_BATCH, np.int64), np.full(_BATCH, 72), np.arange(_BATCH) * spacing_ns
 
-    def decide(self, count: int = _BATCH) -> NDArray[Any]:
-        """Return the decisions for the first datagrams of the next flow."""
+    def decide(self) -> NDArray[Any]:
+        """Return the decisions for the datagrams of the next flow."""
         self._link.start_flow(0, self._flow)
         self._link.core.in_flight = 0
         self._flow += 1
-        return self._link.decide_many(*(column[:count] for column in self._columns))
-
-    def outcomes(self, count: int) -> list[Outcomes]:
-        """Return which datagrams are lost, of several flows."""
-        return [outcomes_of(self.decide()) for _ in range(count // _BATCH)]
-
-    def cost(self) -> Callable[[], float]:
-        """Return what measures nanoseconds per decision."""
-
-        def measured() -> float:
-            begun_ns = time.perf_counter_ns()
-            self.decide(_COSTED)
-            return (time.perf_counter_ns() - begun_ns) / _COSTED
-
-        measured()
-        return measured
+        return self._link.decide_many(*self._columns)
 
 
-def check_row(words: str, limits: Limits, count: int) -> Row:
-    """Return the violations in a number of decisions."""
+def check_rows(words: str, limits: Limits, count: int) -> Iterator[Row]:
+    """Yield the violations in a number of decisions; and the loss rate, if it can be predicted."""
     say(f"{count:,} decisions, {words}")
-    flows = Decider(f"{words} limit 1000000").outcomes(count)
-    note = f"{count:,} decisions, {np.mean(flows):.2%} lost"
-    count = sum(violations(lost, limits) for lost in flows)
-    return Row(f"{words}: violations", count, "", goal=Goal("==", 0), note=note)
-
-
-def expected_row(words: str, count: int) -> Row:
-    """Return the realised loss rate beside the expected one, which may be asked for (keep)."""
-    say(f"{count:,} decisions, {words}")
-    share = float(np.mean(Decider(words).outcomes(count)))
-    expected = expected_loss(settings_of(words)).rate or 0.0
-    note = f"{count:,} decisions: {share:.4%} lost, {expected:.4%} expected"
-    error = 100 * abs(share - expected)
-    return Row(f"{words}: error", error, "% of all", goal=Goal("<=", 0.1), note=note)
+    decider = Decider(f"{words} limit 1000000")
+    flows = [outcomes_of(decider.decide()) for _ in range(count // _BATCH)]
+    number = sum(violations(lost, limits) for lost in flows)
+    yield Row(f"{words}: violations", number, "", goal=Goal("==", 0), note=f"{count:,} decisions")
+    if "delay" not in words and (expected := expected_loss(settings_of(words)).rate):
+        yield Row(f"{words}: lost", 100 * float(np.mean(flows)), "%", Peer("predicted", 100 * expected))
 
 
 def network_rows() -> Iterator[Row]:
@@ -121,37 +88,21 @@ def network_rows() -> Iterator[Row]:
 
 @benchmark("guarantee", "Emulator: the guarantee over many decisions")
 def guarantee(options: argparse.Namespace) -> Iterator[Row]:
-    """Measure costs and networks, then violations, then loss rates, over very many decisions.
+    """Measure networks, then violations and loss rates over very many decisions.
 
     Each combination is decided by the core, a million datagrams per flow. A check that uses nothing
     of netem counts violations at the receiver: outcomes come from the times at which intact
-    datagrams leave. Costs alternate with those of the plain cap that allows as many consecutive
-    losses.
+    datagrams leave.
 
     A reordering network is compared without a cap, with a cap on drops only, and with the
     guarantee. A cap on drops only forces a datagram after m drops, and leaves the delays as they
     are, as the loss models of quic-network-simulator and Rattan do. A datagram counts as lost if it
     is dropped, or if a later one arrives before it.
     """
-    for before in ("loss 50%", f"loss 50% {REORDERING}"):
-        for words in COMBINATIONS:
-            cap = f"mansd {settings_of(words).longest_burst}"
-            if words != cap:
-                ours, plain = (Decider(f"{before} {text} limit 1000000").cost() for text in (words, cap))
-                yield compared(
-                    f"{before} {words}: decision",
-                    "ns",
-                    ours,
-                    (f"{before} {cap}", plain),
-                    Goal("<=", 1.3),
-                    rounds=COST_ROUNDS,
-                )
     yield from network_rows()
     for words, limits in COMBINATIONS.items():
         for before in ("loss 50%", f"loss 30% {REORDERING}"):
-            yield check_row(f"{before} {words}", limits, DECISIONS)
-    for words in EXPECTED:
-        yield expected_row(words, DECISIONS // 5)
+            yield from check_rows(f"{before} {words}", limits, DECISIONS)
 
 
 LOOPS = ("lane_following", "double_integrator", "unstable_pendulum", "f16_lateral")
@@ -243,8 +194,8 @@ def row_of(name: str, worst: Worst) -> Row:
     {
         "--loop": {"action": "append", "choices": LOOPS, "help": "tightness: only this loop"},
         "--policy": {"action": "append", "help": "tightness: only this policy"},
-        "--search-s": {"type": float, "default": 5.0, "help": "tightness: horizon in s"},
-        "--norm": {"choices": ("chosen", "identity"), "default": "chosen", "help": "tightness: the norm"},
+        "--search-s": option(5.0, "tightness: horizon in s"),
+        "--norm": option("chosen", "tightness: the norm", choices=("chosen", "identity")),
     },
 )
 def tightness(options: argparse.Namespace) -> Iterator[Row]:

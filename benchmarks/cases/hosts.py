@@ -1,104 +1,54 @@
 """Two hosts: the bound of the offset between their clocks, and the loop across them.
 
-The hosts are network namespaces with time namespaces, which a veth link connects: their monotonic
-clocks differ by a second, exactly, and the client's has an added drift, so that the true offset is
-known at any time. ``python -m benchmarks.cases.hosts END EXCHANGE`` is one end of an exchange of
-timestamps (:class:`Exchange`, as JSON). The reference prints its port and answers until its
-standard input closes. The client compares its clock with the reference's and prints its figures as
-JSON; errors are those after the first half second. Both ends of a bare exchange are what a plain
-NTP client and server do: no authentication, timestamps of the program, and the newest midpoint as
-the offset, without a bound (RFC 5905).
+The hosts are network namespaces, which a veth link connects. For the bound, one end of an exchange
+of timestamps runs on each: a reference, and a client whose monotonic clock is a second ahead or
+behind, exactly, and drifts, so that the true offset is known at any time. Errors are those after
+the first half second. Both ends of a bare exchange are what a plain NTP client and server do: no
+authentication, timestamps of the program, and the newest midpoint as the offset, without a bound
+(RFC 5905).
 """
 
 import argparse
-import json
 import select
 import socket
 import struct
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from functools import partial
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from benchmarks.programs import FREE_PORTS, TwoHosts, two_hosts
-from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, say
+from benchmarks.programs import in_new_process
+from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, quantiles_us, say
 from noack.runtime.address import Address
-from noack.runtime.host_clocks.clock_offset import ClockOffset, Restart
-from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient, TimeReference, answering
+from noack.runtime.host_clocks.clock_offset import ClockOffset
+from noack.runtime.host_clocks.time_exchange import TimeClient, TimeReference, answering
 from noack.runtime.real_time_loop import realtime
-from tests.integration.conftest import starting
-
-
-class DrivenClocks(HostClocks):
-    """The clocks of this host, with an added offset and drift of the monotonic clock.
-
-    Kernel stamps and the real-time clock have the same drift, as the clocks of a real host have.
-    """
-
-    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0) -> None:
-        self._begin_ns = super().monotonic_ns()
-        self._real_begin_ns = super().realtime_ns()
-        self._offset_ns = offset_ns
-        self._drift_ppb = drift_ppb
-
-    def added_ns(self, true_ns: int) -> int:
-        """What is added to the monotonic clock at its own reading ``true_ns``."""
-        return self._offset_ns + self._drift_ppb * (true_ns - self._begin_ns) // 10**9
-
-    def monotonic_ns(self) -> int:
-        """The monotonic clock, with offset and drift."""
-        true_ns = super().monotonic_ns()
-        return true_ns + self.added_ns(true_ns)
-
-    def realtime_ns(self) -> int:
-        """The real-time clock, with the drift."""
-        return self._drifted(super().realtime_ns())
-
-    def stamp_ns(self, stamp: bytes) -> int:
-        """The time of a kernel stamp, with the drift."""
-        return self._drifted(super().stamp_ns(stamp))
-
-    def _drifted(self, real_ns: int) -> int:
-        return real_ns + self._drift_ppb * (real_ns - self._real_begin_ns) // 10**9
-
+from tests.attacks.attacked import Run
+from tests.attacks.kinds import enter_namespace
+from tests.two_hosts import DrivenClocks, TwoHosts, two_hosts
 
 KEY = bytes(range(32))
 CHECKS_AT_ONCE = 25
 _PRIORITY = 40
 _WAKE_S = 0.001
-_START_NS = 500_000_000
+_START_NS, _LENGTH_NS = 500_000_000, 6_000_000_000
 _PACKET = struct.Struct("<qqq24x")  # 48 bytes, as NTP's
 
 
-class Bare:
-    """An end of a plain NTP exchange; the client takes the newest midpoint for the offset."""
+class BareReference:
+    """The answering end of a plain NTP exchange."""
 
-    def __init__(self, at: Address, clocks: DrivenClocks | None = None) -> None:
-        self._clocks = clocks
-        self._endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.midpoint_ns: int | None = None
-        if clocks is None:  # the reference
-            self._endpoint.bind(at)
-        else:
-            self._endpoint.connect(at)
-            self._endpoint.setblocking(False)
-
-    @property
-    def address(self) -> Address:
-        """Its own address."""
-        name: Address = self._endpoint.getsockname()
-        return name
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait for."""
-        return self._endpoint.fileno()
+    def __init__(self, at: Address) -> None:
+        self._endpoint = socket.socket(type=socket.SOCK_DGRAM)
+        self._endpoint.bind(at)
+        self.address: Address = self._endpoint.getsockname()
+        self.fileno, self.close = self._endpoint.fileno, self._endpoint.close
 
     def answer_all(self) -> None:
         """Answer the waiting request."""
@@ -107,171 +57,132 @@ class Bare:
         sent_ns = _PACKET.unpack(data)[0]
         self._endpoint.sendto(_PACKET.pack(sent_ns, received_ns, time.monotonic_ns()), source)
 
-    def poll(self) -> list[Restart]:
+
+class BareClient:
+    """The asking end of a plain NTP exchange, which takes the newest midpoint for the offset."""
+
+    def __init__(self, to: Address, clocks: DrivenClocks) -> None:
+        self._clocks = clocks
+        self._endpoint = socket.socket(type=socket.SOCK_DGRAM)
+        self._endpoint.connect(to)
+        self._endpoint.setblocking(False)
+        self.midpoint_ns: int | None = None
+        self.fileno, self.close = self._endpoint.fileno, self._endpoint.close
+
+    def poll(self) -> None:
         """Take the answer, or send a request if there is none."""
-        assert self._clocks is not None
         try:
             data = self._endpoint.recv(100)
         except BlockingIOError:
             self._endpoint.send(_PACKET.pack(self._clocks.monotonic_ns(), 0, 0))
-            return []
+            return
         now_ns = self._clocks.monotonic_ns()
         sent_ns, there_ns, answered_ns = _PACKET.unpack(data)
         self.midpoint_ns = (there_ns - sent_ns + answered_ns - now_ns) // 2
-        return []
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._endpoint.close()
 
 
-class Exchange(NamedTuple):
-    """What one end does; what follows the port concerns the client."""
+class Case(NamedTuple):
+    """A setting of the client and of the reference, and the goal of the bound's error."""
 
-    host: str
-    """Address of the reference."""
-    bare: bool = False
+    name: str
+    goal: Goal | None = None
+    period_s: float = 0.02
+    late: bool = False
+    """Whether the client reads replies once a period only."""
+    rate_ppb: int = ClockOffset().rate_ppb
     answer_every_s: float = 0.0
     """The reference answers so often; 0: at once."""
-    port: int = 0
-    ahead_ns: int = 0
-    """The reference's clock minus this host's."""
-    drift_ppb: int = 0
-    rate_ppb: int = ClockOffset().rate_ppb
-    period_s: float = 0.02
-    seconds: float = 2.0
-    late: bool = False
-    """Whether it reads replies once a period only."""
 
 
-def run_reference(options: Exchange) -> None:
-    """Answer until the standard input closes."""
-    listen = (options.host, 0)
-    end = Bare(listen) if options.bare else TimeReference(listen, KEY)
-    with closing(end):
-        print(end.address[1], flush=True)
-        if isinstance(end, TimeReference) and not options.answer_every_s:
+class Clock(NamedTuple):
+    """The client's clock."""
+
+    ahead_ns: int
+    drift_ppb: int
+
+
+def answer(hosts: TwoHosts, case: Case, bare: bool, parent: Connection) -> None:
+    """Send the port to the parent, and answer until it closes its end."""
+    enter_namespace(hosts.names[0])
+    listen = (hosts.addresses[0][0], 0)
+    end = BareReference(listen) if bare else TimeReference(listen, KEY)
+    with closing(end), realtime(True, _PRIORITY):
+        parent.send(end.address[1])
+        if isinstance(end, TimeReference) and not case.answer_every_s:
             with answering(end):
-                sys.stdin.read()
+                parent.poll(None)
             return
-        while not select.select([sys.stdin], (), (), options.answer_every_s)[0]:
-            while select.select([end], (), (), 0 if options.answer_every_s else 0.1)[0]:
+        while not parent.poll(case.answer_every_s):
+            while select.select([end], (), (), 0 if case.answer_every_s else 0.1)[0]:
                 end.answer_all()
 
 
-def run_client(options: Exchange) -> None:
-    """Check the bound against the true offset for a time; print the figures."""
-    clocks = DrivenClocks(0, options.drift_ppb)
-    address = (options.host, options.port)
-    offset = ClockOffset(options.rate_ppb)
-    period_ns = round(options.period_s * 1e9)
-    bare = Bare(address, clocks) if options.bare else None
+def ask(hosts: TwoHosts, case: Case, plain: bool, port: int, clock: Clock) -> Figures:
+    """Check the bound against the true offset for a time; return the figures."""
+    enter_namespace(hosts.names[1])
+    clocks, address = DrivenClocks(*clock), (hosts.addresses[0][0], port)
+    offset, period_ns = ClockOffset(case.rate_ppb), round(case.period_s * 1e9)
+    bare = BareClient(address, clocks) if plain else None
     client = bare or TimeClient(address, KEY, offset, period_ns=period_ns, clocks=clocks)
     errors_ns, estimates_ns = list[int](), list[int]()
-    checks = outside = restarts = 0
+    checks = outside = turns = cpu_ns = due_ns = 0
     steady_ns = time.monotonic_ns() + _START_NS
-    end_ns = steady_ns + round(options.seconds * 1e9)
-    due_ns, turns, cpu_ns = 0, 0, 0
-    with closing(client):
+    end_ns = steady_ns + _LENGTH_NS
+    with closing(client), realtime(True, _PRIORITY):
         while (now_ns := time.monotonic_ns()) < end_ns:
             is_due = now_ns >= due_ns
             readable, _, _ = select.select([client], (), (), 0 if is_due else _WAKE_S)
-            if is_due or (readable and not options.late):
+            if is_due or (readable and not case.late):
                 begin_ns = time.thread_time_ns()
-                restarts += len(client.poll())
+                client.poll()
                 cpu_ns += time.thread_time_ns() - begin_ns
             if is_due:
                 due_ns, turns = max(due_ns, now_ns - period_ns) + period_ns, turns + 1
             for _ in range(CHECKS_AT_ONCE):
                 true_ns = time.monotonic_ns()
                 added_ns = clocks.added_ns(true_ns)
-                truth_ns = options.ahead_ns - added_ns
                 bounds = offset.interval(true_ns + added_ns)
-                estimate_ns = bare.midpoint_ns if bare else bounds and bounds.midpoint_ns
                 if bounds is not None:
                     checks += 1
-                    outside += not bounds.lower_ns <= truth_ns <= bounds.upper_ns
-                if estimate_ns is not None and true_ns > steady_ns:
-                    estimates_ns.append(abs(estimate_ns - truth_ns))
-                    if bounds is not None:
+                    outside += not bounds.lower_ns <= -added_ns <= bounds.upper_ns
+                    if true_ns > steady_ns:
                         errors_ns.append(bounds.error_ns)
-    figures = {
-        "checks": checks,
-        "outside": outside,
-        "restarts": restarts,
-        "turns": turns,
-        "exchanges": offset.exchanges,
-        "cpu_us": cpu_ns / 1e3 / max(turns, 1),
-    }
-    print(json.dumps(figures | _quantiles("error", errors_ns) | _quantiles("estimate", estimates_ns)))
+                estimate_ns = bare.midpoint_ns if bare else bounds and bounds.midpoint_ns
+                if estimate_ns is not None and true_ns > steady_ns:
+                    estimates_ns.append(abs(estimate_ns + added_ns))
+    figures = {"checks": checks, "outside": outside, "cpu_us": cpu_ns / 1e3 / max(turns, 1)}
+    for name, values_ns in (("error", errors_ns), ("estimate", estimates_ns)):
+        if values_ns:
+            figures |= {f"{name}_{quantile}": us for quantile, us in quantiles_us(values_ns).items()}
+    return figures
 
 
-def _quantiles(name: str, values_ns: Sequence[int]) -> dict[str, float]:
-    if not values_ns:
-        return {}
-    p50, p99, most = np.quantile(np.array(values_ns), (0.5, 0.99, 1)) / 1e3
-    return {f"{name}_p50_us": p50, f"{name}_p99_us": p99, f"{name}_max_us": most}
-
-
-def main() -> None:
-    """Run one end of an exchange."""
-    _, end, options = sys.argv
-    exchange = Exchange(**json.loads(options))
-    with realtime(True, _PRIORITY):
-        {"reference": run_reference, "client": run_client}[end](exchange)
+def measured(hosts: TwoHosts, clock: Clock, case: Case, *, bare: bool = False) -> Figures:
+    """Run a reference and a client on two hosts; return the client's figures."""
+    context = get_context("spawn")
+    own, other = context.Pipe()
+    reference = context.Process(target=answer, args=(hosts, case, bare, other))
+    reference.start()
+    other.close()
+    with own:
+        try:
+            port = own.recv()
+        except EOFError:
+            raise MeasurementError("the reference did not start") from None
+        figures = in_new_process(ask, hosts, case, bare, port, clock)
+    reference.join()
+    return figures
 
 
 OURS, BARE = "noack", "plain NTP midpoint, no bound"
-SECONDS = 6.0
-_DEFAULT_ERROR = Goal("<=", 50)
-
-
-class Case(NamedTuple):
-    """A setting of the client and of the reference, and the names of its figures."""
-
-    name: str
-    settings: Mapping[str, float] = {}
-    """Fields of :class:`Exchange`."""
-    goal: Goal | None = None
-
-
-MAIN = Case("20 ms, replies read at once", goal=_DEFAULT_ERROR)
-_LATE = {"period_s": 0.05, "late": True}
+MAIN = Case("20 ms, replies read at once", Goal("<=", 50))
 CASES = (
-    Case("50 ms, replies read at once", {"period_s": 0.05}),
-    Case("50 ms, replies read 50 ms later", _LATE),
-    Case("50 ms, replies read 50 ms later, ρ = 201 ppm", _LATE | {"rate_ppb": 201_000}, _DEFAULT_ERROR),
-    Case("20 ms, reference answers every 50 ms", {"answer_every_s": 0.05}),
+    Case("50 ms, replies read at once", period_s=0.05),
+    Case("50 ms, replies read 50 ms later", period_s=0.05, late=True),
+    Case("50 ms, replies read 50 ms later, ρ = 201 ppm", Goal("<=", 50), 0.05, True, 201_000),
+    Case("20 ms, reference answers every 50 ms", answer_every_s=0.05),
 )
-CLOCKS = [(ahead_s, drift_ppb) for ahead_s in (1, -1) for drift_ppb in (100_000, -100_000)]
-"""Seconds by which the client's clock is ahead, and its drift."""
-
-
-def measured(hosts: TwoHosts, ahead_s: int, drift_ppb: int, case: Case, *, bare: bool = False) -> Figures:
-    """Run a reference and a client on two hosts; return the client's figures."""
-    own = Exchange(
-        hosts.addresses[0][0], bare, ahead_ns=-ahead_s * 10**9, drift_ppb=drift_ppb, seconds=SECONDS
-    )
-
-    def command(end: str, port: int = 0) -> list[str]:
-        content = json.dumps(own._asdict() | {"port": port, **case.settings})
-        is_client = end == "client"
-        program = (sys.executable, "-m", "benchmarks.cases.hosts", end, content)
-        return hosts.inside(is_client, *program, monotonic_s=ahead_s * is_client)
-
-    with subprocess.Popen(
-        command("reference"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as reference:
-        assert reference.stdout is not None
-        port = reference.stdout.readline().strip()
-        if not port:
-            raise MeasurementError("the reference did not start")
-        client = subprocess.run(command("client", int(port)), capture_output=True, text=True, check=False)
-        reference.communicate()
-    if client.returncode:
-        raise MeasurementError(f"the client failed: {client.stderr.strip().splitlines()[-1:]}")
-    figures: Figures = json.loads(client.stdout)
-    return figures
+CLOCKS = [Clock(ahead_s * 10**9, drift) for ahead_s in (1, -1) for drift in (100_000, -100_000)]
 
 
 @benchmark("clock_offset_bound", "Bound of the offset between two clocks")
@@ -283,25 +194,25 @@ def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
     """
     rounds, alternatives = Rounds(), [(case, Rounds()) for case in CASES]
     with two_hosts() as hosts:
-        for ahead_s, drift_ppb in CLOCKS:
-            say(f"client {ahead_s:+} s, {drift_ppb / 1000:+.0f} ppm")
-            rounds.add(BARE, measured(hosts, ahead_s, drift_ppb, MAIN, bare=True))
-            rounds.add(OURS, measured(hosts, ahead_s, drift_ppb, MAIN))
+        for clock in CLOCKS:
+            say(f"client {clock.ahead_ns / 1e9:+.0f} s, {clock.drift_ppb / 1000:+.0f} ppm")
+            rounds.add(BARE, measured(hosts, clock, MAIN, bare=True))
+            rounds.add(OURS, measured(hosts, clock, MAIN))
         for case, own in alternatives:
             say(case.name)
-            own.add(OURS, measured(hosts, *CLOCKS[0], case))
+            own.add(OURS, measured(hosts, CLOCKS[0], case))
     cases = [(MAIN, rounds), *alternatives]
     checks, outside = (sum(sum(own.of(OURS, name)) for _, own in cases) for name in ("checks", "outside"))
     yield Row("checks of the bound against the true offset", checks, "", goal=Goal(">=", 1e5))
     yield Row("true offset outside the bound", outside, "", goal=Goal("==", 0))
     for case, own in cases:
-        note = f"largest: {max(own.of(OURS, 'error_max_us')):.0f} µs"
+        note = f"largest: {max(own.of(OURS, 'error_max')):.0f} µs"
         for q in ("p50", "p99"):
             name = f"error bound, {q}, {case.name}"
-            yield own.row(name, "µs", f"error_{q}_us", OURS, goal=case.goal, note=note)
+            yield own.row(name, "µs", f"error_{q}", OURS, goal=case.goal, note=note)
     for quantity, name in (
-        ("estimate_p50_us", "error of the estimate, p50"),
-        ("estimate_p99_us", "error of the estimate, p99"),
+        ("estimate_p50", "error of the estimate, p50"),
+        ("estimate_p99", "error of the estimate, p99"),
         ("cpu_us", "client's CPU per 20 ms"),
     ):
         yield rounds.row(name, "µs", quantity, OURS, BARE)
@@ -309,30 +220,17 @@ def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
 
 ROUNDS = 3
 ACROSS, ON_LOOPBACK = "noack across a veth link", "noack on loopback"
-_PATIENCE_S = 120.0
 _CHANGES = ("horizon_s=10", "trigger.beta=1e-9", 'network.loss={model="lossless"}')
-_SETTINGS = (*FREE_PORTS, *(word for change in _CHANGES for word in ("--set", change)), "--no-report")
 
 
 def run_by_hand(hosts: TwoHosts | None) -> Figures:
     """Return the latency of a run with the controller on the second host, or all on this one."""
-    with tempfile.TemporaryDirectory() as name, starting() as begin:
-
-        def start(host: int, *arguments: str) -> subprocess.Popen[str]:
-            before = () if hosts is None else hosts.inside(host)
-            return begin(*arguments, before=before, runtime=Path(name), cwd=Path(name))
-
-        listen = () if hosts is None else ("--listen", hosts.addresses[0][0])
-        invited = () if hosts is None else ("--invitation", "invitation.json")
-        recording = start(0, "record", "lane_following", "--json", *listen, *_SETTINGS)
-        joining = [start(0, role) for role in ("plant", "sensor", "netem")]
-        joining.append(start(1, "controller", *invited))
-        stdout, stderr = recording.communicate(timeout=_PATIENCE_S)
-        for process in joining:
-            stderr += process.communicate(timeout=_PATIENCE_S)[1]
-        if any(process.returncode for process in (recording, *joining)):
-            raise MeasurementError(stderr.strip().splitlines()[-1])
-    latency_us = json.loads(stdout)["loops"][0]["latency_us"]
+    settings = (word for change in _CHANGES for word in ("--set", change))
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        run = Run(stack, Path(folder), hosts, *settings).finish(Counter())
+    if run.status:
+        raise MeasurementError(run.stderr.strip().splitlines()[-1])
+    latency_us = run.summary["loops"][0]["latency_us"]
     return {key: latency_us[key] for key in ("p50", "p99", "updates")}
 
 
@@ -351,7 +249,3 @@ def across_hosts(options: argparse.Namespace) -> Iterator[Row]:
     for quantile in ("p50", "p99"):
         yield rounds.row(f"event → update, {quantile}", "µs", quantile, ACROSS, ON_LOOPBACK,
                          Goal("<=", 1.5), note=note, paired=True)  # fmt: skip
-
-
-if __name__ == "__main__":
-    main()

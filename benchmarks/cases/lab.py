@@ -14,11 +14,12 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from benchmarks.programs import FREE_PORTS, noack
-from benchmarks.report import Goal, MeasurementError, Rounds, Row, benchmark, median, say
+from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, median, say
 from tests.cosim.lab.conftest import TEXT, Page, Served
 from tools.screenshot_recording import BROWSERS, EMULATED_CARD, Browser
 
@@ -37,49 +38,7 @@ _BOX = f"""(slider => {{
   const r = slider.getBoundingClientRect();
   return [r.x, r.y + r.height / 2, r.width];
 }})({_DRAGGED})"""
-_NOTE_STROKES = """
-window.STROKES = [];
-let movedAt = 0;
-const NOTE = event => { movedAt = event.timeStamp; };
-addEventListener("pointermove", NOTE, true);
-const notePainted = at => requestAnimationFrame(() => {
-  const painted = new MessageChannel();  // a message follows when the frame has been painted
-  painted.port1.onmessage = () => STROKES.push(performance.now() - at);
-  painted.port2.postMessage(0);
-});
-const show = LabFigure.prototype.show;
-LabFigure.prototype.show = function (content) {
-  show.call(this, content);
-  if (movedAt) notePainted(movedAt);
-  movedAt = 0;
-};
-0
-"""
-_DRAW_ALONE = """
-removeEventListener("pointermove", NOTE, true);
-STROKES.length = 0;
-const canvases = [...document.querySelectorAll("#lab-figure canvas")].map(one => {
-  const made = document.createElement("canvas");
-  [made.width, made.height] = [one.width, one.height];
-  return made;
-});
-const pens = canvases.map(one => one.getContext("2d", {willReadFrequently: true}));
-document.body.replaceChildren(...canvases);
-let moved = 0;
-addEventListener("pointermove", event => {
-  pens.forEach((pen, i) => {
-    const {width, height} = canvases[i];
-    pen.clearRect(0, 0, width, height);
-    pen.beginPath();
-    for (let x = 0; x < width; x++) pen.lineTo(x, (0.5 + 0.4 * Math.sin(x / 90 + moved)) * height);
-    pen.stroke();
-  });
-  moved++;
-  notePainted(event.timeStamp);
-});
-0
-"""
-"""Leaves only the canvases on the page, each with a curve that moves with the mouse."""
+_NOTE_STROKES = Path(__file__).parents[1] / "strokes.js"
 
 
 @contextmanager
@@ -89,13 +48,10 @@ def _opened(folder: Path, *settings: str, card: tuple[str, ...] = EMULATED_CARD)
     if program is None:
         raise MeasurementError("no Chromium or Chrome")
     browser = Browser(program, str(folder / "profile"), card)
-    try:
-        with closing(browser), Served(folder, "lane_following", *settings, *FREE_PORTS) as server:
-            page = Page(browser, server.address)
-            page.wait(f"{TEXT}.includes('certified')")
-            yield page
-    except AssertionError as error:  # of the tests' page
-        raise MeasurementError(f"the page: {error}") from None
+    with closing(browser), Served(folder, "lane_following", *settings, *FREE_PORTS) as server:
+        page = Page(browser, server.address)
+        page.wait(f"{TEXT}.includes('certified')")
+        yield page
 
 
 @contextmanager
@@ -119,9 +75,10 @@ def _moving(page: Page) -> Iterator[None]:
         mover.join()
 
 
-def _strokes_ms(page: Page, prepared: str, x: float, y: float, width: float) -> list[float]:
+def _strokes_ms(page: Page) -> list[float]:
     """Drag a slider; return the times from each move to its curve on the screen."""
-    page.js(prepared)
+    x, y, width = page.js(_BOX)
+    page.js(_NOTE_STROKES.read_text())
 
     def mouse(kind: str, share: float) -> None:
         at = x + share * width
@@ -171,8 +128,7 @@ def stroke(options: argparse.Namespace) -> Iterator[Row]:
     """Measure the median time from a move of a dragged slider until its curve is painted.
 
     A frame of the browser is 17 ms. It draws by the processor, as it does without a graphics card;
-    none is emulated, as the viewer would need. Beside it, the time of a page that has only the same
-    canvases, draws a curve in each and asks nobody.
+    none is emulated, as the viewer would need.
     """
     for name, processes, goal_ms in (("idle", 0, 60), (f"{_BUSY} busy processes", _BUSY, 120)):
         say(name)
@@ -181,11 +137,8 @@ def stroke(options: argparse.Namespace) -> Iterator[Row]:
             _opened(Path(folder), "--set", "horizon_s=20", card=()) as page,
             _busy(processes),
         ):
-            box = page.js(_BOX)
-            median_ms = median(_strokes_ms(page, _NOTE_STROKES, *box))
-            alone_ms = median(_strokes_ms(page, _DRAW_ALONE, *box))
+            median_ms = median(_strokes_ms(page))
         yield Row(f"moved slider to painted curve, {name}", median_ms, "ms", goal=Goal("<=", goal_ms))
-        yield Row(f"moved mouse to a curve of the browser alone, {name}", alone_ms, "ms")
 
 
 @benchmark("lab", "A live run while the lab page is open")
@@ -197,14 +150,16 @@ def lab(options: argparse.Namespace) -> Iterator[Row]:
     Without a graphics card the browser draws by the processor, which is the worst case.
     """
     rounds, sides, roles = Rounds(), (ALONE, OPEN, DRAGGED, VIEWED), ("plant", "controller")
-    for i, side in itertools.product(range(ROUNDS), sides):
-        say(f"round {i + 1} of {ROUNDS}: {side}")
+
+    def lateness_us(side: str) -> Figures:
         with tempfile.TemporaryDirectory(prefix="noack-bench-", ignore_cleanup_errors=True) as folder:
             summary = summary_of(side, Path(folder))
         if summary["exit"]["status"] != 0:
             raise MeasurementError(f"the run ended: {summary['exit']['reason']}")
         late = summary["loops"][0]["lateness_us"]
-        rounds.add(side, {role: late[role]["p99"] for role in roles})
+        return {role: late[role]["p99"] for role in roles}
+
+    rounds.in_turn(ROUNDS, {side: partial(lateness_us, side) for side in sides})
     for side, role in itertools.product(sides[1:], roles):
         name = f"{role} lateness, p99, {side}"
         yield rounds.row(name, "µs", role, side, ALONE, Goal("<=", 1.2), paired=True)

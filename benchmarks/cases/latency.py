@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -13,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.programs import PRIORITY, compiled, execute, noack
-from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark
+from benchmarks.programs import PRIORITY, compiled, execute, noack, program_path
+from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, quantiles_us
 
 ROUNDS = 3
 OURS, PING = "noack", "ping and relay in C"
@@ -54,12 +53,12 @@ def ping(program: Callable[[], Path], case: Case, refused: set[str]) -> Figures:
     command = [str(program()), str(count), str(round(case.period_s * 1e9)), str(priority)]
     try:
         done = subprocess.run(command, capture_output=True, timeout=case.round_s + 30, check=True)
-        latencies_us = np.frombuffer(done.stdout, "<i8") / 1e3
-        p50_us, p99_us = np.quantile(latencies_us, [0.5, 0.99]).tolist()
+        latencies_ns = np.frombuffer(done.stdout, "<i8")
+        figures = quantiles_us(latencies_ns)
     except (subprocess.SubprocessError, IndexError):
         raise MeasurementError("the ping through the bare relay did not end") from None
     refused |= {line.partition(":")[0] for line in done.stderr.decode().splitlines()}
-    return {"p50": p50_us, "p99": p99_us, "count": len(latencies_us)}
+    return {**figures, "count": len(latencies_ns)}
 
 
 def updates(case: Case, refused: set[str]) -> Figures:
@@ -110,8 +109,7 @@ def cyclictest(seconds: int = ROUND_S, priority: int = PRIORITY, core: int | Non
         priority: SCHED_FIFO priority.
         core: its core; None: any core.
     """
-    if (program := shutil.which("cyclictest")) is None:
-        raise MeasurementError("cyclictest is not installed (Debian: apt-get install rt-tests)")
+    program = program_path("cyclictest", "rt-tests")
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "cyclictest.json"
         command = [
@@ -124,9 +122,9 @@ def cyclictest(seconds: int = ROUND_S, priority: int = PRIORITY, core: int | Non
             messages = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[0]
             raise MeasurementError(f"cyclictest failed, said {messages!r}")
         thread = json.loads(output.read_text())["thread"]["0"]
-    low_us, counts = np.array([*map(int, thread["histogram"])]), [*thread["histogram"].values()]
-    p50_us, p99_us = np.quantile(np.repeat(low_us + 0.5, counts), (0.5, 0.99)).tolist()
-    return {"p50": p50_us, "p99": p99_us, "max": float(thread["max"])}
+    histogram = thread["histogram"]
+    late_ns = np.repeat([1000 * int(low_us) + 500 for low_us in histogram], [*histogram.values()])
+    return {**quantiles_us(late_ns), "max": float(thread["max"])}
 
 
 def wake_ups() -> Figures:
@@ -135,8 +133,7 @@ def wake_ups() -> Figures:
     lateness = json.loads(execute([sys.executable, "-m", "cosim.doctor.probe", "wake", *numbers]).stdout)
     if (answer := lateness["granted"]["sched_fifo"]) != "applied":
         raise MeasurementError(f"SCHED_FIFO {answer}")
-    p50, p99, most = (np.quantile(lateness["realtime"], (0.5, 0.99, 1)) / 1e3).tolist()
-    return {"p50": p50, "p99": p99, "max": most}
+    return quantiles_us(lateness["realtime"])
 
 
 @benchmark("lateness", "Lateness of a 1 kHz loop")

@@ -2,13 +2,14 @@
 
 import argparse
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, solve_continuous_are
 
-from benchmarks.report import Goal, Row, benchmark, median, say
+from benchmarks.report import Goal, Row, benchmark, median, option, say
 from cosim.cli import find_scenario
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import (
@@ -21,7 +22,7 @@ from noack.impairments.loss_guarantee import (
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
-from noack.theory.margins.loss_margin import LossMargin, Stability, list_bursts
+from noack.theory.margins.loss_margin import LossMargin, list_bursts
 from noack.theory.margins.switched_system import Edge, find_cycle, strongly_connected
 
 GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
@@ -103,38 +104,29 @@ def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:
     return max(find_cycle(part, 30, 200).growth for part in parts)
 
 
-class Examined(NamedTuple):
-    """What was found about a loop."""
-
-    loop: RandomLoop
-    stability: Stability
-    took_s: float
-
-
 @benchmark(
     "margins",
     "Random time-triggered loops: decided margins",
     {
-        "--margin-loops": {"type": int, "default": 200, "help": "margins: number of loops"},
-        "--margin-first": {"type": int, "default": 0, "help": "margins: number of the first loop"},
+        "--margin-loops": option(200, "margins: number of loops"),
+        "--margin-first": option(0, "margins: number of the first loop"),
     },
 )
 def margins(options: argparse.Namespace) -> Iterator[Row]:
     """Bound the growth of random loops as ``noack margin`` does, and count what is undecided."""
-    examined: list[Examined] = []
+    verdicts, times_s = defaultdict[str, list[str]](list), defaultdict[str, list[float]](list)
     for seed in range(options.margin_first, options.margin_first + options.margin_loops):
         loop = random_loop(seed)
         begun_s = time.process_time()
         stability = loop.margin.stability(loop.guarantee)
         took_s = time.process_time() - begun_s
-        examined.append(Examined(loop, stability, took_s))
+        for kind in (loop.kind, "all"):
+            verdicts[kind].append(stability.verdict)
+            times_s[kind].append(took_s)
         bounds = f"{stability.lower:.6f} to {stability.upper:.6f}"
         text = f"growth {loop.growth:.6f}: {stability.verdict}, {bounds}, {took_s:.2f} s"
         say(f"{seed}: {loop.kind}, {text}, {loop.guarantee.meaning}")
-    for kind in [*sorted({case.loop.kind for case in examined}), "all"]:
-        some = [case for case in examined if kind in (case.loop.kind, "all")]
-        times_s = [case.took_s for case in some]
-        undecided = [case for case in some if case.stability.verdict == "undecided"]
-        note = f"{len(some)} loops, worst {max(times_s):.1f} s"
-        yield Row(f"{kind}: undecided", len(undecided), "", goal=Goal("==", 0), note=note)
-        yield Row(f"{kind}: CPU time, median", median(times_s), "s", goal=Goal("<=", MEDIAN_S))
+    for kind in sorted(verdicts, key=lambda kind: (kind == "all", kind)):
+        note = f"{len(verdicts[kind])} loops, worst {max(times_s[kind]):.1f} s"
+        yield Row(f"{kind}: undecided", verdicts[kind].count("undecided"), "", goal=Goal("==", 0), note=note)
+        yield Row(f"{kind}: CPU time, median", median(times_s[kind]), "s", goal=Goal("<=", MEDIAN_S))

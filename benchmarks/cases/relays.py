@@ -13,38 +13,33 @@ import argparse
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import psutil
 
+from benchmarks import relay_load
 from benchmarks.cases.latency import KERNEL, cyclictest
-from benchmarks.programs import BEFORE_OTHERS, LOAD_CORE, RELAY_CORE, compiled, on_core, scheduled
-from benchmarks.relay_load import (
-    BURST,
-    Built,
-    Nanoseconds,
-    Relay,
-    built,
-    c_relay,
-    direct_ends,
-    figures_of,
-    new_soak,
-    our_relay,
-    running,
-    socat,
-    sources,
-    started,
+from benchmarks.programs import LOAD_CORE, RELAY_CORE, compiled, on_core, program_path, scheduled
+from benchmarks.report import (
+    Figures,
+    Goal,
+    MeasurementError,
+    Peer,
+    Rounds,
+    Row,
+    benchmark,
+    median,
+    option,
+    quantiles_us,
+    say,
 )
-from benchmarks.report import Figures, Goal, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from netem.relay_links import LinkSpec
 from netem.shell.devices import open_devices
 from noack.impairments.link_settings import LinkSettings
@@ -58,32 +53,24 @@ RATES = (
     (PLAIN, "socat", Goal(">=", 2)),
     (PLAIN, "C relay", Goal(">=", 1)),
     (SEGMENTS, "socat", Goal(">=", 5)),
-    (PLAIN, DIRECT, None),
     (SEGMENTS, "C relay, segments", Goal(">=", 0.97)),
     (PLAIN, "C relay, senders' addresses", None),
     (SEGMENTS, "C relay, segments, senders' addresses", None),
 )
-COSTS = ((PLAIN, "socat"), (PLAIN, "C relay"), (PLAIN, DIRECT), (SEGMENTS, "C relay, segments"))
 
 
 @benchmark("relays", "Relays: drained datagrams")
 def drained(options: argparse.Namespace) -> Iterator[Row]:
     """Send bursts to each relay in turn; yield rates and costs."""
-    with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), direct_ends(tools) as direct:
-        count = min(BURST, direct.sink_holds)
-
-        def directly() -> Figures:
-            with on_core(RELAY_CORE):
-                return figures_of(DIRECT, *direct.direct(count), count)
-
-        ours = our_relay(PLAIN, WORDS), our_relay(SEGMENTS, WORDS, "--segment")
-        kinds = socat(), *(c_relay(tools, *modes) for modes in C_MODES), *ours
-        with started(kinds, tools) as (rounds, relays):
-            rounds.in_turn(ROUNDS, {relay.name: relay.burst for relay in relays} | {DIRECT: directly})
+    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+        ours = relay_load.our_relay(PLAIN, WORDS), relay_load.our_relay(SEGMENTS, WORDS, "--segment")
+        kinds = relay_load.socat(), *(relay_load.c_relay(tools, *modes) for modes in C_MODES), *ours
+        with relay_load.started(kinds, tools) as (rounds, relays):
+            rounds.in_turn(ROUNDS, {relay.name: relay.burst for relay in relays})
     for side, peer, goal in RATES:
         yield rounds.row(f"{side}: drained", "datagrams/s", "per_s", side, peer, goal, paired=True)
-    for side, peer in COSTS:
-        yield rounds.row(f"{side}: cost", "µs CPU each", "cpu_us", side, peer, paired=True)
+    for peer in ("socat", "C relay"):
+        yield rounds.row(f"{PLAIN}: cost", "µs CPU each", "cpu_us", PLAIN, peer, paired=True)
 
 
 FLOW_ROUNDS, FLOWS = 2, 10_000
@@ -99,10 +86,15 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
     does what our relay with the reverse direction does: it also waits for answers at all sockets
     and returns them. (To wait for a socket by epoll costs when sending, too.)
     """
-    single, many = sources(1), sources(FLOWS)
-    with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
-        ours = our_relay(PLAIN, WORDS), our_relay(REVERSE, WORDS, reverse=True)
-        with started((c_relay(tools), c_relay(tools, "paths"), *ours), tools) as (rounds, relays):
+    single, many = relay_load.sources(1), relay_load.sources(FLOWS)
+    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+        kinds = (
+            relay_load.c_relay(tools),
+            relay_load.c_relay(tools, "paths"),
+            relay_load.our_relay(PLAIN, WORDS),
+            relay_load.our_relay(REVERSE, WORDS, reverse=True),
+        )
+        with relay_load.started(kinds, tools) as (rounds, relays):
             for relay in relays:
                 relay.burst(many)  # makes the states of the flows; not counted
             loads = (_single, single), (_many, many)
@@ -152,7 +144,7 @@ def delay(options: argparse.Namespace) -> Iterator[Row]:
     at the sink (same clock), which excludes the sink's wake-up. Compared with cyclictest on the
     relay's core.
     """
-    with built() as tools:
+    with relay_load.built() as tools:
         added, late = _added(tools), _late(tools)
     yield added.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT)
     for peer in ("socat", "C relay"):
@@ -164,19 +156,18 @@ def delay(options: argparse.Namespace) -> Iterator[Row]:
         yield late.row(name, "µs", quantile, PLAIN, KERNEL, goal, paired=True)
 
 
-def quantiles_of(name: str, delays_ns: Nanoseconds, base_us: float = 0.0) -> Figures:
+def quantiles_of(name: str, delays_ns: relay_load.Nanoseconds, base_us: float = 0.0) -> Figures:
     """Return quantiles of the delays minus ``base_us``, in µs."""
     if lost := int((delays_ns < 0).sum()):
         raise MeasurementError(f"{name}: {lost} of {len(delays_ns)} datagrams did not arrive")
-    p50_us, p99_us = np.quantile(delays_ns, [0.5, 0.99]) / 1e3 - base_us
-    return {"p50": float(p50_us), "p99": float(p99_us)}
+    return quantiles_us(delays_ns - 1e3 * base_us)
 
 
-def _added(tools: Built) -> Rounds:
-    ours = our_relay(PLAIN, "loss 5% mansd 0 seed 7", lossy=False)
+def _added(tools: relay_load.Built) -> Rounds:
+    ours = relay_load.our_relay(PLAIN, "loss 5% mansd 0 seed 7", lossy=False)
     base_us = 0.0
 
-    def added(relay: Relay) -> Figures:
+    def added(relay: relay_load.Relay) -> Figures:
         return quantiles_of(relay.name, relay.ends.ping(PINGS), base_us)
 
     def base() -> Figures:
@@ -186,31 +177,31 @@ def _added(tools: Built) -> Rounds:
         return delays
 
     with (
-        scheduled(BEFORE_OTHERS),
+        scheduled(),
         on_core(RELAY_CORE),
-        direct_ends(tools) as direct,
-        started((socat(), c_relay(tools), ours), tools) as (rounds, relays),
+        relay_load.direct_ends(tools) as direct,
+        relay_load.started((relay_load.socat(), relay_load.c_relay(tools), ours), tools) as (rounds, relays),
     ):
         sides = {DIRECT: base} | {relay.name: partial(added, relay) for relay in relays}
         rounds.in_turn(PING_ROUNDS, sides, "added delay, ")
     return rounds
 
 
-def _late(tools: Built) -> Rounds:
+def _late(tools: relay_load.Built) -> Rounds:
     def kernel() -> Figures:
         if not os.access(_LATENCY, os.W_OK):
             raise MeasurementError(f"{_LATENCY} cannot be written")
         return cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE)
 
-    def late(relay: Relay) -> Figures:
+    def late(relay: relay_load.Relay) -> Figures:
         with scheduled(FIFO_PRIORITY) as permitted:
             if not permitted:
                 rounds.add(KERNEL, "SCHED_FIFO is refused")
             delays_ns = relay.ends.pace(LINE_ROUND_S * 1_000_000_000 // PERIOD_NS, PERIOD_NS)
         return quantiles_of(relay.name, delays_ns, DELAY_MS * 1e3)
 
-    delayed = our_relay(PLAIN, f"delay {DELAY_MS}ms", "--realtime", lossy=False)
-    with on_core(LOAD_CORE), started([delayed], tools) as (rounds, relays):
+    delayed = relay_load.our_relay(PLAIN, f"delay {DELAY_MS}ms", "--realtime", lossy=False)
+    with on_core(LOAD_CORE), relay_load.started([delayed], tools) as (rounds, relays):
         sides = {KERNEL: kernel} | {relay.name: partial(late, relay) for relay in relays}
         rounds.in_turn(LINE_ROUNDS, sides, "lateness, ")
     return rounds
@@ -223,26 +214,12 @@ _BURSTS = 15
 _GROUP_S = 250e-6
 """Approximate time between two groups of datagrams."""
 _LAST_S = 0.1
-_STARVED = 0.01
-
-
-def _seconds(text: str) -> int:
-    if (seconds := int(text)) < 4:
-        raise argparse.ArgumentTypeError("must be 4 or more")
-    return seconds
 
 
 @benchmark(
     "relay_soak",
     "Our relay under a steady load",
-    {
-        "--soak-s": {
-            "type": _seconds,
-            "default": 20,
-            "metavar": "S",
-            "help": "length of relay_soak (%(default)s)",
-        }
-    },
+    {"--soak-s": option(20, "length of relay_soak, at least 4 s")},
 )
 def steady_load(options: argparse.Namespace) -> Iterator[Row]:
     """Load our relay with half its maximum rate: no unintended loss, constant memory.
@@ -251,53 +228,43 @@ def steady_load(options: argparse.Namespace) -> Iterator[Row]:
     datagrams must arrive at the sink, and at most M − 1 consecutive datagrams may be missing there.
     ``--soak-s 600`` is the full test.
     """
-    kind = our_relay(PLAIN, f"loss 5% mansd {MANSD} seed 7")
-    with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
-        with running(kind, tools) as relay:
+    kind = relay_load.our_relay(PLAIN, f"loss 5% mansd {MANSD} seed 7")
+    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+        with relay_load.running(kind, tools) as relay:
             maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
-        with running(kind, tools) as relay:
+        with relay_load.running(kind, tools) as relay:
             yield from _soak_rows(relay, options.soak_s, maximum_per_s)
 
 
-def growth_kib(resident_kib: Sequence[float]) -> float:
-    """Return the growth of memory from the second quarter to the last, without the start-up."""
-    quarter = max(len(resident_kib) // 4, 1)
-    return median(resident_kib[-quarter:]) - median(resident_kib[quarter : 2 * quarter])
-
-
-def _soak_rows(relay: Relay, seconds: int, maximum_per_s: float) -> list[Row]:
-    """Load a relay with half of its maximum rate, in groups of datagrams; return the rows."""
+def _soak_rows(relay: relay_load.Relay, seconds: int, maximum_per_s: float) -> Iterator[Row]:
+    """Load a relay with half of its maximum rate, in groups of datagrams; yield the rows."""
     group = max(round(maximum_per_s / 2 * _GROUP_S), 1)
     period_ns = round(group / (maximum_per_s / 2) * 1e9)
     groups_per_s = round(1e9 / period_ns)
-    counts, resident_kib = new_soak(), list[float]()
-    begun_s, before_s = time.monotonic(), relay.scheduled_s()
+    counts, resident_kib = relay_load.new_soak(), list[float]()
+    begun_s = time.monotonic()
     for number in range(seconds):
         if number % 60 == 0:
             say(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
         relay.ends.soak(counts, groups_per_s, group, period_ns)
         resident_kib.append(psutil.Process(relay.pid).memory_info().rss / 1024)
     elapsed_s = time.monotonic() - begun_s
-    cpu_s, waited_s = np.subtract(relay.scheduled_s(), before_s).tolist()
     # Empty groups: receive the datagrams still in flight.
     relay.ends.soak(counts, round(_LAST_S / _GROUP_S), 0, period_ns)
-    totals, none, waited = relay.totals(), Goal("==", 0), waited_s / elapsed_s
-    return [
-        Row("load", counts.sent / elapsed_s, "datagrams/s",
-            Peer("drained maximum", maximum_per_s), note=f"for {elapsed_s:.0f} s"),
-        Row("sent but not counted as arrived", counts.sent - totals.received, "datagrams",
-            goal=none),
-        Row("forwarded but not received", totals.forwarded - counts.received, "datagrams",
-            goal=none),
-        Row("lost in the relay's receive buffer", totals.lost_in_kernel, "datagrams", goal=none),
-        Row("longest loss burst", counts.longest_gap, "datagrams", goal=Goal("<=", MANSD)),
-        Row("received out of order", counts.disordered, "datagrams", goal=none),
-        Row("memory, last quarter beyond second", growth_kib(resident_kib), "KiB",
-            goal=MEMORY_GOAL, note=f"of {resident_kib[-1] / 1024:.0f} MiB"),
-        Row("CPU of the relay", 100 * cpu_s / elapsed_s, "% of a core"),
-        Row("the relay waited for its core", 100 * waited, "% of the time",
-            note="others had its core: a loss may be theirs" if waited > _STARVED else None),
-    ]  # fmt: skip
+    totals, none, quarter = relay.totals(), Goal("==", 0), max(seconds // 4, 1)
+    growth_kib = median(resident_kib[-quarter:]) - median(resident_kib[quarter : 2 * quarter])
+    peer, note = Peer("drained maximum", maximum_per_s), f"for {elapsed_s:.0f} s"
+    yield Row("load", counts.sent / elapsed_s, "datagrams/s", peer, note=note)
+    for name, number in (
+        ("sent but not counted as arrived", counts.sent - totals["received"]),
+        ("forwarded but not received", totals["forwarded"] - counts.received),
+        ("lost in the relay's receive buffer", totals["lost_in_kernel"]),
+        ("received out of order", counts.disordered),
+    ):
+        yield Row(name, number, "datagrams", goal=none)
+    yield Row("longest loss burst", counts.longest_gap, "datagrams", goal=Goal("<=", MANSD))
+    note = f"of {resident_kib[-1] / 1024:.0f} MiB"
+    yield Row("memory, last quarter beyond second", growth_kib, "KiB", goal=MEMORY_GOAL, note=note)
 
 
 _SHELL_ROUNDS = 5
@@ -305,13 +272,6 @@ _PINGS = 500
 _SECONDS = 3
 _PORT = 5209
 _SHELL, _BARE_FORWARDER = "noack netem shell", "bare forwarder in C"
-_SHELLS = {
-    _SHELL: [sys.executable, "-m", "netem", "shell", "--"],
-    "mm-loss": ["mm-loss", "uplink", "0"],
-    "mm-delay": ["mm-delay", "0"],
-}
-_Run = Callable[[str], str]
-"""Runs a command line of sh inside, where ``$TO`` is the outside; returns its output."""
 
 
 def _bare(forwarder: Path, command: str) -> str:
@@ -328,16 +288,16 @@ def _bare(forwarder: Path, command: str) -> str:
         return inner.communicate()[0]
 
 
-def _in_shell(words: Sequence[str], command: str) -> str:
-    if shutil.which(words[0]) is None:
-        raise MeasurementError(f"there is no {words[0]}")
-    script = f"TO=${{NOACK_OUTSIDE:-$MAHIMAHI_BASE}}; {command}"
-    words = [*words, "sh", "-c", script]
+def _in_shell(command: str) -> str:
+    words = [sys.executable, "-m", "netem", "shell", "--", "sh", "-c", f"TO=$NOACK_OUTSIDE; {command}"]
     return subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True).stdout
 
 
-def _shell_figures(run: _Run) -> Figures:
-    """Measure throughput from inside to outside, and the time to there and back."""
+def _shell_figures(run: Callable[[str], str]) -> Figures:
+    """Measure throughput from inside to outside, and the time to there and back.
+
+    ``run`` runs a command line of sh inside, where ``$TO`` is the outside; it returns its output.
+    """
     try:
         end = json.loads(run(f"iperf3 -J -c $TO -p {_PORT} -t {_SECONDS}"))["end"]
         pings = run(f"ping -q -i 0.002 -c {_PINGS} $TO")
@@ -349,18 +309,15 @@ def _shell_figures(run: _Run) -> Figures:
 
 @benchmark("shell", "A shell: throughput of TCP, and time to the outside and back")
 def shell(_options: argparse.Namespace) -> Iterator[Row]:
-    """Measure a shell without impairments, in turn with the alternatives; needs root for these."""
-    if missing := [program for program in ("iperf3", "ping", "ip") if shutil.which(program) is None]:
-        raise MeasurementError(f"there is no {', '.join(missing)}")
+    """Measure a shell without impairments, in turn with the alternative, which needs root."""
+    server = [program_path("iperf3", "iperf3"), "-s", "-p", str(_PORT)]
     rounds = Rounds()
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder, ExitStack() as stack:
-        server = ["iperf3", "-s", "-p", str(_PORT)]
         process = stack.enter_context(subprocess.Popen(server, stdout=subprocess.DEVNULL))
         stack.callback(process.kill)
-        runs: dict[str, _Run] = {_BARE_FORWARDER: partial(_bare, compiled("tun.c", Path(folder)))}
-        runs |= {name: partial(_in_shell, words) for name, words in _SHELLS.items()}
-        rounds.in_turn(_SHELL_ROUNDS, {name: partial(_shell_figures, run) for name, run in runs.items()})
-    for peer in [name for name in runs if name != _SHELL]:
-        goal = Goal(">=", 0.9) if peer == _BARE_FORWARDER else None
-        yield rounds.row("TCP", "Mbit/s", "mbit", _SHELL, peer, goal, paired=True)
-        yield rounds.row("ping, mean", "µs", "us", _SHELL, peer, paired=True)
+        bare = partial(_bare, compiled("tun.c", Path(folder)))
+        runs = {_BARE_FORWARDER: partial(_shell_figures, bare), _SHELL: partial(_shell_figures, _in_shell)}
+        rounds.in_turn(_SHELL_ROUNDS, runs)
+    row = partial(rounds.row, ours=_SHELL, peer=_BARE_FORWARDER, paired=True)
+    yield row("TCP", "Mbit/s", "mbit", goal=Goal(">=", 0.9))
+    yield row("ping, mean", "µs", "us")

@@ -1,25 +1,21 @@
 """Live runs as a user starts them: start, many loops, the demo; the installation."""
 
 import argparse
-import json
-import os
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import psutil
 
-from benchmarks.programs import NOACK, Processes, execute, imported_s, noack
+from benchmarks.programs import NOACK, Observed, Sample, execute, imported_s, noack, observed_run
 from benchmarks.report import (
     Figures,
     Goal,
@@ -30,51 +26,18 @@ from benchmarks.report import (
     benchmark,
     compared,
     median,
+    option,
     own_cpu_s,
     say,
 )
-from cosim.record.run_directory import LATEST
 from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
 
 ROOT = Path(__file__).parents[2]
 CAP = 2
-_SCENARIO = """
-name = "fleet"
-horizon_s = {horizon_s}
-recovery = {{ rejoin_within_s = 0 }}
-
-[model]
-name = "double_integrator"
-
-[plant]
-initial_state = [1.0, 0.0]
-initial_state_halfwidth = [0.5, 0.5]
-draw = "uniform"
-uncertainty_A = [[0.0, 0.0], [0.2, 0.2]]
-rate_hz = {rate_hz}
-
-[controller]
-rate_hz = {rate_hz}
-
-[trigger]
-beta = 0.5
-alpha_per_s = 0.25
-floor = 0.02
-
-[network]
-mansd = {cap}
-loss = {{ model = "bernoulli", probability = 0.3 }}
-impairments = [{{ kind = "rate", rate_bps = {rate_bps}, queue = 1000 }}]
-
-[[loops]]
-name = "loop"
-count = {loops}
-"""
+_SCENARIO = Path(__file__).parents[1] / "fleet.toml"
 _KIBI = 1024
 _POLL_S = 2.0
 _SINGLE_S = 60.0
-_FLAT_MIB = 32.0
-_LOOK_S = 0.1
 _MEMORY_MIB, _END_SHARE = Goal("<=", 80), Goal("<=", 0.1)
 _STEP_US = {50.0: Goal("<=", 5)}
 """By the rate of the loops, Hz. Not of 20 loops at 500 Hz, of which a step is due every 100 µs:
@@ -97,8 +60,8 @@ class Load(NamedTuple):
         return f"{self.loops:,} loop{plural} at {self.rate_hz:g} Hz, {self.horizon_s:g} s"
 
     @property
-    def scenario(self) -> str:
-        """The scenario.
+    def arguments(self) -> Sequence[str]:
+        """Scenario and settings.
 
         The bottleneck carries what the guarantee demands even if every sample is an event. A slower
         one would stay congested after a stall of the computer: late updates cause events, events
@@ -106,99 +69,59 @@ class Load(NamedTuple):
         """
         bits = 92 * 8  # an update of two states with its UDP and IP header
         rate_bps = int(self.loops * self.rate_hz * bits / (CAP + 1))
-        return _SCENARIO.format(**self._asdict(), cap=CAP, rate_bps=rate_bps)
-
-    def step_us(self, measured: "Measured") -> float:
-        """CPU time of the processes per loop and step."""
-        return sum(measured.cpu_s.values()) / (self.loops * self.horizon_s * self.rate_hz) * 1e6
-
-
-class Measured(NamedTuple):
-    """A finished run."""
-
-    summary: dict[str, Any]
-    memory_mib: Mapping[str, list[float]]
-    """Private memory over time, by process."""
-    cpu_s: Mapping[str, float]
-    """By process, while the loops ran."""
-    end_s: float
-    """Wall time from the end of the loops to the end of the command."""
+        settings = (
+            f"horizon_s={self.horizon_s}",
+            f"plant.rate_hz={self.rate_hz}",
+            f"controller.rate_hz={self.rate_hz}",
+            f'network.impairments=[{{ kind = "rate", rate_bps = {rate_bps}, queue = 1000 }}]',
+            f'loops=[{{ name = "loop", count = {self.loops} }}]',
+        )
+        return [str(_SCENARIO), *(word for setting in settings for word in ("--set", setting))]
 
 
-def run(load: Load, folder: Path) -> Measured:
+def run(load: Load, folder: Path) -> Observed:
     """Run the loops as a user does."""
-    path = folder / "fleet.toml"
-    path.write_text(load.scenario)
-    command = [*NOACK, "run", str(path), "--json", "--no-report", "--runs", str(folder)]
-    with (folder / "output").open("w+") as output:
-        with subprocess.Popen(command, stdout=output, stderr=subprocess.DEVNULL) as process:
-            followed = _follow(process, folder / LATEST)
-        output.seek(0)
-        summary = json.loads(output.read() or "{}")
-    if process.returncode != 0:
-        reason = summary.get("exit", {}).get("reason", summary.get("error"))
-        raise MeasurementError(f"{load.loops} loops at {load.rate_hz:g} Hz: {reason}")
-    return Measured(summary, *followed)
+    observed = observed_run(load.arguments, folder, load.horizon_s, _POLL_S)
+    if (ending := observed.summary["exit"])["status"]:
+        raise MeasurementError(f"{load}: {ending['reason']}")
+    return observed
 
 
-def _follow(
-    process: subprocess.Popen[bytes], started: Path
-) -> tuple[dict[str, list[float]], dict[str, float], float]:
-    """Return memory and CPU time of a run's processes from its start, when a path exists."""
-    processes = Processes(process.pid)
-    memory, cpu_s = defaultdict[str, list[float]](list), defaultdict[str, list[float]](list)
-    ended_s = sampled_s = time.monotonic()
-    while process.poll() is None:
-        if time.monotonic() >= sampled_s + _POLL_S and started.exists():
-            sampled_s = time.monotonic()
-            for role, sample in processes.sample().items():
-                memory[role].append(sample.uss_kib / _KIBI)
-                if role in LOOP_ROLES:
-                    cpu_s[role].append(sample.cpu_s)
-        if processes.are_alive(LOOP_ROLES):
-            ended_s = time.monotonic()
-        time.sleep(_LOOK_S)
-    used_s = {role: total_s[-1] - total_s[0] for role, total_s in cpu_s.items()}
-    return memory, used_s, time.monotonic() - ended_s
+def cpu_share(samples: Sequence[Sample]) -> float:
+    """Return CPU time per wall time."""
+    first, last = samples[0], samples[-1]
+    return (last.cpu_s - first.cpu_s) / (last.at_s - first.at_s)
 
 
-def figures(load: Load, measured: Measured) -> list[Row]:
-    """Return the figures of a run."""
-    network, loops = measured.summary["network"], measured.summary["loops"]
-    step_us = load.step_us(measured)
-    equal = [loop["replay"]["bit_exact"] for loop in (network, *loops)].count(True)
-    loop_memory = {role: mib for role, mib in measured.memory_mib.items() if role in LOOP_ROLES}
-    growth = max(mib[-1] - mib[len(mib) // 2] for mib in loop_memory.values())
-    rows = [
-        Row("missing samples", sum(loop["missing_samples"] for loop in loops), "", goal=_NOTHING),
-        Row("unintended losses", sum(loop["unintended_losses"] for loop in loops), "", goal=_NOTHING),
-        Row("longest loss burst", max(loop["longest_loss_burst"] for loop in loops), "",
-            goal=Goal("<=", CAP)),
-        Row("updates", network["datagrams"] / load.horizon_s, "/s"),
-        *(
-            Row(f"{role} lateness p99, worst loop",
-                max(loop["lateness_us"][role]["p99"] for loop in loops) * 1e-3, "ms",
-                goal=_LATE_MS[load.rate_hz])
-            for role in WITH_DEADLINES
-        ),
-        Row("loops and network not replayed bit for bit", 1 + len(loops) - equal, "",
-            goal=_NOTHING),
-        Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US.get(load.rate_hz),
-            note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in measured.cpu_s.items())),
-        Row("growth of memory in the second half, worst process", growth, "MiB",
-            goal=Goal("<", _FLAT_MIB),
-            note=", ".join(
-                f"{role} {mib[len(mib) // 2]:.0f}–{mib[-1]:.0f}"
-                for role, mib in measured.memory_mib.items()
-            )),
-        Row("end of the run", measured.end_s, "s", Peer("the run", load.horizon_s), _END_SHARE),
-    ]  # fmt: skip
-    return [replace(row, name=f"{load}: {row.name}") for row in rows]
+def figures(load: Load, run: Observed) -> Iterator[Row]:
+    """Yield the figures of a run."""
+
+    def row(name: str, value: float, unit: str = "", **more: Any) -> Row:
+        return Row(f"{load}: {name}", value, unit, **more)
+
+    network, loops = run.summary["network"], run.summary["loops"]
+    samples = {role: run.in_loops(role) for role in LOOP_ROLES}
+    for key in ("missing_samples", "unintended_losses"):
+        yield row(key.replace("_", " "), sum(loop[key] for loop in loops), goal=_NOTHING)
+    burst = max(loop["longest_loss_burst"] for loop in loops)
+    yield row("longest loss burst", burst, goal=Goal("<=", CAP))
+    yield row("updates", network["datagrams"] / load.horizon_s, "/s")
+    for role in WITH_DEADLINES:
+        late_ms = max(loop["lateness_us"][role]["p99"] for loop in loops) / 1e3
+        yield row(f"{role} lateness p99, worst loop", late_ms, "ms", goal=_LATE_MS[load.rate_hz])
+    different = sum(not loop["replay"]["bit_exact"] for loop in (network, *loops))
+    yield row("loops and network not replayed bit for bit", different, goal=_NOTHING)
+    used_us = {role: 1e6 * cpu_share(samples[role]) / (load.loops * load.rate_hz) for role in samples}
+    note = ", ".join(f"{role} {used:.2f} µs" for role, used in used_us.items())
+    step_us = sum(used_us.values())
+    yield row("CPU time per loop and step", step_us, "µs", goal=_STEP_US.get(load.rate_hz), note=note)
+    end_s, peer = run.closed_s - run.ended_s, Peer("the run", load.horizon_s)
+    yield row("end of the run", end_s, "s", peer=peer, goal=_END_SHARE)
 
 
-def memory(load: Load, measured: Measured) -> Iterator[Row]:
+def memory(load: Load, run: Observed) -> Iterator[Row]:
     """Yield the private memory of the processes of one loop: the median over its run."""
-    used = {role: median(measured.memory_mib[role]) for role in LOOP_ROLES}
+    used = {role: median(sample.uss_kib for sample in run.in_loops(role)) / _KIBI for role in LOOP_ROLES}
     name, total = f"{load}: private memory of {', '.join(used)}", sum(used.values())
     note = ", ".join(f"{role} {mib:.0f}" for role, mib in used.items())
     peer = Peer("as many Pythons that import numpy and zenoh", libraries_mib(len(used)))
@@ -226,9 +149,8 @@ def libraries_mib(count: int) -> float:
     "fleet",
     "Many loops on one network",
     {
-        "--fleet-s": {"type": float, "default": 60.0, "help": "length of the runs, seconds"},
-        "--fleet-loops": {"type": int, "default": 1000, "help": "loops at 50 Hz"},
-        "--fleet-dir": {"type": Path, "help": "where the runs are kept meanwhile"},
+        "--fleet-s": option(60.0, "length of the runs, seconds"),
+        "--fleet-loops": option(1000, "loops at 50 Hz"),
     },
 )
 def fleet(options: argparse.Namespace) -> Iterator[Row]:
@@ -240,9 +162,9 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
     loop, beside as many Pythons that import the libraries of each process.
     """
 
-    def measured(load: Load) -> Measured:
+    def measured(load: Load) -> Observed:
         say(str(load))
-        with tempfile.TemporaryDirectory(dir=options.fleet_dir) as folder:
+        with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
             return run(load, Path(folder))
 
     for loops, rate_hz in ((options.fleet_loops, 50.0), (20, 500.0)):
@@ -369,28 +291,14 @@ def size(options: argparse.Namespace) -> Iterator[Row]:
     yield Row("C", lines("native/*.c", "native/*.h"), "lines", goal=Goal("<=", 5_000))
 
 
-_CLONE_PATIENCE_S = 900.0
-
-
 @benchmark("clone", "The demo from a clean clone")
 def clone(options: argparse.Namespace) -> Iterator[Row]:
     """Clone the last commit, install, and run the demo to its verdict; 20 s of it are the run."""
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         say("make demo from a clean clone")
-        target = Path(folder) / "noack"
-        subprocess.run(["git", "clone", "-q", str(ROOT), str(target)], check=True)
+        subprocess.run(["git", "clone", "-q", str(ROOT), folder], check=True)
         begun_s = time.monotonic()
-        done = subprocess.run(
-            ["make", "demo"],
-            cwd=target,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=_CLONE_PATIENCE_S,
-            env=os.environ | {"VIRTUAL_ENV": ""},
-        )
+        execute(["env", "--unset=VIRTUAL_ENV", "make", "-C", folder, "demo"])
         spent_s = time.monotonic() - begun_s
-    if done.returncode:
-        raise MeasurementError(f"make demo: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
     compiler = "gcc present" if shutil.which("cc") else "no C compiler"
     yield Row(f"make demo from a clean clone to its verdict, {compiler}", spent_s, "s", goal=Goal("<=", 60))

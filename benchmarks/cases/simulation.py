@@ -7,12 +7,12 @@ nothing.
 
 import argparse
 import contextlib
+import json
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from scipy.integrate import solve_ivp
 
 from benchmarks.programs import NOACK, PRIORITY
 from benchmarks.report import (
+    Figures,
     Goal,
     MeasurementError,
     Peer,
@@ -30,21 +31,16 @@ from benchmarks.report import (
     compared,
     cpu_ms,
     median,
+    option,
     per_cpu_s,
     say,
 )
 from cosim.analysis.replay import replay
 from cosim.cli import find_scenario
-from cosim.shipped_files import find_shipped
 from cosim.simulation.exact_simulation import Population, Setting, run_batch, run_with_events, setting_of
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from cosim.studies.campaign import campaign_file
-from cosim.studies.campaign.campaign_grid import grid
-from cosim.studies.campaign.campaign_workers import local
-from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
@@ -137,7 +133,6 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
     lane = resolve(load(find_scenario("lane_following"), ()))
     horizon_s, many, loop = lane.horizon_s, many_loops(lane), SampledLoop(lane)
     conditions = ideal_conditions(lane)
-    work = SampledWork(in_virtual_time(lane), 0, None, None, 0.05, 10**6)
     live = Peer("the live run", 1e3 * horizon_s / lane.speed)
     earlier = Peer("the Python machines of b3991367 in virtual time", 1 / _PYTHON_MACHINES_S)
     machines = cpu_ms(lambda: simulate(lane))
@@ -157,8 +152,6 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
         Goal(">=", 100),
         note="the alternative was measured with that version, not in this run",
     )
-    draws = per_cpu_s(4, lambda: work.run(range(4)))
-    yield compared("draws of a campaign in sampled time", "runs/s", draws)
     record = simulate(lane.model_copy(update={"horizon_s": _REPLAYED_S}))
     replayed = replay(record)
     yield compared(
@@ -248,15 +241,6 @@ _PACE_NS = 2_000_000
 _LINEAR = "lane_following"
 
 
-def plant_cases() -> Iterator[tuple[str, Scenario]]:
-    """Yield name and resolved scenario of each kind of plant, except the linear one."""
-    for kind, settings in PLANTS.items():
-        for variant in settings.variants if settings.scenario not in (None, _LINEAR) else ():
-            changes = [f"plant.system.{key}={value}" for key, value in variant.items()]
-            scenario = resolve(load(find_scenario(settings.scenario or ""), changes))
-            yield ", ".join((kind, *map(str, variant.values()))), scenario
-
-
 def steps_us(scenario: Scenario) -> Iterator[float]:
     """Make the steps of a simulated run one by one; yield the CPU time of each, µs."""
     period_ns = scenario.timing.plant_period_ns
@@ -276,23 +260,20 @@ def steps_us(scenario: Scenario) -> Iterator[float]:
         yield (time.thread_time_ns() - begun_ns) / 1e3
 
 
-def timed_steps(scenario: Scenario) -> list[tuple[float, ...]]:
-    """Make steps of a scenario and of a linear plant in turn; return the µs of both."""
+def plant_rows(name: str, scenario: Scenario) -> Iterator[Row]:
+    """Yield a plant's median, p99, and p99 as a share of its period in wall time."""
+    say(name)
     sides = steps_us(scenario), steps_us(resolve(load(find_scenario(_LINEAR))))
-    timed = list[tuple[float, ...]]()
+    timed_us = list[tuple[float, ...]]()
     with realtime(True, PRIORITY):
         due_ns = time.monotonic_ns()
-        for pair in zip(*sides, strict=False):
-            timed.append(pair)
+        for pair_us in zip(*sides, strict=False):
+            timed_us.append(pair_us)
             due_ns += _PACE_NS
             time.sleep(max(due_ns - time.monotonic_ns(), 0) / NS_PER_S)
-    return timed[1:]  # the first step has length 0
-
-
-def plant_rows(name: str, scenario: Scenario, timed: Sequence[tuple[float, ...]]) -> Iterator[Row]:
-    """Yield the rows of a case: median, p99, and p99 as a share of the period in wall time."""
+    # The first step has length 0.
+    p50, p99 = np.quantile(np.array(timed_us[1:]), (0.5, 0.99), axis=0).tolist()
     period_us = scenario.timing.plant_period_ns / scenario.speed / 1e3
-    p50, p99 = np.quantile(np.array(timed), (0.5, 0.99), axis=0).tolist()
     yield Row(f"{name}: p50", p50[0], "µs/step", Peer("linear plant", p50[1]))
     yield Row(f"{name}: p99", p99[0], "µs/step", Peer("linear plant", p99[1]))
     yield Row(f"{name}: p99, of {period_us / 1e3:g} ms", 100 * p99[0] / period_us, "%", goal=Goal("<", 20.0))
@@ -306,9 +287,11 @@ def plants(options: argparse.Namespace) -> Iterator[Row]:
     pair every 2 ms and with the real-time settings, so that the processor's caches are as in a run.
     Figures are the thread's CPU time, which excludes other load of the machine.
     """
-    for name, scenario in plant_cases():
-        say(name)
-        yield from plant_rows(name, scenario, timed_steps(scenario))
+    for kind, settings in PLANTS.items():
+        for variant in settings.variants if settings.scenario not in (None, _LINEAR) else ():
+            changes = [f"plant.system.{key}={value}" for key, value in variant.items()]
+            scenario = resolve(load(find_scenario(settings.scenario or ""), changes))
+            yield from plant_rows(", ".join((kind, *map(str, variant.values()))), scenario)
 
 
 CAMPAIGN = "mb_vs_zoh"
@@ -317,66 +300,47 @@ SHARED_DRAWS = 40_000
 _LOOK_EVERY_S = 0.5
 
 
-def runs_per_s(workers: int) -> float:
-    """Return the throughput of the campaign with this number of workers."""
-    path = find_shipped(CAMPAIGN, "campaigns")
-    plan = campaign_file.load(path)
-    with tempfile.TemporaryDirectory() as folder:
-        store = Store(Path(folder), grid(plan, path), SHARED_DRAWS, plan.chunk)
-        begun_s = time.perf_counter()
-        with local(workers) as runner:
-            made = run_campaign(store, runner)
-        return made / (time.perf_counter() - begun_s)
-
-
-def whole_campaign(draws: int) -> tuple[float, float]:
-    """Return seconds and peak MiB of the command; shared pages count once."""
+def campaign_figures(draws: int, *options: str) -> Figures:
+    """Run the campaign as a user does; shared pages of memory count once."""
     peak_mib, begun_s = 0.0, time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as messages:
-        command = [*NOACK, "campaign", CAMPAIGN, "--json", "--draws", str(draws), "--out", folder]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=messages) as process:
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as output:
+        command = [*NOACK, "campaign", CAMPAIGN, "--json", "--draws", str(draws), "--out", folder, *options]
+        with subprocess.Popen(command, stdout=output) as process:
             first = psutil.Process(process.pid)
             while process.poll() is None:
                 with contextlib.suppress(psutil.Error):
                     every = first, *first.children(recursive=True)
-                    peak_mib = max(peak_mib, sum(process.memory_full_info().pss for process in every) / 2**20)
+                    used_bytes = sum(process.memory_full_info().pss for process in every)
+                    peak_mib = max(peak_mib, used_bytes / 2**20)
                 time.sleep(_LOOK_EVERY_S)
-        messages.seek(0)
+        took_s = time.perf_counter() - begun_s
         if process.returncode != 0:
-            raise MeasurementError(f"noack campaign {CAMPAIGN}: {messages.read().strip().splitlines()[-1:]}")
-    return time.perf_counter() - begun_s, peak_mib
+            raise MeasurementError(f"noack campaign {CAMPAIGN} ended with {process.returncode}")
+        output.seek(0)
+        runs = draws * len(json.load(output)["points"])
+    return {"runs": runs, "took_s": took_s, "per_s": runs / took_s, "peak_mib": peak_mib}
 
 
 @benchmark(
-    "campaign",
-    "A million runs",
-    {
-        "--campaign-draws": {
-            "type": int,
-            "default": 100_000,
-            "metavar": "N",
-            "help": "draws of the whole campaign at each of its grid points (100000: a million runs)",
-        }
-    },
+    "campaign", "A million runs", {"--campaign-draws": option(100_000, "draws at each of ten grid points")}
 )
 def campaign(options: argparse.Namespace) -> Iterator[Row]:
     """Measure the speed-up of a shipped campaign by a second worker, then a million runs.
 
-    In a round, one and then two workers run the same draws, timed from the start of the first
-    process to the last written file. The million runs are the user's command, with summary and
-    page.
+    These are the user's command, with summary and page. In a round, one and then two workers run
+    the same draws.
     """
     yield compared(
         f"{CAMPAIGN}, two workers",
         "runs/s",
-        lambda: runs_per_s(2),
-        ("one worker", lambda: runs_per_s(1)),
+        lambda: campaign_figures(SHARED_DRAWS, "--workers", "2")["per_s"],
+        ("one worker", lambda: campaign_figures(SHARED_DRAWS, "--workers", "1")["per_s"]),
         Goal(">=", 1.8),
         rounds=3,
     )
-    path, draws = find_shipped(CAMPAIGN, "campaigns"), options.campaign_draws
-    runs = f"{len(grid(campaign_file.load(path), path)) * draws:,} runs"
-    say(runs)
-    spent_s, peak_mib = whole_campaign(draws)
-    yield Row(f"noack campaign {CAMPAIGN} --draws {draws}", spent_s, "s", note=runs)
-    yield Row("the same: peak memory of all its processes", peak_mib, "MiB", goal=Goal("<=", 1024))
+    draws = options.campaign_draws
+    say(f"{draws:,} draws")
+    found = campaign_figures(draws)
+    note = f"{found['runs']:,.0f} runs"
+    yield Row(f"noack campaign {CAMPAIGN} --draws {draws}", found["took_s"], "s", note=note)
+    yield Row("the same: peak memory of all its processes", found["peak_mib"], "MiB", goal=Goal("<=", 1024))

@@ -7,9 +7,9 @@ from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
 
-from benchmarks.programs import two_hosts
 from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
 from tests.attacks.attacked import CHECKS, Attacked, attack, may_forge_addresses
+from tests.two_hosts import two_hosts
 
 
 def counts_at(run: Attacked, role: str) -> Counter[str]:

@@ -19,7 +19,6 @@ from typing import Any
 
 import psutil
 
-from benchmarks.programs import TwoHosts, udp_port
 from cosim.record.run_record import RunRecord, load_record
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -34,7 +33,8 @@ from noack.runtime.join_ticket import Ticket, loads
 from noack.runtime.udp_sockets import SHED
 from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Plan, Sent, Target, carry_out
-from tests.integration.conftest import PATIENCE_S, starting, wait_for
+from tests.integration.conftest import PATIENCE_S, starting, udp_port, wait_for
+from tests.two_hosts import TwoHosts
 
 AWAY = "controller"
 """The process on the second host."""

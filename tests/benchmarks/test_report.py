@@ -39,7 +39,7 @@ def named(name: str, *rows: Row, done: list[str] | None = None) -> Benchmark:
             raise MeasurementError("no such program")
         return list(rows)
 
-    return Benchmark(name, name.title(), measure)
+    return Benchmark(name, name.title(), measure, {})
 
 
 def by_name(*benchmarks: Benchmark) -> dict[str, Benchmark]:

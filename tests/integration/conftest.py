@@ -14,7 +14,7 @@ from typing import Any
 import psutil
 import pytest
 
-from benchmarks.programs import is_of
+from noack.protocol.topology import ROLES
 
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
@@ -116,12 +116,26 @@ def is_over(process: psutil.Process) -> bool:
         return True
 
 
+def is_of(role: str, process: psutil.Process) -> bool:
+    """Whether a process has a role in a run, by its title; not if it has ended."""
+    return command_of(process)[:1] == [f"noack {role}"]
+
+
+def processes_of(launcher: psutil.Process) -> dict[str, psutil.Process]:
+    """Return the processes of a run by role."""
+    children = launcher.children()
+    return {role: child for child in children for role in ROLES if is_of(role, child)}
+
+
+def udp_port(process: psutil.Process) -> int:
+    """Return the port of a process in the loop."""
+    (port,) = {udp.laddr.port for udp in process.net_connections("udp4") if not udp.raddr}
+    return int(port)
+
+
 def child_of(parent: subprocess.Popen[Any], role: str) -> psutil.Process | None:
     """Return the running process of a role, or None."""
-    for child in psutil.Process(parent.pid).children():
-        if is_of(role, child):
-            return child
-    return None
+    return processes_of(psutil.Process(parent.pid)).get(role)
 
 
 RATE_HZ = 100.0
@@ -198,8 +212,8 @@ class Running:
                 return child
         raise AssertionError(f"no process of {role}")
 
-    def finish(self) -> Finished:
-        stdout, stderr = self.process.communicate(timeout=PATIENCE_S)
+    def finish(self, patience_s: float = PATIENCE_S) -> Finished:
+        stdout, stderr = self.process.communicate(timeout=patience_s)
         assert stdout, (self.process.returncode, stderr)
         summary = json.loads(stdout)
         return Finished(self.process.returncode, summary, stderr, (self.runs / "latest").resolve())

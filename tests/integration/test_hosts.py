@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.programs import TwoHosts, two_hosts
-from benchmarks.report import MeasurementError
 from cosim.record.run_record import load_record, load_run
 from noack.core.clock import NS_PER_S
+from noack.core.errors import MachineError
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.topology import LOOP_ROLES
 from noack.scenario.scenario import phases_ns
 from tests.command_line import invoke
 from tests.integration import conftest as live
 from tests.integration.conftest import Start, ended
+from tests.two_hosts import TwoHosts, two_hosts
 
 INVITED = ("--invitation", "invitation.json")
 ROOMY = "clocks.largest_error_us=1000000"
@@ -37,7 +37,7 @@ def hosts() -> Iterator[TwoHosts]:
     try:
         with two_hosts() as made:
             yield made
-    except MeasurementError as error:
+    except MachineError as error:
         pytest.skip(f"no network namespaces here: {error}")
 
 

@@ -15,17 +15,16 @@ from itertools import groupby, islice
 
 import pytest
 
-from benchmarks.programs import TwoHosts, two_hosts
-from benchmarks.report import MeasurementError
 from netem.emulator_options import LINK_NAME
 from netem.tc_words import settings_of
-from noack.core.errors import ExitStatus
+from noack.core.errors import ExitStatus, MachineError
 from noack.runtime.address import address_text
 from noack.runtime.udp_sockets import enlarge_buffer
 from tests.attacks.attacked import unread_bytes
 from tests.attacks.kinds import enter_namespace
 from tests.netem.conftest import FORWARDED, Emulate
 from tests.oracles.link import Link
+from tests.two_hosts import TwoHosts, two_hosts
 
 CASES = [
     ("loss worst mansd 2", "loss worst mansd 2", 3 * 3),
@@ -75,7 +74,7 @@ def hosts() -> Iterator[TwoHosts]:
         with two_hosts() as hosts:
             run(hosts, "tc", "qdisc", "add", "dev", "line", "root", *SLOW_LINE)
             yield hosts
-    except MeasurementError as error:
+    except MachineError as error:
         pytest.skip(f"no network namespaces here: {error}")
 
 

@@ -18,7 +18,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.cases.hosts import DrivenClocks
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Record
@@ -47,6 +46,7 @@ from noack.runtime.host_clocks.time_exchange import (
 from noack.runtime.join_ticket import new_ticket
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import validate
+from tests.two_hosts import DrivenClocks
 
 KEY = bytes(range(32))
 
