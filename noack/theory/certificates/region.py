@@ -13,6 +13,7 @@ first, or the equations their enclosure, there is no certificate, and the report
 """
 
 import contextlib
+import math
 from dataclasses import replace
 from functools import cached_property
 
@@ -32,7 +33,7 @@ from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
 from noack.theory.certificates.conditions import REGION
 from noack.theory.certificates.scenario_certificates import CertificateScope, Phases, box, own_plant
-from noack.theory.certificates.solution import Search
+from noack.theory.certificates.solution import Search, completed_alone
 
 _WIDER = 1.02
 """The next region is larger than the bounds by this factor."""
@@ -40,6 +41,7 @@ _LEAST = 1e-9
 """Least width of a region in each direction, as a share of its largest."""
 _ATTEMPTS = 40
 _MOST_NAMES = 8
+_TIMES = ("sampling_s", "spacing_s", "delay_s", "hold_s", "start_s")
 
 
 def scopes(resolved: Scenario, start_error: float = 0.0) -> list[CertificateScope]:
@@ -130,8 +132,21 @@ class RegionScope(_Box):
         proven = Assumption(stays, "certificate", AssumptionStatus.HOLDS, why)
         return replace(certificate, region=region, assumptions=(*certificate.assumptions, proven))
 
-    def _constants(self, conditions: NetworkConditions, *, longest: bool = True) -> Search[list[Phases]]:
-        widths, where = np.zeros(self._loop.n + self._loop.m), "near 0"
+    def loop_gain(self, conditions: NetworkConditions) -> float:
+        """Return the loop gain on the region; at least 1, perhaps infinite, if there is none."""
+        try:
+            phases = completed_alone(self._constants(conditions, longest=False, near=True))
+        except NoCertificateError as error:
+            return max(error.loop_gain, 1.0)
+        except NotDecayingError:
+            return math.inf
+        return max(phase.loop_gain for phase in phases[0] if phase is not None)
+
+    def _constants(
+        self, conditions: NetworkConditions, *, longest: bool = True, near: bool = False
+    ) -> Search[list[Phases]]:
+        widths = self._widths_within(conditions) if near else np.zeros(self._loop.n + self._loop.m)
+        where = "near 0"
         for _ in range(_ATTEMPTS):
             try:
                 inclusion = self._motion.over(widths)
@@ -154,6 +169,17 @@ class RegionScope(_Box):
             widths = np.maximum(widths, _WIDER * reached + _LEAST * reached.max())
             where = f"on the region {self._described(widths)}"
         raise NoCertificateError(f"{where}: the bounds are not within it")
+
+    def _widths_within(self, conditions: NetworkConditions) -> Vector:
+        """Return the newest region of shorter times, where a search ends sooner than from 0.
+
+        The bounds increase with the times, so that this region is not larger than the smallest one.
+        """
+        for known, region in reversed(self._regions.items()):
+            shorter = all(getattr(known, name) <= getattr(conditions, name) for name in _TIMES)
+            if shorter and known.guarantee == conditions.guarantee:
+                return np.array(region.x + region.u)
+        return np.zeros(self._loop.n + self._loop.m)
 
     def _described(self, widths: Vector) -> str:
         if len(widths) > _MOST_NAMES:

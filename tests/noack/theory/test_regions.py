@@ -17,7 +17,10 @@ from noack.plants.systems.jacobian_enclosure import Enclosed, EnclosedMotion, In
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from noack.theory.certificates.region import _Box
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import nominal_conditions
+from noack.theory.certificates.region import RegionScope, _Box
+from noack.theory.certificates.scenario_certificates import network_limit
 from tests.oracles.attacked_regions import CASES, SCENARIOS, Case, Field, attacked, certificate_of
 
 pytest.importorskip("flint")
@@ -91,6 +94,20 @@ def test_no_attack_exceeds_a_bound_or_leaves_the_region(name: str) -> None:
     certificate = certificate_of(resolved, case.semi_axes)
     worst = attacked(resolved, case, certificate, runs=100, steps=500)
     assert all(0.05 < share < 1 for share in worst.values()), worst
+
+
+@pytest.mark.parametrize(("quantity", "time"), [("sampling", "sampling_s"), ("hold", "hold_s")])
+def test_a_limit_is_that_of_the_region_and_not_of_the_linear_plant(quantity: str, time: str) -> None:
+    resolved = CASES["pendulum"].resolved()
+    scope, scheduled = RegionScope(resolved), nominal_conditions(resolved)
+    limit_s = network_limit(scope, scheduled, quantity)
+
+    def at(t_s: float) -> ScenarioCertificate:
+        spacing_s = t_s if quantity == "sampling" else scheduled.spacing_s
+        return scope.certificate(scheduled._replace(spacing_s=spacing_s, **{time: t_s}))
+
+    assert at(limit_s).constants is not None
+    assert at(1.01 * limit_s).constants is None
 
 
 def test_broken_copies_are_refuted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
