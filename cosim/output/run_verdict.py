@@ -427,7 +427,8 @@ def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim])
     if any(claim.ratio is not None for claim in claims):
         console.print(
             "[dim]share used: largest share of the bound reached during the run; a bound "
-            "computed from the run itself is reached by construction. Sources: (I1) and "
+            "computed from the run itself is reached by construction. ε: the trigger's floor; t_k: "
+            "the k-th event; H = Â + B̂K, or 0 with a hold; β̃: bound of ‖e_s‖. Sources: (I1) and "
             "certificates, docs/theory.md; eq:... and theorems, the paper[/]"
         )
     sources: dict[tuple[str, str], list[str]] = {}

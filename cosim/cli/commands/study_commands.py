@@ -204,7 +204,7 @@ class NetworkOptions:
             those with the longest period for the scenario's guarantee.
         period: Time between two updates of a time-triggered sensor; by default that of a periodic
             scenario. Without it, the paper's trigger is kept, with other α and β.
-        window: Maximise m in "at most m losses in WINDOW updates" instead of M.
+        window: Maximise L in "at most L losses in WINDOW updates" instead of M.
         most: Largest M to examine; 16 with a period, else 1,000.
         cost: Largest cost ∫ xᵀQx + uᵀRu dt, as a multiple of the given loop's. With a period, that
             without losses; else the mean over draws.
@@ -312,7 +312,7 @@ def design(
     Without --for: α, β and the norm with the fewest transmissions that meet your limits. With --for
     network or --for transmissions: K, by LQR and a search without gradients, with α and β, or with
     the hold strategy of a time-triggered loop; the result is certified, as by noack certify or
-    noack margin. This takes up to two minutes.
+    noack margin.
 
     Exit status 1: no choice meets the limits or is proven stable, or fresh draws do not confirm it.
 
@@ -494,7 +494,7 @@ def capacity(
 
     Examples:
         noack capacity shared_bottleneck   periodic, ZOH-ET and MB-ET
-        noack capacity shared_bottleneck --thorough   finite intervals, in an hour or less
+        noack capacity shared_bottleneck --thorough   8 numbers of loops, 10 draws, disturbances: 50 minutes
         noack capacity shared_bottleneck --set 'loops=[{ name = "p" }]'   loops of one kind
         noack capacity shared_bottleneck --loops 11,22 --draws 8 --confirm model=11
     """

@@ -415,7 +415,7 @@ def _input(record: RunRecord) -> FigureDescription:
 def _dashed(curves: Sequence[Line]) -> str:
     if not curves:
         return ""
-    return f" Dashed: claimed bounds; lighter: mostly over {_FAR:g} times the curves."
+    return f" Dashed: claimed bounds; a pale one is mostly over {_FAR:g} times the curves."
 
 
 def _seconds(t_ns: NDArray[np.int64]) -> Reals:

@@ -318,7 +318,8 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
     if not is_linear:
         errors = ", ".join(f"{by_state.max():.2g} within ±{w:g}" for w, by_state in trial.gain.model.errors)
         yield (
-            "The plant itself is not linear: no certificate covers it, and a run checks only what "
+            "The plant itself is not linear. If its equations are known, noack certify searches a "
+            "certificate on a region that it does not leave; without one, a run checks only what "
             "holds for every plant; with --set 'plant.system={kind=\"linear\"}' a run has the "
             "linear plant, and is checked against its certificate. Largest relative error of the "
             f"linear model, sampled: {errors}."
