@@ -6,20 +6,35 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import psutil
 import pytest
 
+from controller_node.controller import controllers_of
 from cosim.record.run_record import load_record
 from native.build import NO_COMPILER
+from noack.controllers.program_controller import ProgramControllerSettings
+from noack.core.clock import RunClock
+from noack.core.errors import PeerError
+from noack.protocol.topology import SENDS
+from noack.protocol.wire_format import Wire
+from noack.runtime.live_driver import LoopChannel
+from noack.runtime.node_driver import NodeDriver
+from noack.runtime.udp_sockets import bind
+from noack.settings.user_files import located
+from tests.approved import lines_of_error
 from tests.command_line import invoke
 from tests.integration import conftest as live
 from tests.integration.test_restarts import goes_on, spooled
+from tests.noack.runtime.live_loops import KEY, RUN_ID, Rows, scenario
 
 Start = Callable[..., live.Running]
 BUILD = Path(__file__).parents[2] / "native" / "build.py"
@@ -40,6 +55,19 @@ def built(folder: Path, **environment: str) -> Path:
     return program
 
 
+@pytest.fixture(scope="module")
+def node(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example, built for this machine."""
+    return built(tmp_path_factory.mktemp("node"))
+
+
+def script(folder: Path, commands: str) -> Path:
+    program = folder / "node"
+    program.write_text(f"#!/bin/sh\n{commands}\n")
+    program.chmod(0o700)
+    return program
+
+
 def by(program: Path, *runner: str, **more: object) -> list[str]:
     """Options with which a program is the controller."""
     return [
@@ -57,10 +85,16 @@ def program_of(running: live.Running) -> psutil.Process:
 
 
 @pytest.mark.parametrize("processor", ["own", EMULATED])
-def test_a_program_takes_part_in_a_live_run_and_is_replayed(processor: str, tmp_path: Path) -> None:
-    """The same steps, whatever the processor: the replay has the bits of the library's core."""
+def test_a_program_takes_part_in_a_live_run_and_is_replayed(
+    processor: str, node: Path, tmp_path: Path
+) -> None:
+    """The same steps, whatever the processor: the replay has the bits of the library's core.
+
+    What a program has started ends with the run, also while it keeps the program's stream open.
+    """
+    number = tmp_path / "number"
     if processor == "own":
-        options = by(built(tmp_path), horizon_s=3.0)
+        options = by(script(tmp_path, f"sleep 600 & echo $! >{number}; exec {node}"), horizon_s=3.0)
     else:
         if shutil.which(f"qemu-{processor}") is None:
             pytest.skip("qemu-user is not installed")
@@ -77,10 +111,13 @@ def test_a_program_takes_part_in_a_live_run_and_is_replayed(processor: str, tmp_
     assert channel["accepted"] == len(record["controller_delivery"]) > 0
     assert channel["rejected"] == channel["send_errors"] == {}
     assert (finished.run_dir / "logs" / "controller.log").read_text() == ""
+    if number.exists():
+        with suppress(psutil.NoSuchProcess):
+            live.wait_for(lambda: live.is_over(psutil.Process(int(number.read_text()))))
 
 
-def test_a_killed_program_ends_the_run_and_its_rows_are_kept(start: Start, tmp_path: Path) -> None:
-    running = start(*by(built(tmp_path), speed=4.0, horizon_s=400.0))
+def test_a_killed_program_ends_the_run_and_its_rows_are_kept(start: Start, node: Path) -> None:
+    running = start(*by(node, speed=4.0, horizon_s=400.0))
     running.wait_recording()
     program_of(running).kill()
     finished = running.finish()
@@ -95,9 +132,9 @@ def test_a_killed_program_ends_the_run_and_its_rows_are_kept(start: Start, tmp_p
     assert running.left_behind() == []
 
 
-def test_a_stopped_program_ends_with_its_process_and_another_goes_on(start: Start, tmp_path: Path) -> None:
+def test_a_stopped_program_ends_with_its_process_and_another_goes_on(start: Start, node: Path) -> None:
     """A program that is stopped does not see the end of its input."""
-    options = by(built(tmp_path), speed=2.0, horizon_s=60.0, recovery__rejoin_within_s=60.0)
+    options = by(node, speed=2.0, horizon_s=60.0, recovery__rejoin_within_s=60.0)
     running = start(*options)
     running.wait_recording()
     live.wait_for(lambda: len(spooled(running, "controller_delivery")) > 0)
@@ -112,51 +149,62 @@ def test_a_stopped_program_ends_with_its_process_and_another_goes_on(start: Star
     assert running.left_behind() == []
 
 
+def driver_of(program: Path, content: dict[str, Any]) -> NodeDriver:
+    """The driver of a program, without a run."""
+    settings = located(ProgramControllerSettings(kind="program", file=str(program)), Path(), "here")
+    assert isinstance(settings, ProgramControllerSettings)
+    ticket = SimpleNamespace(key=KEY)
+    process: Any = SimpleNamespace(wire=Wire(RUN_ID, KEY), admitted_ns=0, ticket=ticket)
+    return NodeDriver(process, controllers_of([scenario(content)]), settings)
+
+
 @pytest.mark.parametrize(
-    ("script", "line"),
+    ("commands", "line"),
     [
-        (None, "cannot be read: No such file or directory"),
-        ("not executable", "cannot be started: Permission denied; it must be executable"),
         ("exit 3", "the program has ended: exit status 3; a node of this version says"),
         ("kill -SEGV $$", "the program has ended: killed by SIGSEGV; a node of this version says"),
         ("echo noack node 7 8", "says 'noack node 7 8'; a node of this version says"),
     ],
-)  # fmt: skip
-def test_what_is_no_node_is_refused_in_one_line(script: str | None, line: str, tmp_path: Path) -> None:
-    program = tmp_path / "node"
-    if script is not None:
-        program.write_text(f"#!/bin/sh\n{script}\n")
-        program.chmod(0o600 if script == "not executable" else 0o700)
-    runs = ("--json", "--runs", tmp_path / "runs", *live.BARE)
-    done = invoke("run", "lane_following", *runs, *by(program))
-    assert done.exit_code == 2, done.stderr
-    error = json.loads(done.stdout)["error"]
-    assert line in error
-    assert "\n" not in error
-
-
-@pytest.mark.parametrize(
-    ("sends", "line"),
-    [
-        ("head -c 64 /dev/zero", "has sent a frame of kind 0 and 0 bytes"),
-        ("true", "has sent 0 ticks, and is"),
-    ],
 )
-def test_a_program_that_breaks_the_protocol_is_named(sends: str, line: str, tmp_path: Path) -> None:
-    program = tmp_path / "node"
-    program.write_text(f"#!/bin/sh\necho {GREETING}; {sends}; exec cat >/dev/null\n")
-    program.chmod(0o700)
+def test_what_is_no_node_is_refused_in_one_line(
+    commands: str, line: str, tmp_path: Path, content: dict[str, Any]
+) -> None:
+    (error,) = lines_of_error(lambda: driver_of(script(tmp_path, commands), content).__enter__())
+    assert error.startswith(f"controller.file (node): {line}")
+
+
+def test_a_run_with_a_program_that_cannot_be_started_is_refused_in_one_line(tmp_path: Path) -> None:
+    (program := tmp_path / "node").touch(0o600)
+    for file, line in (
+        (tmp_path / "none", "cannot be read: No such file or directory"),
+        (program, "cannot be started: Permission denied; it must be executable"),
+    ):
+        runs = ("--json", "--runs", tmp_path / "runs", *live.BARE)
+        done = invoke("run", "lane_following", *runs, *by(file))
+        assert done.exit_code == 2, done.stderr
+        error = json.loads(done.stdout)["error"]
+        assert line in error
+        assert "\n" not in error
+
+
+def test_a_frame_that_no_node_sends_is_named(tmp_path: Path, content: dict[str, Any]) -> None:
+    program = script(tmp_path, f"echo {GREETING}; head -c 64 /dev/zero; exec cat >/dev/null")
+    clock = RunClock(time.monotonic_ns())
+    with bind(0, "test") as endpoint, driver_of(program, content) as driver:
+        driver.set_clock(clock)
+        own = endpoint.getsockname()
+        channel = LoopChannel(endpoint, driver, SENDS["controller"], source=own, destination=own)
+
+        def drive() -> None:
+            while True:
+                driver.drive(clock.now_ns() + 10_000_000, Rows())
+
+        with closing(channel), pytest.raises(PeerError, match=r"\(node\): has sent a frame of kind 0 and 0"):
+            drive()
+
+
+def test_a_program_that_sends_no_ticks_is_named(tmp_path: Path) -> None:
+    program = script(tmp_path, f"echo {GREETING}; exec cat >/dev/null")
     finished = live.run_scenario(tmp_path / "runs", *by(program, horizon_s=3.0))
     assert finished.status == 1
-    assert f"controller.file (node): {line}" in finished.summary["exit"]["reason"]
-
-
-def test_what_a_program_has_started_ends_with_the_run(tmp_path: Path) -> None:
-    """Also while it keeps the program's stream open."""
-    node, program, number = built(tmp_path), tmp_path / "node", tmp_path / "number"
-    program.write_text(f"#!/bin/sh\nsleep 600 & echo $! >{number}; exec {node}\n")
-    program.chmod(0o700)
-    finished = live.run_scenario(tmp_path / "runs", *by(program, horizon_s=1.0))
-    assert finished.status == 0, finished.stderr
-    with suppress(psutil.NoSuchProcess):
-        live.wait_for(lambda: live.is_over(psutil.Process(int(number.read_text()))))
+    assert "controller.file (node): has sent 0 ticks, and is" in finished.summary["exit"]["reason"]

@@ -14,6 +14,7 @@ import pytest
 import noack
 from noack.core.errors import CallerError
 from tests.command_line import invoke
+from tests.integration.conftest import AT_RATE
 
 pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
 pytest.importorskip("zenoh_ros2_sdk", reason="zenoh-ros2-sdk is not installed")
@@ -74,6 +75,7 @@ def test_a_plant_in_ros2_moves_as_the_same_plant_in_noack(port: int) -> None:
     assert run.replay().bit_exact
 
 
+@pytest.mark.usefixtures("no_report", "no_recording")
 def test_a_plant_in_ros2_takes_part_in_a_live_run(port: int) -> None:
     with node(EXAMPLE, port):
         run = noack.run(noack.load(in_ros2(port)))
@@ -102,10 +104,11 @@ def test_who_does_not_answer_is_named(port: int) -> None:
     assert "router nonsense: give it as tcp/127.0.0.1:7447" in done.output
 
 
+@pytest.mark.usefixtures("no_recording")
 def test_an_independent_client_receives_a_live_run(port: int, tmp_path: Path) -> None:
     with node(LISTENER, port) as listener:
         words = ("--listen", "--router", f"tcp/127.0.0.1:{port}", "--runs", tmp_path, "--no-report")
-        done = invoke("bridge", "lane_following", "--set", "horizon_s=3", *words)
+        done = invoke("bridge", "lane_following", "--set", "horizon_s=3", *AT_RATE, *words)
         assert done.exit_code == 0, done.output
         assert listener.stdout is not None
         found = json.loads(listener.stdout.readline())

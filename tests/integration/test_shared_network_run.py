@@ -18,7 +18,7 @@ STEPS = {"lane": 1501, "pendulum-1": 301, "pendulum-2": 301, "mass": 1501}
 
 @pytest.fixture(scope="module")
 def different(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
-    """With the live recording, a change of settings on the way, and a queue that chooses by errors."""
+    """With a change of settings on the way, and a queue that chooses by errors."""
     change = "changes=[{ at_s = 1.5, set = { mansd = 2 } }]"
     queue = '[{kind="rate", rate_bps=300_000, discipline={kind="maximum_error"}}]'
     settings = (
@@ -26,7 +26,7 @@ def different(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
         "--set", change, "--set", f"network.impairments={queue}",
     )  # fmt: skip
     with live.begun(tmp_path_factory.mktemp("different")) as start:
-        return start(*settings, command=("run", "different_loops"), viewer=True).finish()
+        return start(*settings, command=("run", "different_loops")).finish()
 
 
 def test_all_loops_reach_the_horizon_at_their_rates_and_are_replayed(

@@ -1,7 +1,10 @@
 """Prints digests of what the core computes: records of the shipped scenarios, exact batches, and
-functions. ``test_same_bits.py`` compares those of cores that were built in different ways."""
+functions. ``test_same_bits.py`` compares those of cores that were built in different ways, and with
+the argument ``linear`` those that no other library computes."""
 
 import hashlib
+import sys
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +14,7 @@ from cosim.simulation.exact_simulation import run_with_events
 from cosim.simulation.virtual_time import simulate
 from noack.core.core_library import core
 from noack.core.errors import CallerError
+from noack.core.linear_systems import exponential
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from tests.cosim.simulation.batch.exact import random_population, random_setting
@@ -18,6 +22,8 @@ from tests.example_rules import TABLES, random_rule
 
 LANES = ("following", "acknowledged", "actuation_loss", "crosswind")
 """Of the scenarios of the lane, those with machines of their own."""
+LINEAR = ("lane_following", "f16_lateral", "unstable_pendulum")
+"""Scenarios whose matrices and machines are all noack's."""
 FUNCTIONS = ("exp", "expm1", "log", "cube_root", "normal_cdf", "normal_score")
 
 
@@ -25,8 +31,8 @@ def _print(name: str, *parts: bytes) -> None:
     print(name, hashlib.sha256(b"".join(parts)).hexdigest(), flush=True)
 
 
-def _records() -> None:
-    for name in shipped_names("scenarios"):
+def _records(names: Iterable[str]) -> None:
+    for name in names:
         if name.startswith("lane_") and name.removeprefix("lane_") not in LANES:
             continue
         try:
@@ -62,8 +68,19 @@ def _functions() -> None:
         _print(name, np.array([function(x) for x in arguments.tolist()]).tobytes())
 
 
+def _exponentials() -> None:
+    rng = np.random.default_rng(3)
+    for n in (1, 2, 4, 9, 16):
+        for scale in (1e-6, 0.1, 1.0, 30.0):
+            _print(f"exponential {n} {scale}", exponential(scale * rng.normal(size=(n, n))).tobytes())
+
+
 if __name__ == "__main__":
-    print("instructions:", core.noack_exact_instructions())
-    _records()
-    _batches()
-    _functions()
+    _exponentials()
+    if sys.argv[1:] == ["linear"]:
+        _records(LINEAR)
+    else:
+        _records(shipped_names("scenarios"))
+        print("instructions:", core.noack_exact_instructions())
+        _batches()
+        _functions()

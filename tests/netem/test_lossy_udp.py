@@ -1,16 +1,18 @@
 """The emulator within a program, and the plug-in of pytest."""
 
-import os
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 import noack
+from netem import pytest_plugin
 from noack.core.errors import NoackError
 from tests.netem.conftest import Decide
 from tests.pages import blocks
@@ -121,11 +123,11 @@ def test_words_may_name_files(ends: Ends, tmp_path: Path, monkeypatch: pytest.Mo
     assert arrived(ends, "loss trace trace.txt", 0, 6) == [True, False, False] * 2
 
 
-def run_pytest(folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def run_pytest(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     plugin = ["-p", "no:noack", "-p", "netem.pytest_plugin"]  # if it is not installed here, too
     return subprocess.run(
         [sys.executable, "-m", "pytest", *plugin, "-p", "no:cacheprovider", *arguments],
-        cwd=folder, env=os.environ | environment, capture_output=True, text=True, check=False,
+        cwd=folder, capture_output=True, text=True, check=False,
     )  # fmt: skip
 
 
@@ -160,14 +162,20 @@ def test_a_failure_names_the_seed_that_repeats_it(tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text(FAILS)
     first = failure(run_pytest(tmp_path, "-vv"))
     assert failure(run_pytest(tmp_path, "-vv", "--noack-seed", first[1])) == first
-    assert failure(run_pytest(tmp_path, "-vv", NOACK_SEED=first[1])) == first
-    assert failure(run_pytest(tmp_path, "-vv", "-o", f"noack_seed={first[1]}")) == first
-    assert failure(run_pytest(tmp_path, "-vv"))[1] != first[1]
-    assert (
-        run_pytest(tmp_path, NOACK_SEED="x")
-        .stderr.strip()
-        .endswith("NOACK_SEED x: must be 0 or more, below 2^64")
-    )
+
+
+def test_the_seed_is_that_of_the_option_the_environment_or_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    def seed(option: str = "", environment: str = "", file: str = "") -> int:
+        monkeypatch.setenv(pytest_plugin.SEED, environment)
+        config: Any = SimpleNamespace(getoption=lambda _: option, getini=lambda _: file, stash={})
+        pytest_plugin.pytest_configure(config)
+        return int(config.stash[pytest_plugin._COMMON])
+
+    assert (seed("1", "2", "3"), seed("", "2", "3"), seed(file="3")) == (1, 2, 3)
+    assert seed() != seed()
+    for wrong in ("x", "-1", str(2**64)):
+        with pytest.raises(pytest.UsageError, match=f"^NOACK_SEED {wrong}: must be 0 or more, below"):
+            seed(environment=wrong)
 
 
 def test_the_test_of_the_documentation_passes(tmp_path: Path) -> None:

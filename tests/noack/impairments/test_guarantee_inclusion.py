@@ -36,7 +36,7 @@ def random_guarantee(rng: np.random.Generator) -> LossGuarantee:
 
 
 def test_implications_are_those_of_all_patterns() -> None:
-    rng, longest, implied = np.random.default_rng(0), 11, 0
+    rng, longest, implied = np.random.default_rng(0), 9, 0
     patterns = [one for k in range(longest + 1) for one in product((True, False), repeat=k)]
     for _ in range(60):
         one, other = random_guarantee(rng), random_guarantee(rng)

@@ -41,7 +41,7 @@ from tests.noack.machines.any_machines import (
 )
 
 Part = Plant | Sensor | Controller
-COUNT = 120
+COUNT = 80
 
 
 def part_of(role: str, number: int, of: Sizes) -> Part:

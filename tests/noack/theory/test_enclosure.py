@@ -132,6 +132,15 @@ def test_no_integral_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str
     assert kernel.integral() <= 1.01 * float(areas.sum())
 
 
+def test_an_oscillation_that_appears_when_the_rest_has_decayed_is_followed() -> None:
+    """By then, the steps of the enclosure have become long."""
+    G = np.array([[-1.0, 0.0, 0.0], [0.0, -0.05, 30.0], [0.0, -30.0, -0.05]])
+    C, D = np.array([[0.0, 1.0, 0.0]]), np.array([[1.0], [1e-5], [0.0]])
+    kernel = response(G, D).through(C)
+    t_s = np.linspace(0.0, float(kernel.edges_s[-1]), 5000)[:-1]
+    assert (kernel.highest[cell_of(kernel, t_s)] >= values(C, G, D, t_s) * ROUNDING).all()
+
+
 def test_a_system_that_does_not_decay_is_refused() -> None:
     with pytest.raises(NotDecayingError, match=r"a mode of the loop grows at 2 /s"):
         response(np.diag([-1.0, 2.0]), np.eye(2))

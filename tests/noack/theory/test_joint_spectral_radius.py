@@ -124,7 +124,7 @@ def test_a_growth_near_the_threshold_is_decided(seed: int) -> None:
 
 def test_the_estimate_of_the_work_is_mostly_that_of_a_complete_search() -> None:
     ratios = []
-    for seed in range(24):
+    for seed in range(12):
         (system,) = strongly_connected(random_graph(np.random.default_rng(seed)))
         slowest = joint_spectral_radius(system.edges, accuracy=1e-3).lower
         balanced, growth = system.balanced(), 1.05 * slowest
@@ -139,7 +139,7 @@ def test_the_estimate_of_the_work_is_mostly_that_of_a_complete_search() -> None:
 
 def test_a_growth_that_is_the_threshold_is_undecided() -> None:
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    found = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, turn.T)], threshold=1.0)
+    found = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, turn.T)], threshold=1.0, effort=0.1)
     assert found.lower <= 1 <= found.upper < 1 + 1e-3
     assert found.needed_effort == np.inf
 

@@ -47,7 +47,7 @@ def of(system: System) -> tuple[LoopMatrices, Theorem2]:
     return loop, found
 
 
-@settings(SEARCH, max_examples=3)
+@settings(SEARCH, max_examples=2)
 @given(systems(weighted=False))
 def test_theorem_2_is_what_its_equations_say(system: System) -> None:
     """Every quantity recomputed from eq:tau, eq:Htil and eq:normXt; F at t_i = 0 and far out."""
@@ -77,7 +77,7 @@ def test_theorem_2_is_what_its_equations_say(system: System) -> None:
         assert found.state(np.array([t]), alpha)[0] == pytest.approx(right, rel=1e-12)
 
 
-@settings(SEARCH, max_examples=3)
+@settings(SEARCH, max_examples=2)
 @given(systems(weighted=False, **INSTANT), seeds)
 def test_theorem_2_is_never_exceeded_in_the_papers_loop(system: System, seed: int) -> None:
     _, found = of(system)

@@ -62,9 +62,9 @@ def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand
 def test_moments_at_a_lower_rate_than_the_triggers() -> None:
     """Random loops without moments at the trigger's rate, against their runs."""
     share, compared = 1e-3, 0
-    for seed in range(160):
+    for seed in range(24):
         rng = np.random.default_rng(seed)
-        loop = draw(rng)
+        loop = draw(rng, mismatch=0.5, alpha_share=0.8)  # half of them have none
         slower = replace(loop, system=replace(loop.system, alpha=share * loop.system.alpha))
         if certify(loop) is not None or (bounds := certify(slower)) is None:
             continue
@@ -130,7 +130,7 @@ def test_almost_all_runs_of_a_scalar_grow_as_the_mean_of_the_logarithm(
 @pytest.mark.parametrize("process", [independent(0.6), BURSTY], ids=["independent", "bursty"])
 def test_almost_all_runs_of_random_loops_grow_at_most_by_the_bound(process: LossProcess) -> None:
     """40 runs of 2,000 periods, minus six standard errors; the bound is above by 4 % at most."""
-    chain, slack, exceeded = unlimited(process), [], 0
+    chain, slack, exceeded = unlimited(process), [], False
     fewer = unlimited(replace(process, lost=process.lost / 2))  # a broken copy
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -148,7 +148,7 @@ def test_almost_all_runs_of_random_loops_grow_at_most_by_the_bound(process: Loss
         assert bound > grown.mean() - 6 * error
         assert bound <= np.log(mean_square_growth([(delivered, lost)], chain)) + 1e-6
         slack.append(bound - grown.mean())
-        exceeded += np.log(sure_growth(delivered, lost, fewer)) < grown.mean() - 6 * error
+        exceeded = exceeded or np.log(sure_growth(delivered, lost, fewer)) < grown.mean() - 6 * error
     assert np.median(slack) < 0.04
     assert exceeded
 

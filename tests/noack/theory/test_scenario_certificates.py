@@ -76,7 +76,7 @@ def test_a_run_across_the_floor_exceeds_no_bound(system: System, share: float, s
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 2.0])
-@settings(SEARCH, max_examples=4)
+@settings(SEARCH, max_examples=3)
 @given(system=systems(), factor=st.sampled_from([1.0, 1.5, 4.0]), seed=seeds)
 def test_where_alpha_is_too_large_bounds_fall_more_slowly(
     system: System, factor: float, share: float, seed: int
@@ -125,24 +125,18 @@ def test_a_void_certificate_gives_the_reason_and_no_bounds() -> None:
 LOOPS = 'loops=[{name="loop", count=2}]'
 
 
-@pytest.mark.parametrize(
-    "files",
-    [
-        {"lane_following": ["trigger.floor=0.001", LOOPS]},
-        {
-            "tabuada_dynamic": ["plant.initial_state_halfwidth=[0.2, 0.1]", LOOPS],
-            "different_loops": [],
-        },
-        {"lane_crosswind": ["horizon_s=10", LOOPS], "different_loops": []},
-    ],
-    ids=" and ".join,
-)
-def test_certificates_that_are_computed_together_are_those_of_each_loop(
-    files: dict[str, list[str]],
-) -> None:
+FILES = {
+    "lane_following": ["trigger.floor=0.001", LOOPS],
+    "tabuada_dynamic": ["plant.initial_state_halfwidth=[0.2, 0.1]", LOOPS],
+    "lane_crosswind": ["horizon_s=10"],
+    "different_loops": [],
+}
+
+
+def test_certificates_that_are_computed_together_are_those_of_each_loop() -> None:
     loops = [
         resolve(loop)
-        for name, overrides in files.items()
+        for name, overrides in FILES.items()
         for loop in loops_of(load(ROOT / f"scenarios/{name}.toml", overrides))
     ]
     scopes = [
@@ -196,8 +190,8 @@ GAINS: dict[str, Callable[[float], float]] = {
 
 
 @pytest.mark.parametrize("name", GAINS)
-@pytest.mark.parametrize("limit_s", [3e-6, 2e-3, 0.04, 3.0])
-@pytest.mark.parametrize("usual_s", [0.0, 2e-3, 1.0])
+@pytest.mark.parametrize("limit_s", [3e-6, 0.04, 3.0])
+@pytest.mark.parametrize("usual_s", [0.0, 1.0])
 def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s: float) -> None:
     tried: list[float] = []
 
