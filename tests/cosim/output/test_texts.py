@@ -38,10 +38,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("summary-verbose", ["summary", "RUN", "--verbose"]),
         ("fidelity", ["fidelity", "RUN"]),
         ("certify", ["certify", "lane_following"]),
-        ("certify-unlimited", ["certify", "lane_weighted", "--set", "network.enforce_mansd=false"]),
+        ("certify-unlimited", ["certify", "lane_weighted", "--set", "network.enforce_mansd=false",
+                               "--set", "network.loss.probability=0.05"]),
         ("margin", ["margin", "lane_periodic", "--most", "3", "--no-period"]),
     ],
-)
+)  # fmt: skip
 def test_the_terminal_shows_what_was_approved(
     name: str, words: list[str], run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
