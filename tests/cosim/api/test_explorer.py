@@ -11,8 +11,8 @@ import noack
 
 
 def test_results_are_those_of_the_library() -> None:
-    explorer = noack.explore("lane_following")
-    certificate = noack.certify("lane_following").schedule
+    explorer = noack.explore("double_integrator")
+    certificate = noack.certify("double_integrator").schedule
     assert certificate.constants is not None
     found = explorer.certificate
     assert found.verdict == "certified"

@@ -1,6 +1,7 @@
 """``noack certify``: its text and JSON output, and the figures quoted in the documentation."""
 
 import re
+from dataclasses import replace
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +14,7 @@ from scipy.linalg import expm
 
 from cosim.analysis.certificates import Certificates, certificates_of, with_weight
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.output.certificate_report import sentences
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of
@@ -196,6 +198,9 @@ def test_without_a_cap_the_mean_at_events_in_the_chosen_norm_is_beta_over_1_minu
     for shorter, longer in pairwise(found.bursts):
         assert shorter.probability < longer.probability
         assert shorter.state < longer.state
+    gain = "the loop gain of the moments is 1.32, not below 1"
+    void, *_ = sentences(replace(found, moments=(), void=gain, sure_rate_per_s=None))
+    assert void == f"Without the guarantee no mean is certified: {gain}."
 
 
 def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_stated(
