@@ -11,8 +11,8 @@ import noack
 
 
 def test_results_are_those_of_the_library() -> None:
-    explorer = noack.explore("double_integrator")
-    certificate = noack.certify("double_integrator").schedule
+    explorer = noack.explore("lane_following")
+    certificate = noack.certify("lane_following").schedule
     assert certificate.constants is not None
     found = explorer.certificate
     assert found.verdict == "certified"
@@ -57,7 +57,7 @@ def test_a_saved_scenario_has_the_settings_and_the_comments(tmp_path: Path) -> N
 
 def test_sliders_change_the_explorer_and_the_other_way_round() -> None:
     ipywidgets = pytest.importorskip("ipywidgets", reason="the extra `notebook` is not installed")
-    explorer = noack.explore("double_integrator", {"horizon_s": 4.0})
+    explorer = noack.explore("lane_following", {"horizon_s": 4.0})
     controls, figure = explorer.widget().children
     rows = controls.children[0].children
     sliders = {label.value: one for label, one in pairwise(rows)
