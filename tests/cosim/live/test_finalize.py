@@ -223,7 +223,7 @@ def many_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run of more loops than are prepared at once, without a summary."""
     monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
     monkeypatch.setattr(end_helpers, "_LOOPS_AT_ONCE", LOOPS - 1)
-    monkeypatch.setattr(cosim.live.finalize, "_LEAST_LOOPS", 1)  # so that helpers judge loops, too
+    monkeypatch.setattr(cosim.live.finalize, "_LEAST_LOOPS", LOOPS - 1)  # helpers judge loops, too
     monkeypatch.setattr(end_helpers, "cores", lambda: 2)
     scenario = shipped("shared_bottleneck", "horizon_s=0.2")
     assert scenario.loops is not None
