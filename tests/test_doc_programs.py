@@ -1,6 +1,7 @@
 """Run the documentation's commands, snippets and programs, and the tutorial."""
 
 import json
+import os
 import re
 import shlex
 import signal
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.command_line import invoke
-from tests.integration.conftest import wait_for
+from tests.integration.conftest import WITHOUT_VIEWER, wait_for
 from tests.pages import PAGES, ROOT, blocks, fences, fill, target_exists
 
 EXAMPLES = ROOT / "docs/examples"
@@ -198,8 +199,9 @@ def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> N
     """One terminal runs the loop; another changes a runtime parameter and then sends SIGINT."""
     run, change = LIVE
     with subprocess.Popen(
-        noack(run), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+        noack(run), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | WITHOUT_VIEWER,
+    ) as process:  # fmt: skip
         try:
             rows = folder / "runs/latest/spool/plant_step.recorder"
             wait_for(lambda: rows.exists() or process.poll() is not None)

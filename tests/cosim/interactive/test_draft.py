@@ -68,7 +68,7 @@ def test_every_scenario_has_controls_and_an_address(name: str) -> None:
     for slider in controls.sliders:
         low, high = slider.ends
         assert low <= slider.position <= high
-        for share in (0.0, 0.31, 0.5, 0.77, 1.0):
+        for share in (0.0, 0.77, 1.0):
             moved = dragged(draft, slider, slider.value_at(low + share * (high - low)))
             again = draft_of_query(moved.query(), name, {name: name})
             assert again.content == moved.content

@@ -73,7 +73,7 @@ def test_a_difference_in_the_replay_does_not_fail_the_run(run_dir: Path) -> None
     record = load_record(run_dir)
     record[PLANT_STEP]["u"][9, 0] = np.nan
     write_run(alone(record), run_dir)
-    outcome = finalize(ended_well(run_dir), report=False)
+    outcome = finalize(ended_well(run_dir), report=False, view=False)
     assert outcome.status == ExitStatus.OK
     assert outcome.summary.to_json() == summary_of(run_dir)
     first = summary_of(run_dir)["loops"][0]["replay"]["first_difference"]
@@ -123,7 +123,7 @@ def test_a_run_whose_record_is_not_complete_fails(
     damage(run_dir)
     with EndingFile(run_dir) as file:
         file.store(ExitStatus.OK, "horizon", 1.5)
-    outcome = finalize(ended_well(run_dir), report=False)
+    outcome = finalize(ended_well(run_dir), report=False, view=False)
     assert (outcome.status, outcome.reason) == (ExitStatus.FAILED, reason)
     assert summary_of(run_dir)["exit"] == {"status": 1, "reason": reason}
     stored = json.loads((run_dir / ENDING_FILE).read_text())
@@ -141,7 +141,7 @@ def test_a_run_that_cannot_be_replayed_or_whose_directory_is_deleted_fails(
         raise RuntimeError("a mistake of ours")
 
     monkeypatch.setattr(cosim.live.finalize, "replay", crash)
-    outcome = finalize(ended_well(run_dir), report=False)
+    outcome = finalize(ended_well(run_dir), report=False, view=False)
     assert outcome.status == ExitStatus.FAILED
     assert outcome.reason == "the run cannot be replayed: RuntimeError('a mistake of ours')"
     monkeypatch.setattr(cosim.live.finalize, "replay", lambda *_: shutil.rmtree(run_dir))
@@ -159,15 +159,17 @@ def test_an_interrupted_replay_leaves_a_summary(run_dir: Path, monkeypatch: pyte
 
     monkeypatch.setattr(cosim.live.finalize, "replay", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        reopen(run_dir)
+        reopen(run_dir, view=False)
     assert summary_of(run_dir)["loops"][0]["replay"] is None
-    assert reopen(run_dir).summary.loops[0].replay is None
+    assert reopen(run_dir, view=False).summary.loops[0].replay is None
 
 
+@pytest.mark.usefixtures("no_recording")
 def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
     """An empty file comes from a launcher that ended before the run."""
     with EndingFile(run_dir) as file:
-        assert (reopen(run_dir).status, reopen(run_dir).reason) == (1, "the launcher ended early")
+        outcome = reopen(run_dir)
+        assert (outcome.status, outcome.reason) == (1, "the launcher ended early")
         (run_dir / SUMMARY_FILE).unlink()
         file.store(ExitStatus.FAILED, "x" * 10_000)
         file.store(ExitStatus.TERMINATED, "stopped by SIGTERM", 1.5)
@@ -213,14 +215,19 @@ def test_an_interrupted_finalisation_is_completed(run_dir: Path) -> None:
 # --- processes that help with the end of a long run -----------------------------------------------
 
 
+LOOPS = 3
+
+
 @pytest.fixture
 def many_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run of more loops than are prepared at once, without a summary."""
     monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(end_helpers, "_LOOPS_AT_ONCE", LOOPS - 1)
+    monkeypatch.setattr(cosim.live.finalize, "_LEAST_LOOPS", LOOPS - 1)  # helpers judge loops, too
     monkeypatch.setattr(end_helpers, "cores", lambda: 2)
     scenario = shipped("shared_bottleneck", "horizon_s=0.2")
     assert scenario.loops is not None
-    loops = (scenario.loops[0].model_copy(update={"count": 17}),)
+    loops = (scenario.loops[0].model_copy(update={"count": LOOPS}),)
     return simulate_run(scenario.model_copy(update={"loops": loops}), tmp_path).run_dir
 
 
@@ -234,7 +241,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
     helpers.prepare(many_loops)
     for thread in helpers._threads:
         thread.join()
-    assert helpers.expectations(range(17)) is not None
+    assert helpers.expectations(range(LOOPS)) is not None
     monkeypatch.setattr(cosim.live.finalize, "_expectations", _killed)
     if is_killed:
         assert helpers.submit(os.getpid).result() != os.getpid()
@@ -264,7 +271,7 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
     helpers.prepare(many_loops)
     begun.wait()
     ending = PreparedEnding(many_loops, 0, ExitStatus.OK, "horizon", helpers=helpers)
-    assert len(finalize(ending, report=False, view=False).summary.loops) == 17
+    assert len(finalize(ending, report=False, view=False).summary.loops) == LOOPS
 
 
 def _killed(*_: object) -> None:
@@ -285,7 +292,7 @@ def test_the_replay_beside_is_that_of_this_process_and_is_not_lost(
             return part(self)
 
     monkeypatch.setattr(ReplayBeside, "part", told)
-    finalize(ended_well(run_dir), report=False)
+    finalize(ended_well(run_dir), report=False, view=False)
     stored = summary_of(run_dir)["loops"][0]["replay"]
     assert stored == replay(load_record(run_dir)).verdict().model_dump()
     assert len(asked) == 1

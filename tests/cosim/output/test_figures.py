@@ -192,7 +192,7 @@ def test_the_figure_has_the_bound_the_limit_and_a_cross_where_the_bound_is_lost(
 
 
 def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: Path) -> None:
-    run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}), runs=tmp_path)
+    run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}))
     names = {path.stem for path in run.save_figures("svg")}
     assert names == {"errors", "input", "inter-event", "losses", "state-norm", "states"}
     with pytest.raises(CallerError, match='"eps": a figure is saved as svg, png, pdf'):

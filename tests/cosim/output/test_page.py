@@ -266,8 +266,11 @@ def test_a_failed_report_does_not_fail_the_run(
     assert capsys.readouterr().err == "noack: warning: no report.html: no such luck\n"
 
 
-def test_the_command_writes_a_missing_report_and_others_only_if_asked(dead_run: Path) -> None:
-    """Also for a run that has not been finalized."""
+def test_the_command_writes_a_missing_report_and_others_only_if_asked(
+    dead_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also for a run that has not been finalized; without figures, which take most of the time."""
+    monkeypatch.setattr(report_page, "run_figures", lambda *_, **__: {})
     ran = invoke("report", dead_run, "--json")
     assert ran.exit_code == 0, ran.output
     path = dead_run / REPORT_FILE

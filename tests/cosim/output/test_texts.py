@@ -38,10 +38,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("summary-verbose", ["summary", "RUN", "--verbose"]),
         ("fidelity", ["fidelity", "RUN"]),
         ("certify", ["certify", "lane_following"]),
-        ("certify-unlimited", ["certify", "lane_weighted", "--set", "network.enforce_mansd=false"]),
+        ("certify-unlimited", ["certify", "lane_weighted", "--set", "network.enforce_mansd=false",
+                               "--set", "network.loss.probability=0.05"]),
         ("margin", ["margin", "lane_periodic", "--most", "3", "--no-period"]),
     ],
-)
+)  # fmt: skip
 def test_the_terminal_shows_what_was_approved(
     name: str, words: list[str], run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,7 +123,7 @@ def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> No
     margin = noack.margin("lane_periodic", most_m=2, period=False)
     for result, name in (
         (margin, "margin"), (noack.campaign(grid, workers=1), "campaign"),
-        (noack.certify("lane_following"), "certificates"),
+        (noack.certify("double_integrator"), "certificates"),
         (noack.simulate(noack.load("double_integrator", {"horizon_s": 0.1})), "numbers"),
     ):  # fmt: skip
         files = noack.save_tables(result, tmp_path / name)

@@ -32,7 +32,7 @@ def run() -> noack.Run:
 
 @pytest.fixture(scope="module")
 def loops() -> noack.Run:
-    return noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2}))
+    return noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2, "loops.0.count": 2}))
 
 
 def vector(table: pa.Table, name: str) -> np.ndarray:
@@ -132,7 +132,7 @@ def test_several_loops_have_their_names(loops: noack.Run, tmp_path: Path) -> Non
     mat = loadmat(loops.export(tmp_path / "a.mat", certificates=False)[0], simplify_cells=True)
     assert mat["loops"][name.replace("-", "_")]["plant_step"]["now_ns"].tolist() == steps
     assert Path(tmp_path / "loops.csv") in loops.save_tables(tmp_path)
-    plain = noack.simulate(noack.load("lane_following", {"horizon_s": 0.1}))
+    plain = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.1}))
     found_mat = loadmat(plain.export(tmp_path / "plain.mat")[0], simplify_cells=True)
     assert found_mat["certificates"]["certificates"][0]["constants"]["state"] > 0
     files = loops.export(tmp_path / "csv")

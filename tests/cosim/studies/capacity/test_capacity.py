@@ -106,11 +106,11 @@ def capacity(*words: str) -> Result:
 def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
     tmp_path: Path,
 ) -> None:
-    out = "--out", str(tmp_path), "--workers", "1", "--json", "--set", "horizon_s=0.5"
+    out = "--out", str(tmp_path), "--workers", "1", "--json", "--set", "horizon_s=0.2"
     result = capacity("shared_bottleneck", *out, *SHORT[2:])
     assert result.exit_code == 0, result.output
     assert re.search(
-        r"108 runs of 0.5 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
+        r"108 runs of 0.2 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
         r"--thorough: \d+ (s|min)\n",
         result.stderr,
     )

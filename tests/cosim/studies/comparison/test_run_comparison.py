@@ -21,10 +21,13 @@ SETTINGS: list[dict[str, Any]] = [
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    folder = tmp_path_factory.mktemp("runs")
-    scenarios = [noack.load("lane_following", settings) for settings in SETTINGS]
-    return [noack.simulate(scenario, runs=folder).directory for scenario in scenarios]
+def simulated() -> list[noack.Run]:
+    return [noack.simulate(noack.load("lane_following", settings)) for settings in SETTINGS]
+
+
+@pytest.fixture(scope="module")
+def runs(simulated: list[noack.Run]) -> list[Path]:
+    return [run.directory for run in simulated]
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +93,7 @@ def test_the_command_prints_the_table_and_writes_an_escaped_page(runs: list[Path
 
 
 def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: Path) -> None:
-    other = noack.simulate(noack.load("double_integrator", {"horizon_s": 1.0}), runs=tmp_path)
+    other = noack.simulate(noack.load("double_integrator", {"horizon_s": 1.0}))
     mistakes = {
         (runs[0], other.directory): f"noack: {other.directory}: its plant has 2 states, that of "
         f"{runs[0]} has 4; runs with equally many states can be compared\n",
