@@ -154,7 +154,8 @@ OUTSIDE = """(() => {
   const page = document.documentElement.getBoundingClientRect();
   const figures = [...document.querySelectorAll('figure svg')].filter(e => e.clientWidth);
   const fonts = e => 9 * e.clientWidth / e.viewBox.baseVal.width;
-  const scrolled = [...document.querySelectorAll('.scroll:has(table)')].filter(e => e.scrollWidth > e.clientWidth);
+  const tables = [...document.querySelectorAll('.scroll:has(table)')];
+  const scrolled = tables.filter(e => e.scrollWidth > e.clientWidth);
   scrolled.forEach(e => { e.scrollLeft = 30; });
   const lost = scrolled.filter(e => !within(e.querySelector('tbody tr').firstElementChild, page, 0));
   return [figures.length, lost.length, document.scrollingElement.scrollWidth - innerWidth,
