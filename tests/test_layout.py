@@ -17,41 +17,41 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 428
+MOST_MODULES = 432
 LINES = {
     "noack/scenario": 4155,
     "noack/controllers": 265,
     "noack/core": 1325,
     "noack/disturbances": 220,
-    "noack/impairments": 4340,
+    "noack/impairments": 4325,
     "noack/machines": 400,
     "noack/observers": 385,
     "noack/plants": 3220,
     "noack/protocol": 1240,
     "noack/runtime": 5665,
-    "noack/settings": 585,
-    "noack/theory": 11250,
+    "noack/settings": 580,
+    "noack/theory": 11385,
     "noack/traces": 1320,
     "noack/trigger": 1065,
-    "netem": 6500,
+    "netem": 6495,
     "cosim/analysis": 8135,
     "cosim/api": 1675,
     "cosim/cli": 3340,
-    "cosim/doctor": 815,
+    "cosim/doctor": 810,
     "cosim/interactive": 1625,
     "cosim/lab": 2115,
     "cosim/live": 3980,
     "cosim/measurement": 2855,
-    "cosim/output": 8505,
+    "cosim/output": 8520,
     "cosim/record": 3575,
     "cosim/simulation": 1895,
-    "cosim/studies": 8895,
+    "cosim/studies": 8865,
     "plant_server": 420,
     "sensor_node": 395,
     "controller_node": 410,
-    "benchmarks": 4525,
-    "native": 11030,
-    "tests": 46390,
+    "benchmarks": 3625,
+    "native": 11035,
+    "tests": 46545,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
@@ -60,7 +60,7 @@ says why.
 """
 
 MARKS = {
-    "benchmarks": (32, 9, 0),
+    "benchmarks": (29, 7, 0),
     "cosim": (2, 0, 0),
     "cosim/analysis": (8, 4, 0),
     "cosim/cli": (14, 0, 0),
