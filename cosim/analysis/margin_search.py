@@ -261,7 +261,8 @@ class MarginResult:
     def random_text(self) -> str:
         """What holds for random losses without the guarantee, as a sentence."""
         growth = self.without_guarantee
-        return f"without the guarantee: {growth if isinstance(growth, str) else growth.text}"
+        text = growth if isinstance(growth, str) else growth.text
+        return f"if losses were only random, without the guarantee: {text}"
 
     def to_json(self) -> dict[str, object]:
         """Return all fields and the verdicts for JSON."""

@@ -7,7 +7,7 @@ Read :func:`verdict` (three lines), :func:`remarks` (what limits the validity of
 import math
 import shutil
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -406,14 +406,16 @@ def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> Non
 
 
 def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
-    """Return why claims are void, with the number of loops; nothing if the verdict says it."""
-    void = [{claim.why for claim in loop.claims if claim.verdict == "void"} for loop in loops]
-    reasons = Counter(why for whys in void for why in sorted(whys))
+    """Return why claims are void, and in which loops; nothing if the verdict says it."""
+    reasons = defaultdict[str, list[str]](list)
+    for loop in loops:
+        for why in sorted({claim.why for claim in loop.claims if claim.verdict == "void"}):
+            reasons[why].append(loop.name)
     if len(reasons) == 1:
         return []
+    shown = sorted(reasons.items(), key=lambda reason: -len(reason[1]))[:_MOST_REASONS]
     lines = [
-        f"void: {why}" + (f" ({count} loops)" if count > 1 else "")
-        for why, count in reasons.most_common(_MOST_REASONS)
+        f"void: {why} ({names[0] if len(names) == 1 else f'{len(names)} loops'})" for why, names in shown
     ]
     if more := len(reasons) - len(lines):
         lines.append(f"and {more} more reason{'s' * (more > 1)}: the summaries of the loops have them")

@@ -415,7 +415,10 @@ def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str
         )
     delay = update_delay(scenario)
     unknown = [key for key, impairment_s in delay.impairments_s.items() if math.isinf(impairment_s)]
-    covered = f"the certificates cover {delay.certified_s:.3g} s; see certificate.network_delay_s"
+    source = "that of full queues" if scenario.certificate.network_delay_s is None else "as given"
+    covered = (
+        f"the certificates cover {delay.certified_s:.3g} s, {source}; certificate.network_delay_s changes it"
+    )
     if not unknown and not delay.is_certified:
         parts = ", ".join(f"{key} {impairment_s:.3g} s" for key, impairment_s in delay.impairments_s.items())
         yield f"updates may be delayed by up to {delay.largest_s:.3g} s ({parts}), {covered}"

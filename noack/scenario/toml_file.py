@@ -447,6 +447,8 @@ def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
 
 
 def _nearest(key: str, section: type[ScenarioSection] | None) -> str:
+    if key == "M":
+        return "M is network.mansd + 1; set network.mansd"
     section_keys = sorted(section.model_fields) if section is not None else []
     close = difflib.get_close_matches(key, section_keys, n=1)
     return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(section_keys)}"

@@ -418,6 +418,7 @@ class StudyOptions(opt.ScenarioOptions):
         shortest_s = min(kind.period_s for kind in kinds)
         deadline_s = self.late_after or loaded.certificate.network_delay_s or shortest_s
         settings["certificate.network_delay_s"] = deadline_s
+        capacity_plan.require_in_time(loaded, kinds, deadline_s)
         least = capacity_plan.smallest_mixture(kinds)
         if self.loops is None:
             carried = capacity_plan.periodic_loops(loaded, kinds)

@@ -357,6 +357,19 @@ def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
     return queue.rate_bps * loops / needed_bps
 
 
+def require_in_time(scenario: Scenario, kinds: Sequence[Kind], deadline_s: float) -> None:
+    """Raise CallerError if a rate needs longer than the deadline for one update alone."""
+    if not isinstance(queue := bottleneck(scenario), Rate):
+        return
+    updates_bytes = (datagram_bytes(kind.scenario.model.dimensions[0]) for kind in kinds)
+    sent_s = max(int(queue.line_bits(update_bytes)) for update_bytes in updates_bytes) / queue.rate_bps
+    if sent_s >= deadline_s:
+        raise CallerError(
+            f"one update takes {sent_s:.3g} s on {queue.rate_bps} bit/s, and is late after "
+            f"{deadline_s:.3g} s; give a longer --late-after, a longer --update-period, or a higher --rate-bps"
+        )
+
+
 def with_rate(scenario: Scenario, rate_bps: int) -> Scenario:
     """Return the scenario with this rate of its slowest bottleneck; without one, add it."""
     stages = list(scenario.network.impairments)
