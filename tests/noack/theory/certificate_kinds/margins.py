@@ -8,7 +8,6 @@ bound is repeated from the first update on.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from typing import Any
 from unittest.mock import patch
@@ -65,7 +64,8 @@ class LoopMaps:
     def _unit(self, slot: int, delivered: bool) -> Reals:
         begin_ns, end_ns = slot * self.unit_ns, (slot + 1) * self.unit_ns
         first_ns = begin_ns + (self._phase_ns - begin_ns) % self._tick_ns
-        changes = [(t_ns, 0, self._step) for t_ns in range(begin_ns + self._step_ns, end_ns + 1, self._step_ns)]
+        steps_ns = range(begin_ns + self._step_ns, end_ns + 1, self._step_ns)
+        changes = [(t_ns, 0, self._step) for t_ns in steps_ns]
         changes += [(t_ns, 3, self._tick) for t_ns in range(first_ns, end_ns, self._tick_ns)]
         if delivered:
             changes += [(begin_ns, 1, self._send), (begin_ns + self._delay_ns, 2, self._arrive)]
@@ -142,7 +142,6 @@ def worst_pattern(loop: LoopMaps, rng: np.random.Generator) -> tuple[int, Flags,
     return runs, *worst[1:]
 
 
-
 def random_loop(rng: np.random.Generator, **fixed: Any) -> LoopMaps:
     """A loop with periodic updates, or with events that are at least and at most some time apart."""
     periodic, share = fixed.pop("periodic", rng.random() < 0.75), rng.choice([0.05, 0.2])
@@ -156,7 +155,8 @@ def random_loop(rng: np.random.Generator, **fixed: Any) -> LoopMaps:
     A = system.A + rng.uniform(-0.5, 1.5) * np.eye(len(system.A))  # so that it grows or decays
     system = replace(system, A=A, H=system.H * rng.integers(2))
     step_ns, every = round(system.step_s * 1e9 / 12) * 12, int(rng.integers(1, 4))
-    unit_ns, (least, most) = step_ns * every, sorted(rng.integers(1, 4, 2).tolist())
+    unit_ns = step_ns * every
+    least, most = fixed.pop("apart", sorted(rng.integers(1, 4, 2).tolist()))
     if periodic or most == 1:
         unit_ns, least, most = unit_ns * int(rng.integers(1, 9)), 1, 1
         trigger: dict[str, Any] = {"policy": "periodic", "period_s": unit_ns * 1e-9}
@@ -173,7 +173,8 @@ def random_loop(rng: np.random.Generator, **fixed: Any) -> LoopMaps:
     constraints += [{"kind": "recovery", "deliveries": recovery}] * (recovery > 0)
     return LoopMaps(
         resolve(scenario_of(
-            system, trigger, model={"allow_unstable": True}, plant={"rate_hz": 1e9 / step_ns, "measure_every": every},
+            system, trigger, model={"allow_unstable": True},
+            plant={"rate_hz": 1e9 / step_ns, "measure_every": every},
             controller={"rate_hz": 1e9 / tick_ns, "phase": float(rng.choice([0.0, 0.25, 0.5]))},
             network={
                 "constraints": constraints,
@@ -198,10 +199,11 @@ def _no_delay(loop: LoopMaps) -> Stability:
     return bounded(loop.resolved.model_copy(update={"network": network}))
 
 
-def _rare_events(loop: LoopMaps) -> Stability:
-    longest_ns = intervals_ns(loop.resolved)[1]
-    with patch.object(loss_margin, "intervals_ns", lambda resolved: (longest_ns, longest_ns)):
-        return bounded(loop.resolved)
+def _soon(loop: LoopMaps) -> Stability:
+    shortest_ns, longest_ns = intervals_ns(loop.resolved)
+    with patch.object(loss_margin, "intervals_ns", lambda resolved: (shortest_ns, shortest_ns)):
+        found = bounded(loop.resolved)
+    return found._replace(upper=found.upper ** (longest_ns / shortest_ns), pattern=())
 
 
 def _each_burst_alone(loop: LoopMaps) -> Stability:
@@ -237,7 +239,7 @@ MARGINS = Kind(
             ("one loss less", _one_loss_less, {"mansd": 2, "window": (1, 1)}),
             ("no delay", _no_delay, {"delayed": 0.99}),
             ("each burst alone, repeated", _each_burst_alone, {"mansd": 2, "window": (1, 1), "recovery": 0}),
-            ("events are the longest time apart", _rare_events, {"periodic": False}),
+            ("events are the shortest time apart", _soon, {"periodic": False, "apart": (1, 3)}),
         )
     },
 )  # fmt: skip

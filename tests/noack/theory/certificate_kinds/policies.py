@@ -254,19 +254,21 @@ def policy_case(
 
 
 def scenario_of(system: System, trigger: dict[str, Any], **tables: dict[str, Any]) -> Scenario:
-    """The system's matrices with a trigger, not resolved; ``tables`` has more settings."""
+    """The system's matrices with a trigger, not resolved; ``tables`` has more settings.
+
+    A plant of another kind takes the place of A and B.
+    """
     mode = "model" if system.H.any() else "zoh"
     model: Matrix = system.H - system.B @ system.K if mode == "model" else system.A
     content: dict[str, Any] = {
         "name": "random", "horizon_s": 1.0, "mode": mode,
         "model": {"A": model.tolist(), "B": system.B.tolist(), "gain": system.K.tolist()},
-        "plant": {
-            "draw": "given", "A": system.A.tolist(), "B": system.B.tolist(),
-            "initial_state": system.x0.tolist(),
-        },
+        "plant": {"initial_state": system.x0.tolist()},
         "trigger": trigger,
         "network": {"mansd": system.mansd, "loss": {"model": "worst_case"}},
     }  # fmt: skip
+    if "system" not in tables.get("plant", {}):
+        content["plant"] |= {"draw": "given", "A": system.A.tolist(), "B": system.B.tolist()}
     for name, settings in tables.items():
         content[name] = content.get(name, {}) | settings
     return validate(content, "test")
