@@ -15,6 +15,7 @@ from unittest.mock import patch
 import numpy as np
 from scipy.linalg import eig, expm
 
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
@@ -30,6 +31,7 @@ from tests.oracles.lossy_loops import Flags, Reals, Steps, random_system
 
 _SHORT, _LONG, _RANDOM, _ROUNDS = 7, 12, 64, 3
 _ACCURACY = 0.01
+_DOUBLINGS = 40
 _WINDOW = 40
 """Updates for which a repeated pattern is compared with the guarantee."""
 
@@ -61,7 +63,8 @@ class LoopMaps:
         """By choice, the slot or the time to the next update, and whether it is delivered."""
         self._times = np.ones(slots) if self.is_periodic else np.arange(least, most + 1) / most
 
-    def _unit(self, slot: int, delivered: bool) -> Reals:
+    def _changes(self, slot: int, delivered: bool) -> list[tuple[float, Reals]]:
+        """Return what happens in one unit: the time in s since the change before, and the change."""
         begin_ns, end_ns = slot * self.unit_ns, (slot + 1) * self.unit_ns
         first_ns = begin_ns + (self._phase_ns - begin_ns) % self._tick_ns
         steps_ns = range(begin_ns + self._step_ns, end_ns + 1, self._step_ns)
@@ -69,10 +72,33 @@ class LoopMaps:
         changes += [(t_ns, 3, self._tick) for t_ns in range(first_ns, end_ns, self._tick_ns)]
         if delivered:
             changes += [(begin_ns, 1, self._send), (begin_ns + self._delay_ns, 2, self._arrive)]
-        whole, now_ns = np.eye(len(self._rates)), begin_ns
-        for t_ns, _, change in sorted(changes, key=lambda one: one[:2]):
-            whole, now_ns = change @ expm(self._rates * (t_ns - now_ns) * 1e-9) @ whole, t_ns
-        return np.asarray(whole)
+        times_ns, _, whats = zip(*sorted(changes, key=lambda one: one[:2]), strict=True)
+        return list(zip(np.diff(times_ns, prepend=begin_ns) * 1e-9, whats, strict=True))
+
+    def _unit(self, slot: int, delivered: bool) -> Reals:
+        whole = np.eye(len(self._rates))
+        for dt_s, change in self._changes(slot, delivered):
+            whole = change @ expm(self._rates * dt_s) @ whole
+        return whole
+
+    def cost(self, x0: Vector, Q: Matrix, R: Matrix) -> float:
+        """Return ∫ xᵀQx + uᵀRu dt without losses, from x(0), which the controller knows."""
+        n, m = len(Q), len(R)
+        weight, form, whole = np.zeros_like(self._rates), 0 * self._rates, np.eye(len(self._rates))
+        weight[:n, :n], weight[2 * n : 2 * n + m, 2 * n : 2 * n + m] = Q, R
+        nodes, shares = np.polynomial.legendre.leggauss(8)
+        for slot in range(len(self.maps)):
+            for dt_s, change in self._changes(slot, delivered=True):
+                for node, share in zip(nodes, shares, strict=True):
+                    there = expm(self._rates * dt_s * (1 + node) / 2) @ whole
+                    form += share * dt_s / 2 * there.T @ weight @ there
+                whole = change @ expm(self._rates * dt_s) @ whole
+        if np.abs(np.linalg.eigvals(whole)).max() >= 1:
+            return np.inf
+        for _ in range(_DOUBLINGS):
+            form, whole = form + whole.T @ form @ whole, whole @ whole
+        z0 = np.concatenate([x0, x0, np.zeros(2 * m), x0])
+        return float(z0 @ form @ z0)
 
     def repeated(self, lost: Flags, rng: np.random.Generator) -> tuple[Flags, Steps]:
         """Return outcomes until the slots repeat, and choices, of patterns (patterns, updates)."""
@@ -142,8 +168,8 @@ def worst_pattern(loop: LoopMaps, rng: np.random.Generator) -> tuple[int, Flags,
     return runs, *worst[1:]
 
 
-def random_loop(rng: np.random.Generator, **fixed: Any) -> LoopMaps:
-    """A loop with periodic updates, or with events that are at least and at most some time apart."""
+def random_scenario(rng: np.random.Generator, **fixed: Any) -> tuple[Scenario, int, int, int]:
+    """A loop with periodic updates, or events; its unit in ns, least and most units between two."""
     periodic, share = fixed.pop("periodic", rng.random() < 0.75), rng.choice([0.05, 0.2])
     delayed = fixed.pop("delayed", float(rng.choice([0.0, 0.0, 0.3, 0.99])))
     given = {
@@ -152,7 +178,10 @@ def random_loop(rng: np.random.Generator, **fixed: Any) -> LoopMaps:
         "recovery": int(rng.choice([0, 0, 1, 3])),
     }  # fmt: skip
     system = random_system(rng, **(given | fixed))
-    A = system.A + rng.uniform(-0.5, 1.5) * np.eye(len(system.A))  # so that it grows or decays
+    grows_per_s = rng.uniform(-0.5, 1.5)
+    if "rate_per_s" in fixed:
+        grows_per_s = fixed["rate_per_s"] - spectral_abscissa(system.A)
+    A = system.A + grows_per_s * np.eye(len(system.A))
     system = replace(system, A=A, H=system.H * rng.integers(2))
     step_ns, every = round(system.step_s * 1e9 / 12) * 12, int(rng.integers(1, 4))
     unit_ns = step_ns * every
@@ -171,17 +200,22 @@ def random_loop(rng: np.random.Generator, **fixed: Any) -> LoopMaps:
     (losses, window), recovery = system.window, system.recovery
     constraints = [{"kind": "at_most", "losses": losses, "window": window}] * (losses < window)
     constraints += [{"kind": "recovery", "deliveries": recovery}] * (recovery > 0)
-    return LoopMaps(
-        resolve(scenario_of(
-            system, trigger, model={"allow_unstable": True},
-            plant={"rate_hz": 1e9 / step_ns, "measure_every": every},
-            controller={"rate_hz": 1e9 / tick_ns, "phase": float(rng.choice([0.0, 0.25, 0.5]))},
-            network={
-                "constraints": constraints,
-                "impairments": [{"kind": "delay", "delay_s": delay_s}] * (delay_s > 0),
-            },
-        )), unit_ns, least, most,
+    scenario = scenario_of(
+        system, trigger, model={"allow_unstable": True},
+        plant={"rate_hz": 1e9 / step_ns, "measure_every": every},
+        controller={"rate_hz": 1e9 / tick_ns, "phase": float(rng.choice([0.0, 0.25, 0.5]))},
+        network={
+            "constraints": constraints,
+            "impairments": [{"kind": "delay", "delay_s": delay_s}] * (delay_s > 0),
+        },
     )  # fmt: skip
+    return scenario, unit_ns, least, most
+
+
+def random_loop(rng: np.random.Generator, **fixed: Any) -> LoopMaps:
+    """The same, with its maps."""
+    scenario, *times = random_scenario(rng, **fixed)
+    return LoopMaps(resolve(scenario), *times)
 
 
 def bounded(resolved: Scenario, guarantee: LossGuarantee | None = None) -> Stability:

@@ -256,7 +256,7 @@ def policy_case(
 def scenario_of(system: System, trigger: dict[str, Any], **tables: dict[str, Any]) -> Scenario:
     """The system's matrices with a trigger, not resolved; ``tables`` has more settings.
 
-    A plant of another kind takes the place of A and B.
+    A plant of another kind or draw takes the place of A and B.
     """
     mode = "model" if system.H.any() else "zoh"
     model: Matrix = system.H - system.B @ system.K if mode == "model" else system.A
@@ -267,7 +267,7 @@ def scenario_of(system: System, trigger: dict[str, Any], **tables: dict[str, Any
         "trigger": trigger,
         "network": {"mansd": system.mansd, "loss": {"model": "worst_case"}},
     }  # fmt: skip
-    if "system" not in tables.get("plant", {}):
+    if not tables.get("plant", {}).keys() & {"system", "draw"}:
         content["plant"] |= {"draw": "given", "A": system.A.tolist(), "B": system.B.tolist()}
     for name, settings in tables.items():
         content[name] = content.get(name, {}) | settings
