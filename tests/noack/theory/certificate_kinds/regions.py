@@ -142,39 +142,41 @@ _bounds = shares_of(("x", "u", "‖x‖", "‖e_s‖", "‖e_c‖", "inclusion")
 _over, _bounded = EnclosedMotion.over, _Box.bounded
 
 
-def _over_half(motion: EnclosedMotion, halfwidths: Vector) -> Inclusion:
-    return _over(motion, halfwidths / 2)
-
-
-def _no_remainder(motion: EnclosedMotion, halfwidths: Vector) -> Inclusion:
-    box = _over(motion, halfwidths)
+def _no_remainder(motion: EnclosedMotion, widths: Vector) -> Inclusion:
+    box = _over(motion, widths)
     return box._replace(halfwidth_A=0 * box.A, halfwidth_B=0 * box.B)
 
 
-def _first_region(box: _Box, conditions: NetworkConditions) -> Search[Any]:
-    phases, reached = yield from _bounded(box, conditions)
-    return phases, reached * (not box._plants[0.0].halfwidth_A.any())
+def _reaching(change: Callable[[_Box, Vector], Vector]) -> Callable[..., Any]:
+    def bounded(box: _Box, conditions: NetworkConditions) -> Search[Any]:
+        phases, reached = yield from _bounded(box, conditions)
+        return phases, change(box, reached)
+
+    return bounded
 
 
-def _half_the_bounds(box: _Box, conditions: NetworkConditions) -> Search[Any]:
-    phases, reached = yield from _bounded(box, conditions)
-    return phases, reached / 2
-
-
-def _broken(owner: type, name: str, wrong: Any) -> Callable[[Case], Bounds | None]:
+def _broken(owner: type, name: str, wrong: Any, draw: Callable[..., RegionLoop]) -> Broken:
     def certify(case: Case) -> Bounds | None:
         with patch.object(owner, name, wrong):
             return _bounds(case)
 
-    return certify
+    return Broken(certify, drawn(draw, {}))
 
 
 REGIONS = Kind(
     "region", drawn(random_loop, {}), _bounds, _simulate,
     {
-        "equations over half of the region": Broken(_broken(EnclosedMotion, "over", _over_half)),
-        "no remainder": Broken(_broken(EnclosedMotion, "over", _no_remainder)),
-        "the first region": Broken(_broken(_Box, "bounded", _first_region), drawn(_steep_loop, {})),
-        "half of the bounds": Broken(_broken(_Box, "bounded", _half_the_bounds)),
+        "equations over half of the region": _broken(
+            EnclosedMotion, "over", lambda motion, widths: _over(motion, widths / 2), random_loop
+        ),
+        "no remainder": _broken(EnclosedMotion, "over", _no_remainder, random_loop),
+        "half of the bounds": _broken(
+            _Box, "bounded", _reaching(lambda box, reached: reached / 2), random_loop
+        ),
+        "the first region": _broken(
+            _Box, "bounded",
+            _reaching(lambda box, reached: reached * (not box._plants[0.0].halfwidth_A.any())),
+            _steep_loop,
+        ),
     },
 )  # fmt: skip
