@@ -49,7 +49,7 @@ def random_scenario(rng: np.random.Generator, **fixed: Any) -> tuple[Scenario, i
     if periodic or most == 1:
         unit_ns, least, most = unit_ns * int(rng.integers(1, 9)), 1, 1
         trigger: dict[str, Any] = {"policy": "periodic", "period_s": unit_ns * 1e-9}
-        ticks_ns = [step_ns * twelfths // 12 for twelfths in (4, 6, 12, 18, 24)]
+        ticks_ns = [step_ns * twelfths // 12 for twelfths in fixed.pop("ticks", (4, 6, 12, 18, 24, 36, 60))]
     else:
         rule = {"policy": "dwell", "interval_s": (least - 0.5) * unit_ns * 1e-9}
         rule["rule"] = {"policy": "absolute", "delta": 1.0}
@@ -100,6 +100,11 @@ def _soon(loop: LoopMaps) -> Stability:
     return found._replace(upper=found.upper ** (longest_ns / shortest_ns), pattern=())
 
 
+def _late_pattern(loop: LoopMaps) -> Stability:
+    found = bounded(loop.resolved)
+    return found._replace(pattern=found.pattern[1:] + found.pattern[:1])
+
+
 def _each_burst_alone(loop: LoopMaps) -> Stability:
     true = loss_margin.joint_spectral_radius
 
@@ -131,6 +136,7 @@ MARGINS = Kind(
             ("one loss less", _one_loss_less, {"mansd": 2, "window": (1, 1)}),
             ("no delay", _no_delay, {"delayed": 0.99}),
             ("each burst alone, repeated", _each_burst_alone, {"mansd": 2, "window": (1, 1), "recovery": 0}),
+            ("the pattern begins an update late", _late_pattern, {"periodic": True, "ticks": (36, 60)}),
             ("events are the shortest time apart", _soon, {"periodic": False, "apart": (1, 3)}),
         )
     },
