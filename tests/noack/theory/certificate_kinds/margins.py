@@ -127,7 +127,8 @@ def _bounds(certify: Callable[[LoopMaps], Stability]) -> Callable[[Case], Bounds
     return shares_of(("growth", "pattern"), lambda case: certify(case.loop))
 
 
-_BURSTS = {"mansd": 2, "window": (1, 1)}
+_BURSTS = {"mansd": 3, "window": (1, 1)}
+_ONE_SLOT = {"n": 2, "recovery": 0, "ticks": (12,)}
 
 MARGINS = Kind(
     "margin", drawn(random_loop, {}), _bounds(lambda loop: bounded(loop.resolved)),
@@ -137,7 +138,7 @@ MARGINS = Kind(
         for mistake, certify, where in (
             ("one loss less", _one_loss_less, _BURSTS),
             ("no delay", _no_delay, {"delayed": 0.99}),
-            ("each burst alone, repeated", _each_burst_alone, {**_BURSTS, "mansd": 3, "n": 2, "recovery": 0, "ticks": (12,)}),
+            ("each burst alone, repeated", _each_burst_alone, _BURSTS | _ONE_SLOT),
             ("the pattern begins an update late", _late_pattern, {"periodic": True, "ticks": (36, 60)}),
             ("events are the shortest time apart", _soon, {"periodic": False, "apart": (1, 3)}),
         )
