@@ -61,9 +61,10 @@ class EventDesign(NamedTuple):
     certificate: ScenarioCertificate
 
 
-def _random_periodic(rng: Rng) -> Wanted:
+def _random_periodic(rng: Rng, **fixed: Any) -> Wanted:
     scenario, unit_ns, *_ = random_scenario(
-        rng, n=int(rng.choice([1, 1, 2])), periodic=True, rate_per_s=rng.uniform(-0.1, 1)
+        rng,
+        **({"n": int(rng.choice([1, 1, 2])), "periodic": True, "rate_per_s": rng.uniform(-0.1, 1)} | fixed),
     )
     n, m = np.shape(scenario.model.B)
     weights = np.diag(10 ** rng.uniform(-1, 1, n)), np.diag(10 ** rng.uniform(-1, 1, m))
@@ -185,7 +186,7 @@ DESIGNS = Kind(
     {
         mistake: Broken(partial(_certify, change=change), lambda rng, draw=draw: Case(draw(rng)))
         for mistake, change, draw in (
-            ("one rung further", _one_rung_further, _random_periodic),
+            ("one rung further", _one_rung_further, partial(_random_periodic, rate_per_s=1.0)),
             ("the gain of the given loop", _given_gain, _random_periodic),
             ("no cost of inputs", _no_cost_of_inputs, _random_periodic),
             ("one loss less, with events", _one_loss_less, partial(_random_events, **FAR)),
