@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from cosim.analysis.certificates import with_linear_plant, with_weight
+from noack.core.linear_systems import Vector
+from noack.plants.systems.jacobian_enclosure import Inclusion
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
@@ -95,6 +97,17 @@ CASES = {
 def certificate_of(resolved: Scenario, semi_axes: tuple[float, ...]) -> ScenarioCertificate:
     """Return the certificate of all x(0) in an ellipsoid."""
     return RegionScope(resolved, start=np.diag(semi_axes)).certificate(allowed_conditions(resolved))
+
+
+def inclusion_share(box: Inclusion, field: Field, widths: Vector, points: int = 4000) -> float:
+    """Return the largest share of a box of matrices that f uses, in points and corners of a region."""
+    rng, n = np.random.default_rng(1), len(box.A)
+    z = rng.uniform(-1, 1, (points, len(widths)))
+    z[::2] = np.sign(z[::2])
+    z = (z * rng.uniform(0, 1, (points, 1)) ** 0.2 * widths).T
+    middle, half = np.hstack([box.A, box.B]), np.hstack([box.halfwidth_A, box.halfwidth_B])
+    rounding = 1e-12 * np.abs(middle) @ np.abs(z) + 1e-300
+    return float((np.abs(field(z[:n], z[n:]) - middle @ z) / (half @ np.abs(z) + rounding)).max())
 
 
 def attacked(

@@ -1,12 +1,11 @@
-"""The bounds of joint spectral radii, against closed forms and brute force.
+"""The bounds of joint spectral radii, against closed forms.
 
-A published value is in ``noack paper philippe``.
+``certificate_kinds/margins.py`` has brute force; a published value is in ``noack paper philippe``.
 
 The enclosures that they are computed with contain the exact results of rational arithmetic.
 """
 
 from fractions import Fraction
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -57,31 +56,6 @@ def random_graph(rng: np.random.Generator) -> list[Edge]:
     return [edge(i, j, rng.normal(size=(n, n)), int(rng.integers(1, 3))) for i, j in pairs]
 
 
-def fastest_cycle(edges: list[Edge], longest: int) -> float:
-    """The largest growth of all cycles of up to that many edges."""
-    best = 0.0
-    for length in range(1, longest + 1):
-        for path in product(edges, repeat=length):
-            closed = all(path[i - 1].target == path[i].source for i in range(length))
-            if closed:
-                Π = np.linalg.multi_dot([np.eye(len(path[0].matrix.middle[0]))] * 2 + [
-                    one.matrix.middle for one in reversed(path)
-                ])  # fmt: skip
-                growth = np.abs(np.linalg.eigvals(Π)).max()
-                best = max(best, growth ** (1 / sum(one.duration for one in path)))
-    return float(best)
-
-
-@pytest.mark.parametrize("seed", range(25))
-def test_random_systems_against_all_cycles(seed: int) -> None:
-    edges = random_graph(np.random.default_rng(seed))
-    longest = 5 if len(edges) <= 6 else 4
-    found = joint_spectral_radius(edges, accuracy=1e-3)
-    brute = fastest_cycle(edges, longest)
-    assert brute * (1 - 1e-9) <= found.lower <= found.upper
-    assert found.upper / found.lower < 1.01
-
-
 @pytest.mark.parametrize("seed", range(20))
 def test_no_polytopes_prove_too_much(seed: int) -> None:
     """The bound is valid for any vertices, also if they were not grown to the end."""
@@ -119,7 +93,6 @@ def test_a_growth_near_the_threshold_is_decided(seed: int) -> None:
         assert (found.upper < 1) == (wanted < 1)
         assert (found.lower > 1) == (wanted > 1)
         assert found.needed_effort == 0
-        assert fastest_cycle(scaled(edges, wanted / sharp), 4) <= found.upper
 
 
 def test_the_estimate_of_the_work_is_mostly_that_of_a_complete_search() -> None:

@@ -1,8 +1,7 @@
-"""Certificates of nonlinear plants on regions: enclosures, attacks, broken copies, reasons."""
+"""Certificates of nonlinear plants on regions: enclosures, attacks on the shipped ones, reasons."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,9 +18,9 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import nominal_conditions
-from noack.theory.certificates.region import RegionScope, _Box
+from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import network_limit
-from tests.oracles.attacked_regions import CASES, SCENARIOS, Case, Field, attacked, certificate_of
+from tests.oracles.attacked_regions import CASES, SCENARIOS, attacked, certificate_of, inclusion_share
 
 pytest.importorskip("flint")
 REGIONS = {
@@ -42,23 +41,13 @@ def over(resolved: Scenario, widths: Vector) -> Inclusion:
     return EnclosedMotion(resolved.plant.system.system(start), loop.n, loop.m).over(widths)
 
 
-def largest_excess(box: Inclusion, field: Field, widths: Vector) -> float:
-    """Return by how much f leaves the box at random points, and corners, of a region."""
-    rng, n = np.random.default_rng(1), len(box.A)
-    z = rng.uniform(-1, 1, (4000, len(widths)))
-    z[::2] = np.sign(z[::2])
-    z = (z * rng.uniform(0, 1, (4000, 1)) ** 0.2 * widths).T
-    middle, half = np.hstack([box.A, box.B]), np.hstack([box.halfwidth_A, box.halfwidth_B])
-    return float((np.abs(field(z[:n], z[n:]) - middle @ z) - half @ np.abs(z)).max())
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_equations_lie_in_their_enclosure(name: str) -> None:
     case, widths = CASES[name], np.array(REGIONS[name])
     resolved = resolve(load(SCENARIOS / f"{case.scenario}.toml"))
     for share in (1.0, 0.3):
-        assert largest_excess(over(resolved, share * widths), case.field, share * widths) < 1e-9
-    assert largest_excess(over(resolved, 0.5 * widths), case.field, widths) > 1e-3
+        assert inclusion_share(over(resolved, share * widths), case.field, share * widths) <= 1
+    assert inclusion_share(over(resolved, 0.5 * widths), case.field, widths) > 1.1
 
 
 def test_a_sine_is_enclosed_almost_tightly() -> None:
@@ -108,35 +97,6 @@ def test_a_limit_is_that_of_the_region_and_not_of_the_linear_plant(quantity: str
 
     assert at(limit_s).constants is not None
     assert at(1.01 * limit_s).constants is None
-
-
-def test_broken_copies_are_refuted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, bounded = EnclosedMotion.over, _Box.bounded
-
-    def unchecked(self: Any, conditions: Any) -> Any:
-        phases, reached = yield from bounded(self, conditions)
-        return phases, reached * (not self._plants[0.0].halfwidth_A.any())
-
-    def halved(self: Any, conditions: Any) -> Any:
-        phases, reached = yield from bounded(self, conditions)
-        return phases, reached / 2
-
-    for power, semi_axes, *broken in (
-        (7, (1.3, 0.01), EnclosedMotion, "over", lambda self, r: whole(self, r / 2)),
-        (3, (0.01, 4.8), _Box, "bounded", unchecked),  # takes the first region
-        (3, (0.01, 3.0), _Box, "bounded", halved),
-    ):
-        code = STEEP.replace("7", str(power))
-        case = Case("", lambda x, u, p=power: np.stack([x[1], x[0] + x[0] ** p + u[0]]), semi_axes)
-        resolved = own_plant(tmp_path, code)
-        with monkeypatch.context() as patch:
-            patch.setattr(*broken)
-            certificate = certificate_of(resolved, semi_axes)
-        assert certificate.region is not None, broken
-        with np.errstate(all="ignore"):
-            found = attacked(resolved, case, certificate, runs=50, steps=2000)
-        assert found["x"] > 1, broken
-        assert certificate_of(resolved, semi_axes).constants is None
 
 
 def own_plant(folder: Path, code: str) -> Scenario:

@@ -253,26 +253,34 @@ def policy_case(
     return scenario_with(system, settings, push, rate_hz=rate_hz), rule, system
 
 
-def scenario_with(system: System, trigger: dict[str, Any], push: float = 0.0, **plant: float) -> Scenario:
-    """The system's matrices with a trigger; the rates have no effect where conditions are given."""
+def scenario_of(system: System, trigger: dict[str, Any], **tables: dict[str, Any]) -> Scenario:
+    """The system's matrices with a trigger, not resolved; ``tables`` has more settings.
+
+    A plant of another kind or draw takes the place of A and B.
+    """
     mode = "model" if system.H.any() else "zoh"
     model: Matrix = system.H - system.B @ system.K if mode == "model" else system.A
-    weighted = trigger.get("rule", trigger)
-    weighted["weight"] = system.weight.tolist()
     content: dict[str, Any] = {
         "name": "random", "horizon_s": 1.0, "mode": mode,
         "model": {"A": model.tolist(), "B": system.B.tolist(), "gain": system.K.tolist()},
-        "plant": {
-            "draw": "given", "A": system.A.tolist(), "B": system.B.tolist(),
-            "initial_state": system.x0.tolist(), **plant,
-        },
+        "plant": {"initial_state": system.x0.tolist()},
         "trigger": trigger,
         "network": {"mansd": system.mansd, "loss": {"model": "worst_case"}},
     }  # fmt: skip
+    if not tables.get("plant", {}).keys() & {"system", "draw"}:
+        content["plant"] |= {"draw": "given", "A": system.A.tolist(), "B": system.B.tolist()}
+    for name, settings in tables.items():
+        content[name] = content.get(name, {}) | settings
+    return validate(content, "test")
+
+
+def scenario_with(system: System, trigger: dict[str, Any], push: float = 0.0, **plant: Any) -> Scenario:
+    """The same in the system's norm; the rates have no effect where conditions are given."""
+    trigger.get("rule", trigger)["weight"] = system.weight.tolist()
     if push:
         bound = [push] * len(system.A)
-        content["plant"]["disturbances"] = [{"kind": "uniform", "at": "state", "bound": bound}]
-    return resolve(validate(content, "test"))
+        plant["disturbances"] = [{"kind": "uniform", "at": "state", "bound": bound}]
+    return resolve(scenario_of(system, trigger, plant=plant))
 
 
 def policy_shares(trace: Trace, certificate: ScenarioCertificate, system: System) -> dict[str, float]:
