@@ -19,7 +19,7 @@ PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", 
 EXEMPT = ("__init__", "__main__")
 MOST_MODULES = 432
 LINES = {
-    "noack/scenario": 4155,
+    "noack/scenario": 4160,
     "noack/controllers": 265,
     "noack/core": 1325,
     "noack/disturbances": 220,
@@ -45,13 +45,13 @@ LINES = {
     "cosim/output": 8520,
     "cosim/record": 3575,
     "cosim/simulation": 1895,
-    "cosim/studies": 8865,
+    "cosim/studies": 8880,
     "plant_server": 420,
     "sensor_node": 395,
     "controller_node": 410,
     "benchmarks": 3625,
     "native": 11035,
-    "tests": 46545,
+    "tests": 46985,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

@@ -366,7 +366,7 @@ def require_in_time(scenario: Scenario, kinds: Sequence[Kind], deadline_s: float
     if sent_s >= deadline_s:
         raise CallerError(
             f"one update takes {sent_s:.3g} s on {queue.rate_bps} bit/s, and is late after "
-            f"{deadline_s:.3g} s; give a longer --late-after, a longer --update-period, or a higher --rate-bps"
+            f"{deadline_s:.3g} s; give a longer --late-after or --update-period, or a higher --rate-bps"
         )
 
 
