@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -49,7 +49,7 @@ class LinearModel:
     at: Vector
     input: Vector
     drift: Vector
-    source: str  # "derivative" or "motion", or "exact" if the plant has A and B itself
+    source: str  # "derivative" or "motion"; "exact": the plant's own A and B; "known": the loop's Â and B̂
     errors: tuple[tuple[float, Vector], ...]
 
     @property
@@ -106,8 +106,8 @@ class LinearModel:
     @property
     def origin(self) -> str:
         """Where A and B are from."""
-        if self.plant.matrices is not None:
-            return "the matrices of the scenario's plant, as drawn, not from those of its [model]"
+        if self.source == "known":
+            return "the scenario's [model], which sensor and controller know of the plant"
         source = {
             "derivative": "differences of the plant's derivative",
             "motion": f"the matrix logarithm of the plant's motion over {self.plant.step_ns * 1e-9:g} s",
@@ -175,6 +175,7 @@ class LoopGain:
             [
                 _matrix("K", self.K, plant.input_names, plant.state_names),
                 f"u = K x; {self.method}",
+                f"in a scenario's [model]: gain = {self.K.tolist()}",
                 f"Â and B̂ are computed from {self.model.origin}",
                 f"eigenvalues of Â + B̂K: {eigenvalue_text(self.eigenvalues)} /s",
                 f"trigger.alpha_per_s must be below {self.decay_per_s:.4g}; half of it is usual",
@@ -250,6 +251,8 @@ def gain(
 ) -> LoopGain:
     """Compute the gain K of u = K x: a linear-quadratic regulator, or given eigenvalues.
 
+    For a scenario with a linear plant it is that of Â and B̂, which sensor and controller know.
+
     Args:
         plant: a linear model, or a plant as for :func:`linearise`.
         q: weight of the states in ∫ xᵀQx + uᵀRu dt: a number, or the diagonal; by default 1.
@@ -260,7 +263,9 @@ def gain(
     Raises:
         NoackError: an unstable eigenvalue is not controllable, or a value is wrong.
     """
-    model = linearise(plant, settings=settings) if isinstance(plant, str) else plant
+    model = plant if isinstance(plant, LinearModel) else linearise(plant, settings=settings)
+    if model is not plant and (known := model.plant.known) is not None:
+        model = replace(model, A=known[0], B=known[1], source="known")
     label, uncontrollable = model.plant.label, model.uncontrollable
     if len(uncontrollable) and uncontrollable[0].real >= 0:
         worst = eigenvalue_text(uncontrollable[:1])

@@ -48,6 +48,7 @@ class PlantReference:
     rates: Mapping[str, float]  # rate_hz and measure_every of its plant, if they are given
     initial_state: tuple[float, ...] | None = None
     matrices: tuple[Matrix, Matrix] | None = None  # A and B of a linear plant
+    known: tuple[Matrix, Matrix] | None = None  # Â and B̂, which sensor and controller know of it
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -189,7 +190,7 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
         (loop.state_names, loop.input_names),
         {"rate_hz": plant.rate_hz, "measure_every": plant.measure_every},
         plant.initial_state,
-        (loop.A, loop.B) if resolved.coverage.is_linear else None,
+        *(((loop.A, loop.B), (loop.A_model, loop.B_model)) if resolved.coverage.is_linear else ()),
     )
 
 

@@ -174,12 +174,13 @@ def test_poles_are_placed(poles: list[complex]) -> None:
     np.testing.assert_allclose(np.sort_complex(found.eigenvalues), np.sort_complex(poles), atol=1e-5)
 
 
-def test_the_double_integrators_gain_is_the_textbooks_and_none_is_needed_before() -> None:
+def test_the_double_integrators_gain_is_the_textbooks_whatever_plant_is_drawn() -> None:
     model = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}
-    settings = {"model": model, "plant.uncertainty_B": [[0.0], [0.0]]}
+    settings = {"model": model, "plant.uncertainty_B": [[0.0], [0.3]]}
     found = noack.gain("double_integrator", q=[1.0, 0.0], settings=settings)
     np.testing.assert_allclose(found.K, [[-1.0, -np.sqrt(2.0)]], atol=1e-9)
-    assert "the scenario's plant, as drawn, not from those of its [model]" in repr(found)
+    assert "gain = [[-1.0, -1.41421" in repr(found)
+    assert "from the scenario's [model], which sensor and controller know" in repr(found)
 
 
 def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(folder: Path) -> None:
