@@ -293,7 +293,7 @@ class DesignFiles:
         return [] if self.out is None else [write_whole(self.out, scenario_toml)]
 
 
-@cli.command(cli.CAMPAIGNS, 20, takes="up to a minute")
+@cli.command(cli.CAMPAIGNS, 20, takes="up to two minutes")
 def design(
     source: opt.OneLoopOptions,
     *,
