@@ -102,6 +102,7 @@ class NodeDriver(LiveDriver):
                 preexec_fn=partial(prctl, _PR_SET_PDEATHSIG, signal.SIGKILL),
             )
         except OSError as error:
+            self._own.close()
             if runner:
                 raise CallerError(
                     f'controller.runner = "{runner[0]}": cannot be started: {error.strerror}'
