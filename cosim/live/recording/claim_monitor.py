@@ -123,8 +123,11 @@ class ClaimMonitor:
                 self._add(loop, t_ns, "void", "void (assumption violated)", text)
 
     def _limit(self, loop: int, cause: str) -> str:
-        """Return up to which time there are certificates, in words, while there is time for it."""
-        if self._limits_s > _LIMITS_S:
+        """Return up to which time there are certificates, in words, while there is time for it.
+
+        That of a nonlinear plant on its region takes seconds, and is left out.
+        """
+        if self._limits_s > _LIMITS_S or not self._loops[loop].coverage.is_certifiable:
             return ""
         began_s = time.thread_time()
         try:
