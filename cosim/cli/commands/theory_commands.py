@@ -23,7 +23,11 @@ with lazy_modules():
     from noack.theory.certificates import scenario_certificates
 
 
-@cli.command(cli.THEORY, 10, takes="about two seconds; half a minute where events are due after many tests")
+@cli.command(
+    cli.THEORY,
+    10,
+    takes="about two seconds; some 10 s for a nonlinear plant; half a minute where events are due after many tests",
+)
 def certify(
     source: opt.OneLoopOptions,
     *,

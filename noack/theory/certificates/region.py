@@ -146,7 +146,7 @@ class RegionScope(_Box):
         self, conditions: NetworkConditions, *, longest: bool = True, near: bool = False
     ) -> Search[list[Phases]]:
         widths = self._widths_within(conditions) if near else np.zeros(self._loop.n + self._loop.m)
-        where = "near 0"
+        where, step = "near 0", 0.0
         for _ in range(_ATTEMPTS):
             try:
                 inclusion = self._motion.over(widths)
@@ -166,8 +166,12 @@ class RegionScope(_Box):
                     with contextlib.suppress(NoCertificateError, NotDecayingError):
                         return (yield from box._constants(conditions))
                 return phases
-            widths = np.maximum(widths, _WIDER * reached + _LEAST * reached.max())
-            where = f"on the region {self._described(widths)}"
+            wider = np.maximum(widths, _WIDER * reached + _LEAST * reached.max())
+            # The bounds grow faster than the region: towards a region that holds them, steps shrink.
+            grown, step = step, float(np.linalg.norm(wider - widths))
+            if near and 0 < grown < step:
+                break
+            widths, where = wider, f"on the region {self._described(wider)}"
         raise NoCertificateError(f"{where}: the bounds are not within it")
 
     def _widths_within(self, conditions: NetworkConditions) -> Vector:
