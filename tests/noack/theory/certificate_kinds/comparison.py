@@ -31,6 +31,7 @@ KINDS: Mapping[str, Kind] = {
 }  # fmt: skip
 
 _ROUNDING = 1 + 1e-9
+_MOST_REFUSED = 1000
 _CHUNK = 20
 _WORKERS = 2
 _BROKEN_SHARE = 10
@@ -45,8 +46,10 @@ def examine(kind: Kind, seeds: range, broken: Broken | None = None) -> Tally:
     for seed in seeds:
         rng = np.random.default_rng(seed)
         loop = draw(rng)
+        first = refused
         while (bounds := certify(loop)) is None:
             loop, refused = draw(rng), refused + 1
+            assert refused < first + _MOST_REFUSED, f"{kind.name}: no loop has a certificate"
         observed = kind.simulate(loop, rng)
         runs += observed.runs
         for name, bound in bounds.items():
