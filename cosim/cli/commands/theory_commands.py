@@ -26,7 +26,7 @@ with lazy_modules():
 @cli.command(
     cli.THEORY,
     10,
-    takes="about two seconds; some 10 s for a nonlinear plant; half a minute where events are due after many tests",
+    takes="two seconds; 10 s for a nonlinear plant; half a minute where events are due after many tests",
 )
 def certify(
     source: opt.OneLoopOptions,
