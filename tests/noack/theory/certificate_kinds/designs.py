@@ -17,7 +17,7 @@ import numpy as np
 from cosim.studies.design import event_design
 from cosim.studies.design.event_design import Certified, EventSearch
 from cosim.studies.design.network_search import NetworkSearch, Reached, Wish
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
@@ -146,9 +146,12 @@ def _simulate(case: Case, rng: Rng) -> Observed:
 
 
 def _simulate_events(given: System, found: EventDesign, rng: Rng) -> Observed:
+    """The plant is on the edge of the box; without a certificate of the box it is the one drawn."""
     certificate, (K, alpha, beta) = found.certificate, found.best.loop
+    drawn = loop_of(resolve(found.search.scenario_of(found.best.loop, found.best.m)))
     system = replace(
-        given, K=np.array(K), H=given.H + given.B @ (np.array(K) - given.K), alpha=alpha, beta=beta,
+        given, A=given.A if found.search.of_box else drawn.A, alpha=alpha, beta=beta,
+        K=np.array(K), H=given.H + given.B @ (np.array(K) - given.K),
         mansd=found.best.m - 1, delay_steps=int(certificate.conditions.delay_s / given.step_s + 1e-6),
     )  # fmt: skip
 
