@@ -51,7 +51,7 @@ LINES = {
     "controller_node": 410,
     "benchmarks": 3625,
     "native": 11035,
-    "tests": 46985,
+    "tests": 46990,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
