@@ -174,8 +174,8 @@ def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, in_force: 
     first_s = lateness.wakes / lateness.beyond / required.rate_hz
     means = (
         f"{lateness.beyond:,} of them ({share:.2g} %) beyond {allowed}: about one every "
-        f"{first_s:.2g} s of a run of {required.duration_s:g} s; from the first on, a certificate for its "
-        "actual lateness is needed, if there is one"
+        f"{first_s:.2g} s of a run of {required.duration_s:g} s; from the first on, the run needs a "
+        "certificate for its actual lateness"
     )
     if not in_force:
         return GOOD, late, f"{means}. Runs use real-time settings"

@@ -85,7 +85,7 @@ def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
     kind = (
         f'it is of kind "{resolved.plant.system.kind}": {_NOT_BY_THEOREMS}; a certificate on '
-        "a region is apart from them"
+        "a region may cover it"
     )
     why = f"largest real part of an eigenvalue: {nominal:.3g} /s (Â + B̂K){_other_sign(loop)}"
     return [
