@@ -35,7 +35,7 @@ from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.scenario.response_times import Sender, response_ns
 from noack.scenario.run_sections import ProvenDelay
-from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
+from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections
 from noack.scenario.scenario_checks import with_settings
 from noack.scenario.sections import DirectionSection
 from noack.trigger.periodic_trigger import PeriodicSettings
@@ -117,8 +117,9 @@ def link_loads(scenario: Scenario) -> list[LinkLoad]:
         CallerError: a loop cannot be resolved, or its trigger excludes its model.
     """
     updates, actuations = _stages(scenario)
-    update_loads = _link_loads(updates, Flow.UPDATE, "network")
-    return update_loads + _link_loads(actuations, Flow.ACTUATION, "network.actuation")
+    names = loop_names(scenario)
+    update_loads = _link_loads(updates, Flow.UPDATE, "network", names)
+    return update_loads + _link_loads(actuations, Flow.ACTUATION, "network.actuation", names)
 
 
 def update_delay(scenario: Scenario) -> DelayBound:
@@ -170,7 +171,7 @@ def _stages(scenario: Scenario) -> tuple[list[_Stage], list[_Stage]]:
     return updates, actuations
 
 
-def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoad]:
+def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str, names: Sequence[str]) -> list[LinkLoad]:
     loads: list[LinkLoad] = []
     if not stages:
         return loads
@@ -178,12 +179,13 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
     for index, impairment in enumerate(stages[0].direction.impairments):
         key = f"{path}.impairments.{index}"
         if isinstance(impairment, Schedule):
-            loads += _slot_loads(impairment, stages, (key, flow), delays[index])
+            delays_of = [*zip(names, delays[index], strict=True)]
+            loads += _slot_loads(impairment, stages, (key, flow), delays_of)
         if not isinstance(impairment, Rate | Opportunities):
             continue
         previous: LinkLoad | None = None
         delay_s = _largest_bound(delays[index])
-        by_loops = tuple(_by_loops(delays[index])) if len(delays[index]) > 1 else ()
+        by_loops = tuple(_by_loops(names, delays[index])) if len(delays[index]) > 1 else ()
         for begin, direction, loops in stages:
             window = _window(direction)
             bits = [int(impairment.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
@@ -201,14 +203,15 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
     return loads
 
 
-def _by_loops(delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
-    """Yield each bound of a delay, with the loops that have it, such as ``loops 0, 2 to 4``."""
+def _by_loops(names: Sequence[str], delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
+    """Yield each bound of a delay, with the loops that have it, such as ``p-1, p-3 to p-5``."""
     for delay_s in dict.fromkeys(delays_s):
         loops = {loop for loop, loop_delay_s in enumerate(delays_s) if loop_delay_s == delay_s}
         begins = sorted(loops - {loop + 1 for loop in loops})
         ends = sorted(loops - {loop - 1 for loop in loops})
-        spans = (str(a) if a == b else f"{a} to {b}" for a, b in zip(begins, ends, strict=True))
-        yield f"loop{'s' * (len(loops) > 1)} {', '.join(spans)}", delay_s
+        pairs = zip(begins, ends, strict=True)
+        spans = (names[a] if a == b else f"{names[a]} to {names[b]}" for a, b in pairs)
+        yield ", ".join(spans), delay_s
 
 
 def _largest_bound(delays_s: Sequence[float]) -> float | None:
@@ -217,28 +220,35 @@ def _largest_bound(delays_s: Sequence[float]) -> float | None:
 
 
 def _slot_loads(
-    schedule: Schedule, stages: Sequence[_Stage], path: tuple[str, Flow], delays_s: Sequence[float]
+    schedule: Schedule,
+    stages: Sequence[_Stage],
+    path: tuple[str, Flow],
+    delays_of: Sequence[tuple[str, float]],
 ) -> Iterator[LinkLoad]:
-    """Yield for each entry of [[loops]] what its loop with the fewest slots needs of them."""
+    """Yield for each entry of [[loops]] what its loop with the fewest slots needs of them.
+
+    ``delays_of`` has the name of each loop of the run and the bound of its delay.
+    """
     key, flow = path
     first, slots = 0, _slots(schedule, stages)
     round_s = len(schedule.order) * schedule.slot_ns / NS_PER_S
     for entry, loops in enumerate(stages[0].loops):
         number = min(range(first, first + loops.loops), key=lambda loop: len(slots[loop]))
         first += loops.loops
+        name, delay_s = delays_of[number]
         for begin, direction, demands in stages:
             loop, window = demands[entry], _window(direction)
             bits = 8 * loop.payload_bytes
             must_pass = bits * _share(window)
             yield LinkLoad(
-                begin=f"{begin}loop {number}, ",
+                begin=f"{begin}{name}, ",
                 key=key,
                 flow=flow,
                 window=window,
                 rate_bps=bits * len(slots[number]) / round_s,
                 mandatory_at_most_bps=must_pass / loop.least_s,
                 mandatory_at_least_bps=must_pass / loop.largest_s,
-                delay_bound_s=_largest_bound([delays_s[number]]),
+                delay_bound_s=_largest_bound([delay_s]),
             )
 
 
