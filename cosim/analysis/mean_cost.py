@@ -104,7 +104,8 @@ def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None
 
     def attempt(guarantee: LossGuarantee) -> CostUnder | str:
         try:
-            return _under(resolved, periods, guarantee)
+            with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not known
+                return _under(resolved, periods, guarantee)
         except NotPredictableError as error:
             return f"not known: {error}"
 
@@ -131,8 +132,7 @@ def _under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarantee) -
         means, second_moments = fixed_point[1], np.diag(fixed_point[0].moments.sum(axis=0))
         roots = np.sqrt(np.maximum(np.concatenate([means[:-1], second_moments[:n]]), 0.0)).tolist()
         stationary = Stationary(tuple(roots[:n]), tuple(roots[-n:]), tuple(roots[n:-n]), float(means[-1]))
-    with np.errstate(over="ignore"):
-        _, horizon_costs = moments.until(start, resolved.timing.horizon_ns)
+    _, horizon_costs = moments.until(start, resolved.timing.horizon_ns)
     transient = moments.transient(start)
     return CostUnder(
         guarantee.meaning,

@@ -60,7 +60,7 @@ from noack.theory.certificates.conditions import allowed_conditions, network_del
 from noack.traces.packet_trace import PacketTrace
 
 Times = NDArray[np.int64]
-DELAY, ORDER = "delay", " (out of order)"
+DELAY, ORDER, START = "delay", " (out of order)", "start"
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 Reals = NDArray[np.float64]
 SHARES = (0.0, 0.05, 0.5, 0.9, 0.95, 0.99, 0.999, 1.0)
@@ -344,7 +344,7 @@ class VoidShare:
     """How long one condition was violated."""
 
     cause: str
-    """``delay``, or the name of a rule of the guarantee; with ``(out of order)`` if the rule would
+    """``delay``, ``start``, or the name of a rule of the guarantee; with ``(out of order)`` if the rule would
     hold without the packets that arrive out of order."""
     share: float
     """Of the trace's time."""
@@ -397,6 +397,8 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)
     end_ns = int(max(trace.sent_ns[-1], trace.received_ns.max()))
     conditions = list(_violations(trace, allowed, delay_ns, end_ns))
+    if resolved.network.initial_sync == "first_packet":
+        conditions.append(_start(trace, delay_ns, end_ns))
     spans = [span for span in conditions if len(span.begin_ns)]
     total_ns = max(end_ns, 1)
     union = (
@@ -474,6 +476,20 @@ def _violations(
         worst,
         f"an update was in the network for {worst:.4g} s, {allowed_s:.4g} s allowed",
     )
+
+
+def _start(trace: PacketTrace, delay_ns: int, end_ns: int) -> _Spans:
+    """Return the time without any update, if the first one is not the first to arrive.
+
+    If it is, and late, the delay is what is violated.
+    """
+    groups, received_ns = outcomes(trace), trace.received_ns
+    first_ns = int(received_ns[~groups.lost].min(initial=end_ns))
+    if first_ns <= delay_ns or not (groups.lost | groups.out_of_order)[0]:
+        return _Spans(START, np.zeros(0, np.int64), np.zeros(0, np.int64), 0.0, "")
+    first_s, allowed_s = first_ns * 1e-9, delay_ns * 1e-9
+    text = f"the first update was not received, none until {first_s:.4g} s, {allowed_s:.4g} s allowed"
+    return _Spans(START, np.array([delay_ns]), np.array([first_ns]), first_s, text)
 
 
 def _covered_ns(begin_ns: Times, end_ns: Times) -> int:

@@ -229,8 +229,8 @@ class NetworkOptions:
         modes = [mode.strip() for mode in self.holds.split(",")]
         if not set(modes) <= set(network_search.MODES):
             raise CallerError(f'--holds: {", ".join(network_search.MODES)}, not "{self.holds}"')
-        if self.period is not None and not 1e-6 <= self.period < math.inf:
-            raise CallerError(f"--period: must be positive, not {self.period:g}")
+        if self.period is not None and not 1e-6 <= self.period <= 1e7:
+            raise CallerError(f"--period: from 1e-6 to 1e7 seconds, not {self.period:g}")
         if not 0 < self.share < math.inf:
             raise CallerError(f"--share: must be positive, not {self.share:g}")
         return network_search.Wish(

@@ -27,6 +27,7 @@ from cosim.studies.design.network_search import (
     NetworkSearch,
     Progress,
     Wish,
+    examined_m,
     periodic_outcome,
     scaled_steps,
 )
@@ -38,7 +39,7 @@ from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows, rows_of
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import nominal_conditions
-from noack.theory.certificates.scenario_certificates import certify, certify_box
+from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
 from noack.trigger.decaying import DecayingSettings
 
 DRAWS = 200
@@ -80,6 +81,9 @@ class EventSearch:
     def __init__(self, scenario: Scenario, wish: Wish, seed: int, draws: int = DRAWS) -> None:
         trigger = scenario.decaying
         scenario.coverage.require_exact()
+        scenario.coverage.require_unchanging()
+        if not wish.cost > 0:
+            raise CallerError(f"--cost: must be positive, not {wish.cost:g}")
         if wish.window is not None:
             raise CallerError("--window: is for periodic updates; give their --period, too")
         resolved = resolve(scenario)
@@ -89,14 +93,19 @@ class EventSearch:
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
         self.original = EventLoop(rows_of(self.plant.K), trigger.alpha_per_s, trigger.beta)
         self.tried = self.judged = self._likely = 0
-        self.most = wish.most or _MOST_M
+        self.most = examined_m(scenario, wish.most or _MOST_M)
         box = box_of(scenario)
         self._draws = box.population(seed, range(draws))
         self._fresh = box.population(seed, range(draws, 2 * draws))
         self.of_box = False
         certificate = self.certificate(self.original, 1, of_box=True)
-        self.of_box = certificate is not None and certificate.constants is not None
+        is_certified = certificate is not None and certificate.constants is not None
+        self.of_box = is_certified and outside_box(resolved) is None
         base = self.measured(self.original, self._draws)
+        if base.cost == 0:
+            raise CallerError(
+                "the given loop costs 0, so that --cost limits nothing; give another plant.initial_state"
+            )
         self.limits = Measured(wish.cost * base.cost, wish.transmissions * base.transmissions)
 
     def scenario_of(self, loop: EventLoop, m: int | None = None) -> Scenario:
@@ -132,13 +141,19 @@ class EventSearch:
         return bounds["state"] if within else math.inf
 
     def measured(self, loop: EventLoop, population: Population) -> Measured:
-        """Run a loop over draws."""
+        """Run a loop over draws; one whose model does not decay may have too many events to run."""
+        if not self._decay_per_s(loop) > 0:
+            return Measured(math.inf, math.inf)
         Q, R = self.weights
         setting = replace(setting_of(resolve(self.scenario_of(loop))), Q=Q, R=R)
         rows = run_batch(setting, population)
         if np.isnan(rows["cost"]).any():
             return Measured(math.inf, math.inf)
         return Measured(float(rows["cost"].mean()), float(rows["transmissions"].mean()))
+
+    def _decay_per_s(self, loop: EventLoop) -> float:
+        """Return the decay rate of the model's closed loop."""
+        return -spectral_abscissa(self.plant.A_model + self.plant.B_model @ np.array(loop.K))
 
     def largest_m(self, loop: EventLoop) -> int:
         """Return the largest M with a certificate, by bisection; 0: there is none.
@@ -160,19 +175,18 @@ class EventSearch:
 
     def excess(self, loop: EventLoop) -> float:
         """Return what is minimised: below 0 if all limits are met, the lower the better."""
-        plant = self.plant
-        rate_per_s = spectral_abscissa(plant.A_model + plant.B_model @ np.array(loop.K))
-        if not rate_per_s < 0 or not 0 < loop.alpha_per_s < -rate_per_s:
-            return _FORBIDDEN + min(abs(rate_per_s), _FORBIDDEN)
+        decay_per_s = self._decay_per_s(loop)
+        if not 0 < loop.alpha_per_s < decay_per_s:
+            return _FORBIDDEN + min(abs(decay_per_s), _FORBIDDEN)
         self.tried += 1
         measured, least = self.measured(loop, self._draws), self.scenario.network.mansd + 1
-        over = max(0.0, math.log(measured.cost / self.limits.cost))
+        over = _log_over(measured.cost, self.limits.cost)
         if self.wish.goal == "transmissions":
             bound = 0.0 if math.isfinite(self.state_bound(loop, least)) else 1.0
             if over or bound:
                 return min(1.0 + over + bound, _FORBIDDEN)
-            return -math.log(1e6 / measured.transmissions)
-        over += max(0.0, math.log(measured.transmissions / self.limits.transmissions))
+            return math.log(measured.transmissions / 1e6)
+        over += _log_over(measured.transmissions, self.limits.transmissions)
         if over:
             return min(1.0 + over, _FORBIDDEN)
         m = self.largest_m(loop)
@@ -234,6 +248,11 @@ class EventSearch:
                 options={"maxfev": most, "adaptive": True, "initial_simplex": simplex},
             )
         return best, value
+
+
+def _log_over(value: float, limit: float) -> float:
+    """Return the logarithm of the factor by which a value exceeds its limit; 0 within it."""
+    return math.log(value / limit) if value > limit else 0.0
 
 
 def _rounded(entries: Vector, template: EventLoop, alpha_per_s: float, beta: float) -> EventLoop:

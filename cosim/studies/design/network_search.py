@@ -134,8 +134,19 @@ def time_triggered(scenario: Scenario, period_s: float | None) -> Scenario:
     return scenario.model_copy(update={"trigger": trigger})
 
 
+def _further(guarantee: LossGuarantee) -> LossGuarantee:
+    """Return the rules besides the cap M − 1."""
+    return LossGuarantee(tuple(rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)))
+
+
 def _capped(further: LossGuarantee, limit: int) -> LossGuarantee:
     return LossGuarantee((LongestBurst(limit), *further.rules))
+
+
+def examined_m(scenario: Scenario, most: int) -> int:
+    """Return the largest M to examine; above the bursts that the constraints allow, M means nothing."""
+    burst = _further(scenario.network.guarantee).longest_burst
+    return most if burst is None else min(most, burst + 1)
 
 
 def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
@@ -154,11 +165,7 @@ def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
             name = f"m = {m} of {wish.window}"
             rungs.append(Rung(name, m, guarantee, period_ns, settings))
         return rungs
-    further = LossGuarantee(
-        tuple(rule for rule in network.guarantee.rules if not isinstance(rule, LongestBurst))
-    )
-    most = wish.most or _MOST_M
-    most = min(most, (further.longest_burst or most) + 1)
+    further, most = _further(network.guarantee), examined_m(scenario, wish.most or _MOST_M)
     return [
         Rung(f"M = {m}", m, _capped(further, m - 1), period_ns, {"mansd": m - 1}) for m in range(1, most + 1)
     ]
@@ -186,6 +193,7 @@ class NetworkSearch:
                 "--set 'plant.system={kind=\"linear\"}' designs for its model"
             )
         scenario.coverage.require_exact()
+        scenario.coverage.require_unchanging()
         if wish.bounds:
             raise CallerError("--bound: is for a loop with events, not for periodic updates")
         if not wish.cost >= 1:

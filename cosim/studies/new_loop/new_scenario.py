@@ -257,6 +257,7 @@ class _Builder:
     def certified(self, trial: _Trial) -> tuple[ScenarioCertificate, float]:
         """Return the certificate of a trial's linear plant, perhaps void, and its loop gain."""
         resolved = with_linear_plant(resolve(self.scenario(trial)))
+        resolved.coverage.require_unchanging()
         resolved.coverage.require_certifiable()
         conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
         certificate = own_plant(resolved).certificate(conditions)
@@ -314,7 +315,8 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
         )
     else:
         bound = envelope_formula("‖x‖", certificate, "state").format(certificate.constants.state)
-        yield f"Certified for {plant}, for every pattern of losses: {bound}."
+        losses = certificate.conditions.guarantee.meaning
+        yield f"Certified for {plant}, for every pattern of losses with {losses}: {bound}."
     if not is_linear:
         errors = ", ".join(f"{by_state.max():.2g} within ±{w:g}" for w, by_state in trial.gain.model.errors)
         yield (

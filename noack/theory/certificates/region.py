@@ -16,6 +16,7 @@ import contextlib
 import math
 from dataclasses import replace
 from functools import cached_property
+from itertools import starmap
 
 import numpy as np
 
@@ -89,7 +90,8 @@ class _Box(CertificateScope):
         Raises: as :meth:`bounded`.
         """
         if not self.is_simple:
-            return (yield from self._solved(conditions, longest=False))
+            pairs = yield from self._disturbed.constants(conditions, decays=False, longest=False)
+            return [(main, None, persistent) for main, persistent in starmap(self._checked, pairs)]
         trigger = self._trigger
         level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
         tested, reached = trigger.tested(conditions), trigger.floor or None
@@ -117,6 +119,7 @@ class RegionScope(_Box):
 
     def __init__(self, resolved: Scenario, start_error: float = 0.0, start: Matrix | None = None) -> None:
         loop, self._regions = loop_of(resolved), dict[NetworkConditions, Region]()
+        self._other_start = start
         # The plants of the model; those of each region take their place.
         model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
         super().__init__(resolved, model, start_error, start)
@@ -150,7 +153,7 @@ class RegionScope(_Box):
         for _ in range(_ATTEMPTS):
             try:
                 inclusion = self._motion.over(widths)
-                box = _Box(self._resolved, inclusion, self._start_error, self._start)
+                box = _Box(self._resolved, inclusion, self._start_error, self._other_start)
                 phases, reached = yield from box.bounded(conditions)
             except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
                 why = f"{where}: {error}" if widths.any() else str(error)

@@ -279,7 +279,7 @@ def share(certificate_time: object, cause: str) -> float:
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.one_of(st.none(), st.integers(0, 40)), min_size=2, max_size=14))
 def test_shares_are_those_of_a_step_through_the_time(delays: list[int | None]) -> None:
-    """In every millisecond: are more than two packets missing, is one overdue?"""
+    """In every millisecond: are more than two packets missing, is one, or the first, overdue?"""
     sent = 10 * np.arange(len(delays))
     received = [None if d is None else 10 * k + d for k, d in enumerate(delays)]
     lost = np.array([d is None for d in delays])
@@ -300,8 +300,10 @@ def test_shares_are_those_of_a_step_through_the_time(delays: list[int | None]) -
         for k in range(2, len(delays)):
             if all(is_lost[k - 2 : k + 1]) and 10 * k <= ms < replaced(k):
                 missing = True
+        has_none = received[0] is None or stale[0]  # the first is not the first to arrive
+        none_yet = has_none and 4 <= ms < min((t_ms for t_ms in received if t_ms is not None), default=end)
         late += overdue
-        void += overdue or missing
+        void += overdue or missing or none_yet
     times = certificate_time(trace, LANE)
     assert times.allowed_delay_s == 0.004
     assert times.allowed_losses == 2
@@ -320,6 +322,16 @@ def test_every_rule_of_the_guarantee_counts() -> None:
     assert (cause.cause, cause.worst, cause.first_s) == ("atmost 2 in 5", 3, pytest.approx(0.06))
     assert void.kept["dropouts"] == "kept: 1 consecutive updates lost, 2 allowed"
     assert cause.share == pytest.approx(11 / 141)
+
+
+def test_the_first_update_must_be_received_unless_the_state_is_known() -> None:
+    sent, lost = 10 * np.arange(15), np.zeros(15, bool)
+    lost[:2] = True
+    trace = packet_trace(sent * MS, (sent + 1) * MS, lost)
+    (cause,) = certificate_time(trace, LANE).causes
+    assert (cause.cause, cause.first_s, cause.worst) == ("start", pytest.approx(0.004), pytest.approx(0.021))
+    assert cause.share == pytest.approx(17 / 141)
+    assert certificate_time(trace, lane(mansd=2, initial_sync="known_state")).first_s is None
 
 
 def test_the_certificates_of_the_scenario_are_named() -> None:

@@ -220,12 +220,14 @@ def test_the_transient_and_the_stationary_part_are_limits() -> None:
     assert late.horizon_cost - early.horizon_cost == pytest.approx(late.stationary.cost_per_s)
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("words", "status", "message"),
     [
         (["lane_periodic"], 0, "0.862511"),
         (["lane_periodic", "--set", "network.mansd=20"], 1, "∞"),
         (["lane_periodic", "--Q", "[1, 1]"], 2, "--Q [1, 1]: expected 4 x 4 numbers"),
+        (["lane_periodic", "--set", "trigger.period_s=1e6"], 1, "beyond 1e308"),
         (["lane_following"], 2, "trigger.policy"),
         (["pendulum_observed"], 2, "observer.kind"),
         (["lane_crosswind"], 2, "plant.disturbances"),

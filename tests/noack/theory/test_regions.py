@@ -146,3 +146,26 @@ def test_a_run_is_held_against_its_region() -> None:
         claims = [one for one in RunClaims(record).judge() if one.source == "region certificate"]
         assert {one.verdict for one in claims} == {verdict}
         assert ("x stays in the region" in {one.what for one in claims}) == (name != "cart_pole")
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        'plant.disturbances=[{kind="uniform",bound=[0.05]}]',
+        "plant.measurement={noise_bound=[3e-4,3e-4]}",
+        'trigger={policy="absolute",delta=0.01}',
+    ],
+)
+def test_what_persists_is_bounded_on_a_region(setting: str) -> None:
+    resolved = resolve(load(SCENARIOS / "sine_pendulum.toml", ["horizon_s=1.0", setting]))
+    scope, conditions = RegionScope(resolved), nominal_conditions(resolved)
+    certificate = scope.certificate(conditions)
+    assert certificate.persistent_constants is not None
+    assert certificate.region is not None
+    undisturbed = RegionScope(resolve(load(SCENARIOS / "sine_pendulum.toml"))).certificate(conditions)
+    assert undisturbed.region is not None
+    assert np.less(certificate.region.x, np.multiply(1.1, undisturbed.region.x)).all()
+    claims = [
+        claim for claim in RunClaims(simulate(resolved)).judge() if claim.source == "region certificate"
+    ]
+    assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}

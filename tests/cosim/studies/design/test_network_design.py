@@ -197,6 +197,28 @@ def test_fewer_transmissions_of_events_for_the_same_network() -> None:
     assert found.best.m >= given.network.mansd + 1
 
 
+@pytest.mark.parametrize("losses", [0, 2])
+@pytest.mark.parametrize("period_s", [None, 2.0])
+def test_no_m_is_examined_beyond_what_a_constraint_allows(losses: int, period_s: float | None) -> None:
+    constraint = f'network.constraints=[{{kind="at_most", losses={losses}, window=10}}]'
+    scenario = shipped("double_integrator", constraint)
+    shown = design_for_network(scenario, Wish(period_s=period_s, effort=0, most=9))
+    assert shown.original["certified"] == shown.best["certified"] == losses + 1
+
+
+def test_a_plant_outside_its_box_is_certified_itself() -> None:
+    box = "plant.uncertainty_B=[[0.0], [0.1]]"
+    outside = 'plant.draw="given"', "plant.A=[[0.0, 1.0], [0.0, 0.0]]", "plant.B=[[0.0], [1.2]]"
+    assert EventSearch(shipped("double_integrator", box), Wish(), 0, draws=20).of_box
+    assert not EventSearch(shipped("double_integrator", box, *outside), Wish(), 0, draws=20).of_box
+
+
+def test_a_given_loop_that_diverges_sets_no_limit() -> None:
+    unstable = "model.gain=[[5.0, 5.0]]", "model.allow_unstable=true"
+    search = EventSearch(shipped("double_integrator", *unstable), Wish(most=1), 0, draws=20)
+    assert search.excess(search.original._replace(K=((-1.0, -1.4),))) < 0
+
+
 def test_the_lines_about_mistakes_are_those_that_were_approved(tmp_path: Path) -> None:
     def mistake(line: str) -> list[str]:
         words = shlex.split(line)
