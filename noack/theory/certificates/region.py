@@ -100,7 +100,7 @@ class _Box(CertificateScope):
         bounds = list[Vector]()
         for decaying, _, persistent in phases:
             parts = (
-                [(self._plants[decaying.rate_per_s].plant, decaying)]
+                [(self._plants[decaying.rate_per_s], decaying)]
                 if self.is_simple
                 else (self._disturbed.with_plants(decaying, persistent))
             )

@@ -153,7 +153,7 @@ class CertificateScope:
         self._decay = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
         assert start is None or self.is_simple  # other starts are those of the scenario
         self._plant_at = plant_at
-        self._plants: dict[float, _KnownPlant] = {}
+        self._plants: dict[float, PlantGains] = {}
 
     @property
     def is_simple(self) -> bool:
@@ -389,22 +389,15 @@ class CertificateScope:
             plant = self._plant_at(error, self._start, alpha_per_s)
             plant = replace(plant, further_outputs=self._trigger.outputs)
             self._plants[alpha_per_s] = _first_equal(_KnownPlant(plant.identity, plant))
-        known_plant = self._plants[alpha_per_s]
-        plant = known_plant.plant
+        plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
         part = Part(plant.error, plant, self._trigger.bound(conditions, level, reached))
-        problem = Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
-        known, likeness = known_plant.constants, problem.likeness
-        if likeness not in known:
-            constants = yield from sharpened(problem)
-            if len(known) == _MOST_KNOWN:
-                known.clear()
-            known[likeness] = constants
-        return known[likeness]
-
-
-_MOST_KNOWN = 1000
+        return (
+            yield from sharpened(
+                Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -413,14 +406,12 @@ class _KnownPlant:
 
     identity: Hashable
     plant: PlantGains = field(compare=False)
-    constants: dict[Hashable, Constants] = field(default_factory=dict, compare=False)
-    """Of its problems, by their likeness: the same ones are posed again and again."""
 
 
 @lru_cache(maxsize=16)
-def _first_equal(known: _KnownPlant) -> _KnownPlant:
-    """Return the first of several equal plants, whose gains and constants the others use."""
-    return known
+def _first_equal(known: _KnownPlant) -> PlantGains:
+    """Return the first of several equal plants, whose gains the others use."""
+    return known.plant
 
 
 _BOUNDS = ("input_error", "state", "state_weighted", "mismatch", "received_input_error")
