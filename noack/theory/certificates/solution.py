@@ -164,7 +164,7 @@ def sharpened(problem: Problem) -> Search[Constants]:
     if problem.longest and is_plain and is_scheduled_flow(part):
         key = id(part.plant), constants, repr((part.bound, conditions))
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
-            return _sharpened_once(_Sharpening(key, constants, part, conditions))
+            return sharpened_once(_Sharpening(key, constants, part, conditions))
     return constants
 
 
@@ -179,7 +179,7 @@ class _Sharpening:
 
 
 @lru_cache(maxsize=32)
-def _sharpened_once(known: _Sharpening) -> Constants:
+def sharpened_once(known: _Sharpening) -> Constants:
     """Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
     return scheduled_constants(known.constants, known.part, known.conditions)
 
