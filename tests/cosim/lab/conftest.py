@@ -26,9 +26,9 @@ TEXT = "document.body.innerText"
 class Served:
     """A server of the page, whose errors are in a file; a context that ends it by Ctrl-C."""
 
-    def __init__(self, folder: Path, *, viewer: bool = True) -> None:
+    def __init__(self, folder: Path, *arguments: str, viewer: bool = True) -> None:
         self.errors = folder / "errors.txt"
-        command = live.noack_command("lab", "--no-browser", "--json", "--set", "horizon_s=4")
+        command = live.noack_command("lab", "--no-browser", "--json", "--set", "horizon_s=4", *arguments)
         environment = os.environ | ({} if viewer else live.WITHOUT_VIEWER)
         with self.errors.open("w") as errors:
             self._process = subprocess.Popen(
