@@ -3,6 +3,7 @@
 import ast
 import re
 from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -121,7 +122,7 @@ class Module(NamedTuple):
         unexplained = {
             one.lineno
             for function in self.functions
-            for one in ast.walk(function)
+            for one in statements(function)
             if isinstance(one, ast.Import | ast.ImportFrom)
             and "#" not in lines[one.lineno] + lines[one.lineno - 1]
         }
@@ -134,7 +135,15 @@ class Module(NamedTuple):
     @property
     def functions(self) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
         kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
-        return [one for one in ast.walk(self.tree) if isinstance(one, kinds)]
+        return [one for one in statements(self.tree) if isinstance(one, kinds)]
+
+
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield all statements below a node. Expressions, which have none, are most nodes of a tree."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.stmt | ast.excepthandler | ast.match_case):
+            yield child
+            yield from statements(child)
 
 
 @cache

@@ -34,8 +34,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, gammaln, logit, xlogy
-from scipy.stats import chi2, expon, goodness_of_fit
 
+from cosim.lazy_modules import lazy_modules
 from cosim.measurement.loss_bursts import (
     Estimate,
     Flags,
@@ -47,6 +47,9 @@ from cosim.measurement.loss_bursts import (
     poisson_estimate,
     profile_interval,
 )
+
+with lazy_modules():
+    from scipy import stats
 
 Reals = NDArray[np.float64]
 
@@ -188,7 +191,7 @@ def length_test(bursts: LossBursts, left_out: Flags, rates: ChainRates, paramete
         statistic, degrees = statistic + chi_squared, degrees + classes - 1
     if degrees < 1:
         return FitTest(None, max(degrees, 0), None)
-    return FitTest(statistic, degrees, float(chi2.sf(statistic, degrees)))
+    return FitTest(statistic, degrees, float(stats.chi2.sf(statistic, degrees)))
 
 
 def _pearson(observed: NDArray[np.int64], rates: ChainRates, lost: bool) -> tuple[float, int]:
@@ -483,8 +486,8 @@ def fit_outages(
     mean = exponential_estimate(int(complete.sum()), float(durations_s.sum()))
     p_value = None
     if len(durations_s) >= FEWEST_OUTAGES and complete.all():
-        tested = goodness_of_fit(
-            expon,
+        tested = stats.goodness_of_fit(
+            stats.expon,
             durations_s,
             known_params={"loc": 0.0},
             statistic="ad",

@@ -15,11 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq, minimize
-from scipy.special import xlogy
-from scipy.stats import binom, chi2
+from scipy.special import chdtri, xlogy
 
+from cosim.lazy_modules import lazy_modules
 from noack.traces.packet_trace import LOST_NS, Int64s, PacketTrace
+
+with lazy_modules():  # the library imports this module, and seldom needs them
+    from scipy import optimize, stats
 
 Flags = NDArray[np.bool_]
 _NEVER_NS = np.iinfo(np.int64).max
@@ -123,7 +125,7 @@ def loss_bursts(effective: Flags) -> LossBursts:
 Reals = NDArray[np.float64]
 LEVEL = 0.95
 """Nominal coverage of all intervals."""
-_ALLOWED = float(chi2.ppf(LEVEL, 1)) / 2
+_ALLOWED = float(chdtri(1, 1 - LEVEL)) / 2
 """Loss of log-likelihood at the ends of an interval."""
 _TOLERANCE = 0.01
 _LONGEST_STEP = 4.0
@@ -148,7 +150,7 @@ def binomial_estimate(successes: int, trials: int) -> Estimate | None:
         return float(xlogy(successes, share) + xlogy(failures, 1 - share) - log_likelihood) - _ALLOWED
 
     def end(outer: float, certain: bool) -> float:
-        return outer if certain else float(brentq(lacking, share, outer, xtol=1e-15))
+        return outer if certain else float(optimize.brentq(lacking, share, outer, xtol=1e-15))
 
     low = 0.0 if not successes else end(min(1e-300, share / 2), False)
     return Estimate(share, low, 1.0 if not failures else end(1 - 1e-16, False))
@@ -157,8 +159,8 @@ def binomial_estimate(successes: int, trials: int) -> Estimate | None:
 def poisson_estimate(count: int, exposure: float) -> Estimate:
     """Return a rate with its exact interval (Garwood, 1936)."""
     tail = (1 - LEVEL) / 2
-    low = float(chi2.ppf(tail, 2 * count)) / 2 if count else 0.0
-    high = float(chi2.ppf(1 - tail, 2 * count + 2)) / 2
+    low = float(stats.chi2.ppf(tail, 2 * count)) / 2 if count else 0.0
+    high = float(stats.chi2.ppf(1 - tail, 2 * count + 2)) / 2
     return Estimate(count / exposure, low / exposure, high / exposure)
 
 
@@ -167,7 +169,7 @@ def exponential_estimate(count: int, total: float) -> Estimate | None:
     if not count:
         return None
     tail = (1 - LEVEL) / 2
-    ends = (2 * total / float(chi2.ppf(probability, 2 * count)) for probability in (1 - tail, tail))
+    ends = (2 * total / float(stats.chi2.ppf(probability, 2 * count)) for probability in (1 - tail, tail))
     return Estimate(total / count, *ends)
 
 
@@ -183,7 +185,7 @@ def minimise(function: Callable[[Reals], float], start: Reals, limit: float) -> 
     """Return a local minimum with all parameters within ± ``limit``."""
     if not len(start):
         return Minimum(start, function(start))
-    result = minimize(
+    result = optimize.minimize(
         function,
         start,
         method="L-BFGS-B",
@@ -228,7 +230,7 @@ def _profile_end(function: Callable[[Reals], float], best: Minimum, index: int, 
         beyond = inside + float(np.sign(outer)) * min(step, abs(outer - inside))
         following = profile(beyond, start)
         if following.value > limit:
-            return float(brentq(lacking, inside, beyond, args=(start,), xtol=_TOLERANCE))
+            return float(optimize.brentq(lacking, inside, beyond, args=(start,), xtol=_TOLERANCE))
         inside, start, step = beyond, following.at, min(2 * step, _LONGEST_STEP)
     return outer
 
@@ -264,7 +266,7 @@ def quantile_m(bursts: LossBursts, share: float) -> QuantileM:
     count = len(ordered)
     covered = math.ceil(share * count - 1e-9)
     # P(at most rank − 1 of the bursts are in the share) ≥ 95 % (Wilks, 1941)
-    rank = int(binom.ppf(LEVEL, count, share)) + 1
+    rank = int(stats.binom.ppf(LEVEL, count, share)) + 1
     confident = int(ordered[rank - 1]) + 1 if rank <= count else None
     return QuantileM(
         share, int(ordered[covered - 1]) + 1 if covered > 0 else 1, confident, _packet_quantile(bursts, share)

@@ -11,6 +11,8 @@ import contextlib
 import math
 from collections import defaultdict
 from collections.abc import Generator, Hashable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -160,9 +162,26 @@ def sharpened(problem: Problem) -> Search[Constants]:
     (part,), conditions, *_ = problem
     is_plain = problem.structured and problem.earlier_error == 0.0
     if problem.longest and is_plain and is_scheduled_flow(part):
+        key = id(part.plant), constants, repr((part.bound, conditions))
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
-            return scheduled_constants(constants, part, conditions)
+            return sharpened_once(_Sharpening(key, constants, part, conditions))
     return constants
+
+
+@dataclass(frozen=True)
+class _Sharpening:
+    """What :func:`scheduled_constants` needs. The key has the plant's id: the part keeps the plant."""
+
+    key: Hashable
+    constants: Constants = field(compare=False)
+    part: Part = field(compare=False)
+    conditions: NetworkConditions = field(compare=False)
+
+
+@lru_cache(maxsize=32)
+def sharpened_once(known: _Sharpening) -> Constants:
+    """Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
+    return scheduled_constants(known.constants, known.part, known.conditions)
 
 
 def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:

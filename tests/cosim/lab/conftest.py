@@ -26,12 +26,13 @@ TEXT = "document.body.innerText"
 class Served:
     """A server of the page, whose errors are in a file; a context that ends it by Ctrl-C."""
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
+    def __init__(self, folder: Path, *arguments: str, viewer: bool = True) -> None:
         self.errors = folder / "errors.txt"
         command = live.noack_command("lab", "--no-browser", "--json", "--set", "horizon_s=4", *arguments)
+        environment = os.environ | ({} if viewer else live.WITHOUT_VIEWER)
         with self.errors.open("w") as errors:
             self._process = subprocess.Popen(
-                command, cwd=folder, stdout=subprocess.PIPE, stderr=errors, text=True
+                command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True
             )
         assert self._process.stdout is not None
         text = "".join(iter(self._process.stdout.readline, "}\n")) + "}"

@@ -256,7 +256,7 @@ def test_a_click_reaches_the_run_while_the_viewer_draws(with_card: Browser, addr
 
 
 def test_ctrl_c_during_a_live_run_is_quiet_and_keeps_the_record(browser: Browser, tmp_path: Path) -> None:
-    with Served(tmp_path) as server:
+    with Served(tmp_path, viewer=False) as server:
         page = Page(browser, server.address)
         page.click("live", "button")
         page.click("run live", "button")

@@ -27,6 +27,7 @@ from cosim.lab.lab_server import AddressGuard, LabOptions
 from cosim.lab.lab_services import LabServices, PageCalls, Session
 from cosim.lab.live_run import LiveRun
 from tests.integration import conftest as live
+from tests.integration.conftest import WITHOUT_VIEWER
 
 UNANSWERED = {
     "computes": "while True: pass",
@@ -345,7 +346,7 @@ def test_other_output_is_a_line_of_the_log(line: str) -> None:
 
 
 def test_a_run_writes_nothing_beside_the_scenario_and_reads_the_files_there(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another user may replace what is written there, or place links before."""
     folder, private = tmp_path / "shared", tmp_path / "private"
@@ -354,6 +355,7 @@ def test_a_run_writes_nothing_beside_the_scenario_and_reads_the_files_there(
     draft = open_draft("saturated_lqr").with_value("horizon_s", 0.5)
     shutil.copy(draft.folder / "saturated_lqr.py", folder)
     (folder / f".lab-{os.getpid()}.toml").symlink_to(private)
+    monkeypatch.setenv("PYTHONPATH", WITHOUT_VIEWER["PYTHONPATH"])
     before = folder.stat().st_mtime_ns  # changes if a file is made, renamed or removed
 
     async def run() -> LiveRun:
