@@ -33,6 +33,8 @@ ANSWER_S = 60.0
 """So long a browser may take to answer: without a graphics card it may draw for seconds."""
 _GIVE_UP_S = 3.0
 """So long the worker may go on with a call whose page does not want it any more."""
+_MANAGER_ENDS_S = 5.0
+"""Its thread ends at once: its worker is killed."""
 _LOOK_S = 0.4
 _NICE = 10
 """The worker yields to a live run and to the page."""
@@ -53,7 +55,11 @@ class LabServices:
         return self
 
     def __exit__(self, *_: object) -> None:
+        manager = self._pool._executor_manager_thread  # None: nothing was computed
         _end(self._pool)
+        if manager is not None:
+            # The interpreter would wake it up at its exit, perhaps while it closes its pipe.
+            manager.join(_MANAGER_ENDS_S)  # type: ignore[attr-defined] # it is a thread
         if self.live is not None:
             self.live.stop()
 
