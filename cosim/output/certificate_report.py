@@ -98,7 +98,8 @@ def _in_words(results: Certificates) -> Iterator[str]:
         own = "the scenario's plant" if results.nonlinear is None else "the model as the plant"
         plants = {BOX: "every plant of the box", REGION: REGION}.get(certificate.scope, own)
         apart = ""
-        if (spacing_s := certificate.inter_event_s) is not None:
+        spacing_s = certificate.inter_event_s
+        if spacing_s is not None and spacing_s < MOST_S:  # else there is no second event
             apart = f" The inter-event time is at least {_limit(spacing_s)}."
         yield (
             f"In words: for {plants}, under the assumptions above and for every pattern of losses "

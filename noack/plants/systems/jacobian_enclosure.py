@@ -19,7 +19,7 @@ import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -261,12 +261,20 @@ class EnclosedMotion:
             rows = (missed < best)[:, None]
             centre, halves = np.where(rows, middle, centre), np.where(rows, half, halves)
             best = np.minimum(best, missed)
-        at_rest = [_size(rate.value) for rate in self._values(0 * halfwidths, range(0))]
-        if (at_rest > _AT_REST * np.abs(centre).max(axis=1)).any():
+        if (self.at_rest > _AT_REST * np.abs(centre).max(axis=1)).any():
             raise NotEnclosedError(
-                f"it does not rest at x = 0, u = 0: an entry of ẋ is {max(at_rest):.3g} there"
+                f"it does not rest at x = 0, u = 0: an entry of ẋ is {self.at_rest.max():.3g} there"
             )
         return Inclusion(centre[:, :n], centre[:, n:], halves[:, :n], halves[:, n:])
+
+    @cached_property
+    def at_rest(self) -> Vector:
+        """Bounds of the entries of |f(0, 0)|, (n,): 0, or what rounding leaves.
+
+        Raises:
+            NotEnclosedError: there is no enclosure.
+        """
+        return np.array([_size(rate.value) for rate in self._values(np.zeros(self.n + self.m), range(0))])
 
     def _mean_slope(self, halfwidths: Vector, j: int, moved: frozenset[int]) -> "list[arb]":
         """Enclose ∫₀¹ ∂f/∂z_j ds at s z_j, with the coordinates ``moved`` and the others 0."""

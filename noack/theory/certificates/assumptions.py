@@ -33,7 +33,7 @@ class AssumptionStatus(StrEnum):
     NOT_NEEDED = "not needed"
     """It does not hold, or is not checked; no computed bound depends on it."""
     ASSUMED = "assumed"
-    """It depends on the run and is checked in each run."""
+    """It is not proven; what depends on the run is checked in each run."""
 
 
 class Assumption(NamedTuple):

@@ -133,7 +133,16 @@ class RegionScope(_Box):
         why = "the bounds on the region are inside it, so that there is no first exit"
         stays = "x and u stay in the region over which the equations are enclosed"
         proven = Assumption(stays, "certificate", AssumptionStatus.HOLDS, why)
-        return replace(certificate, region=region, assumptions=(*certificate.assumptions, proven))
+        assumptions = (*certificate.assumptions, proven, self._rest())
+        return replace(certificate, region=region, assumptions=assumptions)
+
+    def _rest(self) -> Assumption:
+        """Return that f(0, 0) = 0, on which the inclusion rests."""
+        assumed, left = "the plant rests at x = 0, u = 0", float(self._motion.at_rest.max())
+        if left == 0:
+            return Assumption(assumed, "certificate", AssumptionStatus.HOLDS, "ẋ is 0 there")
+        why = f"an entry of ẋ is at most {left:.2g} there; the bounds leave it out"
+        return Assumption(assumed, "certificate", AssumptionStatus.ASSUMED, why)
 
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain on the region; at least 1, perhaps infinite, if there is none."""

@@ -132,6 +132,16 @@ def test_without_a_certificate_the_reason_is_given(tmp_path: Path, body: str, re
     assert reason in (certificate_of(own_plant(tmp_path, code), (0.1, 0.1)).void or "")
 
 
+@pytest.mark.parametrize(("rest", "status"), [(0.0, "holds"), (1e-10, "assumed")])
+def test_what_the_bounds_leave_out_is_named(tmp_path: Path, rest: float, status: str) -> None:
+    own = own_plant(tmp_path, STEEP.replace("u[0]", f"u[0] + {rest}"))
+    certificate = certificate_of(own, (0.01, 0.01))
+    assert certificate.void is None
+    [rests] = [assumption for assumption in certificate.assumptions if "rests at" in assumption.what]
+    assert rests.verdict.value == status
+    assert (f"at most {rest:.2g} there" in rests.why) == (rest > 0)
+
+
 def test_without_the_library_one_line_says_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
