@@ -227,18 +227,18 @@ class Reach:
         if not self.effects.is_none:
             held = self.effects._replace(late=0.0)
             changes = held.sizes(bounds.unit_effects)
-        by_window = []
-        for cell, moved, forms, roots in self._windows:
-            sizes = spectral_norms(bounds.C @ moved @ roots)
-            first_weights = np.full((1, len(forms)), _OTHERS / len(forms))
-            first_weights[0, _FOUR] += (1 - _OTHERS) * _SHARES[int(sizes.argmin())]
-            largest, _ = largest_outputs(forms[None], (bounds.C @ moved)[None], 0.0, first_weights)
-            size = min(float(sizes.min()) * ROUNDING, float(largest[0]))
-            by_window.append(size + float(changes[cell]) / self.size)
-        return min(by_window)
+        cells, moved, forms, roots = self._windows
+        Y = bounds.C @ moved
+        images = Y[:, None] @ roots
+        sizes = spectral_norms(images.reshape(-1, *images.shape[2:])).reshape(images.shape[:2])
+        first_weights = np.full(forms.shape[:2], _OTHERS / forms.shape[1])
+        first_weights[:, _FOUR] += (1 - _OTHERS) * _SHARES[sizes.argmin(axis=1)]
+        largest, _ = largest_outputs(forms, Y, 0.0, first_weights, improve_all=True)
+        by_window = np.minimum(sizes.min(axis=1) * ROUNDING, largest) + changes[cells] / self.size
+        return float(by_window.min())
 
     @cached_property
-    def _windows(self) -> list[tuple[int, Matrix, Stack, Stack]]:
+    def _windows(self) -> tuple[NDArray[np.int64], Stack, Stack, Stack]:
         """What holds of z a time T' ago, after the last node that is followed, for each T'.
 
         T' as a cell, the flow in it, forms that are at most 1, all for c = 1 and in (x_c, e_c):
@@ -282,7 +282,8 @@ class Reach:
             usable = values[:, :1] > _CONDITION * values[:, -1:]  # others are too flat
             roots = V / np.sqrt(np.where(usable, values, _CONDITION))[:, None]
             windows.append((flow.cell_at(since_s), moved @ turn, forms, roots))
-        return windows
+        cells, moves, forms_of, roots_of = zip(*windows, strict=True)
+        return np.array(cells), np.array(moves), np.array(forms_of), np.array(roots_of)
 
 
 class _CellBounds:
