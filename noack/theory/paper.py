@@ -280,6 +280,10 @@ def _theorem_2(
     )
 
 
+_GAMMAS = np.geomspace(1e-3, 1e3, 61)
+"""The γ that are tried, (61,)."""
+
+
 class Interval(NamedTuple):
     """A trajectory between two events: k samples."""
 
@@ -301,14 +305,13 @@ def longest_interval_s(interval: Interval, beta: float, alpha_per_s: float, kapp
     passed_s = interval.t_s - interval.t_s[0]
     zeta = float((interval.model_norm * np.exp(kappa * passed_s)).max())
     level = beta * math.exp(-alpha_per_s * float(interval.t_s[0]))
-    found_s = math.inf
-    gammas = np.geomspace(1e-3, 1e3, 61)
-    etas = (interval.x_norm * np.exp(-gammas[:, None] * passed_s)).min(axis=1)
-    for gamma, eta in zip(gammas.tolist(), etas.tolist(), strict=True):
-        if eta > 0:
-            ratio = (max(zeta, eta) + level) / eta
-            found_s = min(found_s, math.log(ratio) / (gamma + min(kappa, alpha_per_s)))
-    return found_s
+    etas = (interval.x_norm * np.exp(-_GAMMAS[:, None] * passed_s)).min(axis=1)
+    exists = etas > 0
+    etas, gammas = etas[exists], _GAMMAS[exists]
+    with np.errstate(over="ignore"):  # of a tiny η_j: it gives no interval
+        ratios = (np.maximum(zeta, etas) + level) / etas
+    intervals_s = np.log(ratios) / (gammas + min(kappa, alpha_per_s))
+    return float(intervals_s.min(initial=math.inf))
 
 
 def theorem_1(H: Matrix, alpha_per_s: float, longest_s: Sequence[float]) -> float:
