@@ -241,7 +241,7 @@ def _slot_loads(
             bits = 8 * loop.payload_bytes
             must_pass = bits * _share(window)
             yield LinkLoad(
-                begin=f"{begin}{name}, ",
+                begin=f"{begin}loop {number} ({name}), ",
                 key=key,
                 flow=flow,
                 window=window,

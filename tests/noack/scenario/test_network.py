@@ -191,7 +191,7 @@ def test_recorded_opportunities_are_a_bottleneck(content: dict[str, Any]) -> Non
     [
         ([0, 1, 0], "order: loop 2 has no slot; the run has the loops 0 to 2"),
         ([1, 2, 3, 0], "order: a slot is for loop 3; the run has the loops 0 to 2"),
-        ([0, 0, 0, 1, 2], "loop 1, the datagrams that must pass, 1 of any 3 of each loop, need"),
+        ([0, 0, 0, 1, 2], "loop 1 (a-2), the datagrams that must pass, 1 of any 3 of each loop, need"),
     ],
 )
 def test_a_schedule_has_enough_slots_for_each_loop(
