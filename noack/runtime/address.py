@@ -23,7 +23,9 @@ def parse_address(text: str, setting: str, like: Address | None = None) -> Addre
     CallerError if it has another form, or the host does not exist; ``setting`` is in the message.
     """
     match = _FORM.fullmatch(text)
-    if match is None or int(match["port"]) > 65_535:
+    if match is not None and int(match["port"]) > 65_535:
+        raise CallerError(f"{setting}: expected a port up to 65535; found {text!r}")
+    if match is None:
         hint = "; put an IPv6 address in brackets" if text.count(":") > 1 else ""
         raise CallerError(
             f"{setting}: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; found {text!r}{hint}"

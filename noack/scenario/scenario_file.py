@@ -65,6 +65,8 @@ def completed(content: ReadTable, path: Path, source: str | None = None) -> Scen
     per mistake.
     """
     source = source or str(path)
+    if "axes" in content and "model" not in content:
+        raise CallerError(f"{source}: a campaign, not a scenario; `noack campaign` runs it")
     content = with_matrices(content, path.parent, source)
     content = with_named_scenarios(content, path.parent, source)
     return _with_files(validate(content, source), path, source)

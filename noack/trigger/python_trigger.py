@@ -79,6 +79,9 @@ class PythonTrigger:
         """
         with self._user_code():
             left, right = _sides(self._object.test(t_ns * 1e-9, read_only(x), read_only(e_s)))
+            # In a run that diverges, x or e_s may be infinite, and what is computed from them NaN.
+            if np.isnan([left, right]).any() and np.isfinite([x, e_s]).all():
+                raise ValueError("test(t_s, x, e_s) returned NaN")
         return TriggerDecision(left > right, left, right)
 
 

@@ -63,6 +63,8 @@ def campaign(
     start, figure_files = worker_pool(workers, scheduler), figures.files
     path = find_shipped(file, "campaigns")
     plan = campaign_file.load(path)
+    if figure_files is not None and not plan.figures:
+        raise CallerError(f"--format: there is no figure; {path} has no [[figures]]")
     folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
     summary, _, _, new_runs, files = execute_campaign(
         plan, path, start, folder=folder, draws=draws, figure_files=figure_files
@@ -534,10 +536,11 @@ def _announce(
     estimated_s = capacity_result.estimated_s(missing, cpu_s, workers)
     longer_s = capacity_result.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
     of_live = f", and {live} live" if live else ""
+    sizes = " to ".join(f"{size:,}" for size in sorted({min(plan.sizes), max(plan.sizes)}))
     idle = "an idle core" if workers == 1 else f"{workers} idle cores"
     print_to_stderr(
         f"noack capacity: {len(plan.sizes) * plan.draws:,} runs of {plan.scenario.horizon_s:g} s "
-        f"with {min(plan.sizes):,} to {max(plan.sizes):,} loops{of_live}; the simulation takes "
+        f"with {sizes} loops{of_live}; the simulation takes "
         f"about {capacity_result.time_text(estimated_s)} on {idle}"
         + ("" if longer == plan else f"; --thorough: {capacity_result.time_text(longer_s)}")
     )

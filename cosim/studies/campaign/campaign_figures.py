@@ -1,7 +1,7 @@
 """The figures of a campaign; intervals are 95 % confidence intervals of the means."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -189,6 +189,7 @@ def _pareto(
     return pareto_figure(series, spec.x, spec.y), (
         f"{_title(spec.y)} against {METRICS[spec.x].title}, means with 95 % confidence "
         f"intervals; for each {series_name} the points that none of its own dominates are joined"
+        + _left_out(estimate for pair in series.values() for estimates in pair for estimate in estimates)
     )
 
 
@@ -206,6 +207,7 @@ def _curve(
     numbers = None if axis.numbers is None else np.array(axis.numbers)[places]
     return curve_figure(numbers, labels, series, axis.heading, spec.metric), (
         f"{_title(spec.metric)} over {axis.called}: means and 95 % confidence intervals"
+        + _left_out(estimate for curve in series.values() for estimate in curve if estimate)
     )
 
 
@@ -269,10 +271,21 @@ def _name(text: str) -> str:
 
 
 def _means(estimates: Sequence[Estimate | None]) -> tuple[Vector, Vector]:
-    """Return means and half-widths, (k,); NaN and 0 where there is none."""
+    """Return means and half-widths, (k,); NaN where there is none: a single run has no interval."""
     mean = np.array([e.mean if e and math.isfinite(e.mean) else np.nan for e in estimates])
-    half = [e.halfwidth if e and math.isfinite(e.halfwidth) else 0.0 for e in estimates]
-    return mean, np.array(half)
+    half = np.array([e.halfwidth if e and math.isfinite(e.halfwidth) else np.nan for e in estimates])
+    return mean, half
+
+
+def _left_out(estimates: Iterable[Estimate]) -> str:
+    """Return what a caption says of runs whose metric is infinite, which the means leave out."""
+    shares = [estimate.finite / estimate.draws for estimate in estimates]
+    if min(shares, default=1.0) == 1:
+        return ""
+    text = "; runs without a finite value are left out"
+    if (most := max((1 - share for share in shares if share), default=0.0)) > 0:
+        text += f", at one point {100 * most:.3g} % of them"
+    return text + ("; a point without other runs is missing" if min(shares) == 0 else "")
 
 
 def _title(metric: Metric) -> str:

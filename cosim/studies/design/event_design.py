@@ -288,9 +288,9 @@ def event_outcome(search: EventSearch, original: Certified, best: Certified) -> 
         "tried": search.tried,
         "judged": search.judged,
     }
+    proven = "its certificate is proven, that it is the best is not" if best.m else "it has no certificate"
     notes = [
-        f"the best of {search.tried:,} loops tried with {limit}; its certificate is proven, that "
-        "it is the best is not",
+        f"the best of {search.tried:,} loops tried with {limit}; {proven}",
         "costs and transmissions are means over fresh draws with the scenario's own network",
     ]
     return DesignOutcome(
@@ -321,7 +321,7 @@ def _cells(search: EventSearch, certified: Certified) -> dict[str, str]:
     own_m = search.scenario.network.mansd + 1
     return {
         "certified for": _reach(search, certified),
-        "sup‖x‖ there at most": bound(certified.m),
+        "sup‖x‖ for that M at most": bound(certified.m),
         f"sup‖x‖ with M = {own_m} at most": bound(own_m),
         "cost, mean": f"{certified.measured.cost:.4g}",
         "transmissions, mean": f"{certified.measured.transmissions:.4g}",

@@ -305,9 +305,10 @@ def _placed(model: LinearModel, poles: Complex) -> Matrix:
         raise CallerError(f"poles: {len(poles)} given; the controllable part has {model.rank} eigenvalues")
     try:
         placed = place_poles(basis.T @ model.A @ basis, basis.T @ model.B, poles)
-    except ValueError as error:  # not in conjugate pairs, or one too often
+    except ValueError:
         raise CallerError(
-            f"poles: {error} (none may occur more often than there are independent inputs)"
+            "poles: complex ones must be in conjugate pairs, and none may occur more often than there "
+            f"are independent inputs ({np.linalg.matrix_rank(model.B)})"
         ) from None
     return np.asarray(-placed.gain_matrix @ basis.T, dtype=np.float64)
 
@@ -325,7 +326,7 @@ def _diagonal(key: str, weights: ArrayLike | None, shaped: Matrix) -> Matrix:
 def _diagonal_text(matrix: Matrix) -> str:
     values = np.diag(matrix)
     if (values == values[0]).all():
-        return f"{values[0]:g} I"
+        return "I" if values[0] == 1 else f"{values[0]:g} I"
     return f"diag({', '.join(f'{value:g}' for value in values)})"
 
 

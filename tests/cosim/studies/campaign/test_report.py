@@ -11,11 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import t as student
 
+from cosim.output.figures.figure_description import Band
 from cosim.output.figures.figure_files import inline
 from cosim.shipped_files import find_shipped
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_figures import (
+    _left_out,
     curve_figure,
     distribution_figure,
     heat_map_figure,
@@ -331,3 +333,14 @@ def test_terminal_tables_print_names_literally_and_list_failed_runs(
     assert result.exit_code == 0, result.output
     text = " ".join(result.stdout.split())
     assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in text
+
+
+def test_a_caption_says_what_the_means_leave_out() -> None:
+    whole, half, none = (estimate(np.array(values)) for values in ([1.0, 2.0], [1.0, np.inf], [np.inf] * 2))
+    assert _left_out([whole]) == ""
+    assert _left_out([whole, half]).endswith("left out, at one point 50 % of them")
+    assert _left_out([whole, none]).endswith("left out; a point without other runs is missing")
+    figure = curve_figure(np.array([1.0, 2.0]), ["1", "2"], {"a": [whole, half]}, "x", "cost")
+    ((panel,),) = (row.panels for row in figure.rows)
+    (band,) = (item for item in panel.items if isinstance(item, Band))
+    assert np.isfinite(band.high).tolist() == [True, False]  # a single run has no interval
