@@ -113,7 +113,7 @@ endif
 test: check pytest ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
 
 pytest: setup-dev
-	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=4 --dist=loadfile --no-loadscope-reorder)
+	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=3 --dist=loadfile --no-loadscope-reorder)
 
 fuzz: setup-dev ## Fuzz every parser for MINUTES=10 in total; exit status 1 if an input fails
 	$(BIN)/python -m tests.fuzz run --minutes $(MINUTES) $(ARGS)
