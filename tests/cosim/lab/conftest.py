@@ -143,11 +143,15 @@ class Page:
         self.js(f"{found}[0].click()")
 
     def fill(self, key: str, text: str) -> None:
-        """Type a text into a field of the form."""
+        """Type a text into a field of the form; again if another element took the focus meanwhile."""
         found = f"document.getElementById({json.dumps(f'lab-field-{key}')})"
-        self.wait(f"!!{found}")
-        self.js(f"{found}.focus(), {found}.select()")
-        self.call("Input.insertText", text=text)
+        deadline_s, typed = time.monotonic() + live.PATIENCE_S, None
+        while typed != text:
+            assert time.monotonic() < deadline_s, (key, text, typed)
+            self.wait(f"!!{found}")
+            self.js(f"{found}.focus(), {found}.select()")
+            self.call("Input.insertText", text=text)
+            typed = self.js(f"{found}?.value")
 
     def resize(self, width: int, height: int) -> None:
         """Give the window another size."""
