@@ -110,7 +110,7 @@ def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again
             names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []
             for name in (*names, None):
                 with _is_optional(run_dir / file_of_loop(REPORT_FILE, name)):
-                    _write_report(run, summary, run_dir, name)
+                    _write_report(run, summary, run_dir, name, over_time)
     return Outcome(run_dir, status, reason, summary)
 
 
@@ -438,7 +438,13 @@ def _write_recording(
     write_view(run, summary, run_dir, loop, known)
 
 
-def _write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> Path:
+def _write_report(
+    run: RecordedRun,
+    summary: RunSummary,
+    run_dir: Path,
+    loop: str | None,
+    known: Sequence[LoopOverTime] | None = None,
+) -> Path:
     from cosim.output.report_page import write_report  # imports matplotlib
 
-    return write_report(run, summary, run_dir, loop)
+    return write_report(run, summary, run_dir, loop, known)

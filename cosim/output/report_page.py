@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from cosim.analysis.summary.network_summary import worst_loop
+from cosim.analysis.summary.network_summary import LoopOverTime, worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary, RunSummary
 from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.network_figures import network_figures
@@ -97,8 +97,16 @@ class Report:
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None = None) -> Path:
+def write_report(
+    run: RecordedRun,
+    summary: RunSummary,
+    run_dir: Path,
+    loop: str | None = None,
+    known: Sequence[LoopOverTime] | None = None,
+) -> Path:
     """Write the report of a run, or of one of its loops; replace an existing one.
+
+    ``known`` is how each loop of the run went, if that is known.
 
     Returns:
         The report's path.
@@ -116,7 +124,7 @@ def write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str
         worst.number,
         worst.why,
         figures=[describe() for describe in described.values()],
-        network_figures=network_figures(run, shown) if shown.loops[1:] else (),
+        network_figures=network_figures(run, shown, known) if shown.loops[1:] else (),
         description=(run if shown.loops[1:] else record).scenario.description,
         scenario_toml=(run_dir / SCENARIO_FILE).read_text(encoding="utf-8"),
         environment=read_object(run_dir / ENVIRONMENT_FILE),

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.summary.network_summary import LoopsOverTime, loops_over_time, quantiles
+from cosim.analysis.summary.network_summary import LoopOverTime, LoopsOverTime, loops_over_time, quantiles
 from cosim.analysis.summary.summary_model import InFlightPart, RunSummary
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
@@ -64,13 +64,15 @@ def page_figures(
     return run_figures(record, envelopes(record) if bounded else ())
 
 
-def network_figures(run: RecordedRun, summary: RunSummary) -> list[FigureDescription]:
-    """Describe the figures of all loops.
+def network_figures(
+    run: RecordedRun, summary: RunSummary, known: Sequence[LoopOverTime] | None = None
+) -> list[FigureDescription]:
+    """Describe the figures of all loops; ``known`` is how each loop went, if that is known.
 
     Raises:
         CallerError: a table of the record is damaged.
     """
-    over_time = loops_over_time(run)
+    over_time = loops_over_time(run, known)
     names = [plain(loop.name) for loop in summary.loops]
     stayed = np.array([loop.diverged_at_s is None for loop in summary.loops])
     in_flight = summary.network.in_flight
