@@ -22,7 +22,9 @@ SETTINGS: list[dict[str, Any]] = [
 
 @pytest.fixture(scope="module")
 def simulated() -> list[noack.Run]:
-    return [noack.simulate(noack.load("lane_following", settings)) for settings in SETTINGS]
+    with pytest.MonkeyPatch.context() as patch:  # nobody looks at their reports
+        patch.setattr("cosim.live.finalize._write_report", lambda *_: None)
+        return [noack.simulate(noack.load("lane_following", settings)) for settings in SETTINGS]
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +94,7 @@ def test_the_command_prints_the_table_and_writes_an_escaped_page(runs: list[Path
     assert "distance in x to A, RMS" in repr(mine)
 
 
+@pytest.mark.usefixtures("no_report")
 def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: Path) -> None:
     other = noack.simulate(noack.load("double_integrator", {"horizon_s": 1.0}))
     mistakes = {
