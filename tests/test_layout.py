@@ -52,7 +52,7 @@ LINES = {
     "controller_node": 410,
     "benchmarks": 3645,
     "native": 11035,
-    "tests": 47130,
+    "tests": 47140,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

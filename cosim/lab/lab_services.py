@@ -34,7 +34,7 @@ ANSWER_S = 60.0
 _GIVE_UP_S = 3.0
 """So long the worker may go on with a call whose page does not want it any more."""
 _MANAGER_ENDS_S = 5.0
-"""Its thread ends at once: its worker is killed."""
+"""So long, at most, the end waits for the thread of the pool, whose worker is killed."""
 _LOOK_S = 0.4
 _NICE = 10
 """The worker yields to a live run and to the page."""

@@ -285,7 +285,7 @@ def _left_out(estimates: Iterable[Estimate]) -> str:
     text = "; runs without a finite value are left out"
     if (most := max((1 - share for share in shares if share), default=0.0)) > 0:
         text += f", at one point {100 * most:.3g} % of them"
-    return text + ("; a point without other runs is missing" if min(shares) == 0 else "")
+    return text + ("; where none is left, the point is missing" if min(shares) == 0 else "")
 
 
 def _title(metric: Metric) -> str:

@@ -10,6 +10,7 @@ import pytest
 import rerun.chunk
 from typer.testing import Result
 
+from cosim.analysis.summary import network_summary
 from cosim.analysis.summary.network_summary import in_flight
 from cosim.analysis.summary.summary_model import ReplayPart, read_summary
 from cosim.live.finalize import finalize
@@ -127,6 +128,16 @@ def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: s
     done = invoke("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
     assert json.loads(done.stdout) == {"recording": str(path), "exists": True}
     assert path.read_bytes().startswith(b"RRF")
+
+
+@pytest.mark.usefixtures("no_recording")
+def test_the_report_reads_no_loop_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """How each loop went is known at the end of a run; to find it out takes most of the time."""
+    monkeypatch.setattr(network_summary, "loop_over_time", None)
+    loops = 'loops=[{ name = "a", count = 5 }]'
+    ending = simulate_run(load(PATH, ["horizon_s=0.5", loops]), tmp_path)
+    finalize(ending)
+    assert (ending.run_dir / "report.html").is_file()
 
 
 @pytest.mark.usefixtures("no_report", "no_recording")

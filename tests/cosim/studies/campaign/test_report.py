@@ -339,7 +339,7 @@ def test_a_caption_says_what_the_means_leave_out() -> None:
     whole, half, none = (estimate(np.array(values)) for values in ([1.0, 2.0], [1.0, np.inf], [np.inf] * 2))
     assert _left_out([whole]) == ""
     assert _left_out([whole, half]).endswith("left out, at one point 50 % of them")
-    assert _left_out([whole, none]).endswith("left out; a point without other runs is missing")
+    assert _left_out([whole, none]).endswith("left out; where none is left, the point is missing")
     figure = curve_figure(np.array([1.0, 2.0]), ["1", "2"], {"a": [whole, half]}, "x", "cost")
     ((panel,),) = (row.panels for row in figure.rows)
     (band,) = (item for item in panel.items if isinstance(item, Band))
