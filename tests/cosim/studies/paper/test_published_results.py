@@ -140,4 +140,4 @@ def test_without_the_gain_at_the_plants_side_the_tube_is_left(
     own = optimisation.K[0]
     assert umsonst_barbosa.run(optimisation, 0.5, drawn, own).tube < 1
     assert umsonst_barbosa.run(optimisation, 0.5, drawn, 0 * own).tube > 1
-    assert umsonst_barbosa.run(optimisation, 0.5, 1.01 * worst, own).tube == pytest.approx(1.01)
+    assert umsonst_barbosa.run(optimisation, 0.5, 1.01 * worst, own).tube == pytest.approx(1.01, rel=1e-4)
