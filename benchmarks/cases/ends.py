@@ -25,7 +25,7 @@ from cosim.live.simulated_run import simulate_run
 from cosim.record.record_source import joined
 from cosim.record.run_directory import RECORD, write_environment
 from cosim.record.table_files import TableFile
-from noack.protocol.topology import RECORDER
+from noack.protocol.roles import RECORDER
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load

@@ -27,7 +27,7 @@ with lazy_modules():
     from cosim.record import run_directory
     from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
     from noack.core import core_library
-    from noack.protocol import topology
+    from noack.protocol import roles
     from noack.runtime import address, run_registry
     from noack.runtime.connections import metrics_server
     from noack.scenario import link_load, resolution, scenario
@@ -125,7 +125,7 @@ def run_processes(
                 ending = launcher.launch(
                     loaded,
                     options.runs,
-                    spawn=spawn or topology.ROLES,
+                    spawn=spawn or roles.ROLES,
                     session=session,
                     live=options.live,
                     watcher=run_watcher.joint_watcher(watchers),

@@ -39,7 +39,7 @@ from noack.core.file_access import write_whole
 from noack.core.number_format import byte_size
 from noack.core.process_limits import cores as usable_cores
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.topology import PLANT, RECORDER, ROLES
+from noack.protocol.roles import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, stop_reason

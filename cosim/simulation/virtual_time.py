@@ -18,9 +18,8 @@ from netem.channel import RUN_ID, Network, channel_of
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi
 from noack.machines.loop_machines import LoopMachines, row_types
-from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, OWNER
-from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER
+from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.parameter_changes import change_notice, scheduled, settings_key

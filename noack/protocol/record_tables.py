@@ -1,6 +1,6 @@
 """The tables of the numeric record, each with its columns; one row per input of a machine.
 
-A machine emits its rows as :class:`noack.protocol.machine_interface.Record`, in the order of the
+A machine emits its rows as :class:`noack.protocol.roles.Record`, in the order of the
 columns here; live runs, simulation and replay fill the same tables. Everything else follows from
 :data:`TABLES`: row types, Parquet files, the processes' tables, the description in
 ``docs/record.md``. Times are nanoseconds of simulated time since the run's epoch: ``t_ns`` is

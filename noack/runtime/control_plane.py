@@ -22,7 +22,7 @@ from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from noack.core.errors import CallerError, NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
-from noack.protocol.topology import COORDINATOR
+from noack.protocol.roles import COORDINATOR
 from noack.runtime.address import address_text
 from noack.runtime.control_messages import ChangeAnnouncement, message_json, parse_message
 from noack.runtime.join_ticket import RemoteAccess, Ticket

@@ -10,7 +10,7 @@ from unittest.mock import patch
 from cosim.live import coordinator
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
-from noack.protocol.topology import ROLES
+from noack.protocol.roles import ROLES
 from noack.runtime import join_ticket, run_registry
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.private_folder import open_private
