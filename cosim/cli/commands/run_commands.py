@@ -23,7 +23,7 @@ with lazy_modules():
     from cosim.live.monitoring import progress, ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict
     from cosim.simulation import continuous
-    from noack.runtime import control_messages, run_registry
+    from noack.runtime import control_messages, control_plane
     from noack.scenario import link_load, resolution, runtime_parameters, scenario, scenario_file
 
 if TYPE_CHECKING:
@@ -268,7 +268,7 @@ def set_(
         noack set mansd 2 trigger.beta 0.3 --json   change M − 1 and β at once
     """
     changes = parsed(settings or ())
-    answer = run_registry.request_change(run_registry.find(session, run), changes)
+    answer = control_plane.request_change(control_plane.find_run(session, run), changes)
     if json:
         cli.print_json(answer.fields())
     elif changes:
