@@ -19,10 +19,10 @@ with lazy_modules():
     from cosim.analysis.summary import summary_model
     from cosim.interactive import draft
     from cosim.lab import lab_server
-    from cosim.live import remote_access, simulated_run
+    from cosim.live import remote_access
     from cosim.live.monitoring import progress, ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict
-    from cosim.simulation import continuous
+    from cosim.simulation import continuous, virtual_time
     from noack.runtime import control_messages, control_plane
     from noack.scenario import link_load, resolution, runtime_parameters, scenario, scenario_file
 
@@ -166,7 +166,7 @@ def simulate(
     if trigger is opt.TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=options.json)
     with progress.simulation_bar(progress.error_console(), loaded.horizon_s) as bar:
-        ending = simulated_run.simulate_run(loaded, runs, bar)
+        ending = virtual_time.simulate_run(loaded, runs, bar)
     return finalize_run(ending, options)
 
 
