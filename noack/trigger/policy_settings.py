@@ -38,8 +38,6 @@ class ModelMatrices(NamedTuple):
 class PolicySettings(ScenarioSection):
     """Settings of a trigger policy."""
 
-    events_may_accumulate: ClassVar[bool] = False
-    """Whether events of this policy alone may accumulate where updates are lost."""
     example_keys: ClassVar[ReadTable | None] = None
     """Keys of the example, which :meth:`example` returns."""
     at_start_only: ClassVar[tuple[str, ...]] = ()
