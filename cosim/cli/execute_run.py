@@ -20,7 +20,7 @@ from noack.runtime.command_line import LogFormat, log_format, print_to_stderr
 
 with lazy_modules():
     from cosim.live import finalize, launcher, remote_access
-    from cosim.live.monitoring import progress, run_metrics, run_watcher
+    from cosim.live.monitoring import progress, run_watcher
     from cosim.live.processes import fork_server
     from cosim.output import run_verdict
     from cosim.output.viewer import rerun_program
@@ -142,7 +142,7 @@ def run_processes(
 def _served_metrics(loaded: "scenario.Scenario", requested_address: str) -> "Iterator[run_watcher.Watcher]":
     """Serve the metrics of a run within the context; yield what updates them."""
     metrics_server.require_package()
-    metrics = run_metrics.RunMetrics(loaded)
+    metrics = run_watcher.RunMetrics(loaded)
     with metrics_server.metrics_server(requested_address, metrics.collect) as bound:
         print_to_stderr(f"noack: metrics: http://{address.address_text(bound)}/metrics")
         yield metrics.watcher()
