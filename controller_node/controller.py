@@ -21,8 +21,8 @@ from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
-from noack.protocol.machine_interface import BEGINNING, FAILED, External, Notice, Start
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
+from noack.protocol.roles import BEGINNING, FAILED, External, Notice, Start
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ChangeSchedule
 from noack.scenario.resolution import loop_of, setpoint_of

@@ -24,7 +24,6 @@ from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.linear_systems import ModelFlow, Propagator, all_entries, largest_sizes, row_norms
-from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -32,6 +31,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+from noack.protocol.roles import GENERATION
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of, steady_state
 from noack.scenario.scenario import Scenario
 from noack.theory.paper import ErrorMonitor

@@ -37,7 +37,7 @@ from noack.protocol.record_tables import (
     direction_of,
     effective,
 )
-from noack.protocol.topology import CHANGEABLE
+from noack.protocol.roles import CHANGEABLE
 from noack.protocol.wire_format import HEADER_ROW, MAGIC, VERSIONS, Flow
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange, settings_of
 from noack.scenario.resolution import loop_of, policy_of

@@ -28,7 +28,7 @@ from noack.core.clock import NS_PER_S, RunClock
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError, PeerError, shortened
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.topology import SENDS
+from noack.protocol.roles import SENDS
 from noack.runtime.address import Address, SocketName
 from noack.runtime.live_driver import LiveDriver, LoopChannel, ends_of
 from noack.runtime.real_time_loop import RecordSink

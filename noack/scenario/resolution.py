@@ -46,7 +46,6 @@ class LoopMatrices:
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     setpoint: Vector | None = None  # x_r, (n,); None is 0
-    setpoint_input: Vector | None = None  # u_r, (m,), with Âx_r + B̂u_r = 0; None is 0
 
     @property
     def n(self) -> int:
@@ -260,7 +259,6 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
         x0=np.array(plant.initial_state),
         weight=None if weight is None else np.array(weight),
         setpoint=None if setpoint is None else setpoint[0],
-        setpoint_input=None if setpoint is None else setpoint[1],
         state_names=model.state_names or (),
         input_names=model.input_names or (),
     )

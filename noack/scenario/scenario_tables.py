@@ -14,7 +14,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import as_html, as_text
 from noack.plants.linear import LinearSettings
-from noack.protocol.topology import PROTOCOLS, LoopProtocol
+from noack.protocol.roles import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import Flow
 from noack.scenario.run_sections import (
     NAME_PATTERN,

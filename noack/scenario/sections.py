@@ -21,10 +21,9 @@ from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
 from noack.observers.observer_settings import NoiseVariances, ObserverSettings
-from noack.plants.linear import LinearSettings
+from noack.plants.linear import NAMED_MODELS, LinearSettings, NamedModel, parameters_of
 from noack.plants.plant_settings import PlantSettings
 from noack.protocol.wire_format import Flow
-from noack.scenario.named_models import NAMED_MODELS, NamedModel, parameters_of
 from noack.settings.section import (
     Bounds,
     Deviations,
@@ -74,7 +73,7 @@ class ModelSection(ScenarioSection):
     """
 
     name: Literal["lane_following", "single_track_lane", "double_integrator"] | None = None
-    """A named model; see noack/scenario/named_models.py."""
+    """A named model; see noack/plants/linear.py."""
     parameters: dict[str, FiniteFloat] = Field({})
     """Parameters of the named model that differ from its defaults."""
     A: Rows | None = None

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.impairments.loss_guarantee import LongestBurst, LossRule
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.conditions import ideal_conditions

@@ -33,7 +33,7 @@ from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, a
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Matrix, Propagator, all_entries, row_norms, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import (

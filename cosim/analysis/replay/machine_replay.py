@@ -23,7 +23,6 @@ from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.machine_interface import GENERATION, Record, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -36,7 +35,7 @@ from noack.protocol.record_tables import (
     SETTINGS,
     entry_names,
 )
-from noack.protocol.topology import RECEIVES, SENDS
+from noack.protocol.roles import GENERATION, RECEIVES, SENDS, Record, Start
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ParameterChange, settings_of
 from noack.scenario.scenario import Scenario, loops_of

@@ -33,7 +33,7 @@ from noack.protocol.record_tables import (
     SETTINGS,
     direction_of,
 )
-from noack.protocol.topology import ENDS, LOOP_ROLES
+from noack.protocol.roles import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import HEADER_ROW, MAGIC, Flow, datagram_bytes
 
 _RECEIVED = {

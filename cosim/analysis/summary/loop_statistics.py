@@ -51,7 +51,7 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
-from noack.protocol.topology import ENDS, LOOP_ROLES
+from noack.protocol.roles import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import loop_of, setpoint_of

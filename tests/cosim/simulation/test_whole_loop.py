@@ -13,7 +13,7 @@ from cosim.analysis.summary.loop_statistics import unintended_losses
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.protocol.topology import RECEIVES, SENDS, receiver_of
+from noack.protocol.roles import RECEIVES, SENDS, receiver_of
 from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate

@@ -26,7 +26,7 @@ from noack.observers.luenberger import LuenbergerSettings
 from noack.observers.observer_settings import EstimationModel
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import SystemFailedError
-from noack.protocol.machine_interface import GENERATION, Notice, Output, Start
+from noack.protocol.roles import GENERATION, Notice, Output, Start
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import CodedPolicy, Policy, TriggerDecision
 from plant_server.plant import Disturbance, MeasurementModel, Plant, Watchdog

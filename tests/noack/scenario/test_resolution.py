@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from noack.core.errors import CallerError
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.plants.linear import lane_following
 from noack.protocol.record_tables import CHANGE_BYTES
-from noack.scenario.named_models import lane_following
 from noack.scenario.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
