@@ -14,7 +14,7 @@ from importlib import import_module
 from itertools import pairwise
 from operator import or_
 from pkgutil import iter_modules
-from typing import Annotated, TypeVar, get_args
+from typing import Annotated, Self, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -49,6 +49,14 @@ class ScenarioSection(BaseModel):
     # Validators are built at their first use, that of a scenario with those of all its tables. So
     # defaults in classes are made by model_construct, which needs no validator.
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
+
+    def __copy__(self) -> Self:
+        """Return a copy of the keys alone: it may change, and kept results follow from them."""
+        copied, keys = super().__copy__(), type(self).model_fields
+        if len(copied.__dict__) > len(keys):
+            for name in copied.__dict__.keys() - keys.keys():
+                del copied.__dict__[name]
+        return copied
 
     def content(self) -> Table:
         """Return the table as JSON has it, without keys that have no value."""

@@ -100,6 +100,8 @@ class SampledSeries(NamedTuple):
 
         Of these series, the first value above any limit and the largest value are the same.
         """
+        if not len(self.value):
+            return self
         records = []
         for part in (self.t_s < since_s, self.t_s >= since_s):
             t_s, value = self.t_s[part], self.value[part]
