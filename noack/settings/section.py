@@ -61,8 +61,9 @@ class ScenarioSection(BaseModel):
 
     def __eq__(self, other: object) -> bool:
         """Whether it is the same table."""
-        same_type = isinstance(other, ScenarioSection) and type(self) is type(other)
-        return same_type and self.__copy__().__dict__ == other.__copy__().__dict__
+        if not isinstance(other, ScenarioSection) or type(self) is not type(other):
+            return False
+        return self.__copy__().__dict__ == other.__copy__().__dict__
 
     def __getstate__(self) -> dict[Any, Any]:
         """Return what is pickled."""
