@@ -14,7 +14,7 @@ from importlib import import_module
 from itertools import pairwise
 from operator import or_
 from pkgutil import iter_modules
-from typing import Annotated, Any, Self, TypeVar, get_args
+from typing import Annotated, Self, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -65,7 +65,7 @@ class ScenarioSection(BaseModel):
             return False
         return self.__copy__().__dict__ == other.__copy__().__dict__
 
-    def __getstate__(self) -> dict[Any, Any]:
+    def __getstate__(self) -> Table:
         """Return what is pickled."""
         return super().__getstate__() | {"__dict__": self.__copy__().__dict__}
 
