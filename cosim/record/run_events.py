@@ -128,7 +128,7 @@ def model_flow_of(record: RunRecord) -> ModelFlow:
 
 def _changes_in(rows: Rows) -> list[tuple[ParameterChange, int]]:
     changes = []
-    for row in rows[np.argsort(rows["input"], kind="stable")]:
+    for row in sorted(rows, key=lambda row: int(row["input"])):
         try:
             settings = settings_of(row["change"].tobytes())
         except ValueError:

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
@@ -242,6 +243,7 @@ def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
         )
 
 
+@cached_method
 def loop_of(resolved: Scenario) -> LoopMatrices:
     """Return the matrices of a resolved scenario."""
     model, plant = resolved.model, resolved.plant
@@ -264,6 +266,7 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
     )
 
 
+@cached_method
 def policy_of(resolved: Scenario) -> Policy:
     """Return a resolved scenario's trigger policy; raise CallerError if its model excludes it."""
     return resolved.trigger.trigger_policy(resolved.model.trigger_matrices)
@@ -283,6 +286,7 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
     return x_r, input_at(*resolved.model.matrices, x_r)
 
 
+@cached_method
 def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
     """Return the row types of the tables of a loop, from its resolved scenario."""
     return tables(**vars(shape_of(resolved)))

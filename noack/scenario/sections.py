@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.controllers.controller_settings import ControllerSettings
+from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
 from noack.impairments.constraints import join_guarantee, require_consistent
@@ -347,9 +348,10 @@ class DirectionSection(ScenarioSection):
         return self
 
     @property
+    @cached_method
     def link(self) -> LinkSettings:
         """The link of this direction."""
-        return LinkSettings.model_construct(  # of checked parts; every loop asks several times
+        return LinkSettings.model_construct(  # of checked parts
             impairments=(LossOf.model_construct(loss=self.loss), *self.impairments),
             mansd=self.mansd,
             constraints=self.constraints,
@@ -443,6 +445,7 @@ class NetworkSection(DirectionSection):
         return self.acknowledgements or AcknowledgementSection()
 
     @property
+    @cached_method
     def link(self) -> LinkSettings:
         """The link from sensor to controller."""
         update: dict[str, object] = {"first_delivered": self.initial_sync == "first_packet"}
@@ -451,6 +454,7 @@ class NetworkSection(DirectionSection):
         return super().link.model_copy(update=update)
 
     @property
+    @cached_method
     def guarantee(self) -> LossGuarantee:
         """What mansd and the constraints say, also if the network does not enforce it."""
         return join_guarantee(self.mansd, self.constraints)

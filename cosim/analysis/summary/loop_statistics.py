@@ -352,7 +352,9 @@ class SampleFactsReader:
         gaps = np.flatnonzero(started & ~common)
         gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
         until = t_s < self._until_s
-        both = np.concatenate([joined.x_s[until], joined.x_c[common & until]])
+        both = np.concatenate(
+            [joined.x_s.compress(until, axis=0), joined.x_c.compress(common & until, axis=0)]
+        )
         largest = float(np.abs(both[np.isfinite(both)]).max(initial=facts.largest_state))
         changes = joined.t_ns[np.flatnonzero(np.diff(joined.received, prepend=self._newest))]
         ends_ns = changes if self._fresh_ns is None else np.append(self._fresh_ns, changes)
