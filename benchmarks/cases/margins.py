@@ -22,7 +22,7 @@ from noack.impairments.loss_guarantee import (
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
-from noack.theory.margins.loss_margin import LossMargin, list_bursts
+from noack.theory.margins.loss_margin import LossMargin
 from noack.theory.margins.switched_system import Edge, find_cycle, strongly_connected
 
 GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
@@ -97,8 +97,13 @@ def random_loop(seed: int) -> RandomLoop:
 
 def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:
     edges = [
-        Edge(burst.source, burst.target, margin.maps(burst.slot, burst.steps - 1), burst.steps)
-        for burst in list_bursts(guarantee, margin.loop.times.slots)
+        Edge(
+            burst.source,
+            burst.target,
+            margin.maps(burst.slot, burst.usable_ns, burst.steps - 1),
+            burst.steps,
+        )
+        for burst in margin.bursts(guarantee)
     ]
     parts = [part.balanced() for part in strongly_connected(edges)]
     return max(find_cycle(part, 30, 200).growth for part in parts)

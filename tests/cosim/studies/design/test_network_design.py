@@ -131,7 +131,7 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         exact = LossMargin(resolve(search.scenario))
         bursts = list_bursts(search.ladder[4].guarantee, exact.loop.times.slots)
         quick = search.quick_loop(search.original, exact.longest_ns).maps(bursts)
-        maps = np.array([exact.maps(one.slot, one.losses).middle for one in bursts])
+        maps = np.array([exact.maps(one.slot, one.usable_ns, one.losses).middle for one in bursts])
         if not more:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
         stability = exact.coarse_bounds(search.ladder[4].guarantee)
