@@ -11,7 +11,6 @@ pattern of losses, and of such times, is a path. The edges, with the loop's maps
 
 import math
 import time
-from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -67,23 +66,21 @@ class Burst(NamedTuple):
 
 def list_bursts(
     guarantee: LossGuarantee,
-    slots: int = 1,
+    loop: LoopTimes,
     times: EventTimes = EVERY_STEP,
-    usable_ns: Callable[[int], int] = lambda steps: 0,
 ) -> list[Burst]:
     """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
 
     Different states of the automaton after which the same is allowed are one node.
 
     Of edges between the same nodes with the same time, there is the one with the fewest losses.
-    ``usable_ns`` is how much longer an update is used, up to its delay, that is some steps old.
 
     Raises:
         CallerError: there are more than 5,000 edges.
     """
     automaton = LossAutomaton(guarantee)
     first = int(automaton.after_delivery(np.zeros(1, int))[0])
-    begin = first, 0, usable_ns(1)
+    begin = first, 0, loop.usable_ns(1, loop.delay_ns)
     numbers, pending = {begin: 0}, [begin]
     bursts: dict[tuple[int, int, int], Burst] = {}
     while pending:
@@ -93,7 +90,7 @@ def list_bursts(
             after = int(automaton.after_delivery(np.array([state]))[0])
             sent = losses + 1
             for steps in range(sent * times.shortest, sent * times.longest + 1):
-                target = after, (slot + steps) % slots, usable_ns(steps)
+                target = after, (slot + steps) % loop.slots, loop.usable_ns(steps, loop.delay_ns)
                 if target not in numbers:
                     numbers[target] = len(numbers)
                     pending.append(target)
@@ -235,8 +232,7 @@ class LossMargin:
 
     def bursts(self, guarantee: LossGuarantee) -> list[Burst]:
         """Return the graph of a guarantee; raise CallerError if it has too many edges."""
-        times = self.loop.times
-        return list_bursts(guarantee, times.slots, self._times, times.usable_ns)
+        return list_bursts(guarantee, self.loop.times, self._times)
 
     def stability(
         self,
@@ -320,8 +316,7 @@ class LossMargin:
 def require_covered(resolved: Scenario) -> None:
     """Raise CallerError unless the loop is linear, transmits in time, and the watchdog is idle."""
     resolved.coverage.require_direct_inputs()
-    controller = resolved.controller.model_copy(update={"update_timeout_s": None})  # the maps have it
-    resolved.model_copy(update={"controller": controller}).coverage.require_exact()
+    without_timeout(resolved).coverage.require_exact()
     resolved.coverage.require_constant()
     require_idle_watchdog(resolved)
     if resolved.controller.update_timeout_s is None or resolved.controller.timeout_input == "hold":
@@ -333,6 +328,12 @@ def require_covered(resolved: Scenario) -> None:
             "controller.safe_input: with update_timeout_s the margin needs the input at rest, "
             f"{at_rest.tolist()}"
         )
+
+
+def without_timeout(scenario: Scenario) -> Scenario:
+    """Return a scenario whose controller uses every update, however old."""
+    controller = scenario.controller.model_copy(update={"update_timeout_s": None})
+    return scenario.model_copy(update={"controller": controller})
 
 
 def require_idle_watchdog(resolved: Scenario) -> None:

@@ -52,9 +52,9 @@ class LoopTimes(NamedTuple):
     holds_input: bool = False
     """Whether w is then sent once more; else it is 0."""
 
-    def usable_ns(self, periods: int) -> int:
-        """Return how much longer, up to d, an update is used that is some periods old."""
-        return min(max(self.timeout_ns - periods * self.period_ns, 0), self.delay_ns)
+    def usable_ns(self, periods: int, most_ns: int) -> int:
+        """Return how much longer, up to some time, an update is used that is some periods old."""
+        return min(max(self.timeout_ns - periods * self.period_ns, 0), most_ns)
 
     @property
     def slots(self) -> int:

@@ -75,7 +75,7 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
 
     slots = margin.loop.times.slots
     for before, one, following in zip(delivered[1:], delivered[2:], delivered[3:], strict=False):
-        usable_ns = margin.loop.times.usable_ns(int(one - before))
+        usable_ns = margin.loop.times.usable_ns(int(one - before), delay_ns)
         map_ = margin.loop.map(int(one % slots), usable_ns, int(following - one - 1)).middle
         expected = state(following, one)
         np.testing.assert_allclose(

@@ -17,7 +17,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.margins import loss_margin
 from noack.theory.margins.joint_spectral_radius import JointSpectralRadius
-from noack.theory.margins.loss_margin import LossMargin, Stability, capped, intervals_ns
+from noack.theory.margins.loss_margin import LossMargin, Stability, capped, intervals_ns, without_timeout
 from noack.theory.margins.switched_system import Edge, SwitchedSystem, find_cycle
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.policies import scenario_of
@@ -100,8 +100,7 @@ def _no_delay(loop: LoopMaps) -> Stability:
 
 
 def _used_forever(loop: LoopMaps) -> Stability:
-    controller = loop.resolved.controller.model_copy(update={"update_timeout_s": None})
-    return bounded(loop.resolved.model_copy(update={"controller": controller}))
+    return bounded(without_timeout(loop.resolved))
 
 
 def _soon(loop: LoopMaps) -> Stability:
