@@ -5,14 +5,14 @@ Every T the sensor transmits x. The loop is that of the processes, with no step 
 * at kh the plant, ẋ = Ax + Bu, replaces its input u by the newest actuation w that it has received;
 * at its ticks φ, φ + τ, … the controller sends w = K x_c; it arrives at once, after a step of the
   plant at the same time;
-* a tick at least F after the time of the newest update sends w = 0 instead, or w once more;
+* a tick at least Θ after the time of the newest update sends w = 0 instead, or w once more;
 * between updates ẋ_c = H x_c; an update of time t_k that arrives at t_k + d sets x_c to
   e^{Hd} x(t_k). At one time, the order is: step of the plant, transmission, arrival, tick.
 
 A delivered update removes all knowledge of older ones. So the state of the loop just after the
 delivery, if d = 0, is z = (x, u): x_c = x and w = u there. If 0 < d < T, z is the state at the
 time of the transmission, (x, x_c); there u is K e^{−Hδ} x_c for the last tick, δ ago, unless there
-may be no tick since the last arrival, or F is finite; then z = (x, x_c, u), and the map depends on
+may be no tick since the last arrival, or Θ is finite; then z = (x, x_c, u), and the map depends on
 how much longer x_c may be used.
 """
 
@@ -48,7 +48,7 @@ class LoopTimes(NamedTuple):
     delay_ns: int
     """d, of an update; below T."""
     timeout_ns: int = NEVER_NS
-    """F, from the time of the newest update on."""
+    """Θ, from the time of the newest update on."""
     holds_input: bool = False
     """Whether w is then sent once more; else it is 0."""
 
