@@ -234,6 +234,14 @@ class LossMargin:
         """Return the graph of a guarantee; raise CallerError if it has too many edges."""
         return list_bursts(guarantee, self.loop.times, self._times)
 
+    def edges(self, bursts: list[Burst]) -> list[Edge]:
+        """Return a graph with the loop's maps."""
+        maps = [self.maps(burst.slot, burst.usable_ns, burst.steps - 1) for burst in bursts]
+        return [
+            Edge(burst.source, burst.target, matrix, burst.steps)
+            for burst, matrix in zip(bursts, maps, strict=True)
+        ]
+
     def stability(
         self,
         guarantee: LossGuarantee | None = None,
@@ -265,19 +273,10 @@ class LossMargin:
         return stability._replace(took_s=time.process_time() - begun_s)
 
     def _bounded(self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float) -> Stability:
-        edges = [
-            Edge(
-                burst.source,
-                burst.target,
-                self.maps(burst.slot, burst.usable_ns, burst.steps - 1),
-                burst.steps,
-            )
-            for burst in bursts
-        ]
         # Short steps would need many vertices.
         vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
         radius = joint_spectral_radius(
-            edges,
+            self.edges(bursts),
             accuracy=accuracy / self._times.longest,
             most_vertices=vertices,
             threshold=1.0 if decide else None,
