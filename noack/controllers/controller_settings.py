@@ -68,7 +68,7 @@ class ControllerSettings(ScenarioSection):
     """x_r, n entries: the state at which the loop is to rest; by default 0. It must be an
     equilibrium of the model, Âx_r + B̂u_r = 0; then u = K(x_c − x_r) + u_r."""
 
-    update_timeout_s: Annotated[FiniteFloat, Field(ge=1e-6, le=1e6)] | None = None
+    update_timeout_s: Annotated[FiniteFloat, Field(ge=1e-6, le=1e9)] | None = None
     """Age of the newest update from which on it is no longer used; by default there is none."""
     timeout_input: Literal["safe", "hold"] = "safe"
     """The input from then on: `safe_input`, or the last one held."""

@@ -10,15 +10,16 @@ from noack.theory.margins.time_triggered_loop import LoopTimes
 
 _LENGTHS = (2, 4, 8)
 """Numbers of predictions that are tried, if none is given."""
+_MOST = 64
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True)
 class Hold:
     """A hold strategy; two that are equal do the same."""
 
     text: str
     mode: Literal["model", "zoh"]
-    updates: int = 0
+    periods: int = 0
     """Number of periods for which the newest update is used; 0: forever, or the scenario's timeout."""
     timeout_input: Literal["safe", "hold"] = "safe"
     timeout_s: float | None = None
@@ -29,10 +30,10 @@ class Hold:
 
         A late update still replaces the one before: a period of the controller is added, or less.
         """
-        if self.updates == 0:
+        if self.periods == 0:
             return NEVER_NS if self.timeout_s is None else round(self.timeout_s * NS_PER_S)
         late_ns = min(times.tick_ns, (times.period_ns - times.delay_ns) // 2)
-        return self.updates * times.period_ns + times.delay_ns + late_ns
+        return self.periods * times.period_ns + times.delay_ns + late_ns
 
     def changes(self, scenario: Scenario, times: LoopTimes) -> dict[str, object]:
         """Return the keys of a scenario that say so."""
@@ -40,7 +41,7 @@ class Hold:
             keys: dict[str, object] = {"update_timeout_s": None, "timeout_input": "safe"}
         else:
             keys = {"update_timeout_s": timeout_ns / NS_PER_S, "timeout_input": self.timeout_input}
-            keys |= {"safe_input": None} if self.updates else {}
+            keys |= {"safe_input": None} if self.periods else {}
         return {"mode": self.mode, "controller": scenario.controller.model_copy(update=keys)}
 
 
@@ -80,9 +81,9 @@ def read_holds(words: str) -> list[Hold]:
         match word.split(":"):
             case [name] if name in HOLDS:
                 holds += HOLDS[name]
-            case ["predictions", number] if number.isdecimal() and 1 <= int(number) <= 1000:
+            case ["predictions", number] if number.isdecimal() and 1 <= int(number) <= _MOST:
                 holds.append(_predictions(int(number)))
-            case ["predictions", number, "hold"] if number.isdecimal() and 1 <= int(number) <= 1000:
+            case ["predictions", number, "hold"] if number.isdecimal() and 1 <= int(number) <= _MOST:
                 holds.append(_predictions(int(number), "hold"))
             case _:
                 names = ", ".join(HOLDS)

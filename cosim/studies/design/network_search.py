@@ -338,7 +338,9 @@ class NetworkSearch:
     def run(self, progress: Progress = lambda share: None) -> tuple[Reached, Reached]:
         """Return what the given loop reaches, and the best loop found."""
         original = self.first()
-        self.tried, best, rung = 0, original.candidate, original.rung
+        self.tried, best, rung = 0, original.candidate, -1
+        if best.hold in self.wish.holds or best.hold.timeout_s is not None:  # no word has its timeout
+            rung = original.rung
         progress(0.1)
         starts = [Candidate(hold, original.candidate.K) for hold in self.wish.holds]
         starts += self.regulators()
@@ -353,7 +355,7 @@ class NetworkSearch:
                     best, rung = candidate, reached
         progress(0.3)
         first_of_each = {candidate.hold: candidate for _, _, candidate in reversed(ranked)}
-        pool = [best] if best.hold in self.wish.holds else []
+        pool = [best] if rung >= 0 else []
         pool += [candidate for _, _, candidate in ranked[:_STARTS]]
         pool = list(dict.fromkeys([*pool, *first_of_each.values()]))
         share = max(self.wish.effort // len(pool), 1)
