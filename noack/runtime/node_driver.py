@@ -47,7 +47,7 @@ _READS = 16
 _LOOK_S = 0.05
 _ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
 _COPIED = (
-    *("has_point", "acknowledges", "predictions", "carries_model"),
+    *("has_point", "acknowledges", "predictions", "carries_model", "timeout_ns", "holds_input"),
     *("model_ns", "knows_state", "newest"),
 )
 _HEAD = struct.Struct("<qq")

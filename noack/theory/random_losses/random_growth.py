@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from noack.core.clock import NEVER_NS
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
@@ -65,6 +66,8 @@ def random_growth(resolved: Scenario, losses: LossProcess) -> RandomGrowth:
     if shortest_ns != longest_ns:
         raise NotPredictableError("the times between updates are not known")
     loop, times = loop_of(resolved), loop_times(resolved, longest_ns)
+    if times.timeout_ns < NEVER_NS:
+        raise NotPredictableError("controller.update_timeout_s: the input depends on the update's age")
     nothing = np.zeros_like(loop.A)
     periods = LoopPeriods(loop, times, nothing, nothing, np.zeros((0, loop.n + loop.m, loop.n + loop.m)))
     outcomes = losses.outcomes(LossGuarantee())

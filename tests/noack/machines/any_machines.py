@@ -206,7 +206,8 @@ def controller(
         int(rng.integers(0, 10)) * MS if first_ns is None else first_ns, 10**12,
         LossGuarantee(tuple(chosen)), matrix(rng, scale, n) if chance(rng) else None,
         of.acknowledged, Start(int(chance(rng)), 33 * MS), matrix(rng, scale, m),
-        of.predictive, of.predictions, point,
+        of.predictive, of.predictions,
+        int(rng.integers(1, 60)) * MS if chance(rng) else NEVER_NS, chance(rng), point,
     )  # fmt: skip
 
 
