@@ -18,10 +18,10 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 425
+MOST_MODULES = 426
 LINES = {
-    "noack/scenario": 4055,
-    "noack/controllers": 265,
+    "noack/scenario": 4075,
+    "noack/controllers": 270,
     "noack/core": 1335,
     "noack/disturbances": 220,
     "noack/impairments": 4320,
@@ -31,13 +31,13 @@ LINES = {
     "noack/protocol": 1235,
     "noack/runtime": 5665,
     "noack/settings": 600,
-    "noack/theory": 11425,
+    "noack/theory": 11480,
     "noack/traces": 1320,
     "noack/trigger": 1055,
     "netem": 6495,
     "cosim/analysis": 8145,
     "cosim/api": 1675,
-    "cosim/cli": 3350,
+    "cosim/cli": 3355,
     "cosim/doctor": 810,
     "cosim/interactive": 1625,
     "cosim/lab": 2120,
@@ -46,13 +46,13 @@ LINES = {
     "cosim/output": 8545,
     "cosim/record": 3575,
     "cosim/simulation": 1945,
-    "cosim/studies": 9195,
+    "cosim/studies": 9315,
     "plant_server": 420,
     "sensor_node": 395,
-    "controller_node": 410,
-    "benchmarks": 3645,
-    "native": 11035,
-    "tests": 47205,
+    "controller_node": 420,
+    "benchmarks": 3640,
+    "native": 11055,
+    "tests": 47315,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
