@@ -11,11 +11,21 @@ from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
+from noack.theory.random_losses import mean_square_growth as mean_square_module
 from noack.theory.random_losses import moments as moments_module
-from noack.theory.random_losses.mean_square_growth import mean_square_growth
+from noack.theory.random_losses import random_growth as random_growth_module
 from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments, moments_of_runs
-from noack.theory.random_losses.random_growth import sure_growth
 from tests.noack.theory.certificate_kinds.random_losses import certify, draw, simulate_runs
+
+
+def mean_square_growth(maps: list[tuple[Array, Array]], chain: OutcomeChain) -> float:
+    exact = [(exactly(delivered), exactly(lost)) for delivered, lost in maps]
+    return mean_square_module.mean_square_growth(exact, chain)
+
+
+def sure_growth(delivered: Array, lost: Array, chain: OutcomeChain) -> float:
+    return random_growth_module.sure_growth(exactly(delivered), exactly(lost), chain)
 
 
 def independent(p: float) -> LossProcess:
@@ -207,3 +217,27 @@ def test_a_spectral_radius_that_was_computed_too_small_is_not_accepted(
     monkeypatch.setattr(np.linalg, "eigvals", lambda matrix: 0.999 * values(matrix))
     with pytest.raises(NotPredictableError, match="bounded numerically"):
         mean_square_growth(maps, chain)
+
+
+@pytest.mark.parametrize("radius", [0.0, 1e-9])
+def test_a_bound_of_the_second_moments_is_proven_with_all_rounding(radius: float) -> None:
+    """x becomes ax with |a| ≤ 0.7 + radius, and has another state that nothing moves."""
+    size, chain = 0.7 + radius, unlimited(independent(0.4)).recurrent()
+    M = IntervalMatrix(np.diag([0.7, 0.0]), np.diag([radius, 1e-16]))
+    maps = mean_square_module.PeriodMaps([(np.array([[0.7]]), np.array([[0.7]]))], [(M, M)])
+    forms = np.ones((len(chain.lost), 1, 1))
+    assert maps.prove_below(size**2 * (1 + 1e-12), forms, chain)
+    assert not maps.prove_below(size**2 * (1 - 1e-15), forms, chain)
+
+
+def test_a_tilted_bound_contains_the_rounding_of_the_frequencies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An inverse that is known to 1e-6 only makes the bound larger by as much times the weights."""
+    delivered, lost, chain = np.array([[0.2]]), np.array([[2.5]]), unlimited(BURSTY)
+    exact, inverse = sure_growth(delivered, lost, chain), random_growth_module.inverse
+
+    def inaccurate(matrix: Array) -> IntervalMatrix | None:
+        found = inverse(matrix)
+        return found and IntervalMatrix(found.middle, found.radius + 1e-6)
+
+    monkeypatch.setattr(random_growth_module, "inverse", inaccurate)
+    assert 1e-7 < sure_growth(delivered, lost, chain) / exact - 1 < 1e-4
