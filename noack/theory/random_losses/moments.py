@@ -62,6 +62,8 @@ _A, _PI, _ONE = np.eye(3)
 ORDERS = (1, 2)
 _MOST_BURST = 64
 _CERTAIN = 1 - 1e-9
+_ROUNDING = 1e-9
+"""Above the relative error of a probability, which is a sum of products of numbers that are not negative."""
 _SLOWER = 0.9
 _RATES = (1.0, 0.5, 0.25, 1e-3)
 """Shares of the trigger's rate at which moments are tried, until one of the smaller ones has a loop
@@ -113,7 +115,7 @@ def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, o
     # Number kN + j, j ≤ N, adds at most r g_N ((k + 1) S_N)^{r−1}; P(J ≥ kN + j) ≤ longestᵏ P(J ≥ j).
     later = (1 - longest) ** -order - 1  # Σ_{k≥1} (k + 1)^{r−1} longestᵏ
     beyond = order * gains[-1] * sums[-1] ** (order - 1) * tails.sum() * later
-    return float((1.0 + tails @ np.diff(sums**order) + beyond) ** (1 / order))
+    return float((1.0 + tails @ np.diff(sums**order) + beyond) ** (1 / order)) * (1 + _ROUNDING)
 
 
 def moments(
@@ -327,7 +329,7 @@ def moments_of_runs(bursts: Sequence[BurstCertificate]) -> list[RunMoments]:
     if not bursts:
         return []
     last, rate_per_s = bursts[-1], min(burst.rate_per_s for burst in bursts)
-    reached = [1.0, *(1 - burst.probability for burst in bursts[:-1])]
+    reached = [1.0, *(1 - burst.probability * (1 - _ROUNDING) for burst in bursts[:-1])]
     sizes = np.array([(0.0, 0.0), *((burst.controller_error, burst.state) for burst in bursts)])
     return [
         RunMoments(order, last.most, last.probability, rate_per_s, *map(float, means ** (1 / order)))
