@@ -277,7 +277,7 @@ class _Missing(NamedTuple):
         beyond = ratio if order == 1 else 2 * ratio * (sums[-1] + c[-1] / (1 - probability))
         slope = float((weights * powers)[few].sum() + powers[-1] * beyond)
         value = float(((weights * c)[~few].sum() + slope * whole) ** (1 / order))
-        tangent = slope / (order * value ** (order - 1))
+        tangent = slope / (order * value ** (order - 1)) if slope else 0.0
         return np.asarray(tangent * self.whole + (value - tangent * whole) * _ONE)
 
 

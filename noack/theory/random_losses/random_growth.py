@@ -156,7 +156,7 @@ class _Tilts:
         """Return an upper bound of f · s, with the rounding of the frequencies f.
 
         The distribution of the states is the last row of the inverse of P − I with ones in its last
-        column.
+        column. That its entries are rounded moves each share by at most u times a column sum of the inverse.
         """
         chances = self._chances[self._steps]
         by_state = np.bincount(self._steps[1], chances * s, len(self._chain.lost))
@@ -165,7 +165,7 @@ class _Tilts:
         moves[:, -1] = 1.0
         if (undone := inverse(moves)) is None:
             raise NotPredictableError("the frequencies of the losses could not be enclosed")
-        shares, radii = undone.middle[-1], undone.radius[-1]
+        shares, radii = undone.middle[-1], undone.radius[-1] + EPSILON * undone.magnitude.sum(axis=0)
         error = (radii + (len(s) + 4) * EPSILON * np.abs(shares)) @ sizes
         return float(shares @ by_state + error * (1 + 1e-9))
 

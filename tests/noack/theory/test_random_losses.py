@@ -74,7 +74,7 @@ def test_the_mean_of_the_largest_values_of_runs_by_hand() -> None:
 
 
 @pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("p", [0.01, 0.3, 0.9])
+@pytest.mark.parametrize("p", [0.0, 0.01, 0.3, 0.9])
 def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand(
     p: float, order: int
 ) -> None:
