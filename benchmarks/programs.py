@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, TypeVar
 import psutil
 
 from benchmarks.report import MeasurementError
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from tests.integration.conftest import PATIENCE_S, begun, is_over, processes_of
 
 PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")

@@ -41,7 +41,7 @@ from cosim.record.run_directory import RECORD
 from cosim.record.run_record import load_record
 from noack.core.errors import NoackError
 from noack.protocol.record_tables import NETEM_RELEASE
-from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.spool import SPOOL
 from noack.scenario.scenario_file import load
 

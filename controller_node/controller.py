@@ -4,6 +4,7 @@ This file turns a scenario into the core's controller, whose steps are in native
 At an update x_c ← e^{H(t−t_i)} x(t_i), so that a late update still restores x_c = x_s. At every
 tick the controller sends the input of its control law: u = K(x_c − x_r) + u_r, unless the scenario
 names another law. Before its first update it sends a declared safe input, unless x(0) is given.
+If the newest update is too old, it sends the safe input, or its last input again.
 Losses are compared with the network's guarantee from the recorded rows.
 """
 
@@ -16,13 +17,13 @@ from numpy.typing import NDArray
 
 from noack.controllers.controller_settings import ControlFailedError, ControlLaw, ControlModel
 from noack.controllers.linear_feedback import LinearFeedback
-from noack.core.clock import NS_PER_S
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
-from noack.protocol.machine_interface import BEGINNING, FAILED, External, Notice, Start
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
+from noack.protocol.roles import BEGINNING, FAILED, External, Notice, Start
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ChangeSchedule
 from noack.scenario.resolution import loop_of, setpoint_of
@@ -161,6 +162,8 @@ class Controller(MachinePart):
         predictive: whether an actuation also carries x_c, for the plant's watchdog.
         predictions: number of inputs of an actuation: that of the tick, and those for the
             following ticks if no update arrives until then; only with a linear law.
+        timeout_ns: age from which on the newest update is too old; only with a linear law.
+        holds_input: whether the last input is then held; else the input is the safe input.
         setpoint: u = K(x_c − x_r) + u_r; None is 0.
         schedule: the announced changes of its settings; None if they cannot change.
     """
@@ -178,6 +181,8 @@ class Controller(MachinePart):
     safe_input: Vector | None = None
     predictive: bool = False
     predictions: int = 1
+    timeout_ns: int = NEVER_NS
+    holds_input: bool = False
     setpoint: Setpoint | None = None
     schedule: ChangeSchedule[Setpoint | None] | None = None
 
@@ -234,6 +239,8 @@ class Controller(MachinePart):
                 "is_user": not linear,
                 "acknowledges": self.acknowledges,
                 "predictions": self.predictions,
+                "timeout_ns": self.timeout_ns,
+                "holds_input": self.holds_input,
                 "carries_model": self.predictive,
                 "x_c": np.zeros(n) if self.x0 is None else self.x0,
                 # A model without a state starts at the first tick, which is recorded.
@@ -361,6 +368,8 @@ def _part(start: Start, resolved: Scenario) -> Controller:
         safe_input=None if safe_input is None else np.array(safe_input),
         predictive=resolved.message_sizes.is_predictive,
         predictions=resolved.controller.predictions,
+        timeout_ns=resolved.timing.update_timeout_ns,
+        holds_input=resolved.controller.timeout_input == "hold",
         setpoint=setpoint_of(resolved),
         schedule=ChangeSchedule(resolved, setpoint_of) if changes else None,
     )

@@ -555,12 +555,15 @@ typedef struct { /* controller_node/controller.py makes it */
     int64_t is_user;    /* 1: the user's control law gives u */
     int64_t acknowledges;
     int64_t predictions, carries_model; /* as of the plant */
+    int64_t timeout_ns;                 /* age from which on an update is too old; above 0 */
+    int64_t holds_input;                /* 1: it then holds its last input, else the safe input */
     /* state */
     double *x_c; /* (n,) */
     int64_t model_ns;
     int64_t knows_state;
     int64_t newest; /* number of the last update; NOACK_UNKNOWN_SEQUENCE after a restart */
-    double *x, *u;  /* (n,), (m,) the question to the user's law, and its answer */
+    int64_t update_ns; /* time of its event; 0: that of x(0) */
+    double *x, *u; /* (n,), (m,) the question to the user's law, and its answer; else the last input */
     int64_t asked_ns;
     double *scratch; /* (3n + m,) */
 } noack_controller;
@@ -1052,6 +1055,7 @@ typedef struct { /* of a controller; then H (n, n), K (m, n), x_r (n,), u_r (m,)
     noack_clock clock;
     noack_machine machine;
     int64_t is_static, has_point, acknowledges, predictions, carries_model;
+    int64_t timeout_ns, holds_input;
     int64_t model_ns, knows_state, newest;
 } noack_node_settings;
 

@@ -14,7 +14,7 @@ from noack.runtime.command_line import stoppable_imports
 with stoppable_imports():
     from netem.run_network import NetworkChannel, RunNetwork
     from noack.core.errors import ExitStatus, NoackError
-    from noack.protocol.topology import ENDS
+    from noack.protocol.roles import ENDS
     from noack.runtime.command_line import Parser, failed
     from noack.runtime.run_process import RunProcess, add_options, join_run
 

@@ -18,8 +18,8 @@ from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
+from noack.protocol.roles import BEGINNING, Notice, Record, Start
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario

@@ -15,8 +15,8 @@ from netem.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.clock import RunClock
 from noack.core.core_library import Rows, core
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING
+from noack.protocol.roles import Notice, Record, Start
 from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.real_time_loop import RecordSink, RowSink

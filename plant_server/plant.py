@@ -34,8 +34,8 @@ from noack.disturbances.disturbance_settings import Place, SignalSource
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedError
-from noack.protocol.machine_interface import BEGINNING, FAILED, External, Notice, Start
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP, RecordShape
+from noack.protocol.roles import BEGINNING, FAILED, External, Notice, Start
 from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario

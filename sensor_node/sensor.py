@@ -27,13 +27,13 @@ from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.observers.observer_settings import EstimationModel, ObserverSettings
-from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.record_tables import (
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
     SENSOR_SETTING,
     RecordShape,
 )
+from noack.protocol.roles import BEGINNING, Notice, Start
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ChangeSchedule
 from noack.scenario.resolution import assumed_model, loop_of, policy_of, setpoint_of

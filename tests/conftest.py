@@ -39,6 +39,7 @@ settings.register_profile(
     print_blob=True,
     suppress_health_check=[HealthCheck.too_slow],  # this check reads the wall clock
 )
+settings.register_profile("few", settings.get_profile("noack"), max_examples=8)  # with sanitizers
 settings.register_profile(
     "search",
     settings.get_profile("noack"),

@@ -8,7 +8,7 @@ import numpy as np
 from controller_node.controller import Controller, controllers_of
 from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
+from noack.protocol.roles import BEGINNING, Notice, Output, Record, Start
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.scenario import Scenario

@@ -30,7 +30,7 @@ from noack.impairments.constraints import CONSTRAINTS
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.loss_models import LOSS_MODELS
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.command_line import Parser
 from noack.runtime.run_process import add_options
 from noack.scenario.scenario import Scenario

@@ -21,11 +21,11 @@ from benchmarks.programs import NOACK, in_new_process
 from benchmarks.report import Goal, MeasurementError, Peer, Row, benchmark, say
 from cosim.analysis.replay.run_replay import stored_verdict
 from cosim.cli import find_scenario
-from cosim.live.simulated_run import simulate_run
 from cosim.record.record_source import joined
 from cosim.record.run_directory import RECORD, write_environment
 from cosim.record.table_files import TableFile
-from noack.protocol.topology import RECORDER
+from cosim.simulation.virtual_time import simulate_run
+from noack.protocol.roles import RECORDER
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load

@@ -30,9 +30,8 @@ from cosim.live.processes.child_processes import MODULES
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
-from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.topology import LOOP_ROLES, ROLES
+from noack.protocol.roles import GENERATION, LOOP_ROLES, ROLES
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import RunProgress

@@ -22,8 +22,8 @@ from noack.impairments.loss_guarantee import (
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
-from noack.theory.margins.loss_margin import LossMargin, list_bursts
-from noack.theory.margins.switched_system import Edge, find_cycle, strongly_connected
+from noack.theory.margins.loss_margin import LossMargin
+from noack.theory.margins.switched_system import find_cycle, strongly_connected
 
 GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
 MEDIAN_S = 2.0
@@ -87,8 +87,8 @@ def random_loop(seed: int) -> RandomLoop:
     scale = wanted / _fastest(margin, guarantee)
     original = margin.maps
 
-    def scaled(slot: int, losses: int) -> IntervalMatrix:
-        matrix = original(slot, losses)
+    def scaled(slot: int, usable_ns: int, losses: int) -> IntervalMatrix:
+        matrix = original(slot, usable_ns, losses)
         return matrix @ exactly(np.eye(len(matrix.middle[0])) * scale ** (losses + 1))
 
     margin.maps = scaled  # type: ignore[assignment]
@@ -96,10 +96,7 @@ def random_loop(seed: int) -> RandomLoop:
 
 
 def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:
-    edges = [
-        Edge(burst.source, burst.target, margin.maps(burst.slot, burst.steps - 1), burst.steps)
-        for burst in list_bursts(guarantee, margin.loop.times.slots)
-    ]
+    edges = margin.edges(margin.bursts(guarantee))
     parts = [part.balanced() for part in strongly_connected(edges)]
     return max(find_cycle(part, 30, 200).growth for part in parts)
 

@@ -30,7 +30,7 @@ from benchmarks.report import (
     own_cpu_s,
     say,
 )
-from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
+from noack.protocol.roles import LOOP_ROLES, WITH_DEADLINES
 
 ROOT = Path(__file__).parents[2]
 CAP = 2

@@ -1,1 +1,1 @@
-"""Analysis of runs: summary, claims, fidelity, replay, adversary."""
+"""Analysis of runs: summary, claims, fidelity, replay; of scenarios: certificates, margin, adversary."""

@@ -189,6 +189,8 @@ class MarginResult:
 
     scenario: str
     mode: str
+    between_updates: str
+    """What the controller does between updates, in words."""
     mansd: int
     """M − 1 of the scenario."""
     guarantee: str
@@ -347,7 +349,8 @@ def find_margin(
     if others_read:
         compared = compare_guarantees([network.guarantee, *others_read], examine)
     return MarginResult(
-        resolved.name, resolved.mode, network.mansd, network.guarantee.meaning,
+        resolved.name, resolved.mode, resolved.between_updates, network.mansd,
+        network.guarantee.meaning,
         margin.shortest_ns / NS_PER_S, margin.longest_ns / NS_PER_S,
         margin.loop.times.delay_ns / NS_PER_S, tuple(caps), every_m,
         find_longest_period(resolved, progress) if with_period else None,

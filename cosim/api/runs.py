@@ -24,12 +24,13 @@ with lazy_modules():
     from cosim.analysis import fidelity as fidelity_analysis
     from cosim.analysis.summary import run_summary
     from cosim.live import finalize as run_end
-    from cosim.live import launcher, simulated_run
+    from cosim.live import launcher
     from cosim.live.monitoring import progress as progress_display
     from cosim.output import export as exports
     from cosim.output import result_tables, run_tables
     from cosim.output.figures import figure_drawing, figure_files, figure_format, network_figures, run_figures
     from cosim.record import data_frames, run_record, table_files
+    from cosim.simulation import virtual_time
     from cosim.studies import run_archive, run_comparison
 
 if TYPE_CHECKING:
@@ -312,7 +313,7 @@ def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
     """
     link_load.require_slots(loaded := load(scenario))
     with _folder(runs) as (folder, temporary):
-        ending, view = simulated_run.simulate_run(loaded, folder), temporary is None
+        ending, view = virtual_time.simulate_run(loaded, folder), temporary is None
         simulated = Run(ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary)
     if temporary is None:
         simulated.summary  # noqa: B018  # writes it into the run directory

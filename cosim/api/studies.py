@@ -30,7 +30,7 @@ from noack.core.process_limits import cores
 from noack.scenario import toml_file
 from noack.scenario.resolution import resolve
 from noack.theory.margins.joint_spectral_radius import ACCURACY
-from noack.traces.trace_formats import find_trace
+from noack.traces.packet_trace import find_trace
 
 with lazy_modules():
     from cosim.live.monitoring import progress as progress_display

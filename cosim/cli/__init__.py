@@ -1,4 +1,4 @@
-"""The command line ``noack``: one file per command in :mod:`cosim.cli.commands`."""
+"""The command line ``noack``; its commands are in :mod:`cosim.cli.commands`."""
 
 import gc
 import os

@@ -20,15 +20,15 @@ from noack.runtime.command_line import LogFormat, log_format, print_to_stderr
 
 with lazy_modules():
     from cosim.live import finalize, launcher, remote_access
-    from cosim.live.monitoring import progress, run_metrics, run_watcher
+    from cosim.live.monitoring import progress, run_watcher
     from cosim.live.processes import fork_server
     from cosim.output import run_verdict
     from cosim.output.viewer import rerun_program
     from cosim.record import run_directory
     from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
     from noack.core import core_library
-    from noack.protocol import topology
-    from noack.runtime import address, run_registry
+    from noack.protocol import roles
+    from noack.runtime import address, control_plane
     from noack.runtime.connections import metrics_server
     from noack.scenario import link_load, resolution, scenario
     from noack.theory.certificates import assumptions
@@ -125,7 +125,7 @@ def run_processes(
                 ending = launcher.launch(
                     loaded,
                     options.runs,
-                    spawn=spawn or topology.ROLES,
+                    spawn=spawn or roles.ROLES,
                     session=session,
                     live=options.live,
                     watcher=run_watcher.joint_watcher(watchers),
@@ -142,7 +142,7 @@ def run_processes(
 def _served_metrics(loaded: "scenario.Scenario", requested_address: str) -> "Iterator[run_watcher.Watcher]":
     """Serve the metrics of a run within the context; yield what updates them."""
     metrics_server.require_package()
-    metrics = run_metrics.RunMetrics(loaded)
+    metrics = run_watcher.RunMetrics(loaded)
     with metrics_server.metrics_server(requested_address, metrics.collect) as bound:
         print_to_stderr(f"noack: metrics: http://{address.address_text(bound)}/metrics")
         yield metrics.watcher()
@@ -170,7 +170,7 @@ def warn_of_violations(loaded: "scenario.Scenario") -> None:
 def warn_of_other_runs() -> None:
     """Print on standard error which runs are active: each may make the others late."""
     try:
-        other_runs = run_registry.active_runs()
+        other_runs = control_plane.active_runs()
     except PeerError:  # a damaged file of another run must not prevent this one
         return
     for run in other_runs:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S, RunClock
-from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Wire
 from noack.runtime.address import LOOPBACK
 from noack.runtime.live_driver import LiveDriver

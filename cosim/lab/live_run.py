@@ -22,7 +22,7 @@ from cosim.live.monitoring.run_watcher import Watcher
 from cosim.output.viewer.rerun_program import is_installed
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import RunProgress, parse_message
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from cosim.lab.run_views import RunView, compared, recorded_view, replayed
 from cosim.output.run_verdict import DOUBTFUL, NEUTRAL, VerdictLine, transmission_line
 from noack.core.errors import NoackError
 from noack.core.number_format import number
-from noack.runtime.run_registry import find, request_change
+from noack.runtime.control_plane import find_run, request_change
 
 Changed = Callable[[], Awaitable[None]]
 _REJOIN_S = 5.0
@@ -148,7 +148,7 @@ class LiveSource:
         if not known:
             return
         try:
-            run = find(run_dir=live.run_dir)
+            run = find_run(run_dir=live.run_dir)
             await asyncio.to_thread(request_change, run, {key: draft.value(key) for key in known})
         except NoackError as error:
             ui.notify(str(error), type="warning")

@@ -19,7 +19,7 @@ from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.core.process_limits import cores
 from noack.impairments.loss_prediction import found_probabilities
-from noack.protocol.topology import COORDINATOR, LOOP_ROLES, ROLES
+from noack.protocol.roles import COORDINATOR, LOOP_ROLES, ROLES
 from noack.runtime.control_messages import (
     Admission,
     AdmissionRequest,

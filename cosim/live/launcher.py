@@ -39,11 +39,10 @@ from noack.core.file_access import write_whole
 from noack.core.number_format import byte_size
 from noack.core.process_limits import cores as usable_cores
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.topology import PLANT, RECORDER, ROLES
-from noack.runtime import run_registry
+from noack.protocol.roles import PLANT, RECORDER, ROLES
 from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, stop_reason
-from noack.runtime.control_plane import run_name
+from noack.runtime.control_plane import registered_run, run_name
 from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, ticket_file
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import resolve_run, resolved_loops, tables_of
@@ -171,7 +170,7 @@ def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
 def _publish_run(stack: contextlib.ExitStack, ticket: Ticket, session: str | None) -> None:
     """Let `noack set` find the run; without that the run goes on."""
     try:
-        stack.enter_context(run_registry.registered_run(ticket, session))
+        stack.enter_context(registered_run(ticket, session))
     except NoackError as error:
         print(f"noack: warning: `noack set` cannot reach this run: {error}", file=sys.stderr)
 

@@ -26,7 +26,7 @@ from cryptography.x509.oid import NameOID
 from cosim.live.coordinator import AdmissionPass, Coordinator
 from cosim.live.processes.child_processes import Host, load_hosts
 from noack.core.errors import CallerError, PeerError, why
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.address import Address, address_text, family_of, parse_address
 from noack.runtime.connections.coordinator_link import InvitationProof, Protection, forwarding, tls_context
 from noack.runtime.control_plane import RUNS, run_name, socket_path

@@ -123,7 +123,7 @@ def write_network(measurement: Measurement, path: Path, form: Form) -> list[Path
 
 
 def trace_csv(trace: PacketTrace) -> str:
-    """Return a trace as CSV in ns; :func:`noack.traces.trace_formats.read_trace` reads the same."""
+    """Return a trace as CSV in ns; :func:`noack.traces.packet_trace.read_trace` reads the same."""
     columns = (trace.sequence.tolist(), trace.sent_ns.tolist(), trace.received_ns.tolist())
     rows = (
         f"{number},{sent},{'' if received == LOST_NS else received}\n"

@@ -36,8 +36,14 @@ from noack.protocol.record_tables import CONTROLLER_DELIVERY, Fate
 from noack.settings.user_files import NamedFile
 from noack.traces.capture_packets import is_capture
 from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
-from noack.traces.packet_trace import LOST_NS, MAX_PACKETS, PacketTrace, TraceRecordError, packet_trace
-from noack.traces.trace_formats import read_trace
+from noack.traces.packet_trace import (
+    LOST_NS,
+    MAX_PACKETS,
+    PacketTrace,
+    TraceRecordError,
+    packet_trace,
+    read_trace,
+)
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

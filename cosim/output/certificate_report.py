@@ -209,13 +209,12 @@ MARGIN_HEADINGS = ("M", "maximum consecutive losses (M − 1)", "at least", "at 
 def margin_title(margin: MarginResult) -> str:
     """Return the title of the table of the bounds."""
     delay = f", updates delayed by {margin.delay_s:g} s" if margin.delay_s else ""
-    mode = "model-based" if margin.mode == "model" else "zero-order hold"
     times = f"with an update every {margin.period_s:g} s"
     if not margin.is_periodic:
         times = f"with updates {margin.shortest_s:g} to {margin.period_s:g} s apart"
     return (
         f"{margin.scenario}: growth of the worst loss pattern per {margin.period_s:g} s, "
-        f"{times}, {mode}{delay}"
+        f"{times}, {margin.between_updates}{delay}"
     )
 
 

@@ -254,7 +254,7 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     loss = network.loss.model_dump(exclude={"model"}, exclude_defaults=True)
     model = network.loss.model.replace("_", "-")
     details = _settings(loss)
-    yield "between updates", "model Â + B̂K" if scenario.mode == "model" else "zero-order hold"
+    yield "between updates", scenario.between_updates
     yield "trigger", trigger.description
     yield "norm of errors", "‖e‖₂" if trigger.weight is None else "‖W e‖₂, W from the scenario"
     yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")

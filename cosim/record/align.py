@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.linear_systems import ModelFlow, Propagator, all_entries, largest_sizes, row_norms
-from noack.protocol.machine_interface import GENERATION
+from noack.core.linear_systems import ModelFlow, Propagator, all_entries, largest_sizes, row_norms, set_rows
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -32,6 +31,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+from noack.protocol.roles import GENERATION
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of, steady_state
 from noack.scenario.scenario import Scenario
 from noack.theory.paper import ErrorMonitor
@@ -109,7 +109,7 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     order = np.argsort(inputs, kind="stable")
     newest = np.concatenate([np.full(len(steps), NO_SEQUENCE), deliveries["sequence"]])[order]
     model_ns = np.concatenate([steps["model_t_ns"], deliveries["model_t_ns"]])[order]
-    x_c = np.concatenate([steps["x_c"], deliveries["x_c"]])[order]
+    x_c = np.concatenate([steps["x_c"], deliveries["x_c"]]).take(order, axis=0)
     lives = inputs[order] // GENERATION
     track, begins = before, np.flatnonzero(np.diff(lives, prepend=-1)).tolist()
     for begin, end in pairwise([*begins, len(lives)]):
@@ -130,10 +130,10 @@ def _continued(
             life,
         )
     received = np.maximum.accumulate(np.concatenate([track.received[-1:], newest]))[1:]
-    unknown = (received == NO_SEQUENCE) & (life > 0)
+    x_c[(received == NO_SEQUENCE) & (life > 0)] = np.nan
     return ControllerTrack(
         np.concatenate([track.model_ns, model_ns]),
-        np.concatenate([track.x_c, np.where(unknown[:, None], np.nan, x_c)]),
+        np.concatenate([track.x_c, x_c]),
         np.concatenate([track.received, received]),
         life,
     )
@@ -162,7 +162,8 @@ def join(
     """
     t_ns = measurements["t_ns"]
     reset = (measurements["event"] != NO_SEQUENCE) & (not acknowledged)
-    x_s = np.where(reset[:, None], measurements["x"], measurements["x_s"])
+    x_s = measurements["x_s"].copy()
+    x_s[reset] = measurements["x"][reset]
     flow = ModelFlow(loop.H, loop.setpoint) if flow is None else flow
     x_c, received = _at(flow, track, t_ns, until_ns)
     e_c = x_c - measurements["x"]
@@ -196,22 +197,22 @@ def _threshold(measurements: Rows) -> Reals:
 def _at(
     flow: ModelFlow, track: ControllerTrack, t_ns: Times, until_ns: int
 ) -> tuple[Reals, NDArray[np.int64]]:
-    x_c = np.full((len(t_ns), track.x_c.shape[1]), np.nan)
-    received = np.full(len(t_ns), NO_SEQUENCE, dtype=np.int64)
     index = np.searchsorted(track.model_ns, t_ns, side="right") - 1
     known = (index >= 0) & (t_ns <= until_ns)
-    received[known] = track.received[index[known]]
+    received = np.where(known, track.received[index], NO_SEQUENCE)
+    x_c = track.x_c.take(index, axis=0)
+    x_c[~known] = np.nan
     dt_ns = t_ns - track.model_ns[index]
     if flow.moved:
         for i in np.flatnonzero(known):
             state = int(index[i])
             x_c[i] = flow(track.x_c[state], int(track.model_ns[state]), int(t_ns[i]))
         return x_c, received
-    x_c[known] = track.x_c[index[known]]
-    older = np.flatnonzero(known & (dt_ns != 0))  # few: mostly the model is advanced to these times
-    for step_ns in np.unique(dt_ns[older]):
+    older = np.flatnonzero(known & (dt_ns != 0))
+    steps_ns = np.sort(dt_ns[older])  # few different ones; np.unique takes longer
+    for step_ns in steps_ns[np.diff(steps_ns, prepend=0) > 0].tolist():
         behind = older[dt_ns[older] == step_ns]
-        x_c[behind] = flow.propagate.rows(x_c[behind], int(step_ns))
+        set_rows(x_c, behind, flow.propagate.rows(x_c.take(behind, axis=0), step_ns))
     return x_c, received
 
 
@@ -408,7 +409,7 @@ class EventFollower:
         newest = np.cumsum(rows["event"] != NO_SEQUENCE)
         period_ns = self._scenario.timing.measurement_period_ns
         age_ns = rows["t_ns"] - event_ns[newest]
-        predicted = self._propagate.leaps(x[newest], age_ns // period_ns, period_ns)
+        predicted = self._propagate.leaps(x.take(newest, axis=0), age_ns // period_ns, period_ns)
         age_s = np.where(events[newest] == NO_SEQUENCE, np.nan, age_ns * 1e-9)
         shared = in_common(self._scenario, aligned)
         missing = np.where(shared, events[newest] - aligned.received, UNKNOWN)

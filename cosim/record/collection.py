@@ -27,9 +27,8 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import RunRecord, load_run
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError, why
-from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import OWNER
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import GENERATION, LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
 from noack.runtime.spool import (
     KEPT_KEY,

@@ -18,9 +18,8 @@ from cosim.record.record_source import RecordSource, Rows, Slice
 from cosim.record.run_directory import REPORTS_FILE, read_object
 from noack.core.errors import PeerError
 from noack.core.file_access import write_whole
-from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import OWNER
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import GENERATION, LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
 from noack.runtime.spool import KEPT_REPORT, SPOOL, read_chunks
 from noack.scenario.resolution import network_tables

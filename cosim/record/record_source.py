@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CLOCK_TABLES, LOOP, NETEM_SETTING
+from noack.protocol.roles import GENERATION
 from noack.scenario.resolution import has_loop, is_of_network, network_tables
 
 Rows = NDArray[np.void]

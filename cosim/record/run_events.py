@@ -37,7 +37,7 @@ from noack.protocol.record_tables import (
     direction_of,
     effective,
 )
-from noack.protocol.topology import CHANGEABLE
+from noack.protocol.roles import CHANGEABLE
 from noack.protocol.wire_format import HEADER_ROW, MAGIC, VERSIONS, Flow
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange, settings_of
 from noack.scenario.resolution import loop_of, policy_of
@@ -128,7 +128,7 @@ def model_flow_of(record: RunRecord) -> ModelFlow:
 
 def _changes_in(rows: Rows) -> list[tuple[ParameterChange, int]]:
     changes = []
-    for row in rows[np.argsort(rows["input"], kind="stable")]:
+    for row in sorted(rows, key=lambda row: int(row["input"])):
         try:
             settings = settings_of(row["change"].tobytes())
         except ValueError:

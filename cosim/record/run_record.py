@@ -46,7 +46,6 @@ from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
 from noack.core.process_limits import cores
-from noack.protocol.machine_interface import RESTART
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     LOOP,
@@ -56,7 +55,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES, RESTART
 from noack.runtime.control_messages import LogLine, parse_message
 from noack.scenario.resolution import (
     LoopMatrices,

@@ -3,24 +3,37 @@
 The machines, their messages and the protocol are those of a live run; only the driver differs. A
 datagram arrives at the time of sending, unless the network delays it. So a simulated run equals a
 live run in which no deadline is missed. It depends on its scenario alone, bit for bit. The queues
-of the network couple the loops.
+of the network couple the loops. :func:`simulate_run` writes the run directory of such a run.
 """
 
+import secrets
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
 from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, joined, packed
-from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
+from cosim.record.run_directory import (
+    EndingFile,
+    RunEnding,
+    active_run,
+    new_run_dir,
+    point_to_latest,
+    write_environment,
+    write_scenario,
+)
+from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles, write_run
 from netem.channel import RUN_ID, Network, channel_of
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi
+from noack.core.errors import ExitStatus, MachineError, why
+from noack.core.process_limits import require_limits
 from noack.machines.loop_machines import LoopMachines, row_types
-from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, OWNER
-from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER
+from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.parameter_changes import change_notice, scheduled, settings_key
@@ -28,6 +41,7 @@ from noack.scenario.resolution import (
     has_loop,
     is_of_network,
     network_tables,
+    resolve_run,
     resolved_loops,
     shape_of,
     tables_of,
@@ -277,6 +291,39 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Reco
         The record of the run; its reports have no entries about sockets or real-time settings.
     """
     return _simulated(scenario, resolved_loops(scenario), None, progress)
+
+
+def simulate_run(scenario: Scenario, runs: Path, progress: Progress | None = None) -> RunEnding:
+    """Simulate a scenario into a new run directory; :func:`cosim.live.finalize.finalize` ends it.
+
+    An interrupted simulation leaves no run directory.
+
+    Args:
+        scenario: as loaded; it is resolved here.
+        runs: where run directories are made.
+        progress: called with the simulated time.
+
+    Raises:
+        CallerError: the scenario's numbers are too large.
+        MachineError: the run directory cannot be written, or a limit of the system is too low.
+    """
+    require_limits()
+    resolved = resolve_run(scenario)
+    run_dir = new_run_dir(runs, scenario.name)
+    run_id = secrets.randbits(64)  # identifies the recording in the viewer
+    try:
+        with active_run(run_dir), EndingFile(run_dir) as ending:
+            write_environment(run_dir, "simulated")
+            simulated = simulate_loops(write_scenario(resolved, run_dir), progress)
+            write_run(simulated, run_dir)
+            ending.store(ExitStatus.OK, HORIZON)
+    except BaseException as error:
+        shutil.rmtree(run_dir, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise MachineError(f"{run_dir}: cannot be written: {why(error)}") from None
+        raise
+    point_to_latest(run_dir)
+    return RunEnding(run_dir, run_id, ExitStatus.OK, HORIZON)
 
 
 def _simulated(

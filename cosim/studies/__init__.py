@@ -1,1 +1,1 @@
-"""Studies over many runs: campaigns, trigger design, the paper reproduced."""
+"""Studies: campaigns, capacity, design, new loops, the paper; comparison and archives of runs."""

@@ -26,7 +26,6 @@ from cosim.analysis.replay import replay
 from cosim.analysis.replay.replay_result import difference, rows_differ
 from cosim.analysis.summary.summary_model import ReplayDifference
 from cosim.live.finalize import finalize, reopen
-from cosim.live.simulated_run import simulate_run
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_tables import network_rows
 from cosim.record.record_source import Slice
@@ -42,6 +41,7 @@ from cosim.record.run_directory import (
     kind_of,
 )
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, steps_of
+from cosim.simulation.virtual_time import simulate_run
 from cosim.studies.run_comparison import compare_runs
 from noack.core.errors import CallerError, MachineError, one_line, printable, why
 from noack.core.file_access import new_file, open_regular

@@ -21,8 +21,9 @@ const char *noack_segments_check(const noack_segments *segments) {
     const noack_machine *machine = &plant->machine;
     if (plant->system != NOACK_LINEAR || plant->predictions != 1 || plant->carries_model
         || segments->sensor->is_user || segments->sensor->acknowledged
-        || segments->controller->is_user || segments->controller->acknowledges)
-        return "segments need a linear loop without acknowledgements and predictions";
+        || segments->controller->is_user || segments->controller->acknowledges
+        || segments->controller->timeout_ns <= MESSAGE_TIMES_NS)
+        return "segments need a linear loop without acknowledgements, predictions and timeouts";
     if (segments->sensor->machine.n != machine->n || segments->controller->machine.n != machine->n
         || segments->controller->machine.m != machine->m)
         return "the machines of a loop have different sizes";

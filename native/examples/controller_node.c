@@ -145,6 +145,8 @@ static void take_settings(void) {
     controller.acknowledges = settings.acknowledges;
     controller.predictions = settings.predictions;
     controller.carries_model = settings.carries_model;
+    controller.timeout_ns = settings.timeout_ns;
+    controller.holds_input = settings.holds_input;
     controller.model_ns = settings.model_ns;
     controller.knows_state = settings.knows_state;
     controller.newest = settings.newest;

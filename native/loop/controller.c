@@ -3,7 +3,8 @@
    At an update x_c <- e^(H(t - t_i)) x(t_i), so that a late update still restores x_c = x_s. At
    every tick the controller sends the input of its control law: u = K(x_c - x_r) + u_r, unless the
    user's law gives it. Before its first update it sends a declared safe input, unless x(0) is
-   given. The model's time advances with ticks and updates and never runs backward: an update older
+   given. If the newest update is too old, it sends the safe input, or its last input again. The
+   model's time advances with ticks and updates and never runs backward: an update older
    than the last tick is propagated to the time of that tick, a newer one advances the model. */
 #include "loop.h"
 
@@ -34,6 +35,7 @@ int64_t noack_controller_handle(
         &controller->model, controller->x_c, controller->model_ns, model_ns, before);
     noack_model_advance(&controller->model, message->vector, event_ns, model_ns, controller->x_c);
     controller->model_ns = machine->reached_ns = model_ns;
+    controller->update_ns = event_ns;
     controller->knows_state = 1;
     begin_row(output, NOACK_MESSAGES, machine, message->sequence, event_ns, now_ns);
     put(output, model_ns);
@@ -66,6 +68,16 @@ static void apply_law(noack_controller *controller, const double *x, double *u) 
         u[k] += controller->u_r[k];
 }
 
+/* Replace u, the input before, by the input for t_ns, at which the model's state is x. */
+static void choose_input(noack_controller *controller, int64_t t_ns, const double *x, double *u) {
+    if (!controller->knows_state)
+        copy(controller->machine.m, controller->safe_input, u);
+    else if (t_ns - controller->update_ns < controller->timeout_ns)
+        apply_law(controller, x, u);
+    else if (!controller->holds_input)
+        copy(controller->machine.m, controller->safe_input, u);
+}
+
 /* Append the inputs for the times one period, two periods ... after the model's time. */
 static void append_predictions(noack_controller *controller, noack_output *output) {
     const noack_machine *machine = &controller->machine;
@@ -78,7 +90,7 @@ static void append_predictions(noack_controller *controller, noack_output *outpu
             int64_t next_ns = min_of(t_ns + machine->period_ns, MESSAGE_TIMES_NS);
             noack_model_advance(&controller->model, x, t_ns, next_ns, x);
             t_ns = next_ns;
-            apply_law(controller, x, u);
+            choose_input(controller, t_ns, x, u);
         }
         append(output, m, u);
     }
@@ -106,10 +118,9 @@ int64_t noack_controller_tick(noack_controller *controller, int64_t now_ns, noac
     begin_message(output, NOACK_ACTUATION, number, model_ns);
     double *u = output->message.vector;
     output->message.entries = m;
-    if (controller->knows_state)
-        apply_law(controller, controller->x_c, u);
-    else
-        copy(m, controller->safe_input, u);
+    copy(m, controller->u, u);
+    choose_input(controller, model_ns, controller->x_c, u);
+    copy(m, u, controller->u);
     put(output, model_ns);
     put_reals(output, n, controller->x_c);
     put_reals(output, m, u);

@@ -174,7 +174,8 @@ static const char *check_controller(const noack_controller *controller) {
         || controller->x == NULL || controller->u == NULL || controller->scratch == NULL
         || (controller->has_point && (controller->x_r == NULL || controller->u_r == NULL)))
         return "a controller has no state";
-    if (!is_reached(controller->model_ns)
+    if (!is_reached(controller->model_ns) || !is_reached(controller->update_ns)
+        || controller->timeout_ns < 1
         || !is_between(NOACK_UNKNOWN_SEQUENCE, controller->newest, INT64_MAX))
         return "a controller has a time or a newest update out of range";
     return check_model(&controller->model, n);

@@ -1,7 +1,7 @@
 """The settings and the interface that every kind of controller has."""
 
 from abc import abstractmethod
-from typing import Annotated, ClassVar, NamedTuple, Protocol
+from typing import Annotated, ClassVar, Literal, NamedTuple, Protocol
 
 from pydantic import Field, FiniteFloat
 
@@ -63,10 +63,15 @@ class ControllerSettings(ScenarioSection):
     """Offset of the controller's ticks from the plant's steps, in periods; with half a period, a
     fresh update takes effect within the same period."""
     safe_input: Row | None = None
-    """The input before the first update, m entries; by default 0."""
+    """The input before the first update, and without one that may be used, m entries; by default 0."""
     setpoint: Row | None = None
     """x_r, n entries: the state at which the loop is to rest; by default 0. It must be an
     equilibrium of the model, Âx_r + B̂u_r = 0; then u = K(x_c − x_r) + u_r."""
+
+    update_timeout_s: Annotated[FiniteFloat, Field(ge=1e-6, le=1e9)] | None = None
+    """Age of the newest update from which on it is no longer used; by default there is none."""
+    timeout_input: Literal["safe", "hold"] = "safe"
+    """The input from then on: `safe_input`, or the last one held."""
 
     predictions: Annotated[int, Field(ge=1, le=MAX_DIMENSION)] = 1
     """Number of inputs in an actuation: that of the tick, and those of the model for the following

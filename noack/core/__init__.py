@@ -1,1 +1,1 @@
-"""Clock, random streams, linear systems, errors."""
+"""The library in C; clock, random streams, linear systems; errors, files, processes, numbers as text."""

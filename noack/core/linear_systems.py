@@ -174,6 +174,16 @@ def all_entries(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(reduce(np.logical_and, holds.T))
 
 
+def set_rows(matrix: Matrix, places: NDArray[np.intp], rows: Matrix) -> None:
+    """Set the rows of a matrix at k places to others, (k, n), entry by entry.
+
+    ``matrix[places] = rows`` takes ten times as long for many short rows. Neither should rows be
+    read so: ``matrix.take(places, axis=0)`` and ``matrix.compress(holds, axis=0)`` are fast.
+    """
+    for column, entries in zip(matrix.T, rows.T, strict=True):
+        column[places] = entries
+
+
 def largest_sizes(rows: Matrix) -> Vector:
     """Return the size of the largest entry of each row, (k, n) → (k,); NaN if there is a NaN."""
     return np.asarray(reduce(np.maximum, np.abs(rows).T))

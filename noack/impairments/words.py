@@ -75,13 +75,13 @@ def _float(number: Decimal) -> float:
     return value
 
 
-def _percent(low: int, high: int, *, below: bool = False) -> Callable[[str], float]:
+def _percent(low: int, *, below: bool = False) -> Callable[[str], float]:
     def read(text: str) -> float:
         number, unit = _split(text)
-        if unit not in ("", "%") or not low <= number <= high:
+        if unit not in ("", "%") or not low <= number <= 100:
             raise ValueError
         share = _float(number.scaleb(-2))
-        if below and share >= high / 100:
+        if below and share >= 1:
             raise ValueError
         return share
 
@@ -193,11 +193,9 @@ def brief_number(number: float) -> str:
     return number_text(float(f"{number:.4g}"))
 
 
-PERCENT = Quantity("a percentage from 0% to 100%, e.g. 5%", _percent(0, 100), percent_text)
-CORRELATION = Quantity(
-    "a correlation from 0% to below 100%, e.g. 25%", _percent(0, 100, below=True), percent_text
-)
-SIGNED_PERCENT = Quantity("a correlation from -100% to 100%, e.g. 80%", _percent(-100, 100), percent_text)
+PERCENT = Quantity("a percentage from 0% to 100%, e.g. 5%", _percent(0), percent_text)
+CORRELATION = Quantity("a correlation from 0% to below 100%, e.g. 25%", _percent(0, below=True), percent_text)
+SIGNED_PERCENT = Quantity("a correlation from -100% to 100%, e.g. 80%", _percent(-100), percent_text)
 TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms (a bare number is in us)", _time_s, time_text)
 """A time of tc: a number without a unit is in microseconds."""
 OWN_TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms", _own_time_s, time_text)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
-from noack.protocol.machine_interface import External, Notice, Record
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
+from noack.protocol.roles import External, Notice, Record
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import AppliedParameters, ChangeSchedule, ParameterChange, settings_key
 from noack.scenario.scenario import Scenario

@@ -3,8 +3,7 @@
 from typing import ClassVar, Literal
 
 from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import EquationSettings, PlantEquations
-from noack.plants.systems.expressions import cos, sin
+from noack.plants.plant_settings import EquationSettings, PlantEquations, cos, sin
 from noack.settings.section import NonNegative, Positive
 
 

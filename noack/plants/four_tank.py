@@ -6,8 +6,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat
 
 from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import EquationSettings, PlantEquations
-from noack.plants.systems.expressions import sqrt
+from noack.plants.plant_settings import EquationSettings, PlantEquations, sqrt
 from noack.settings.section import Positive
 
 Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]

@@ -1,6 +1,12 @@
-"""A linear system, advanced exactly under a constant input."""
+"""Linear plants, advanced exactly under a constant input, and linear models by name.
 
-from typing import ClassVar, Literal
+A scenario may refer to a named model for the nominal matrices. The keyword arguments of a model's
+function are its parameters, with their default values.
+"""
+
+from collections.abc import Callable, Mapping
+from inspect import signature
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -33,3 +39,114 @@ class LinearSystem:
         """x(t + dt) = Ad x(t) + Bd u."""
         Ad, Bd = discretise(self.A, self.B, dt_ns)
         self.x = product(Ad, self.x) + product(Bd, u)
+
+
+class NamedModel(NamedTuple):
+    """A nominal model ``dx/dt = A x + B u`` with a stabilising gain ``u = K x``."""
+
+    A: Matrix
+    B: Matrix
+    K: Matrix
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+
+
+def lane_following(
+    *, a11: float = -1.6579, a12: float = 10.45, a21: float = 0.4886, a22: float = -2.718,
+    b1: float = -12.1053, b2: float = 13.1429,
+    speed: float = -12.0, look_ahead: float = 40.0, gain: float = 1.0,
+) -> NamedModel:  # fmt: skip
+    """Vehicle lane following, Section V of Garcia & Antsaklis (after Unyelioglu et al., 1997).
+
+    States: lateral velocity V, yaw rate r, yaw ψ, lateral position Y_g of the centre of gravity.
+    ``speed`` is U (negative: "considered in the opposite direction"), ``look_ahead`` is d; the two
+    inputs are steered alike by ``u = gain · (Y_g/d − ψ)``. Units follow the paper (SI, radian).
+
+    Raises:
+        ValueError: the look-ahead distance is 0.
+    """
+    if look_ahead == 0:
+        raise ValueError("parameters.look_ahead: the look-ahead distance cannot be 0")
+    A = np.array(
+        [
+            [a11, a12, 0.0, 0.0],
+            [a21, a22, 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0],
+            [1.0, 0.0, speed, 0.0],
+        ]
+    )
+    B = np.array([[b1, 0.0], [0.0, b2], [0.0, 0.0], [0.0, 0.0]])
+    row = [0.0, 0.0, -gain, gain / look_ahead]
+    return NamedModel(A, B, np.array([row, row]), ("V", "r", "psi", "Y_g"), ("u_1", "u_2"))
+
+
+def single_track_lane(
+    *,
+    mass_kg: float = 1093.3,
+    inertia_kg_m2: float = 1791.6,
+    front_m: float = 1.1562,
+    rear_m: float = 1.4227,
+    front_n_per_rad: float = 129_697.0,
+    rear_n_per_rad: float = 105_400.0,
+    speed_m_per_s: float = 15.0,
+    look_ahead_m: float = 20.0,
+    gain: float = 0.5,
+) -> NamedModel:
+    """A car on a lane, as the linear single-track model (Riekert and Schunck, 1940).
+
+    The car has mass m and moment of inertia I about the vertical axis. Its axles are at distances a
+    and b in front of and behind the centre of gravity, with cornering stiffnesses c_f and c_r. At
+    speed v and steering angle δ:
+
+        m (v̇_y + v r) = F_f + F_r,  I ṙ = a F_f − b F_r,
+        F_f = c_f (δ − (v_y + a r)/v),  F_r = −c_r (v_y − b r)/v.
+
+    The states are those of :func:`lane_following`, with its lateral axis, which has the opposite
+    direction: V = −v_y, yaw rate r, yaw ψ, lateral position Y_g with Ẏ_g = V − v ψ. Input: δ = gain
+    · (Y_g/look_ahead − ψ). By default the car is the BMW 320i of CommonRoad's vehicle models, with
+    its tyres under the static load.
+
+    Raises:
+        ValueError: a parameter that is a divisor is 0.
+    """
+    divisors = {
+        "mass_kg": mass_kg,
+        "inertia_kg_m2": inertia_kg_m2,
+        "speed_m_per_s": speed_m_per_s,
+        "look_ahead_m": look_ahead_m,
+    }
+    for name, value in divisors.items():
+        if value == 0:
+            raise ValueError(f"parameters.{name}: cannot be 0")
+    m, inertia, v = mass_kg, inertia_kg_m2, speed_m_per_s
+    a, b, c_f, c_r = front_m, rear_m, front_n_per_rad, rear_n_per_rad
+    uneven = a * c_f - b * c_r
+    A = np.array(
+        [
+            [-(c_f + c_r) / (m * v), uneven / (m * v) + v, 0.0, 0.0],
+            [uneven / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v), 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0],
+            [1.0, 0.0, -v, 0.0],
+        ]
+    )
+    B = np.array([[-c_f / m], [a * c_f / inertia], [0.0], [0.0]])
+    K = np.array([[0.0, 0.0, -gain, gain / look_ahead_m]])
+    return NamedModel(A, B, K, ("V", "r", "psi", "Y_g"), ("steering",))
+
+
+def double_integrator(*, stiffness: float = 1.0, damping: float = 1.5) -> NamedModel:
+    """A unit mass driven by a force: ``ẍ = u``, with ``u = −stiffness·x − damping·ẋ``."""
+    A, B, K = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), [-stiffness, -damping]
+    return NamedModel(A, B, np.array([K]), ("position", "velocity"), ("force",))
+
+
+NAMED_MODELS: Mapping[str, Callable[..., NamedModel]] = {
+    "lane_following": lane_following,
+    "single_track_lane": single_track_lane,
+    "double_integrator": double_integrator,
+}
+
+
+def parameters_of(name: str) -> tuple[str, ...]:
+    """Return the parameters of a named model."""
+    return tuple(signature(NAMED_MODELS[name]).parameters)

@@ -1,9 +1,12 @@
 """The interface of a system that a plant advances, and the settings that every kind of plant has.
 
+Plants that are given by equations have a base with its integrator, and elementary functions.
+
 The loop uses x and u, the deviations from an operating point. The plant's own state z may have
 other coordinates, and more of them.
 """
 
+import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -311,3 +314,26 @@ class OdeSystem:
             except BaseException as error:
                 self._raised.append(error)
         return np.full_like(z, np.nan)
+
+
+def _of_number(name: str, of_float: Callable[[float], float]) -> Callable[[object], float]:
+    """Return a function of floats, and of numbers that carry an enclosure.
+
+    So equations with these functions, or numpy's, are the plant's motion and a certificate's
+    evidence alike: evaluated with floats they give dx/dt, evaluated with the numbers of
+    :mod:`noack.plants.systems.jacobian_enclosure` they give enclosed derivatives. numpy's functions
+    call a method of the same name of such a number, and so do these.
+    """
+
+    def function(x: object) -> float:
+        if isinstance(x, float):
+            return of_float(x)
+        value: float = getattr(x, name)()  # stands for a float in the equations
+        return value
+
+    return function
+
+
+sin = _of_number("sin", math.sin)
+cos = _of_number("cos", math.cos)
+sqrt = _of_number("sqrt", math.sqrt)

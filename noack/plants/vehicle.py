@@ -1,7 +1,7 @@
 """A road vehicle: the vehicle models of CommonRoad, steered by a servo, along a lane.
 
 The library's equations and parameters are used unchanged. The lane is the library's x-axis. The
-lateral axis of the lane models (:mod:`noack.scenario.named_models`) has the opposite direction: V
+lateral axis of the lane models (:mod:`noack.plants.linear`) has the opposite direction: V
 and Y_g are minus the library's lateral velocity and y. Yaw, yaw rate and steering angle have the
 same sign.
 

@@ -1,1 +1,1 @@
-"""What the processes exchange: wire format, topology, machine interface, record tables."""
+"""What the processes exchange: wire format, roles, record tables."""

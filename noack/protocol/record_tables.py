@@ -1,6 +1,6 @@
 """The tables of the numeric record, each with its columns; one row per input of a machine.
 
-A machine emits its rows as :class:`noack.protocol.machine_interface.Record`, in the order of the
+A machine emits its rows as :class:`noack.protocol.roles.Record`, in the order of the
 columns here; live runs, simulation and replay fill the same tables. Everything else follows from
 :data:`TABLES`: row types, Parquet files, the processes' tables, the description in
 ``docs/record.md``. Times are nanoseconds of simulated time since the run's epoch: ``t_ns`` is
@@ -109,16 +109,16 @@ class Column(NamedTuple):
     exists: Callable[[RecordShape], bool] = lambda shape: True
 
 
-def _vector(name: str, unit: str, entries: Callable[[RecordShape], int], meaning: str) -> Column:
-    return Column(name, unit, meaning, entries, "<f8")
+def _vector(name: str, entries: Callable[[RecordShape], int], meaning: str) -> Column:
+    return Column(name, "model units", meaning, entries, "<f8")
 
 
 def _state(name: str, meaning: str) -> Column:
-    return _vector(name, "model units", lambda shape: shape.n, meaning)
+    return _vector(name, lambda shape: shape.n, meaning)
 
 
 def _input(name: str, meaning: str) -> Column:
-    return _vector(name, "model units", lambda shape: shape.m, meaning)
+    return _vector(name, lambda shape: shape.m, meaning)
 
 
 def _real(name: str, meaning: str) -> Column:
@@ -184,19 +184,19 @@ TABLES = (
         Column("entry", "", "number of the input in that actuation, from 0; −1: the watchdog's "
                "input; with `controller.predictions` only",
                exists=lambda shape: shape.predictions > 1),
-        _vector("z", "model units", lambda shape: shape.internal,
+        _vector("z", lambda shape: shape.internal,
                 "the system's own state, for a system with more states than x"),
-        _vector("d", "model units", lambda shape: shape.m * shape.disturbed_input,
+        _vector("d", lambda shape: shape.m * shape.disturbed_input,
                 "disturbance added to the input, where there is one"),
-        _vector("w", "model units", lambda shape: shape.n * shape.disturbed_state,
+        _vector("w", lambda shape: shape.n * shape.disturbed_state,
                 "disturbance added to ẋ, where there is one"),
     )),
     Table(PLANT_ACTUATION, "plant", "actuation received by the plant; `t_ns` is the model time of "
           "its input", (
         _input("u", "input"),
-        _vector("predicted", "model units", lambda shape: shape.m * (shape.predictions - 1),
+        _vector("predicted", lambda shape: shape.m * (shape.predictions - 1),
                 "inputs for the following ticks, with `controller.predictions` only"),
-        _vector("x_c", "model units", lambda shape: shape.n * shape.predictive,
+        _vector("x_c", lambda shape: shape.n * shape.predictive,
                 "the model's state, with `plant.watchdog.policy = \"model\"` only"),
     )),
     Table(SENSOR_MEASUREMENT, "sensor", "measurement received by the sensor", (
@@ -208,10 +208,9 @@ TABLES = (
         _real("threshold", "right side; an event happens if the left side exceeds it, or when a "
               "timer of the trigger expires"),
         Column("event", "", "sequence number of the update that was sent, −1 for none"),
-        _vector("y", "model units", lambda shape: shape.outputs,
+        _vector("y", lambda shape: shape.outputs,
                 "measured outputs, with an observer only"),
-        _vector("u_applied", "model units",
-                lambda shape: shape.inputs_reported if shape.outputs else 0,
+        _vector("u_applied", lambda shape: shape.inputs_reported if shape.outputs else 0,
                 "inputs applied in the plant's steps since the last measurement, in order, with an "
                 "observer only"),
     )),

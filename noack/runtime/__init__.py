@@ -1,1 +1,1 @@
-"""The shells' side: UDP sockets, the real-time loop, the zenoh control plane, telemetry."""
+"""A process in a run: its UDP sockets, real-time loop, control plane (zenoh) and telemetry."""

@@ -1,34 +1,46 @@
-"""The control plane: start barrier, liveliness, stop, telemetry, all on zenoh.
+"""The control plane of a run: start barrier, liveliness, stop, telemetry, all on zenoh.
 
 Loop data never travels here, and the loop never waits for it. The coordinator listens on a Unix
 socket in the user's runtime directory, which is closed to other users; all other processes connect
 to it. From another host, a session connects through ``connections/coordinator_link.py`` by TLS to
 :mod:`cosim.live.remote_access`, which forwards to that socket. Both ends have certificates of the
 run.
+
+The launcher keeps a lock file for its run beside the socket. By these files other programs of the
+user find the active runs, and change their settings.
 """
 
 import json
 import os
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import zenoh
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from noack.core.errors import CallerError, NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
-from noack.protocol.topology import COORDINATOR
+from noack.protocol.roles import COORDINATOR
 from noack.runtime.address import address_text
-from noack.runtime.control_messages import ChangeAnnouncement, message_json, parse_message
+from noack.runtime.control_messages import (
+    ChangeAnnouncement,
+    ChangeReply,
+    ChangeRequest,
+    message_json,
+    parse_message,
+)
 from noack.runtime.join_ticket import RemoteAccess, Ticket
-from noack.runtime.private_folder import open_private
+from noack.runtime.private_folder import LockFile, live_lock_files, lock_file, open_private
 from noack.runtime.spool import writer_of
+from noack.scenario.runtime_parameters import require_finite
 from noack.scenario.scenario_tables import MOST_CHANGES
+from noack.scenario.toml_file import brief
 
 LEASE_MS = 6000
 """A connection whose other end is silent for longer breaks. On a busy machine a process may not run
@@ -45,6 +57,8 @@ RUNS = "runs"
 """Folder of the active runs in the user's runtime directory: sockets, lock files."""
 _FIRST_POLL_S, _POLL_SHARE = 0.001, 0.05
 """Time between two looks for a reply: at first, and as a share of the time waited so far."""
+_ANSWER_S = 30.0
+"""Longest wait for the answer to a change of settings."""
 
 
 def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
@@ -395,3 +409,74 @@ class ParameterUpdates:
                 self._next_number = announced.number + 1
                 updates.append(announced)
         return updates
+
+
+class OpenRun(NamedTuple):
+    """How to reach a run."""
+
+    name: str  # of its socket, and in the keys of its control plane
+    run_dir: str
+    session: str | None  # session name for processes started by hand; None if all were launched
+
+
+_OPEN_RUN = TypeAdapter(OpenRun, config=ConfigDict(defer_build=True))
+
+
+@contextmanager
+def registered_run(ticket: Ticket, session: str | None) -> Iterator[Path]:
+    """Keep a run's lock file while the context lasts."""
+    run = OpenRun(run_name(ticket.run_id), ticket.run_dir, session)
+    with lock_file(RUNS, run.name, run._asdict()) as path:
+        yield path
+
+
+def active_runs() -> list[OpenRun]:
+    """Return the user's active runs. Raise PeerError if the file of one is not valid."""
+    return [_open_run(file) for file in live_lock_files(RUNS)]
+
+
+def find_run(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
+    """Return the user's active run, of this session or with this run directory.
+
+    Raise CallerError if no such run is active, or several are.
+    """
+    runs = active_runs()
+    fitting = [
+        run
+        for run in runs
+        if (session is None or run.session == session)
+        and (run_dir is None or Path(run.run_dir) == run_dir.resolve())
+    ]
+    if len(fitting) == 1:
+        return fitting[0]
+    if not runs:
+        raise CallerError("no run is active; start one, e.g. `noack demo`")
+    active = "active: " + ", ".join(run.run_dir for run in fitting or runs)
+    if fitting:
+        raise CallerError(f"several runs are {active}; choose one by --run DIRECTORY")
+    criterion = f"in session {session!r}" if run_dir is None else f"in {run_dir}"
+    raise CallerError(f"no run is active {criterion}; {active}")
+
+
+def request_change(run: OpenRun, settings: Mapping[str, object]) -> ChangeReply:
+    """Request a change of runtime parameters; without settings, their values. Return the answer.
+
+    Raise CallerError, with one line per mistake, for wrong settings, PeerError without an answer.
+    """
+    require_finite(settings)
+    request = message_json(ChangeRequest.model_validate({"settings": dict(settings)}))
+    try:
+        with open_session(RUNS, run.name, listen=False) as plane:
+            answer = answer_to(plane, f"noack/{run.name}/runtime_parameters", request, _ANSWER_S)
+    except zenoh.ZError as error:
+        raise PeerError(f"{run.run_dir}: the run cannot be reached: {cause_of(error)}") from None
+    if answer is None:
+        raise PeerError(f"{run.run_dir}: the run does not answer")
+    return parse_message(ChangeReply, answer)
+
+
+def _open_run(file: LockFile) -> OpenRun:
+    try:
+        return _OPEN_RUN.validate_json(file.content, strict=True)
+    except ValidationError as error:
+        raise PeerError(f"{file.path}: not a valid file of an active run: {brief(error)}") from None

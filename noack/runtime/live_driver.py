@@ -17,7 +17,7 @@ import numpy as np
 from noack.core.clock import RunClock
 from noack.core.core_library import CData, core, ffi
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.topology import ENDS, RECEIVES, SENDS, receiver_of, sender_to
+from noack.protocol.roles import ENDS, RECEIVES, SENDS, receiver_of, sender_to
 from noack.protocol.wire_format import (
     HEADER_BYTES,
     TAG_BYTES,

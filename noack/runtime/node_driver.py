@@ -28,7 +28,7 @@ from noack.core.clock import NS_PER_S, RunClock
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError, PeerError, shortened
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.topology import SENDS
+from noack.protocol.roles import SENDS
 from noack.runtime.address import Address, SocketName
 from noack.runtime.live_driver import LiveDriver, LoopChannel, ends_of
 from noack.runtime.real_time_loop import RecordSink
@@ -47,7 +47,7 @@ _READS = 16
 _LOOK_S = 0.05
 _ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
 _COPIED = (
-    *("has_point", "acknowledges", "predictions", "carries_model"),
+    *("has_point", "acknowledges", "predictions", "carries_model", "timeout_ns", "holds_input"),
     *("model_ns", "knows_state", "newest"),
 )
 _HEAD = struct.Struct("<qq")

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S, RunClock
-from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.roles import Notice, Record
 
 _HOUSEKEEPING_S = 0.05
 _OVERLOAD_PAUSE_S = 0.002

@@ -27,9 +27,18 @@ from setproctitle import setproctitle
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, ExitStatus, NoackError, NoAnswerError, PeerError, one_line
 from noack.core.process_limits import exhausted_limit, require_limits
-from noack.protocol.machine_interface import BEGINNING, RESTART, Notice, Record, Start
 from noack.protocol.record_tables import OWNER, clock_table
-from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER, WITH_DEADLINES
+from noack.protocol.roles import (
+    BEGINNING,
+    CHANGEABLE,
+    LOOP_ROLES,
+    RECORDER,
+    RESTART,
+    WITH_DEADLINES,
+    Notice,
+    Record,
+    Start,
+)
 from noack.protocol.wire_format import Wire
 from noack.runtime.address import Address, address_text
 from noack.runtime.command_line import TICKET_ON_STDIN, Parser, Signals, failed, print_to_stderr

@@ -16,7 +16,7 @@ from typing import IO, BinaryIO, NamedTuple
 
 from noack.core.errors import MachineError, why
 from noack.core.file_access import open_append, read_regular
-from noack.protocol.machine_interface import GENERATION
+from noack.protocol.roles import GENERATION
 
 SPOOL = "spool"  # the spool's folder in the run directory
 EARLY = "early"

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from noack.core.errors import MachineError, PeerError
 from noack.core.file_access import write_whole
-from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP
+from noack.protocol.roles import Notice, Record
 from noack.runtime.control_messages import BatchHeader, MissingRows, PersistedAck, parse_message
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.spool import (

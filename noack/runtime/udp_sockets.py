@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 
 from noack.core.errors import CallerError, PeerError
-from noack.protocol.machine_interface import Notice
+from noack.protocol.roles import Notice
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES
 from noack.runtime.address import LOOPBACK, Address, SocketName, address_text, family_of
 from noack.runtime.real_time_loop import RecordSink

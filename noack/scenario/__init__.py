@@ -1,1 +1,1 @@
-"""The scenario file: sections, file readers, validation messages, resolution."""
+"""The scenario file: its tables and their checks, files that it names, names and draws as numbers."""

@@ -15,8 +15,8 @@ from typing import Generic, NamedTuple, TypeVar
 
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
-from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import CHANGE_BYTES
+from noack.protocol.roles import Notice, Record
 from noack.scenario.runtime_parameters import CONSTRAINTS, LOSS, MANSD, SETPOINT, text_of, trigger_parameters
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_checks import with_settings

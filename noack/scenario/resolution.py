@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
@@ -46,7 +47,6 @@ class LoopMatrices:
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     setpoint: Vector | None = None  # x_r, (n,); None is 0
-    setpoint_input: Vector | None = None  # u_r, (m,), with Âx_r + B̂u_r = 0; None is 0
 
     @property
     def n(self) -> int:
@@ -243,6 +243,7 @@ def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
         )
 
 
+@cached_method
 def loop_of(resolved: Scenario) -> LoopMatrices:
     """Return the matrices of a resolved scenario."""
     model, plant = resolved.model, resolved.plant
@@ -260,12 +261,12 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
         x0=np.array(plant.initial_state),
         weight=None if weight is None else np.array(weight),
         setpoint=None if setpoint is None else setpoint[0],
-        setpoint_input=None if setpoint is None else setpoint[1],
         state_names=model.state_names or (),
         input_names=model.input_names or (),
     )
 
 
+@cached_method
 def policy_of(resolved: Scenario) -> Policy:
     """Return a resolved scenario's trigger policy; raise CallerError if its model excludes it."""
     return resolved.trigger.trigger_policy(resolved.model.trigger_matrices)
@@ -285,6 +286,7 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
     return x_r, input_at(*resolved.model.matrices, x_r)
 
 
+@cached_method
 def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
     """Return the row types of the tables of a loop, from its resolved scenario."""
     return tables(**vars(shape_of(resolved)))

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import GetJsonSchemaHandler, ValidationError, create_model, model_validator
 from pydantic_core import CoreSchema
 
+from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.random_streams import named_stream_keys, stream
 from noack.scenario.run_sections import MOST_LOOPS, LoopSection, SeedsSection
@@ -99,6 +100,7 @@ def loops_by_entry(scenario: Scenario) -> list[list[Scenario]]:
     ]
 
 
+@cached_method
 def phases_ns(scenario: Scenario) -> tuple[int, ...]:
     """Return when each loop begins: the time of the run at which the time of the loop is 0."""
     sections, phases = loop_sections(scenario), list[int]()

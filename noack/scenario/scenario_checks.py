@@ -204,6 +204,11 @@ def _check_watchdog(scenario: ScenarioTables) -> None:
             "controller.predictions: needs u = K x_c; "
             f'not with controller.kind = "{scenario.controller.kind}"'
         )
+    if scenario.controller.update_timeout_s is not None and not scenario.controller.is_linear:
+        raise ValueError(
+            "controller.update_timeout_s: needs u = K x_c; "
+            f'not with controller.kind = "{scenario.controller.kind}"'
+        )
     if scenario.message_sizes.is_predictive and not scenario.controller.is_linear:
         raise ValueError(
             'plant.watchdog.policy: "model" predicts u = K x_c; '

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, FiniteFloat
 
 from noack.controllers.linear_feedback import LinearFeedbackSettings
-from noack.core.clock import NS_PER_S
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import as_html, as_text
 from noack.plants.linear import LinearSettings
-from noack.protocol.topology import PROTOCOLS, LoopProtocol
+from noack.protocol.roles import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import Flow
 from noack.scenario.run_sections import (
     NAME_PATTERN,
@@ -78,11 +78,20 @@ class ScenarioTables(ScenarioSection):
     ports: PortsSection = PortsSection.model_construct()
     realtime: RealtimeSection = RealtimeSection.model_construct()
 
+    @property
+    def between_updates(self) -> str:
+        """What the controller does between updates, in words."""
+        words = "model-based" if self.mode == "model" else "zero-order hold"
+        if self.controller.update_timeout_s is None:
+            return words
+        later = "the last input" if self.controller.timeout_input == "hold" else "the safe input"
+        return f"{words} for {self.controller.update_timeout_s:g} s, then {later}"
+
     def _rows(self) -> list[tuple[str, str]]:
         n, m = self.model.dimensions
         rows = [
             ("scenario", self.name + (f": {self.description}" if self.description else "")),
-            ("mode", "model-based" if self.mode == "model" else "zero-order hold"),
+            ("mode", self.between_updates),
             ("plant", f"{self.plant.system.kind}, n = {n}, m = {m}, {self.plant.rate_hz:g} Hz"),
             ("trigger", _section_text(self.trigger, "policy")),
             ("network", f"{_section_text(self.network.loss, 'model')}; M − 1 = {self.network.mansd}"),
@@ -193,6 +202,12 @@ class Timing:
             return max(usual_ns, self.predicted_ns)
         last_ns = self.predicted_ns + round(actuation.link.longest_delay_s * NS_PER_S)
         return max(usual_ns, last_ns) if self.scenario.plant.watchdog.policy == "hold" else last_ns
+
+    @property
+    def update_timeout_ns(self) -> int:
+        """Age of the newest update from which on the controller does not use it."""
+        timeout_s = self.scenario.controller.update_timeout_s
+        return NEVER_NS if timeout_s is None else round(timeout_s * NS_PER_S)
 
     @property
     def actuation_gap_ns(self) -> int | None:
@@ -340,6 +355,8 @@ class TheoryCoverage:
             return f'network.protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'
         if not scenario.controller.is_linear:
             return f'controller.kind = "{scenario.controller.kind}": u is not K x_c'
+        if scenario.controller.update_timeout_s is not None:
+            return "controller.update_timeout_s: without a recent update, u is not K x_c"
         return self._beyond_actuation
 
     @property

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.controllers.controller_settings import ControllerSettings
+from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
 from noack.impairments.constraints import join_guarantee, require_consistent
@@ -21,10 +22,9 @@ from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
 from noack.observers.observer_settings import NoiseVariances, ObserverSettings
-from noack.plants.linear import LinearSettings
+from noack.plants.linear import NAMED_MODELS, LinearSettings, NamedModel, parameters_of
 from noack.plants.plant_settings import PlantSettings
 from noack.protocol.wire_format import Flow
-from noack.scenario.named_models import NAMED_MODELS, NamedModel, parameters_of
 from noack.settings.section import (
     Bounds,
     Deviations,
@@ -74,7 +74,7 @@ class ModelSection(ScenarioSection):
     """
 
     name: Literal["lane_following", "single_track_lane", "double_integrator"] | None = None
-    """A named model; see noack/scenario/named_models.py."""
+    """A named model; see noack/plants/linear.py."""
     parameters: dict[str, FiniteFloat] = Field({})
     """Parameters of the named model that differ from its defaults."""
     A: Rows | None = None
@@ -348,9 +348,10 @@ class DirectionSection(ScenarioSection):
         return self
 
     @property
+    @cached_method
     def link(self) -> LinkSettings:
         """The link of this direction."""
-        return LinkSettings.model_construct(  # of checked parts; every loop asks several times
+        return LinkSettings.model_construct(  # of checked parts
             impairments=(LossOf.model_construct(loss=self.loss), *self.impairments),
             mansd=self.mansd,
             constraints=self.constraints,
@@ -444,6 +445,7 @@ class NetworkSection(DirectionSection):
         return self.acknowledgements or AcknowledgementSection()
 
     @property
+    @cached_method
     def link(self) -> LinkSettings:
         """The link from sensor to controller."""
         update: dict[str, object] = {"first_delivered": self.initial_sync == "first_packet"}
@@ -452,6 +454,7 @@ class NetworkSection(DirectionSection):
         return super().link.model_copy(update=update)
 
     @property
+    @cached_method
     def guarantee(self) -> LossGuarantee:
         """What mansd and the constraints say, also if the network does not enforce it."""
         return join_guarantee(self.mansd, self.constraints)

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field
 
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.protocol.machine_interface import External
+from noack.protocol.roles import External
 from noack.protocol.ros2_messages import DEFAULT_ROUTER, Entries
 from noack.settings.section import Positive, ScenarioSection
 

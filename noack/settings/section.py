@@ -14,7 +14,7 @@ from importlib import import_module
 from itertools import pairwise
 from operator import or_
 from pkgutil import iter_modules
-from typing import Annotated, TypeVar, get_args
+from typing import Annotated, Self, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -49,6 +49,25 @@ class ScenarioSection(BaseModel):
     # Validators are built at their first use, that of a scenario with those of all its tables. So
     # defaults in classes are made by model_construct, which needs no validator.
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
+
+    # The results of cached methods are kept with a section. They are no part of it.
+
+    def __copy__(self) -> Self:
+        """Return a copy, whose keys may then change."""
+        copied = super().__copy__()
+        for name in self.__dict__.keys() - type(self).__pydantic_fields__.keys():
+            del copied.__dict__[name]
+        return copied
+
+    def __eq__(self, other: object) -> bool:
+        """Whether it is the same table."""
+        if not isinstance(other, ScenarioSection) or type(self) is not type(other):
+            return False
+        return self.__copy__().__dict__ == other.__copy__().__dict__
+
+    def __getstate__(self) -> Table:
+        """Return what is pickled."""
+        return super().__getstate__() | {"__dict__": self.__copy__().__dict__}
 
     def content(self) -> Table:
         """Return the table as JSON has it, without keys that have no value."""

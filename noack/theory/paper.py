@@ -122,7 +122,7 @@ class MissedEvents:
             event = np.repeat(np.arange(begin, last), lengths[begin:last])
             measurement = np.arange(len(event)) - (totals - lengths)[event] + earlier + begins[event]
             periods = (t_ns[measurement] - times_ns[event]) // self._period_ns
-            jumps = self._propagate.leaps(errors[event], periods, self._period_ns)
+            jumps = self._propagate.leaps(errors.take(event, axis=0), periods, self._period_ns)
             yield MissedJumps(measurement, times_ns[event], periods, jumps)
             begin = last
 

@@ -27,12 +27,12 @@ from noack.traces.packet_trace import (
     MAX_PACKETS,
     Int64s,
     PacketTrace,
+    TraceFormat,
     TraceRecordError,
     envelope_slope,
     packet_trace,
     relative_delays,
 )
-from noack.traces.trace_formats import TraceFormat
 
 _MOST_FLOWS = 1_000_000
 _KEY = os.urandom(16)

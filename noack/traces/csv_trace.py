@@ -17,8 +17,13 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from noack.core.errors import shortened
-from noack.traces.packet_trace import PacketTrace, TraceRecordError, packet_trace, relative_delays
-from noack.traces.trace_formats import TraceFormat
+from noack.traces.packet_trace import (
+    PacketTrace,
+    TraceFormat,
+    TraceRecordError,
+    packet_trace,
+    relative_delays,
+)
 
 _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _TIME_COLUMN = re.compile(f"(sent|received(?:_other_clock)?)_({'|'.join(_UNITS_NS)})")
@@ -76,7 +81,7 @@ def _lines(file: IO[bytes]) -> Iterator[str]:
 
 
 def read_csv_trace(file: IO[bytes], most_packets: int, clocks_differ: bool) -> PacketTrace:
-    """Read a CSV trace; see :class:`noack.traces.trace_formats.TraceFormat`."""
+    """Read a CSV trace; see :class:`noack.traces.packet_trace.TraceFormat`."""
     trace, differ = _read(file, most_packets, clocks_differ)
     return relative_delays(trace) if differ else trace
 

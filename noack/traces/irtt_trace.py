@@ -13,8 +13,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from noack.traces.packet_trace import LOST_NS, PacketTrace, TraceRecordError, packet_trace
-from noack.traces.trace_formats import TraceFormat
+from noack.traces.packet_trace import LOST_NS, PacketTrace, TraceFormat, TraceRecordError, packet_trace
 
 _PIECE = 2**16
 _LONGEST_ENTRY = 2**16

@@ -6,7 +6,7 @@ if the controller receives nothing for T_max, an update was lost. The rule's err
 
 from typing import ClassVar, Literal
 
-from noack.trigger.combined import CombinedSettings
+from noack.trigger.policy_settings import CombinedSettings
 from noack.trigger.trigger_rule import TriggerRule
 
 

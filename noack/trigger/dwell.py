@@ -6,7 +6,7 @@ compares may exceed the threshold.
 
 from typing import ClassVar, Literal
 
-from noack.trigger.combined import CombinedSettings
+from noack.trigger.policy_settings import CombinedSettings
 from noack.trigger.trigger_rule import TriggerRule
 
 

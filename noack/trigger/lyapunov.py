@@ -21,8 +21,6 @@ from noack.trigger.trigger_rule import QuadraticForm, TriggerRule, empty_map, st
 class LyapunovSettings(LyapunovFunctionSettings):
     """Transmit when V(x) = xᵀPx > V(x(t_k)) e^{−ρ(t−t_k)}, t_k the last event."""
 
-    events_may_accumulate: ClassVar = True
-
     example_keys: ClassVar = {"rate_per_s": 0.3}
 
     policy: Literal["lyapunov"]

@@ -1,4 +1,4 @@
-"""The settings that every trigger policy has.
+"""The settings that every trigger policy has, and those of policies of the same form.
 
 A policy is one file of this folder. The file holds a subclass of :class:`PolicySettings` with a
 field ``policy``, and the behaviour that the settings describe;
@@ -8,20 +8,23 @@ field ``policy``, and the behaviour that the settings describe;
 import json
 import warnings
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self, TypeAlias, get_args
 
 import numpy as np
-from pydantic import Field, FiniteFloat
+from pydantic import Field, FiniteFloat, field_validator
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.settings.section import ReadTable, Rows, ScenarioSection, require_shape
-from noack.trigger.trigger_rule import Policy
+from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule
 
 Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]
 Share = Annotated[FiniteFloat, Field(gt=0, le=1e9)]
 Interval = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
+
+if TYPE_CHECKING:
+    AnyTrigger: TypeAlias = "PolicySettings"  # noack.scenario.sections inserts the union of all policies
 
 
 class ModelMatrices(NamedTuple):
@@ -35,8 +38,6 @@ class ModelMatrices(NamedTuple):
 class PolicySettings(ScenarioSection):
     """Settings of a trigger policy."""
 
-    events_may_accumulate: ClassVar[bool] = False
-    """Whether events of this policy alone may accumulate where updates are lost."""
     example_keys: ClassVar[ReadTable | None] = None
     """Keys of the example, which :meth:`example` returns."""
     at_start_only: ClassVar[tuple[str, ...]] = ()
@@ -151,6 +152,46 @@ class LyapunovFunctionSettings(WeightedSettings):
                 "rounding: modes of Â + B̂K differ too much"
             )
         return P, Q
+
+
+class CombinedSettings(PolicySettings):
+    """Settings of a policy that combines a rule with an interval."""
+
+    rule: "AnyTrigger"
+    """The rule that is combined."""
+    interval_s: Interval
+    """Time since the last event."""
+
+    @field_validator("rule")
+    @classmethod
+    def _check_rule(cls, rule: PolicySettings) -> PolicySettings:
+        if rule.beyond_exact is not None:
+            raise ValueError(f'"{rule.policy}" cannot be combined; let the class test the interval')
+        return rule
+
+    @abstractmethod
+    def combined(self, rule: TriggerRule, interval_ns: int) -> TriggerRule:
+        """Return a rule with the interval."""
+
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
+        rule = require_rule(self.rule.trigger_policy(model))
+        return self.combined(rule, nanoseconds(self.interval_s))
+
+    @property
+    def weight(self) -> Rows | None:
+        return self.rule.weight
+
+    def at_origin(self, t_s: float) -> Self:
+        return self.model_copy(update={"rule": self.rule.at_origin(t_s)})
+
+    def check(self, n: int, why: str) -> None:
+        try:
+            self.rule.check(n, why)
+        except ValueError as error:
+            raise ValueError(str(error).replace("trigger.", "trigger.rule.", 1)) from None
+
+    def check_period(self, measured_ns: int, key: str = "trigger") -> None:
+        self.rule.check_period(measured_ns, f"{key}.rule")
 
 
 def nanoseconds(seconds: float) -> int:

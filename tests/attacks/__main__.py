@@ -7,7 +7,7 @@ from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
 
-from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
+from noack.protocol.roles import LOOP_ROLES, RECEIVES, sender_to
 from tests.attacks.attacked import CHECKS, Attacked, attack, may_forge_addresses
 from tests.two_hosts import two_hosts
 

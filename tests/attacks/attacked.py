@@ -26,7 +26,7 @@ from noack.protocol.record_tables import (
     PLANT_ACTUATION,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
+from noack.protocol.roles import LOOP_ROLES, RECEIVES, sender_to
 from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.address import LOOPBACK
 from noack.runtime.join_ticket import Ticket, loads

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from tests.attacks.attacked import CHECKS, Attacked, attack, may_forge_addresses
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, PEER, STRANGER, Target

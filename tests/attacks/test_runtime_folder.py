@@ -24,7 +24,7 @@ from netem.fates import FateRecorder
 from netem.relay_links import LinkSpec
 from noack.core.errors import CallerError, NoackError
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime import run_registry
+from noack.runtime import control_plane
 from noack.runtime.join_ticket import Ticket, find_ticket, new_ticket, ticket_file, write_invitation
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.matrix_files import write_matrices
@@ -73,8 +73,8 @@ Use = Callable[[Ticket], object]
 USES: dict[str, Use] = {
     "publish a ticket": lambda ticket: ticket_file(ticket, "default").__enter__(),
     "join a run": lambda _: join(),
-    "publish a run": lambda ticket: run_registry.registered_run(ticket, None).__enter__(),
-    "find a run": lambda _: run_registry.find(),
+    "publish a run": lambda ticket: control_plane.registered_run(ticket, None).__enter__(),
+    "find a run": lambda _: control_plane.find_run(),
     "publish an emulator": lambda _: emulator_session.registered_emulator(EMULATOR).__enter__(),
     "list emulators": lambda _: emulator_session.running(),
 }
@@ -170,7 +170,7 @@ def test_only_regular_files_are_read(shared: Path) -> None:
 def test_a_run_without_a_usable_folder_is_refused(shared: Path) -> None:
     assert find_ticket("default") is None
     with pytest.raises(CallerError, match="no run is active"):
-        run_registry.find()
+        control_plane.find_run()
     assert emulator_session.running() == []
     assert not (shared / OWN).exists()
 

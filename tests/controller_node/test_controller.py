@@ -15,8 +15,8 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
-from noack.protocol.machine_interface import Notice, Output, Record
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
+from noack.protocol.roles import Notice, Output, Record
 from noack.protocol.wire_format import Flow, Message
 from tests.machine_parts import OneLoop, machine
 

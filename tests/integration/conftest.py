@@ -14,7 +14,7 @@ from typing import Any
 import psutil
 import pytest
 
-from noack.protocol.topology import ROLES
+from noack.protocol.roles import ROLES
 
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")

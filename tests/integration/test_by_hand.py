@@ -16,7 +16,7 @@ import pytest
 
 from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.join_ticket import loads
 from tests.integration import conftest as live
 

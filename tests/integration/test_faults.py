@@ -20,7 +20,7 @@ import pytest
 from cosim.live.finalize import reopen
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import MachineError
-from noack.protocol.topology import ROLES
+from noack.protocol.roles import ROLES
 from tests.command_line import invoke
 from tests.cosim.output.viewer.test_viewer import is_left, read
 from tests.integration import conftest as live

@@ -18,7 +18,7 @@ from cosim.record.run_record import load_record, load_run
 from noack.core.clock import NS_PER_S
 from noack.core.errors import MachineError
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import phases_ns
 from tests.command_line import invoke
 from tests.integration import conftest as live

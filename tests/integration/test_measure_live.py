@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.traces.trace_formats import read_trace
+from noack.traces.packet_trace import read_trace
 from tests.integration.conftest import Start, starting
 
 LONG_S = 120

@@ -24,7 +24,7 @@ from native.build import NO_COMPILER
 from noack.controllers.program_controller import ProgramControllerSettings
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
-from noack.protocol.topology import SENDS
+from noack.protocol.roles import SENDS
 from noack.protocol.wire_format import Wire
 from noack.runtime.live_driver import LoopChannel
 from noack.runtime.node_driver import NodeDriver

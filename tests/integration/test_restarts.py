@@ -8,8 +8,8 @@ import pytest
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.record.processes import places_of_lives
 from cosim.record.run_record import Rows, RunRecord, load_record
-from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import OWNER
+from noack.protocol.roles import GENERATION
 from noack.runtime.spool import read_chunks
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load

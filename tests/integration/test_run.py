@@ -32,7 +32,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     tables,
 )
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from tests.command_line import invoke
 from tests.cosim.output.viewer.test_viewer import read, series
 from tests.integration.conftest import (

@@ -8,7 +8,7 @@ import pytest
 from tests.native import sanitized_core
 
 ROOT = sanitized_core.ROOT
-PYTEST = ("pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-s")
+PYTEST = ("pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-s", "--hypothesis-profile=few")
 
 
 def run(*module: str) -> subprocess.CompletedProcess[str]:

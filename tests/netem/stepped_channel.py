@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from netem.channel import Channel, Datagram
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import core, ffi
-from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
+from noack.protocol.roles import Notice, Record
 from noack.scenario.parameter_changes import ParameterChange
 from tests.oracles.link import flipped
 

@@ -16,8 +16,8 @@ from netem.tc_words import settings_of
 from noack.core.core_library import address_of, core, ffi
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import NETEM_PACKET, Fate, tables
+from noack.protocol.roles import Notice, Record
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.netem.any_settings import capped, computable, harsh

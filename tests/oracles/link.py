@@ -20,8 +20,8 @@ from noack.impairments.disciplines.maximum_error import MaximumError
 from noack.impairments.disciplines.priority import Priority
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import Counters, Decisions, LinkSettings
-from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
+from noack.protocol.roles import BEGINNING, Notice, Record, Start
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
 from tests.machine_parts import Machine

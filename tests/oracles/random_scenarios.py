@@ -71,6 +71,10 @@ class _Draw:
         self.watch(content, model=x_r is None)
         if not acknowledged and self.chance(0.35):
             content["changes"] = self.changes(content, x_r)
+        if self.chance(0.25):
+            controller = content["controller"]
+            controller["update_timeout_s"] = self.one_of(0.06, self.between(0.005, 0.3))
+            controller["timeout_input"] = self.one_of("safe", "hold")
         return content
 
     def model(self) -> tuple[Any, Any, Any]:

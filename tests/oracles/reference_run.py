@@ -46,6 +46,8 @@ def settings_of(scenario: Scenario) -> Settings:
         setpoints=[(t_ns, _x_r(one)) for t_ns, one in in_force],
         safe_input=np.zeros(loop.m) if safe_input is None else np.array(safe_input),
         predictions=scenario.controller.predictions,
+        update_timeout_ns=np.rint(1e9 * (scenario.controller.update_timeout_s or np.inf)),
+        timeout_input=scenario.controller.timeout_input,
         watchdog=scenario.plant.watchdog.policy,
         watchdog_timeout_ns=timing.actuation_timeout_ns,
         observer=None if scenario.observer is None else observer_of(scenario),

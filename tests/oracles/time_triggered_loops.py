@@ -30,7 +30,7 @@ class LoopMaps:
     Two updates are between ``least`` and ``most`` units apart; a unit is the time between two
     measurements, or the period if the two are 1. In patterns, (patterns, updates), each update has
     a choice: the number of units, from ``least`` on; or with a period the slot, its place relative
-    to the controller's ticks.
+    to the controller's ticks. The age of x_c is counted in units, up to one at which it is too old.
     """
 
     def __init__(self, resolved: Scenario, unit_ns: int, least: int = 1, most: int = 1) -> None:
@@ -44,16 +44,24 @@ class LoopMaps:
         self._rates = np.vstack([loop.A @ x + loop.B @ u, loop.H @ x_c, 0 * u, 0 * w, 0 * s])
         arrived = expm(loop.H * self._delay_ns * 1e-9) @ s
         self._step, self._send = np.vstack([x, x_c, w, w, s]), np.vstack([x, x_c, u, w, x])
-        self._arrive, self._tick = np.vstack([x, arrived, u, w, s]), np.vstack([x, x_c, u, loop.K @ x_c, s])
+        controller = resolved.controller
+        self._arrive = np.vstack([x, arrived, u, w, s])
+        without = w if controller.timeout_input == "hold" else 0 * w
+        self._ticks = [np.vstack([x, x_c, u, sent, s]) for sent in (loop.K @ x_c, without)]
+        timeout_s = controller.update_timeout_s
+        self._timeout_ns = 2**62 if timeout_s is None else round(timeout_s * 1e9)
+        self._oldest = 1 if timeout_s is None else -(-self._timeout_ns // unit_ns)
         cycle_ns = int(np.lcm(self._step_ns, self._tick_ns))
         slots = cycle_ns // int(np.gcd(cycle_ns, unit_ns))
-        units = [[self._unit(slot, delivered) for delivered in (False, True)] for slot in range(slots)]
-        if not self.is_periodic:
-            assert slots == 1
-            later = [np.linalg.matrix_power(units[0][0], k - 1) for k in range(least, most + 1)]
-            units = [[one @ first for first in units[0]] for one in later]
-        self._maps = np.array(units)  # by choice and whether the update is delivered
-        self._times = np.ones(slots) if self.is_periodic else np.arange(least, most + 1) / most
+        assert self.is_periodic or slots == 1
+        lengths = [1] * slots if self.is_periodic else range(least, most + 1)
+        self._maps = np.array([
+            [[self._interval(choice, length, age, delivered) for delivered in (False, True)]
+             for age in range(1, self._oldest + 1)]
+            for choice, length in enumerate(lengths)
+        ])  # by choice, age before, and whether the update is delivered  # fmt: skip
+        self._lengths = np.array(lengths)
+        self._times = self._lengths / (1 if self.is_periodic else most)
 
     def cost(self, x0: Vector, Q: Matrix, R: Matrix) -> float:
         """Return ∫ xᵀQx + uᵀRu dt without losses, from x(0), which the controller knows."""
@@ -62,7 +70,7 @@ class LoopMaps:
         weight[:n, :n], weight[2 * n : 2 * n + m, 2 * n : 2 * n + m] = Q, R
         nodes, shares = np.polynomial.legendre.leggauss(8)
         for slot in range(len(self._maps)):
-            for dt_s, change in self._changes(slot, delivered=True):
+            for dt_s, change in self._changes(slot, 1, delivered=True):
                 for node, share in zip(nodes, shares, strict=True):
                     there = expm(self._rates * dt_s * (1 + node) / 2) @ whole
                     form += share * dt_s / 2 * there.T @ weight @ there
@@ -111,21 +119,40 @@ class LoopMaps:
             examine(worst ^ np.eye(worst.shape[1], dtype=bool))
         return tried, self._limits(repeated, choices)[0]
 
-    def _changes(self, slot: int, delivered: bool) -> list[tuple[float, Reals]]:
+    def _changes(self, slot: int, age: int, delivered: bool) -> list[tuple[float, Reals]]:
         """Return what happens in one unit: the time in s since the change before, and the change."""
         begin_ns, end_ns = slot * self.unit_ns, (slot + 1) * self.unit_ns
+
+        def tick(t_ns: int) -> Reals:
+            has_arrived = delivered and t_ns >= begin_ns + self._delay_ns
+            update_ns = begin_ns if has_arrived else begin_ns - age * self.unit_ns
+            return self._ticks[t_ns - update_ns >= self._timeout_ns]
+
         first_ns = begin_ns + (self._phase_ns - begin_ns) % self._tick_ns
         steps_ns = range(begin_ns + self._step_ns, end_ns + 1, self._step_ns)
         changes = [(t_ns, 0, self._step) for t_ns in steps_ns]
-        changes += [(t_ns, 3, self._tick) for t_ns in range(first_ns, end_ns, self._tick_ns)]
+        changes += [(t_ns, 3, tick(t_ns)) for t_ns in range(first_ns, end_ns, self._tick_ns)]
         if delivered:
             changes += [(begin_ns, 1, self._send), (begin_ns + self._delay_ns, 2, self._arrive)]
         times_ns, _, whats = zip(*sorted(changes, key=lambda one: one[:2]), strict=True)
         return list(zip(np.diff(times_ns, prepend=begin_ns) * 1e-9, whats, strict=True))
 
-    def _unit(self, slot: int, delivered: bool) -> Reals:
-        maps = [change @ expm(self._rates * dt_s) for dt_s, change in self._changes(slot, delivered)]
+    def _interval(self, choice: int, length: int, age: int, delivered: bool) -> Reals:
+        """Return the map from an update to the next one, some units later."""
+        slot, maps = choice if self.is_periodic else 0, []
+        for _ in range(length):
+            changes = self._changes(slot, age, delivered)
+            maps += [change @ expm(self._rates * dt_s) for dt_s, change in changes]
+            age, delivered = 1 if delivered else age + 1, False
         return reduce(lambda before, map_: map_ @ before, maps)
+
+    def _chosen(self, lost: Flags, choices: Steps) -> Reals:
+        """Return the maps of repeated patterns, (patterns, updates, size, size)."""
+        age, ages = np.full(len(lost), self._oldest), np.zeros(lost.shape, int)
+        for k in [*range(lost.shape[1])] * 2:
+            ages[:, k] = np.minimum(age, self._oldest)
+            age = np.where(lost[:, k], age, 0) + self._lengths[choices[:, k]]
+        return self._maps[choices, ages - 1, (~lost).astype(int)]
 
     def _is_allowed(self, lost: Flags) -> Flags:
         """Whether each pattern keeps the guarantee if it is repeated."""
@@ -141,13 +168,13 @@ class LoopMaps:
         return lost, np.where(rng.random((len(lost), 1)) < 0.5, last, choices)
 
     def _products(self, lost: Flags, choices: Steps) -> Reals:
-        maps = self._maps[choices, (~lost).astype(int)].swapaxes(0, 1)
+        maps = self._chosen(lost, choices).swapaxes(0, 1)
         return reduce(lambda before, map_: map_ @ before, maps)
 
     def _limits(self, lost: Flags, choices: Steps) -> tuple[float, float]:
         """Return what the growth of one pattern is at least and at most, with rounding."""
         values, left, right = eig(self._products(lost, choices)[0], left=True)
-        sizes = np.linalg.norm(self._maps[choices, (~lost).astype(int)], axis=(-2, -1))
+        sizes = np.linalg.norm(self._chosen(lost, choices), axis=(-2, -1))
         first, power = int(np.abs(values).argmax()), 1 / self._times[choices].sum()
         radius = abs(values[first])
         error = 1e-15 * sizes.prod() / abs(np.vdot(left[:, first], right[:, first]))

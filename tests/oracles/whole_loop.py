@@ -52,6 +52,8 @@ class Settings:
     setpoints: Sequence[tuple[int, Array]]  # from when on which x_r is in force
     safe_input: Array  # before the first update
     predictions: int  # inputs in an actuation
+    update_timeout_ns: float  # age from which on the newest update is not used
+    timeout_input: str  # from then on: "safe" or "hold"
     watchdog: str  # "hold", "zero" or "model"
     watchdog_timeout_ns: int
     observer: Mapping[str, Array] | None  # first x̂; L, or P, Q and R of a Kalman filter
@@ -262,6 +264,7 @@ class Controller:
         self.s, self.rows, self.model = s, rows, Model(s)
         self.x_c, self.t_ns = (s.x0 if s.known_state else 0 * s.x0), 0
         self.has_state, self.newest = s.known_state, NONE
+        self.update_ns, self.u = 0, 0 * s.safe_input  # the newest update's time, the last input
 
     def update(self, number: int, event_ns: int, x: Array) -> None:
         """Reset x_c to an update; a late one is propagated from its event to the model's time."""
@@ -272,17 +275,24 @@ class Controller:
             "sequence": number, "t_ns": event_ns, "model_t_ns": t_ns, "x": x,
             "x_c_before": before, "x_c": self.x_c, "dropouts": number - self.newest - 1,
         })  # fmt: skip
-        self.has_state, self.newest = True, number
+        self.has_state, self.newest, self.update_ns = True, number, event_ns
 
-    def tick(self, k: int, t_ns: int) -> tuple[int, Array, Array]:
+    def tick(self, number: int, t_ns: int) -> tuple[int, Array, Array]:
         """Return an actuation: its model time, the inputs for it and the next ticks, and x_c."""
         self.x_c, self.t_ns = self.model.flow(self.x_c, self.t_ns, t_ns), t_ns
-        x_r, x, inputs = in_force(self.s.setpoints, t_ns), self.x_c, []
-        for _ in range(self.s.predictions):
-            inputs.append(self.model.input(x_r, x) if self.has_state else self.s.safe_input)
+        x_r, x, inputs = in_force(self.s.setpoints, t_ns), self.x_c, [self.u]
+        for k in range(self.s.predictions):
+            age_ns = t_ns + k * self.s.controller_period_ns - self.update_ns
+            if self.has_state and age_ns < self.s.update_timeout_ns:
+                inputs.append(self.model.input(x_r, x))
+            else:
+                holds = self.has_state and self.s.timeout_input == "hold"
+                inputs.append(inputs[-1] if holds else self.s.safe_input)
             x = self.model.towards(x_r, x, self.s.controller_period_ns)
+        inputs = inputs[1:]
+        self.u = inputs[0]
         self.rows["controller_step"].append({
-            "sequence": k, "t_ns": t_ns, "model_t_ns": t_ns, "x_c": self.x_c, "u": inputs[0],
+            "sequence": number, "t_ns": t_ns, "model_t_ns": t_ns, "x_c": self.x_c, "u": inputs[0],
         })  # fmt: skip
         return t_ns, np.array(inputs), self.x_c
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario

@@ -10,8 +10,8 @@ from scipy.linalg import expm
 
 from noack.core.core_library import core, ffi
 from noack.observers.observer_settings import observer_gain, unobservable_mode
-from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, tables
+from noack.protocol.roles import Output, Record
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from noack.scenario.resolution import assumed_model, resolve, steady_state, true_model
 from noack.scenario.scenario import Scenario

@@ -45,7 +45,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     SETTINGS,
 )
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.runtime_parameters import text_of

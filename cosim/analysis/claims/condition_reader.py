@@ -36,7 +36,6 @@ from cosim.record.run_events import updates_in
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import largest_sizes
-from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     CONTROLLER_DELIVERY,
@@ -50,7 +49,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     effective,
 )
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import GENERATION, LOOP_ROLES
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import allowed_conditions

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.impairments.loss_guarantee import LongestBurst, LossRule
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.conditions import ideal_conditions
@@ -100,13 +100,15 @@ class SampledSeries(NamedTuple):
 
         Of these series, the first value above any limit and the largest value are the same.
         """
+        if not len(self.value):
+            return self
+        early = self.t_s < since_s
         records = []
-        for part in (self.t_s < since_s, self.t_s >= since_s):
+        for part in (early, ~early) if early.any() else (slice(None),):
             t_s, value = self.t_s[part], self.value[part]
-            before = np.append(-np.inf, np.fmax.accumulate(value)[:-1]) if len(value) else value
-            records.append((t_s[value > before], value[value > before]))
-        (early_s, early), (late_s, late) = records
-        return SampledSeries(np.append(early_s, late_s), np.append(early, late))
+            above = value > np.append(-np.inf, np.fmax.accumulate(value)[:-1])
+            records.append((t_s[above], value[above]))
+        return SampledSeries(*map(np.concatenate, zip(*records, strict=True)))
 
 
 class PacketLosses(NamedTuple):

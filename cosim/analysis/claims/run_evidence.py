@@ -33,7 +33,7 @@ from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, a
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Matrix, Propagator, all_entries, row_norms, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import (
@@ -100,6 +100,11 @@ class Samples:
         return np.asarray(self.joined.t_ns * 1e-9)
 
     @cached_property
+    def x_norm(self) -> Reals:
+        """‖x‖, measured or estimated by the sensor, (k,)."""
+        return row_norms(self.joined.x)
+
+    @cached_property
     def with_x(self) -> NDArray[np.bool_]:
         """Where the plant's own state is known, (k,)."""
         if self.true_x is self.joined.x:
@@ -138,15 +143,15 @@ class RunEvidence:
         for part in aligned_parts(self.record) if self.part.offset else ():
             joined = part.aligned
             compared = joined.threshold > 0  # a periodic trigger compares nothing
-            below = np.flatnonzero(compared & (joined.threshold < self.rounding(joined.x)))
+            below = np.flatnonzero(compared & (joined.threshold < self.rounding(row_norms(joined.x))))
             if len(below):
                 why = "the threshold is below the rounding error of x at the set-point"
                 return VoidFrom(float(joined.t_ns[below[0]]) * 1e-9, why)
         return None
 
-    def rounding(self, x: Reals) -> Reals:
-        """Return the rounding error of states of the part, x (k, n), (k,)."""
-        return np.asarray(ROUNDING * (row_norms(x) + self.part.offset))
+    def rounding(self, x_norm: Reals) -> Reals:
+        """Return the rounding error of states of the part, from their norms, (k,) each."""
+        return np.asarray(ROUNDING * (x_norm + self.part.offset))
 
     @cached_property
     def facts(self) -> SampleFacts:

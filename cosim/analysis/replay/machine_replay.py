@@ -23,7 +23,6 @@ from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.machine_interface import GENERATION, Record, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -36,7 +35,7 @@ from noack.protocol.record_tables import (
     SETTINGS,
     entry_names,
 )
-from noack.protocol.topology import RECEIVES, SENDS
+from noack.protocol.roles import GENERATION, RECEIVES, SENDS, Record, Start
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ParameterChange, settings_of
 from noack.scenario.scenario import Scenario, loops_of
@@ -314,19 +313,18 @@ class SharedMachines:
     """
 
     def __init__(self, records: Sequence[RunRecord]) -> None:
-        self._loops = [
-            record for record in records if record.is_short and not any(map(record.count, SETTINGS))
-        ]
+        shared = [record for record in records if record.is_short and not any(map(record.count, SETTINGS))]
+        self._loops = [record.scenario for record in shared]
+        self._places = {record.number: place for place, record in enumerate(shared)}
 
     def place(self, record: RunRecord) -> int | None:
         """Return the place of a loop among the machines; None if they do not have it."""
-        numbers = [loop.number for loop in self._loops]
-        return numbers.index(record.number) if record.number in numbers else None
+        return self._places.get(record.number)
 
     @cached_method
     def of(self, role: str) -> LoopMachines:
         """Return the machines of a role."""
-        return _MACHINES[role]([loop.scenario for loop in self._loops], start=Start(0))
+        return _MACHINES[role](self._loops, start=Start(0))
 
 
 class MachineReplay:

@@ -4,6 +4,7 @@ Every message that the next process received must be bit-identical to one that a
 its replay. Messages that were lost in the network are not compared.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -33,7 +34,7 @@ from noack.protocol.record_tables import (
     SETTINGS,
     direction_of,
 )
-from noack.protocol.topology import ENDS, LOOP_ROLES
+from noack.protocol.roles import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import HEADER_ROW, MAGIC, Flow, datagram_bytes
 
 _RECEIVED = {
@@ -156,7 +157,7 @@ class _Hop:
         self._waiting: Rows | None = None
         self._newest = -1
         self._received = self._read = 0
-        self._run: np.void | None = None
+        self._run: tuple[int, int] | None = None
         """Version and run number of the datagrams."""
         self._compared = 0
         # Whether a message that was not sent, or not forwarded, is a difference is known at the
@@ -264,8 +265,8 @@ class _Hop:
         is_valid = headers["magic"] == MAGIC
         if self._run is None and is_valid.any():
             # The run number is random and recorded only here.
-            kinds, counts = np.unique(headers[is_valid][["version", "run_id"]], return_counts=True)
-            self._run = kinds[np.argmax(counts)]
+            counts = Counter(headers[is_valid][["version", "run_id"]].tolist())
+            self._run = max(sorted(counts), key=counts.__getitem__)
         sequences = np.where(is_valid, headers["sequence"].view(np.int64), -1)
         self._newest = int(max(self._newest, sequences.max(initial=-1)))
         places, known = self._places(sequences)
@@ -276,7 +277,7 @@ class _Hop:
             own = expected[known]
             own["magic"], own["flow"] = MAGIC, self._flow
             own["dimension"], own["loop"] = entries, self._loop
-            own["version"], own["run_id"] = (0, 0) if self._run is None else self._run.tolist()
+            own["version"], own["run_id"] = self._run or (0, 0)
             own["sequence"], own["t_ns"], own["error_level"] = sent[:, SEQUENCE], sent[:, TIME], sent[:, -1]
             expected[known] = own
         size_bytes = datagram_bytes(entries)

@@ -51,7 +51,7 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
-from noack.protocol.topology import ENDS, LOOP_ROLES
+from noack.protocol.roles import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import loop_of, setpoint_of
@@ -352,7 +352,9 @@ class SampleFactsReader:
         gaps = np.flatnonzero(started & ~common)
         gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
         until = t_s < self._until_s
-        both = np.concatenate([joined.x_s[until], joined.x_c[common & until]])
+        both = np.concatenate(
+            [joined.x_s.compress(until, axis=0), joined.x_c.compress(common & until, axis=0)]
+        )
         largest = float(np.abs(both[np.isfinite(both)]).max(initial=facts.largest_state))
         changes = joined.t_ns[np.flatnonzero(np.diff(joined.received, prepend=self._newest))]
         ends_ns = changes if self._fresh_ns is None else np.append(self._fresh_ns, changes)

@@ -43,7 +43,6 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_prediction import expected_loss
 from noack.plants.plant_settings import PlantSystem
 from noack.plants.systems.linearisation import NO_STATE, STEP_NS, linearise
-from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
@@ -52,7 +51,7 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
-from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.protocol.roles import FAILED, LOOP_ROLES, RECORDER, RESTART
 from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import loop_of
 from noack.scenario.runtime_parameters import text_of

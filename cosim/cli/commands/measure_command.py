@@ -21,7 +21,7 @@ with lazy_modules():
         trace_sources,
     )
     from noack.core import core_library
-    from noack.traces import trace_formats
+    from noack.traces import packet_trace
 
 
 class NetworkForm(StrEnum):
@@ -224,7 +224,7 @@ def _result(
         refuse(how, trace_sources.FILE_OPTIONS, "a live probe", "period_ns")
         return live_measurement.send_live(sources[0], live), f"probe of {sources[0]}"
     refuse(live, options, f"{sources[0]}, which is no address of a listener", "rate")
-    trace = trace_sources.read_source([*map(trace_formats.find_trace, sources)], how)
+    trace = trace_sources.read_source([*map(packet_trace.find_trace, sources)], how)
     return probe_ends.ProbeResult(trace, trace.notes, None), " ".join(sources)
 
 

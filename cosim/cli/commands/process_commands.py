@@ -20,7 +20,7 @@ with lazy_modules():
     from cosim.live import remote_access
     from cosim.simulation import helics_federate
     from netem import __main__ as emulator
-    from noack.protocol import topology
+    from noack.protocol import roles
 
 SessionOption = Annotated[str, opt.SESSION]
 
@@ -70,7 +70,7 @@ def record(
     return run_processes(
         source.load(),
         options,
-        spawn=(topology.RECORDER,),
+        spawn=(roles.RECORDER,),
         session=session,
         server=context.obj,
         listening=listening,

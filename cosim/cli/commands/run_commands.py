@@ -19,11 +19,11 @@ with lazy_modules():
     from cosim.analysis.summary import summary_model
     from cosim.interactive import draft
     from cosim.lab import lab_server
-    from cosim.live import remote_access, simulated_run
+    from cosim.live import remote_access
     from cosim.live.monitoring import progress, ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict
-    from cosim.simulation import continuous
-    from noack.runtime import control_messages, run_registry
+    from cosim.simulation import continuous, virtual_time
+    from noack.runtime import control_messages, control_plane
     from noack.scenario import link_load, resolution, runtime_parameters, scenario, scenario_file
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ def simulate(
     if trigger is opt.TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=options.json)
     with progress.simulation_bar(progress.error_console(), loaded.horizon_s) as bar:
-        ending = simulated_run.simulate_run(loaded, runs, bar)
+        ending = virtual_time.simulate_run(loaded, runs, bar)
     return finalize_run(ending, options)
 
 
@@ -268,7 +268,7 @@ def set_(
         noack set mansd 2 trigger.beta 0.3 --json   change M − 1 and β at once
     """
     changes = parsed(settings or ())
-    answer = run_registry.request_change(run_registry.find(session, run), changes)
+    answer = control_plane.request_change(control_plane.find_run(session, run), changes)
     if json:
         cli.print_json(answer.fields())
     elif changes:

@@ -24,7 +24,14 @@ with lazy_modules():
     from cosim.output import result_tables
     from cosim.studies.campaign import campaign_file, campaign_grid, campaign_report
     from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result
-    from cosim.studies.design import design_page, design_search, design_space, event_design, network_search
+    from cosim.studies.design import (
+        design_page,
+        design_search,
+        design_space,
+        event_design,
+        hold_strategies,
+        network_search,
+    )
     from cosim.studies.paper import paper_page, published_result
     from cosim.studies.paper import results as paper_results
     from noack.core import linear_systems
@@ -211,7 +218,9 @@ class NetworkOptions:
         cost: Largest cost ∫ xᵀQx + uᵀRu dt, as a multiple of the given loop's. With a period, that
             without losses; else the mean over draws.
         share: Most transmissions of events, as a multiple of the given loop's.
-        holds: Hold strategies to try: `model`, or `zoh` to hold the last input.
+        holds: What to try between two updates: `zero`, `zoh` to hold the last input, `model`, or
+            `predictions:N`: the model for N periods, then zero (`predictions:N:hold`: the last
+            input); `predictions`: N = 2, 4 and 8.
         effort: Number of loops that the search may try.
     """
 
@@ -221,16 +230,13 @@ class NetworkOptions:
     most: Annotated[int | None, Option(min=1, max=10_000)] = None
     cost: float = 1.2
     share: float = 1.0
-    holds: str = "model,zoh"
+    holds: str = "model,zoh,zero,predictions"
     effort: Annotated[int, Option(min=0)] = 1500
 
     def wish(
         self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]", bounds: "design_search.Bounds"
     ) -> "network_search.Wish":
         """Return what is asked for; raise CallerError if an option is wrong."""
-        modes = [mode.strip() for mode in self.holds.split(",")]
-        if not set(modes) <= set(network_search.MODES):
-            raise CallerError(f'--holds: {", ".join(network_search.MODES)}, not "{self.holds}"')
         if self.period is not None and not 1e-6 <= self.period <= 1e7:
             raise CallerError(f"--period: from 1e-6 to 1e7 seconds, not {self.period:g}")
         if not 0 < self.share < math.inf:
@@ -244,7 +250,7 @@ class NetworkOptions:
             cost=self.cost,
             bounds=bounds,
             weights=weights,
-            modes=[mode for mode in network_search.MODES if mode in modes],
+            holds=hold_strategies.read_holds(self.holds),
             effort=self.effort,
         )
 

@@ -24,10 +24,16 @@ from noack.core.process_limits import python_command
 from noack.protocol import ros2_messages as ros2
 from noack.protocol.record_tables import LOOP
 from noack.protocol.ros2_node import Node, Publisher
-from noack.runtime import run_registry
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.control_plane import RUNS, cause_of, header_of, open_session
-from noack.runtime.run_registry import OpenRun
+from noack.runtime.control_plane import (
+    RUNS,
+    OpenRun,
+    active_runs,
+    cause_of,
+    find_run,
+    header_of,
+    open_session,
+)
 from noack.scenario import scenario_file
 from noack.scenario.resolution import loop_of, resolve_run, resolved_loops, run_tables
 from noack.scenario.scenario import phases_ns
@@ -93,7 +99,7 @@ def bridge_run(run: OpenRun, node: Node) -> int:
                 return bridge.sent
             if time.monotonic() - looked_s > _LOOK_S:
                 looked_s = time.monotonic()
-                is_active = any(active.name == run.name for active in run_registry.active_runs())
+                is_active = any(active.name == run.name for active in active_runs())
             time.sleep(_POLL_S)
 
 
@@ -117,7 +123,7 @@ def wait_for_run(run_dir: Path, timeout_s: float) -> OpenRun:
     until_s = time.monotonic() + timeout_s
     while True:
         try:
-            return run_registry.find(run_dir=run_dir)
+            return find_run(run_dir=run_dir)
         except CallerError:
             if time.monotonic() > until_s:
                 raise

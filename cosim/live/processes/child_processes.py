@@ -26,7 +26,7 @@ from cosim.live.processes.fork_server import ENVIRONMENT, ForkedProcess, ForkSer
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import open_append
 from noack.core.process_limits import python_command
-from noack.protocol.topology import LOOP_ROLES, PLANT, RECORDER
+from noack.protocol.roles import LOOP_ROLES, PLANT, RECORDER
 from noack.runtime.join_ticket import Ticket
 from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario

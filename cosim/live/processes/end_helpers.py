@@ -66,6 +66,8 @@ class EndHelpers:
         if len(self._loops) <= _LOOPS_AT_ONCE:
             return
         self.start()
+        # This process keeps them, too.
+        self._due.append(partial(called, "cosim.record.run_record", "scenarios_of", run_dir))
         for first in self._loops[::_LOOPS_AT_ONCE]:
             block = self._loops[first:][:_LOOPS_AT_ONCE]
             self._due.append(partial(self._prepare_loops, run_dir, block))

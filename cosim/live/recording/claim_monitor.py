@@ -16,8 +16,8 @@ from cosim.record.record_source import rows_by_loop
 from cosim.record.run_events import GrowthMonitor
 from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
-from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import LOOP, SENSOR_MEASUREMENT
+from noack.protocol.roles import Notice
 from noack.scenario.resolution import resolved_loops, tables_of
 from noack.scenario.scenario import Scenario, phases_ns
 from noack.theory.certificates.conditions import allowed_conditions

@@ -28,7 +28,6 @@ from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.errors import ExitStatus, MachineError, PeerError
-from noack.protocol.machine_interface import BEGINNING, RESTART, Notice, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     LOOP,
@@ -36,7 +35,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     effective,
 )
-from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.protocol.roles import BEGINNING, LOOP_ROLES, RECORDER, RESTART, Notice, Start
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane, header_of

@@ -10,9 +10,8 @@ import numpy as np
 
 from cosim.record.run_record import Rows
 from noack.core.errors import PeerError
-from noack.protocol.machine_interface import GENERATION, Notice, Start
 from noack.protocol.record_tables import OWNER
-from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.protocol.roles import GENERATION, LOOP_ROLES, RECORDER, Notice, Start
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
 from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, lines_in, notice_number, notices_of, read_chunks
 from noack.runtime.telemetry import ReceivedRows

@@ -19,7 +19,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
-from matplotlib.ticker import LogFormatter, MaxNLocator
+from matplotlib.ticker import LogFormatter, MaxNLocator, ScalarFormatter
 
 from cosim.analysis.value_reduction import decimate
 from cosim.output.figures.figure_description import (
@@ -129,6 +129,8 @@ def _axes(figure: Figure, place: Place, beside: Axes | None = None) -> Axes:
     for letter, axis in (("x", place.panel.x), ("y", place.panel.y)):
         if axis.logarithmic:
             _make_logarithmic(axes, letter)  # type: ignore[arg-type]
+        else:
+            (axes.xaxis if letter == "x" else axes.yaxis).set_major_formatter(_Plain())
         if None not in axis.ends:
             _set_ends(axes, letter, axis)  # type: ignore[arg-type]
         if not axis.grid:
@@ -387,6 +389,14 @@ def _for_font(text: str) -> str:
 
 def _set_ends(axes: Axes, letter: Literal["x", "y"], described: Axis) -> None:
     (axes.set_xlim if letter == "x" else axes.set_ylim)(*described.ends)
+
+
+class _Plain(ScalarFormatter):
+    """Writes numbers as plain text: typesetting is slow. The fonts of LaTeX lack the minus sign."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        text = super().__call__(x, pos)
+        return text if layout().latex else text.removeprefix(r"$\mathdefault{").removesuffix("}$")
 
 
 class _Numbers(LogFormatter):

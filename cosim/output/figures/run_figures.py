@@ -387,6 +387,8 @@ def _input(record: RunRecord) -> FigureDescription:
     """Describe the inputs, each of which is held until the next."""
     names, table = record.loop.input_names, CONTROLLER_STEP
     title, caption = "Control input $u = K x_c$", "Control input u = K x_c, held between ticks."
+    if record.scenario.controller.update_timeout_s is not None:
+        title, caption = "Control input", "Input that the controller sends, held between ticks."
     if record.scenario.network.actuation is not None:
         table, title = PLANT_STEP, "Applied input"
         caption = "Input that the plant applied, also while actuations were missing."

@@ -31,7 +31,7 @@ from cosim.record.align import Reals
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import Scenario
 
 Flags = NDArray[np.bool_]

@@ -54,7 +54,7 @@ from cosim.output.viewer.table_feed import ViewFeed, log_level
 from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
 from noack.core.clock import NS_PER_S
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.resolution import loop_of, resolved_loops
 from noack.scenario.scenario import Scenario, loop_names, phases_ns
 

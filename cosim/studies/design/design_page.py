@@ -195,6 +195,8 @@ class DesignOutcome:
             "network": ("mansd", "constraints"),
             "trigger": ("policy", "period_s", "alpha_per_s", "beta"),
         }
+        if "update_timeout_s" in document["controller"]:
+            keys["controller"] = ("update_timeout_s", "timeout_input")
         tables = {
             table: {key: document[table][key] for key in table_keys if document[table].get(key, []) != []}
             for table, table_keys in keys.items()

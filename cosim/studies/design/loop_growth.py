@@ -48,17 +48,19 @@ class QuickLoop:
     ) -> None:
         A, B, K, H = matrices
         n, m = B.shape
-        self._times, self._m, size = times, m, 2 * (n + m)
+        self.times, self._m, size = times, m, 2 * (n + m)
         x, x_c, u, w = np.split(np.eye(size), [n, 2 * n, 2 * n + m])
         self._generator = x.T @ A @ x + x_c.T @ H @ x_c + x.T @ B @ u
         self._weight = x.T @ weights[0] @ x + u.T @ weights[1] @ u
-        self._latch, self._tick = np.vstack([x, x_c, w, w]), np.vstack([x, x_c, u, K @ x_c])
+        without_update = w if times.holds_input else 0 * w
+        self._latch = np.vstack([x, x_c, w, w])
+        self._ticks = [np.vstack([x, x_c, u, sent]) for sent in (K @ x_c, without_update)]
         self._x_c, self._arrived = slice(n, 2 * n), expm(H * (times.delay_ns / NS_PER_S)) @ x
-        self._flow = cache(self._exponential)
+        self._flow, self._lost = cache(self._exponential), cache(self._lost_period)
+        self._delivered = cache(self._delivered_period)
         self._z = np.eye(size), np.eye(size)
         if not times.delay_ns:  # just after a delivery x_c = x and w = u
             self._z = np.vstack([x, u]), np.vstack([x, x, u, u]) @ np.vstack([x, u]).T
-        self._periods = [self._period(slot) for slot in range(times.slots)]
 
     def _exponential(self, dt_ns: int) -> _Map:
         """Return the flow over dt (Van Loan, IEEE Trans. Autom. Control 23(3), 1978)."""
@@ -68,49 +70,59 @@ class QuickLoop:
         M = exponential[n:, n:]
         return _Map(M, M.T @ exponential[:n, n:])
 
-    def _between(self, from_ns: int, until_ns: int) -> _Map:
+    def _between(self, from_ns: int, until_ns: int, timeout_ns: int) -> _Map:
         """Return the map from a time to another; a tick at its end is excluded, a step at 0."""
-        times = self._times
+        split_ns = min(max(timeout_ns, from_ns), until_ns)
+        in_time = self._cycles(from_ns, split_ns, is_late=False)
+        if split_ns == until_ns:
+            return in_time
+        return self._cycles(split_ns, until_ns, is_late=True).after(in_time)
+
+    def _cycles(self, from_ns: int, until_ns: int, *, is_late: bool) -> _Map:
+        times = self.times
         cycle_ns = int(np.lcm(times.step_ns, times.tick_ns))
         cycles, rest_ns = divmod(until_ns - from_ns, cycle_ns)
-        remainder = self._occurrences(from_ns, from_ns + rest_ns)
-        square = self._occurrences(from_ns + rest_ns, from_ns + rest_ns + cycle_ns)
+        remainder = self._occurrences(from_ns, from_ns + rest_ns, is_late)
+        square = self._occurrences(from_ns + rest_ns, from_ns + rest_ns + cycle_ns, is_late)
         while cycles:
             if cycles & 1:
                 remainder = square.after(remainder)
             cycles, square = cycles >> 1, square.after(square)
         return remainder
 
-    def _occurrences(self, from_ns: int, until_ns: int) -> _Map:
-        times = self._times
-        first = -(-(from_ns - times.phase_ns) // times.tick_ns) * times.tick_ns + times.phase_ns
-        occurrences = [(t_ns, 1, self._tick) for t_ns in range(first, until_ns, times.tick_ns)]
-        steps = range((from_ns // times.step_ns + 1) * times.step_ns, until_ns + 1, times.step_ns)
-        occurrences += [(t_ns, 0, self._latch) for t_ns in steps]
+    def _occurrences(self, from_ns: int, until_ns: int, is_late: bool) -> _Map:
         none = np.zeros_like(self._generator)
         passed, now_ns = _Map(np.eye(len(none)), none), from_ns
-        for t_ns, _, matrix in sorted(occurrences, key=lambda occurrence: occurrence[:2]):
+        for t_ns, is_tick in self.times.occurrences(from_ns, until_ns):
+            matrix = self._ticks[is_late] if is_tick else self._latch
             passed = _Map(matrix, none).after(self._flow(t_ns - now_ns).after(passed))
             now_ns = t_ns
         return self._flow(until_ns - now_ns).after(passed)
 
-    def _period(self, slot: int) -> tuple[_Map, _Map]:
-        """Return the maps of a period whose update is lost, and of one whose update is not."""
-        from_ns = slot * self._times.period_ns
-        until_ns, arrival_ns = from_ns + self._times.period_ns, from_ns + self._times.delay_ns
-        first, second = self._between(from_ns, arrival_ns), self._between(arrival_ns, until_ns)
+    def _lost_period(self, slot: int, usable_ns: int) -> _Map:
+        """Return the map of a period whose update is lost; x_c is used for some time."""
+        from_ns = slot * self.times.period_ns
+        return self._between(from_ns, from_ns + self.times.period_ns, from_ns + usable_ns)
+
+    def _delivered_period(self, slot: int, usable_ns: int) -> _Map:
+        """Return the map of a period whose update is delivered; x_c before it is used for some time."""
+        from_ns = slot * self.times.period_ns
+        until_ns, arrival_ns = from_ns + self.times.period_ns, from_ns + self.times.delay_ns
+        first = self._between(from_ns, arrival_ns, from_ns + usable_ns)
+        second = self._between(arrival_ns, until_ns, from_ns + self.times.timeout_ns)
         arrived = first.M.copy()
         arrived[self._x_c] = self._arrived
-        return second.after(first), second.after(_Map(arrived, first.C))
+        return second.after(_Map(arrived, first.C))
 
     def cost(self, x0: Vector) -> float:
         """Return ∫ xᵀQx + uᵀRu dt from x(0) with every update delivered; infinite if unstable.
 
         The controller knows x(0), and the input is 0 until its first tick.
         """
-        round_map = self._periods[0][1]
-        for _, delivered in self._periods[1:]:
-            round_map = delivered.after(round_map)
+        usable_ns = self.times.usable_ns(1, self.times.delay_ns)
+        round_map = self._delivered(0, usable_ns)
+        for slot in range(1, self.times.slots):
+            round_map = self._delivered(slot, usable_ns).after(round_map)
         if not np.isfinite([round_map.M, round_map.C]).all() or not _radius(round_map.M) < 1 - 1e-9:
             return np.inf
         z0 = np.concatenate([x0, x0, np.zeros(2 * self._m)])
@@ -118,11 +130,12 @@ class QuickLoop:
 
     def maps(self, bursts: Sequence[Burst]) -> Matrix:
         """Return the maps of bursts between two deliveries, (k, d, d)."""
-        (rows, start), slots, maps = self._z, len(self._periods), []
+        (rows, start), times, maps = self._z, self.times, []
         for burst in bursts:
-            M = self._periods[burst.slot][1].M @ start
+            M = self._delivered(burst.slot, burst.usable_ns).M @ start
             for number in range(1, burst.losses + 1):
-                M = self._periods[(burst.slot + number) % slots][0].M @ M
+                usable_ns = times.usable_ns(number, times.period_ns)
+                M = self._lost((burst.slot + number) % times.slots, usable_ns).M @ M
             maps.append(rows @ M)
         return np.array(maps)
 

@@ -11,6 +11,7 @@ pattern of its guarantee is proven stable there.
    (Nelder and Mead). As soon as it is below 1, the loop is judged, and the search aims higher.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from cosim.output.figures.figure_description import Axis, FigureDescription, Ite
 from cosim.studies.design.design_page import DesignOutcome, figure_of, gain_text
 from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain
+from cosim.studies.design.hold_strategies import HOLDS, Hold, given_hold
 from cosim.studies.design.loop_growth import PatternGraph, QuickLoop
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -34,13 +36,12 @@ from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows, rows_of
-from noack.theory.margins.loss_margin import LossMargin, Stability, list_bursts
+from noack.theory.margins.loss_margin import LossMargin, Stability, list_bursts, without_timeout
+from noack.theory.margins.time_triggered_loop import LoopTimes
 from noack.trigger.periodic_trigger import PeriodicSettings
 
-Mode = Literal["model", "zoh"]
 Goal = Literal["network", "transmissions"]
 Progress = Callable[[float], None]
-MODES: tuple[Mode, ...] = ("model", "zoh")
 COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
 """Factors of R of the regulators that the search begins with."""
 _LONGER = 1.02
@@ -48,7 +49,6 @@ _LONGER = 1.02
 _RUNGS = 400
 _MOST_M = 16
 _MOST_POINTS = 60
-_HOLDS = {"model": "the model's input", "zoh": "hold"}
 _CAPTION = (
     "Growth of the worst loss pattern found, per period: a lower bound, quickly computed. Below 1 "
     "every pattern may be stable; the marks are where this is proven."
@@ -62,7 +62,7 @@ _UNSTABLE = 1e3
 class Candidate(NamedTuple):
     """A gain and what the controller does between updates."""
 
-    mode: Mode
+    hold: Hold
     K: Rows
 
 
@@ -97,7 +97,7 @@ class Wish:
     """Q and R of the cost; None: identities."""
     bounds: Bounds = field(default_factory=dict)
     """Upper limits of the certified bounds of a loop with events."""
-    modes: Sequence[Mode] = MODES
+    holds: Sequence[Hold] = tuple(itertools.chain(*HOLDS.values()))
     effort: int = 1500
     """Number of loops that the search without gradients may try."""
 
@@ -192,7 +192,7 @@ class NetworkSearch:
                 f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear; '
                 "--set 'plant.system={kind=\"linear\"}' designs for its model"
             )
-        scenario.coverage.require_exact()
+        without_timeout(scenario).coverage.require_exact()
         scenario.coverage.require_unchanging()
         if wish.bounds:
             raise CallerError("--bound: is for a loop with events, not for periodic updates")
@@ -211,35 +211,40 @@ class NetworkSearch:
         n, m = self.plant.n, self.plant.m
         self.weights = wish.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
-        self.original = Candidate(resolved.mode, rows_of(self.plant.K))
+        self.original = Candidate(given_hold(self.scenario), rows_of(self.plant.K))
         base = self.quick_loop(self.original, margin.longest_ns).cost(self.plant.x0)
         self.limit = wish.cost * base
         """Largest cost; infinite if the given loop is unstable without losses."""
         self.tried = self.judged = 0
-        self._graphs: dict[tuple[LossGuarantee, int], PatternGraph] = {}
+        self._graphs: dict[tuple[LossGuarantee, int, Hold, int], PatternGraph] = {}
 
     def quick_loop(self, candidate: Candidate, period_ns: int) -> QuickLoop:
         """Return the loop of a candidate in double precision."""
         plant, K = self.plant, np.array(candidate.K)
         H = plant.A_model + plant.B_model @ K
-        if candidate.mode == "zoh":
+        if candidate.hold.mode == "zoh":
             H = np.zeros_like(H)
-        times = self._times._replace(period_ns=period_ns)
-        return QuickLoop((plant.A, plant.B, K, H), times, self.weights)
+        return QuickLoop((plant.A, plant.B, K, H), self.times(candidate.hold, period_ns), self.weights)
 
-    def graph(self, rung: Rung) -> PatternGraph:
-        """Return the loss patterns of a rung."""
-        slots = self._times._replace(period_ns=rung.period_ns).slots
-        key = rung.guarantee, slots
+    def times(self, hold: Hold, period_ns: int) -> LoopTimes:
+        """Return the times of a loop with another hold strategy and period."""
+        times = self._times._replace(period_ns=period_ns)
+        return times._replace(timeout_ns=hold.timeout_ns(times), holds_input=hold.timeout_input == "hold")
+
+    def graph(self, rung: Rung, hold: Hold) -> PatternGraph:
+        """Return the loss patterns of a rung; those that were the worst ones depend on the hold."""
+        times = self.times(hold, rung.period_ns)
+        key = rung.guarantee, times.slots, hold, 0 if hold.timeout_s is None else rung.period_ns
         if key not in self._graphs:
-            self._graphs[key] = PatternGraph(list_bursts(rung.guarantee, slots))
+            self._graphs[key] = PatternGraph(list_bursts(rung.guarantee, times))
         return self._graphs[key]
 
     def growth(self, candidate: Candidate, rung: int) -> float:
         """Return a lower bound of the logarithm of the growth per period."""
         self.tried += 1
         setting = self.ladder[rung]
-        loop, graph = self.quick_loop(candidate, setting.period_ns), self.graph(setting)
+        loop = self.quick_loop(candidate, setting.period_ns)
+        graph = self.graph(setting, candidate.hold)
         return graph.growth(loop.maps(graph.bursts)).logarithm
 
     def cost(self, candidate: Candidate, rung: int) -> float:
@@ -276,8 +281,8 @@ class NetworkSearch:
         return scenario.model_copy(
             update={
                 "model": scenario.model.model_copy(update={"gain": candidate.K}),
-                "mode": candidate.mode,
                 "trigger": trigger,
+                **candidate.hold.changes(scenario, self._times._replace(period_ns=setting.period_ns)),
                 "network": scenario.network.model_copy(update=setting.network),
             }
         )
@@ -328,14 +333,16 @@ class NetworkSearch:
         """Return LQR gains of the model with all hold strategies."""
         plant, (Q, R) = self.plant, self.weights
         gains = [lqr_gain(plant.A_model, plant.B_model, Q, c * R) for c in COSTS_OF_INPUT]
-        return [_rounded(mode, K) for mode in self.wish.modes for K in gains]
+        return [_rounded(hold, K) for hold in self.wish.holds for K in gains]
 
     def run(self, progress: Progress = lambda share: None) -> tuple[Reached, Reached]:
         """Return what the given loop reaches, and the best loop found."""
         original = self.first()
-        self.tried, best, rung = 0, original.candidate, original.rung
+        self.tried, best, rung = 0, original.candidate, -1
+        if best.hold in self.wish.holds or best.hold.timeout_s is not None:  # no word has its timeout
+            rung = original.rung
         progress(0.1)
-        starts = [Candidate(mode, original.candidate.K) for mode in self.wish.modes]
+        starts = [Candidate(hold, original.candidate.K) for hold in self.wish.holds]
         starts += self.regulators()
         ranked = sorted(
             ((*self.climb(start, max(rung, 0)), start) for start in starts),
@@ -347,7 +354,10 @@ class NetworkSearch:
                 if stability is not None:
                     best, rung = candidate, reached
         progress(0.3)
-        pool = [best, *dict.fromkeys(candidate for _, _, candidate in ranked[:_STARTS])]
+        first_of_each = {candidate.hold: candidate for _, _, candidate in reversed(ranked)}
+        pool = [best] if rung >= 0 else []
+        pool += [candidate for _, _, candidate in ranked[:_STARTS]]
+        pool = list(dict.fromkeys([*pool, *first_of_each.values()]))
         share = max(self.wish.effort // len(pool), 1)
         for number, start in enumerate(pool):
             candidate = start
@@ -375,7 +385,7 @@ class NetworkSearch:
         scale = scaled_steps(K)
 
         def objective(steps: Vector) -> float:
-            candidate = _rounded(start.mode, (K.ravel() + scale * steps).reshape(K.shape))
+            candidate = _rounded(start.hold, (K.ravel() + scale * steps).reshape(K.shape))
             excess = self.excess(candidate, rung)
             if excess < -_SLACK:
                 raise _FoundError(candidate)
@@ -405,9 +415,9 @@ def scaled_steps(K: Matrix) -> Vector:
     return np.ravel(np.maximum(np.abs(K), 0.1 * np.abs(K).max(axis=1, keepdims=True)))
 
 
-def _rounded(mode: Mode, K: Matrix) -> Candidate:
+def _rounded(hold: Hold, K: Matrix) -> Candidate:
     """Return a candidate with six digits: what is judged is what is printed."""
-    return Candidate(mode, tuple(tuple(float(f"{entry:.6g}") for entry in row) for row in K))
+    return Candidate(hold, tuple(tuple(float(f"{entry:.6g}") for entry in row) for row in K))
 
 
 class _FoundError(Exception):
@@ -439,7 +449,7 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
             "the next one": _beyond(ladder, reached),
             "cost without losses": f"{reached.cost:.4g}",
             "share of measurements sent": f"{100 * sent(reached):.3g} %",
-            "between updates": _HOLDS[reached.candidate.mode],
+            "between updates": reached.candidate.hold.text,
             "K": gain_text(reached.candidate.K),
         }
 
@@ -447,7 +457,8 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         certified = None if reached.rung < 0 else ladder[reached.rung].number
         figures = {"certified": certified, "cost": reached.cost, "transmitted": sent(reached)}
         bounds = {"stability": _document(reached.stability), "beyond": _document(reached.beyond)}
-        return {**figures, **reached.candidate._asdict(), **bounds}
+        hold, K = reached.candidate
+        return {**figures, "mode": hold.mode, "hold": hold.text, "K": K, **bounds}
 
     verdict = f"stable for every loss pattern: {reach(original)} before, {reach(best)} after"
     if best.candidate == original.candidate:

@@ -24,8 +24,8 @@ from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.plants.linear import lane_following
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
-from noack.scenario.named_models import lane_following
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import Constants

@@ -26,8 +26,7 @@ from noack.impairments.markov_chain import NotPredictableError, Pattern
 from noack.impairments.words import OWN_TIME_NS, PERCENT, Quantity, brief_number, brief_percent, time_ns_text
 from noack.settings.section import Probability
 from noack.settings.user_files import NamedFile
-from noack.traces.packet_trace import LOST_NS, PacketTrace
-from noack.traces.trace_formats import find_trace, read_trace
+from noack.traces.packet_trace import LOST_NS, PacketTrace, find_trace, read_trace
 
 MOST_RECORDS = 1_000_000
 LONGEST_DELAY_NS = 3600 * NS_PER_S

@@ -1,1 +1,4 @@
-"""Support code of systems whose equations are compiled: the integrator, the cache."""
+"""What plants need beside their equations: linear models and enclosures of them, compiled code.
+
+``jump_integrator.py`` and ``code_cache.py`` are for systems whose equations are compiled.
+"""

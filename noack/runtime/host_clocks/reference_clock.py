@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from noack.core.clock import NS_PER_S, RunClock, clock_identity
 from noack.core.errors import PeerError
-from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import LOST_NS, clock_table
+from noack.protocol.roles import Notice, Record, Start
 from noack.runtime.address import Address, address_text
 from noack.runtime.host_clocks.clock_offset import SLEW_PPB, ClockOffset, Restart, RestartCause, SlewedClock
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient

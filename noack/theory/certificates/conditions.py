@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.disturbances.step import StepDisturbance
@@ -28,6 +29,7 @@ _AT_REST = 1e-9
 """The plant rests if |A x_r + B u_r| is at most this share of its larger term."""
 
 
+@cached_method
 def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkConditions:
     """Return the conditions of a scenario's schedule, with lateness up to ``late_periods`` steps.
 
@@ -119,6 +121,7 @@ def allowed_conditions(resolved: Scenario) -> NetworkConditions:
     return nominal_conditions(resolved, resolved.certificate.late_periods)
 
 
+@cached_method
 def ideal_conditions(resolved: Scenario) -> NetworkConditions:
     """The paper's conditions: a continuous trigger, a network and input without delay.
 

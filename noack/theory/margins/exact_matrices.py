@@ -1,7 +1,6 @@
 """Matrices with all rounding: enclosures in double precision, and 384 digits after the point.
 
 :class:`IntervalMatrix`: entries are known up to a radius. A computed product of k terms differs
-from numpy.typing import NDArray
 from the exact one by at most k u/(1 − k u) times the product of the absolute values, u = 2⁻⁵³, in
 whichever order it is summed (Higham, *Accuracy and Stability of Numerical Algorithms*, section
 3.1). The bounds themselves are rounded too; they are enlarged by more than that can be, and by more

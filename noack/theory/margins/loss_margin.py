@@ -20,7 +20,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.loss_guarantee import LongestBurst, LossAutomaton, LossGuarantee, outcome_letters
-from noack.scenario.resolution import loop_of, rule_of
+from noack.scenario.resolution import loop_of, rule_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import ACCURACY, MOST_VERTICES, joint_spectral_radius
 from noack.theory.margins.switched_system import Edge
@@ -49,6 +49,8 @@ class Burst(NamedTuple):
     target: int
     slot: int
     """Number of the step of the first delivered update, modulo the number of slots."""
+    usable_ns: int
+    """How long the update before the first one is used after the first one's transmission."""
     losses: int
     steps: int
     """Time between the two deliveries."""
@@ -62,7 +64,11 @@ class Burst(NamedTuple):
         return intervals
 
 
-def list_bursts(guarantee: LossGuarantee, slots: int = 1, times: EventTimes = EVERY_STEP) -> list[Burst]:
+def list_bursts(
+    guarantee: LossGuarantee,
+    loop: LoopTimes,
+    times: EventTimes = EVERY_STEP,
+) -> list[Burst]:
     """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
 
     Different states of the automaton after which the same is allowed are one node.
@@ -74,20 +80,21 @@ def list_bursts(guarantee: LossGuarantee, slots: int = 1, times: EventTimes = EV
     """
     automaton = LossAutomaton(guarantee)
     first = int(automaton.after_delivery(np.zeros(1, int))[0])
-    numbers, pending = {(first, 0): 0}, [(first, 0)]
+    begin = first, 0, loop.usable_ns(1, loop.delay_ns)
+    numbers, pending = {begin: 0}, [begin]
     bursts: dict[tuple[int, int, int], Burst] = {}
     while pending:
-        state, slot = pending.pop()
-        source, losses = numbers[state, slot], 0
+        node = state, slot, usable = pending.pop()
+        source, losses = numbers[node], 0
         while state >= 0:
             after = int(automaton.after_delivery(np.array([state]))[0])
             sent = losses + 1
             for steps in range(sent * times.shortest, sent * times.longest + 1):
-                target = (after, (slot + steps) % slots)
+                target = after, (slot + steps) % loop.slots, loop.usable_ns(steps, loop.delay_ns)
                 if target not in numbers:
                     numbers[target] = len(numbers)
                     pending.append(target)
-                burst = Burst(source, numbers[target], slot, losses, steps)
+                burst = Burst(source, numbers[target], slot, usable, losses, steps)
                 bursts.setdefault((source, numbers[target], steps), burst)
             if len(bursts) > MOST_EDGES:
                 raise CallerError(
@@ -221,7 +228,19 @@ class LossMargin:
         knows_start = resolved.network.initial_sync == "known_state"
         self._first_slot = int(knows_start) % self.loop.times.slots
         self.maps = cache(self.loop.map)
-        """The loop's maps by slot and number of lost updates."""
+        """The loop's maps by slot, use of the update before, and number of lost updates."""
+
+    def bursts(self, guarantee: LossGuarantee) -> list[Burst]:
+        """Return the graph of a guarantee; raise CallerError if it has too many edges."""
+        return list_bursts(guarantee, self.loop.times, self._times)
+
+    def edges(self, bursts: list[Burst]) -> list[Edge]:
+        """Return a graph with the loop's maps."""
+        maps = [self.maps(burst.slot, burst.usable_ns, burst.steps - 1) for burst in bursts]
+        return [
+            Edge(burst.source, burst.target, matrix, burst.steps)
+            for burst, matrix in zip(bursts, maps, strict=True)
+        ]
 
     def stability(
         self,
@@ -242,7 +261,7 @@ class LossMargin:
         Raises:
             CallerError: the loop grows so much between deliveries that products overflow.
         """
-        bursts = list_bursts(guarantee or self.guarantee, self.loop.times.slots, self._times)
+        bursts = self.bursts(guarantee or self.guarantee)
         begun_s = time.process_time()
         try:
             with np.errstate(over="raise"):
@@ -254,14 +273,10 @@ class LossMargin:
         return stability._replace(took_s=time.process_time() - begun_s)
 
     def _bounded(self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float) -> Stability:
-        edges = [
-            Edge(burst.source, burst.target, self.maps(burst.slot, burst.steps - 1), burst.steps)
-            for burst in bursts
-        ]
         # Short steps would need many vertices.
         vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
         radius = joint_spectral_radius(
-            edges,
+            self.edges(bursts),
             accuracy=accuracy / self._times.longest,
             most_vertices=vertices,
             threshold=1.0 if decide else None,
@@ -300,9 +315,24 @@ class LossMargin:
 def require_covered(resolved: Scenario) -> None:
     """Raise CallerError unless the loop is linear, transmits in time, and the watchdog is idle."""
     resolved.coverage.require_direct_inputs()
-    resolved.coverage.require_exact()
+    without_timeout(resolved).coverage.require_exact()
     resolved.coverage.require_constant()
     require_idle_watchdog(resolved)
+    if resolved.controller.update_timeout_s is None or resolved.controller.timeout_input == "hold":
+        return
+    setpoint, m = setpoint_of(resolved), resolved.model.dimensions[1]
+    at_rest = np.zeros(m) if setpoint is None else setpoint[1]
+    if not np.allclose(resolved.controller.safe_input or np.zeros(m), at_rest, rtol=1e-9, atol=0):
+        raise CallerError(
+            "controller.safe_input: with update_timeout_s the margin needs the input at rest, "
+            f"{at_rest.tolist()}"
+        )
+
+
+def without_timeout(scenario: Scenario) -> Scenario:
+    """Return a scenario whose controller uses every update, however old."""
+    controller = scenario.controller.model_copy(update={"update_timeout_s": None})
+    return scenario.model_copy(update={"controller": controller})
 
 
 def require_idle_watchdog(resolved: Scenario) -> None:
@@ -349,7 +379,13 @@ def loop_times(resolved: Scenario, unit_ns: int) -> LoopTimes:
             f"than the period between {pair}, {unit_ns / NS_PER_S:g} s"
         )
     return LoopTimes(
-        timing.plant_period_ns, timing.controller_period_ns, timing.controller_phase_ns, unit_ns, delay_ns
+        timing.plant_period_ns,
+        timing.controller_period_ns,
+        timing.controller_phase_ns,
+        unit_ns,
+        delay_ns,
+        timing.update_timeout_ns,
+        resolved.controller.timeout_input == "hold",
     )
 
 

@@ -5,13 +5,15 @@ Every T the sensor transmits x. The loop is that of the processes, with no step 
 * at kh the plant, ẋ = Ax + Bu, replaces its input u by the newest actuation w that it has received;
 * at its ticks φ, φ + τ, … the controller sends w = K x_c; it arrives at once, after a step of the
   plant at the same time;
+* a tick at least Θ after the time of the newest update sends w = 0 instead, or w once more;
 * between updates ẋ_c = H x_c; an update of time t_k that arrives at t_k + d sets x_c to
   e^{Hd} x(t_k). At one time, the order is: step of the plant, transmission, arrival, tick.
 
 A delivered update removes all knowledge of older ones. So the state of the loop just after the
 delivery, if d = 0, is z = (x, u): x_c = x and w = u there. If 0 < d < T, z is the state at the
 time of the transmission, (x, x_c); there u is K e^{−Hδ} x_c for the last tick, δ ago, unless there
-may be no tick since the last arrival; then z = (x, x_c, u).
+may be no tick since the last arrival, or Θ is finite; then z = (x, x_c, u), and the map depends on
+how much longer x_c may be used.
 """
 
 import math
@@ -20,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from noack.core.clock import NEVER_NS
 from noack.core.linear_systems import Matrix, balancing_exponents
 from noack.theory.margins.exact_matrices import (
     FixedPointMatrix,
@@ -44,6 +47,14 @@ class LoopTimes(NamedTuple):
     """T, between two transmissions; a multiple of h."""
     delay_ns: int
     """d, of an update; below T."""
+    timeout_ns: int = NEVER_NS
+    """Θ, from the time of the newest update on."""
+    holds_input: bool = False
+    """Whether w is then sent once more; else it is 0."""
+
+    def usable_ns(self, periods: int, most_ns: int) -> int:
+        """Return how much longer, up to some time, an update is used that is some periods old."""
+        return min(max(self.timeout_ns - periods * self.period_ns, 0), most_ns)
 
     @property
     def slots(self) -> int:
@@ -88,13 +99,14 @@ class TimeTriggeredLoop:
         self._x, self._x_c, self._K = slice(n), slice(n, 2 * n), fixed(K)
         self._inputs = slice(2 * n, size)
         self._latch = fixed(np.vstack([x, x_c, w, w]))
-        self._tick = fixed(np.vstack([x, x_c, u, K @ x_c]))
+        without_update = w if times.holds_input else 0 * w
+        self._ticks = [fixed(np.vstack([x, x_c, u, sent])) for sent in (K @ x_c, without_update)]
         self._flow = cache(lambda dt_ns: exponential(generator, dt_ns))
         self._advance = cache(self._advance_from_cycle)
-        self._states: dict[int, list[FixedPointMatrix]] = {}
-        """By slot: (x, x_c, u, w) after 1, 2, … periods, as functions of z."""
+        self._states: dict[tuple[int, int], list[FixedPointMatrix]] = {}
+        """By slot and use of x_c: (x, x_c, u, w) after 1, 2, … periods, as functions of z."""
         since_ns = [times.since_tick_ns(k * times.period_ns) for k in range(times.slots)]
-        follows = max(since_ns) <= times.period_ns - times.delay_ns
+        follows = max(since_ns) <= times.period_ns - times.delay_ns and times.timeout_ns == NEVER_NS
         if times.delay_ns == 0:
             self._kept = [*range(n), *range(2 * n, 2 * n + m)]  # x, u
         else:
@@ -103,17 +115,20 @@ class TimeTriggeredLoop:
         rows = np.vstack([of_x, of_x, of_u, of_u])[self._kept]
         self._given_units = rows.T - rows
 
-    def map(self, slot: int, losses: int) -> IntervalMatrix:
+    def map(self, slot: int, usable_ns: int, losses: int) -> IntervalMatrix:
         """Return the map of z from a delivered update to the next one.
 
         Args:
             slot: number of the first update, modulo the number of slots.
+            usable_ns: how long the update before it is used after its transmission, up to d.
             losses: number of lost updates between the two.
         """
-        return self._after(slot, losses).rows(self._kept).interval().scaled(self._given_units)
+        return self._after(slot, usable_ns, losses).rows(self._kept).interval().scaled(self._given_units)
 
     def period(self, slot: int, is_delivered: bool) -> IntervalMatrix:
         """Return the map of (x, x_c, u, w), in units of its own, from one transmission to the next.
+
+        Updates are used without a limit of time.
 
         Args:
             slot: number of the first transmission, modulo the number of slots.
@@ -123,30 +138,34 @@ class TimeTriggeredLoop:
             OverflowError: an entry is beyond double precision.
         """
         from_ns, start = slot * self.times.period_ns, fixed(np.eye(len(self._latch.entries)))
-        until_ns = from_ns + self.times.period_ns
-        after = self._updated(start, from_ns) if is_delivered else self._between(from_ns, until_ns)
-        return after.interval()
+        if is_delivered:
+            return self._updated(start, from_ns, NEVER_NS, NEVER_NS).interval()
+        return self._between(from_ns, from_ns + self.times.period_ns, NEVER_NS).interval()
 
-    def _after(self, slot: int, losses: int) -> FixedPointMatrix:
+    def _after(self, slot: int, usable_ns: int, losses: int) -> FixedPointMatrix:
         period_ns = self.times.period_ns
-        states = self._states.setdefault(slot, [])
+        timeout_ns = slot * period_ns + self.times.timeout_ns
+        states = self._states.setdefault((slot, usable_ns), [])
         while len(states) <= losses:
             from_ns = (slot + len(states)) * period_ns
             if states:
-                states.append(self._between(from_ns, from_ns + period_ns) @ states[-1])
+                states.append(self._between(from_ns, from_ns + period_ns, timeout_ns) @ states[-1])
             else:
-                states.append(self._updated(self._state(from_ns), from_ns))
+                state = self._state(from_ns)
+                states.append(self._updated(state, from_ns, from_ns + usable_ns, timeout_ns))
         return states[losses]
 
-    def _updated(self, state: FixedPointMatrix, from_ns: int) -> FixedPointMatrix:
+    def _updated(
+        self, state: FixedPointMatrix, from_ns: int, old_timeout_ns: int, timeout_ns: int
+    ) -> FixedPointMatrix:
         """Return the state a period after the transmission of a delivered update."""
         until_ns = from_ns + self.times.period_ns
         # Until the update arrives, x_c is that of older ones.
         sent, arrival_ns = state.rows(self._x), from_ns + self.times.delay_ns
-        state = self._between(from_ns, arrival_ns) @ state
+        state = self._between(from_ns, arrival_ns, old_timeout_ns) @ state
         updated = exponential(self._H, self.times.delay_ns) @ sent
         state = stacked(state.rows(self._x), updated, state.rows(self._inputs))
-        return self._between(arrival_ns, until_ns) @ state
+        return self._between(arrival_ns, until_ns, timeout_ns) @ state
 
     def _state(self, t_ns: int) -> FixedPointMatrix:
         """Return (x, x_c, u, w) as a function of z at a transmission."""
@@ -159,21 +178,25 @@ class TimeTriggeredLoop:
         u = self._K @ exponential(-self._H, self.times.since_tick_ns(t_ns)) @ z.rows(self._x_c)
         return stacked(z, u, u)
 
-    def _between(self, from_ns: int, until_ns: int) -> FixedPointMatrix:
+    def _between(self, from_ns: int, until_ns: int, timeout_ns: int) -> FixedPointMatrix:
         """Return the map of (x, x_c, u, w); a tick at its end is excluded, a step at its start."""
-        return self._advance(from_ns % self._cycle_ns, until_ns - from_ns)
+        split_ns = min(max(timeout_ns, from_ns), until_ns)
+        in_time = self._advance(from_ns % self._cycle_ns, split_ns - from_ns, False)
+        if split_ns == until_ns:
+            return in_time
+        return self._advance(split_ns % self._cycle_ns, until_ns - split_ns, True) @ in_time
 
-    def _advance_from_cycle(self, from_ns: int, duration_ns: int) -> FixedPointMatrix:
+    def _advance_from_cycle(self, from_ns: int, duration_ns: int, is_late: bool) -> FixedPointMatrix:
         cycles, rest_ns = divmod(duration_ns, self._cycle_ns)
-        last_part = self._occurrences(from_ns, from_ns + rest_ns)
+        last_part = self._occurrences(from_ns, from_ns + rest_ns, is_late)
         if not cycles:
             return last_part
-        return last_part @ power(self._occurrences(from_ns, from_ns + self._cycle_ns), cycles)
+        return last_part @ power(self._occurrences(from_ns, from_ns + self._cycle_ns, is_late), cycles)
 
-    def _occurrences(self, from_ns: int, until_ns: int) -> FixedPointMatrix:
+    def _occurrences(self, from_ns: int, until_ns: int, is_late: bool) -> FixedPointMatrix:
         result, now_ns = fixed(np.eye(len(self._latch.entries))), from_ns
         for t_ns, is_tick in self.times.occurrences(from_ns, until_ns):
-            occurrence = self._tick if is_tick else self._latch
+            occurrence = self._ticks[is_late] if is_tick else self._latch
             result = occurrence @ self._flow(t_ns - now_ns) @ result
             now_ns = t_ns
         return self._flow(until_ns - now_ns) @ result

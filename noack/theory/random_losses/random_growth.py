@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from noack.core.clock import NEVER_NS
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
@@ -75,6 +76,8 @@ def random_growth(resolved: Scenario, losses: LossProcess) -> RandomGrowth:
     if shortest_ns != longest_ns:
         raise NotPredictableError("the times between updates are not known")
     loop, times = loop_of(resolved), loop_times(resolved, longest_ns)
+    if times.timeout_ns < NEVER_NS:
+        raise NotPredictableError("controller.update_timeout_s: the input depends on the update's age")
     require_few_slots(times)
     exact = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
     try:

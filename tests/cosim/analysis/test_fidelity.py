@@ -16,9 +16,8 @@ import cosim.analysis.fidelity
 from cosim.analysis.fidelity import Fidelity, IncomparableError, compute_fidelity, fidelity_for_summary
 from cosim.analysis.summary.summary_model import NoFidelityPart
 from cosim.live.finalize import finalize
-from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import RunRecord
-from cosim.simulation.virtual_time import Network, simulate
+from cosim.simulation.virtual_time import Network, simulate, simulate_run
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load

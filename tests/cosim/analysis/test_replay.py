@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from cosim.analysis.replay import replay
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -28,7 +27,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     SETTINGS,
 )
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import GENERATION, LOOP_ROLES, RESTART, Start
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from tests.cosim.live.outage import Reborn, simulate_with

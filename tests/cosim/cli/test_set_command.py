@@ -13,7 +13,7 @@ from cosim.cli.commands.run_commands import parsed
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
 from noack.core.errors import CallerError
-from noack.runtime import run_registry
+from noack.runtime import control_plane
 from noack.runtime.join_ticket import Ticket, new_ticket
 from noack.scenario.parameter_changes import changed
 from noack.scenario.resolution import resolve
@@ -82,22 +82,25 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
     ticket: Ticket, capsys: pytest.CaptureFixture[str]
 ) -> None:
     second_ticket = new_ticket(ticket.scenario, Path("elsewhere"), launched=True)
-    with run_registry.registered_run(second_ticket, "lab"):
-        assert run_registry.find().run_dir == "elsewhere"
+    with control_plane.registered_run(second_ticket, "lab"):
+        assert control_plane.find_run().run_dir == "elsewhere"
         warn_of_other_runs()
         assert "elsewhere is active, too" in capsys.readouterr().err
-    with run_registry.registered_run(second_ticket, "lab"), run_registry.registered_run(ticket, None) as path:
+    with (
+        control_plane.registered_run(second_ticket, "lab"),
+        control_plane.registered_run(ticket, None) as path,
+    ):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
         assert ticket.key.hex() not in path.read_text()
         with pytest.raises(CallerError, match="several runs are active: "):
-            run_registry.find()
-        assert run_registry.find(session="lab").run_dir == "elsewhere"
-        assert run_registry.find(run_dir=Path(ticket.run_dir)).run_dir == ticket.run_dir
+            control_plane.find_run()
+        assert control_plane.find_run(session="lab").run_dir == "elsewhere"
+        assert control_plane.find_run(run_dir=Path(ticket.run_dir)).run_dir == ticket.run_dir
         with pytest.raises(CallerError, match="no run is active in session 'none'; active: "):
-            run_registry.find(session="none")
+            control_plane.find_run(session="none")
         with pytest.raises(CallerError, match="probability = nan: should be a finite number"):
-            run_registry.request_change(run_registry.find(session="lab"), parsed(["loss.p", "nan"]))
+            control_plane.request_change(control_plane.find_run(session="lab"), parsed(["loss.p", "nan"]))
     assert list(path.parent.iterdir()) == []
 
 

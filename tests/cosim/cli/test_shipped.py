@@ -29,7 +29,7 @@ def test_a_shipped_scenario_runs_from_the_command_line_and_in_the_library(name: 
         pytest.skip(str(error))
     checked = invoke("check", name)
     assert checked.exit_code == 0, checked.output
-    if scenario.loops:  # tests/cosim/test_scenarios.py and live/test_simulated_run.py run them
+    if scenario.loops:  # tests/cosim/test_scenarios.py and simulation/test_simulated_run.py run them
         return
     explored = noack.explore(scenario)
     assert explored.run.t_s[-1] == pytest.approx(0.2)

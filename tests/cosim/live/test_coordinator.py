@@ -12,7 +12,7 @@ import zenoh
 from cosim.live import coordinator, remote_access
 from cosim.live.coordinator import AdmissionPass, ChangeRequests, Coordinator
 from noack.core.errors import CallerError
-from noack.protocol.topology import LOOP_ROLES, RECORDER, ROLES
+from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import load
 from tests.approved import compare_lines, lines_of_error

@@ -20,7 +20,6 @@ from cosim.analysis.replay import replay
 from cosim.live.finalize import ReplayBeside, finalize, reopen
 from cosim.live.processes import end_helpers
 from cosim.live.processes.end_helpers import EndHelpers, PreparedEnding
-from cosim.live.simulated_run import simulate_run
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORDING_FILE,
@@ -33,7 +32,7 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import load_record, write_run
 from cosim.record.spool_conversion import finish_record
-from cosim.simulation.virtual_time import simulate
+from cosim.simulation.virtual_time import simulate, simulate_run
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter

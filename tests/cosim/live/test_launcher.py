@@ -14,7 +14,7 @@ from cosim.live.monitoring.run_watcher import Watcher
 from cosim.live.processes.child_processes import ChildProcesses, Failure
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus, MachineError
-from noack.protocol.topology import RECORDER, ROLES
+from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime.command_line import Signals
 from noack.runtime.join_ticket import new_ticket, ticket_file
 from noack.scenario.resolution import resolve

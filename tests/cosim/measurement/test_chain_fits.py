@@ -23,8 +23,7 @@ from cosim.measurement.loss_bursts import (
 )
 from cosim.measurement.network_measurement import Measurement, MeasurementOptions
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
-from noack.traces.packet_trace import packet_trace
-from noack.traces.trace_formats import read_trace
+from noack.traces.packet_trace import packet_trace, read_trace
 from tests.cosim.measurement.chains import chain_losses
 
 GILBERT = ChainRates(0.02, 0.2, 0.0, 1.0)

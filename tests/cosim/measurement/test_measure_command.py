@@ -35,8 +35,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.scenario.sections import NetworkSection
-from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
-from noack.traces.trace_formats import read_trace
+from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace, read_trace
 from tests.command_line import invoke
 from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
 from tests.fuzz.parsers.fates import SPECS, TABLE

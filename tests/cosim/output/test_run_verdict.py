@@ -14,9 +14,9 @@ import noack
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize, reopen
-from cosim.live.simulated_run import simulate_run
 from cosim.output.run_tables import short_numbers
 from cosim.output.run_verdict import print_outcome, remarks, state_text, verdict
+from cosim.simulation.virtual_time import simulate_run
 from tests.approved import compare_lines
 from tests.cosim.summaries import with_values
 from tests.shipped import shipped

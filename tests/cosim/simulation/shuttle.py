@@ -12,9 +12,8 @@ import numpy as np
 
 from cosim.record.run_record import RunRecord
 from netem.channel import RUN_ID, Datagram, Network, channel_of
-from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER, Fate
-from noack.protocol.topology import CHANGEABLE, ENDS, LOOP_ROLES, RECEIVES, RECORDER, receiver_of
+from noack.protocol.roles import CHANGEABLE, ENDS, LOOP_ROLES, RECEIVES, RECORDER, Notice, Record, receiver_of
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, loop_number
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.parameter_changes import change_notice, scheduled

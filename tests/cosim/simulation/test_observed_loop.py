@@ -18,8 +18,8 @@ from cosim.simulation.exact_simulation import setting_of
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.core.linear_systems import row_norms
-from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.roles import GENERATION, RESTART, Start
 from noack.scenario.resolution import resolve, steady_state
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate

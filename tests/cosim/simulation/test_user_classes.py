@@ -16,9 +16,8 @@ from cosim.analysis.replay import replay
 from cosim.analysis.summary.run_summary import linearisation, summarise
 from cosim.analysis.summary.summary_model import NoLinearisationPart
 from cosim.live.finalize import finalize
-from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import RunRecord, load_record
-from cosim.simulation.virtual_time import simulate
+from cosim.simulation.virtual_time import simulate, simulate_run
 from noack.controllers.controller_settings import ControlModel
 from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP

@@ -13,7 +13,7 @@ from cosim.analysis.summary.loop_statistics import unintended_losses
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.protocol.topology import RECEIVES, SENDS, receiver_of
+from noack.protocol.roles import RECEIVES, SENDS, receiver_of
 from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
@@ -95,6 +95,11 @@ def test_the_random_scenarios_have_every_feature() -> None:
             f"observer {scenario.observer and scenario.observer.kind}": True,
             f"watchdog {scenario.plant.watchdog.policy}": any(r["entry"] == NONE for r in steps),
             "prediction": any(row["entry"] > 0 for row in steps),
+            f"input after the timeout: {scenario.controller.timeout_input}": any(
+                row["t_ns"] - max((d["t_ns"] for d in delivered if d["model_t_ns"] <= row["t_ns"]), default=0)
+                >= scenario.timing.update_timeout_ns
+                for row in one.found["controller_step"]
+            ),
             "set point": any(scenario.controller.setpoint or ()),
             "changes": bool(scenario.changes),
             "acknowledgements": bool(one.found["sensor_acknowledgement"]),
@@ -110,7 +115,7 @@ def test_the_random_scenarios_have_every_feature() -> None:
             "damaged": "tag" in rejected_in(random_run(number)),
         }
         counts.update(feature for feature, found in has.items() if found)
-    assert len(counts) == 22, counts
+    assert len(counts) == 24, counts
     assert min(counts.values()) >= 4, counts
 
 

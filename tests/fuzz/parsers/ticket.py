@@ -10,8 +10,8 @@ from unittest.mock import patch
 from cosim.live import coordinator
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
-from noack.protocol.topology import ROLES
-from noack.runtime import join_ticket, run_registry
+from noack.protocol.roles import ROLES
+from noack.runtime import control_plane, join_ticket
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.private_folder import open_private
 from noack.scenario.parameter_changes import ChangeSchedule, settings_bytes, settings_of
@@ -189,7 +189,7 @@ def _find(data: bytes) -> None:
         with path.open() as lock:  # locked as by the launcher
             fcntl.flock(lock, fcntl.LOCK_EX)
             with refusal(str(path)):
-                run = run_registry.find()
+                run = control_plane.find_run()
                 assert all(isinstance(field, str) for field in run if field is not None)
 
 

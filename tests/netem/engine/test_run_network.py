@@ -19,8 +19,8 @@ from netem.relay_links import LinkSpec
 from netem.run_network import NetworkChannel, RunNetwork
 from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
+from noack.protocol.roles import BEGINNING, Notice, Record, Start
 from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.runtime.address import address_text
 from noack.runtime.real_time_loop import run_loop

@@ -18,7 +18,7 @@ from noack.impairments.kinds.replay import Replay
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_prediction import read_files
-from noack.traces.trace_formats import read_trace
+from noack.traces.packet_trace import read_trace
 from tests.oracles.link import Link
 
 COUNT = 400_000

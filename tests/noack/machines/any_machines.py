@@ -26,7 +26,7 @@ from noack.observers.luenberger import LuenbergerSettings
 from noack.observers.observer_settings import EstimationModel
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import SystemFailedError
-from noack.protocol.machine_interface import GENERATION, Notice, Output, Start
+from noack.protocol.roles import GENERATION, Notice, Output, Start
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import CodedPolicy, Policy, TriggerDecision
 from plant_server.plant import Disturbance, MeasurementModel, Plant, Watchdog
@@ -206,7 +206,8 @@ def controller(
         int(rng.integers(0, 10)) * MS if first_ns is None else first_ns, 10**12,
         LossGuarantee(tuple(chosen)), matrix(rng, scale, n) if chance(rng) else None,
         of.acknowledged, Start(int(chance(rng)), 33 * MS), matrix(rng, scale, m),
-        of.predictive, of.predictions, point,
+        of.predictive, of.predictions,
+        int(rng.integers(1, 60)) * MS if chance(rng) else NEVER_NS, chance(rng), point,
     )  # fmt: skip
 
 

@@ -14,8 +14,8 @@ from controller_node.controller import Controller
 from noack.core.core_library import ffi
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines, row_types
-from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import LOOP, tables
+from noack.protocol.roles import Record
 from noack.protocol.wire_format import Message
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import resolve

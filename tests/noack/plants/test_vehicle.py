@@ -9,10 +9,10 @@ from scipy.integrate import solve_ivp
 
 from noack.core.errors import CallerError
 from noack.plants import vehicle as compiled
+from noack.plants.linear import single_track_lane
 from noack.plants.plant_settings import OdeSystem
 from noack.plants.systems.linearisation import linearise
 from noack.plants.vehicle import VehicleSettings, equations, library
-from noack.scenario.named_models import single_track_lane
 from tests.noack.plants.motion import H_NS, motion
 
 X0 = np.array([0.2, -0.1, 0.05, 3.0])

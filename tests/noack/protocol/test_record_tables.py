@@ -7,7 +7,7 @@ from noack.protocol.record_tables import (
     SENSOR_ACKNOWLEDGEMENT,
     tables,
 )
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 
 
 def test_every_table_is_written_by_one_process_of_the_loop() -> None:

@@ -11,8 +11,7 @@ import numpy as np
 from controller_node.controller import controllers_of
 from noack.core.clock import RunClock
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.machine_interface import Notice, Record
-from noack.protocol.topology import SENDS
+from noack.protocol.roles import SENDS, Notice, Record
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from noack.runtime.live_driver import LiveDriver, LoopChannel
 from noack.runtime.udp_sockets import bind

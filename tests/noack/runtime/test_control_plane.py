@@ -18,7 +18,7 @@ import noack.runtime.control_plane
 import noack.runtime.run_process
 from cosim.live.coordinator import Coordinator
 from noack.core.errors import NoAnswerError, PeerError
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.command_line import Signals
 from noack.runtime.control_messages import RunStart, parse_message
 from noack.runtime.control_plane import RUNS, ControlPlane, cause_of, label, run_name

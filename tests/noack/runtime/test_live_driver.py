@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from noack.core.core_library import core
-from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.roles import Record
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.live_driver import LiveDriver
 from tests.noack.runtime.live_loops import HOUR_NS, Live, measurement, plain, received, scenario

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from noack.core.clock import RunClock
-from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.roles import Notice, Record
 from noack.runtime import real_time_loop
 from noack.runtime.real_time_loop import RecordSink, _fifo, run_loop
 

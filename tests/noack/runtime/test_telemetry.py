@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.core.errors import MachineError, NoAnswerError
-from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.roles import Notice, Record
 from noack.runtime import telemetry
 from noack.runtime.spool import NOTICES, SpoolWriter, kept_run_name, read_chunks
 from noack.runtime.telemetry import OwnSpool, ReceivedRows, TelemetryBuffer, deliver_report, first_row

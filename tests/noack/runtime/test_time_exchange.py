@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
-from noack.protocol.machine_interface import BEGINNING, Notice, Record
 from noack.protocol.record_tables import LOST_NS
+from noack.protocol.roles import BEGINNING, Notice, Record
 from noack.protocol.wire_format import Rejection
 from noack.runtime.address import Address
 from noack.runtime.host_clocks.clock_offset import ClockOffset

@@ -1,6 +1,7 @@
 """From a scenario to a run: draws, matrices, set points; changes of runtime parameters."""
 
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ from hypothesis import strategies as st
 from noack.core.errors import CallerError
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.plants.linear import lane_following
 from noack.protocol.record_tables import CHANGE_BYTES
-from noack.scenario.named_models import lane_following
 from noack.scenario.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
@@ -205,3 +206,19 @@ def test_changes_announced_out_of_order_are_applied_in_order_of_time(scenario: S
     assert schedule.next_ns > 10**18
     caps = [one.network.mansd for one in schedule.between(0, 150)]
     assert caps == [2, 5]
+
+
+def test_results_that_are_kept_with_a_scenario_are_no_part_of_it() -> None:
+    """Copies with other keys, comparisons and pickles do not see what was computed before."""
+    path = SCENARIOS / "lane_following.toml"
+    asked, other = resolve(load(path)), resolve(load(path))
+    for scenario in (asked, other):  # arrays, which == does not compare
+        loop_of(scenario)
+        assert scenario.network.link.mansd == 4
+    assert loop_of(asked) is loop_of(asked)
+    assert asked == other == pickle.loads(pickle.dumps(asked))
+    plant = asked.plant.model_copy(update={"initial_state": (1.0, 2.0, 3.0, 4.0)})
+    moved = asked.model_copy(update={"plant": plant})
+    assert loop_of(moved).x0.tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert moved != asked
+    assert asked.network.model_copy(update={"mansd": 7}).link.mansd == 7

@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[3]
 PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'
 DWELL = '{policy="dwell", interval_s=0.11, rule={policy="absolute", delta=1}}'
 DEADLINE = f'{{policy="deadline", interval_s=0.3, rule={DWELL}}}'
+HOLDS = 'controller.timeout_input="hold"'
 DELAYED = 'network.impairments=[{kind="delay", delay_s=0.0333}]'
 
 
@@ -39,6 +40,14 @@ def scenario(name: str, *settings: str) -> Scenario:
         ("double_integrator", ("controller.rate_hz=40", "controller.phase=0.3")),
         ("double_integrator", ("plant.measure_every=7", "controller.phase=0")),
         ("lane_following", ("controller.phase=0", "controller.rate_hz=125", DELAYED)),
+        ("double_integrator", ("mode=zoh", "controller.update_timeout_s=0.1")),
+        ("double_integrator", ("controller.update_timeout_s=0.25", HOLDS)),
+        ("double_integrator", ("controller.update_timeout_s=0.21", HOLDS, DELAYED)),
+        ("lane_following", ("controller.update_timeout_s=0.11", "controller.rate_hz=125", DELAYED)),
+        (
+            "lane_following",
+            ("mode=zoh", "controller.update_timeout_s=0.133", "controller.rate_hz=40", DELAYED),
+        ),
     ],
 )
 def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -> None:
@@ -66,7 +75,8 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
 
     slots = margin.loop.times.slots
     for before, one, following in zip(delivered[1:], delivered[2:], delivered[3:], strict=False):
-        map_ = margin.loop.map(int(one % slots), int(following - one - 1)).middle
+        usable_ns = margin.loop.times.usable_ns(int(one - before), delay_ns)
+        map_ = margin.loop.map(int(one % slots), usable_ns, int(following - one - 1)).middle
         expected = state(following, one)
         np.testing.assert_allclose(
             map_ @ state(one, before), expected, rtol=0, atol=1e-11 * np.abs(expected).max()

@@ -21,8 +21,14 @@ from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from noack.traces.capture_packets import CapturedFlow, captured_packets, find_udp
 from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
 from noack.traces.irtt_trace import read_irtt
-from noack.traces.packet_trace import MAX_PACKETS, PacketTrace, envelope_slope, packet_trace, relative_delays
-from noack.traces.trace_formats import read_trace
+from noack.traces.packet_trace import (
+    MAX_PACKETS,
+    PacketTrace,
+    envelope_slope,
+    packet_trace,
+    read_trace,
+    relative_delays,
+)
 from tests.approved import compare_lines, lines_of_error
 from tests.oracles.capture_files import LINKS, Sent, pcap_of, pcapng_of
 

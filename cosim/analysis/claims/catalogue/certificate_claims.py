@@ -63,7 +63,7 @@ def estimation_error(
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     here, void = samples.with_x, run.violation_of(certificate)
     t_s = samples.t_s[here]
-    errors = row_norms((samples.joined.x[here] - samples.true_x[here]) @ weight.T)
+    errors = row_norms((samples.joined.x - samples.true_x).compress(here, axis=0) @ weight.T)
     formula = envelope_formula("‖x̂ − x‖", certificate, "estimation_error")
     shares = upper_shares(errors, certificate.estimation_error(t_s))
     return Findings(Bound(formula, t_s, shares, void, constants.estimation_error))
@@ -86,7 +86,7 @@ def sensor_error(
 ) -> Findings:
     """‖e_s‖_W before each reset."""
     formula = envelope_formula("‖e_s‖", certificate, "overshoot")
-    slack = run.rounding(samples.joined.x)
+    slack = run.rounding(samples.x_norm)
     shares = upper_shares(samples.joined.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void = run.violation_of(certificate)
     return Findings(Bound(formula, samples.t_s, shares, void, constants.overshoot))
@@ -100,7 +100,7 @@ def state(
     formula = envelope_formula("‖x‖", certificate, "state")
     here, values = samples.with_x, certificate.state(samples.t_s)
     slack = ROUNDING * run.part.offset
-    shares = upper_shares(row_norms(samples.true_x[here]), values[here] + slack)
+    shares = upper_shares(row_norms(samples.true_x.compress(here, axis=0)), values[here] + slack)
     void = run.violation_of(certificate)
     return Findings(
         Bound(formula, samples.t_s[here], shares, void, constants.state),
@@ -116,7 +116,7 @@ def region(
     if certificate.region is None:
         return Findings()
     here, limits = samples.with_x, np.array(certificate.region.x)
-    shares = (np.abs(samples.true_x[here]) / limits).max(axis=1)
+    shares = (np.abs(samples.true_x.compress(here, axis=0)) / limits).max(axis=1)
     names = run.record.loop.state_names
     formula = ", ".join(f"|{name}| ≤ {limit:.4g}" for name, limit in zip(names, limits, strict=True))
     return Findings(Bound(formula, samples.t_s[here], shares, run.violation_of(certificate)))
@@ -133,8 +133,8 @@ def state_from_events(
     most = bounds.state_deviation(t_s, since.age_s, run.missing_events(samples, since, bounds))
     predicted = row_norms(since.predicted)
     here = samples.with_x & ~np.isnan(since.age_s)
-    deviation = row_norms(samples.true_x[here] - since.predicted[here])
-    shares = upper_shares(deviation, most[here] + run.rounding(since.predicted[here]))
+    deviation = row_norms((samples.true_x - since.predicted).compress(here, axis=0))
+    shares = upper_shares(deviation, most[here] + run.rounding(predicted[here]))
     formula = "‖x − e^((A+BK)(t−t_k)) x(t_k)‖ ≤ ∫‖e^((A+BK)s) B‖ ‖u − Kx‖ds, since the event t_k"
     values = np.fmin(predicted + most, certificate.state(t_s))
     return Findings(

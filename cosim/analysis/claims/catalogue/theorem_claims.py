@@ -16,7 +16,7 @@ from cosim.analysis.claims.claim_definition import (
     upper_shares,
 )
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
-from noack.core.linear_systems import Propagator, row_norms
+from noack.core.linear_systems import Propagator
 
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
 _COMPLETE = "a complete record"
@@ -124,6 +124,6 @@ def theorem_2_state(run: RunEvidence, samples: Samples) -> Findings:
     if not run.record.scenario.coverage.knows_state:
         return Findings(None, envelope)
     slack = ROUNDING * run.part.offset
-    shares = upper_shares(row_norms(samples.joined.x), values + slack)
+    shares = upper_shares(samples.x_norm, values + slack)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
     return Findings(Bound(formula, samples.t_s, shares, run.paper_violation), envelope)

@@ -23,7 +23,6 @@ from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.protocol.machine_interface import Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     NO_SEQUENCE,
@@ -32,7 +31,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES, Start
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load

@@ -26,7 +26,7 @@ from noack.protocol.record_tables import (
     OWNER,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import MS, Make, event_s, without

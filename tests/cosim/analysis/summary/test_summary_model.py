@@ -22,8 +22,8 @@ from cosim.output.run_verdict import print_outcome
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
-from noack.protocol.machine_interface import GENERATION, RESTART
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
+from noack.protocol.roles import GENERATION, RESTART
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed as altered

@@ -25,9 +25,8 @@ from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_record
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import MachineError
-from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.protocol.roles import BEGINNING, GENERATION, LOOP_ROLES, RECORDER, Start
 from noack.runtime.control_messages import RunProgress, parse_message
 from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
 from noack.scenario.resolution import resolve, run_tables

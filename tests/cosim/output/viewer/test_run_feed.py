@@ -14,8 +14,8 @@ from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun
 from cosim.simulation.virtual_time import simulate_loops
-from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NETEM_PACKET, PACKET_HEAD_BYTES, Fate, tables
+from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.scenario.resolution import loop_of
 from tests.cosim.live.recording.test_claim_monitor import live_rows

@@ -257,7 +257,7 @@ def simulated(number: int) -> RunRecord:
         (content, ("observer", "changes")),
         (content["plant"], ("disturbances", "measurement", "watchdog")),
         (content["network"], ("protocol", "acknowledgements", "actuation")),
-        (content["controller"], ("setpoint", "safe_input", "predictions")),
+        (content["controller"], ("setpoint", "safe_input", "predictions", "update_timeout_s")),
     ):
         for key in keys:
             section.pop(key, None)

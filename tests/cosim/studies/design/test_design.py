@@ -21,7 +21,7 @@ from cosim.studies.design.design_search import DesignLimits, DesignResult, desig
 from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
-from noack.scenario.named_models import lane_following
+from noack.plants.linear import lane_following
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.conditions import ideal_conditions

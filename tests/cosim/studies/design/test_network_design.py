@@ -5,6 +5,7 @@
 
 import json
 import shlex
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,19 +16,22 @@ import pytest
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.design.design_page import DesignOutcome
 from cosim.studies.design.event_design import Certified, EventSearch, design_for_network, event_outcome
+from cosim.studies.design.hold_strategies import read_holds
 from cosim.studies.design.loop_growth import PatternGraph
 from cosim.studies.design.network_search import NetworkSearch, Reached, Wish, periodic_outcome
 from noack.impairments.loss_guarantee import LossesInWindow
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify_box
-from noack.theory.margins.loss_margin import LossMargin, list_bursts
+from noack.theory.margins.loss_margin import LossMargin
 from tests.approved import compare_lines
 from tests.command_line import invoke
 from tests.shipped import shipped
 
 ROOT = Path(__file__).parents[4]
+ZERO = "mode=zoh", "controller.update_timeout_s=0.252"
 LINEAR = 'plant.system={kind="linear"}'
 PERIOD_S = 0.25
 
@@ -62,6 +66,14 @@ def searched_events(given: Scenario, wish: Wish, seed: int) -> FoundEvents:
     return FoundEvents(search, *loops, event_outcome(search, *loops))
 
 
+def final_size(scenario: Scenario, pattern: Sequence[bool]) -> float:
+    """‖x‖ at the end of a simulated run of the processes under a pattern, repeated."""
+    resolved = resolve(scenario.model_copy(update={"horizon_s": 120.0}))
+    numbers = iter(range(100_000))
+    run = simulate(resolved, lambda data, now_ns: 0 if pattern[next(numbers) % len(pattern)] else None)
+    return float(np.linalg.norm(run["plant_step"]["x"][-1]))
+
+
 @pytest.fixture(scope="module")
 def pole() -> Found:
     """The pole on a cart, by regulators alone."""
@@ -76,19 +88,11 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
     assert beyond is not None
     assert beyond.verdict == "destabilised"
     more = pole.search.scenario_of(pole.best.candidate, pole.best.rung + 1)
-
-    def final(pattern: Sequence[bool]) -> float:
-        """‖x‖ at the end of a simulated run of the processes under a pattern, repeated."""
-        resolved = resolve(more.model_copy(update={"horizon_s": 120.0}))
-        numbers = iter(range(100_000))
-        run = simulate(resolved, lambda data, now_ns: 0 if pattern[next(numbers) % len(pattern)] else None)
-        return float(np.linalg.norm(run["plant_step"]["x"][-1]))
-
     kept = pole.best.stability
     assert kept is not None
-    assert final(kept.pattern) < 1e-3
-    assert final((True, False, False, True, False)) < 1e-3
-    assert final(beyond.pattern) > 1e3
+    assert final_size(more, kept.pattern) < 1e-3
+    assert final_size(more, (True, False, False, True, False)) < 1e-3
+    assert final_size(more, beyond.pattern) > 1e3
 
 
 @pytest.mark.parametrize(
@@ -96,8 +100,9 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
     [
         ("lane_periodic", (), Wish(effort=0, most=8)),
         ("lane_periodic", (), Wish(effort=0, window=8)),
-        ("unstable_pendulum", (), Wish(effort=200, period_s=PERIOD_S, modes=("model",))),
-        ("unstable_pendulum", ("mode=zoh",), Wish(effort=60, period_s=PERIOD_S, modes=("zoh",))),
+        ("unstable_pendulum", (), Wish(effort=200, period_s=PERIOD_S, holds=read_holds("model"))),
+        ("unstable_pendulum", ("mode=zoh",), Wish(effort=60, period_s=PERIOD_S, holds=read_holds("zoh"))),
+        ("unstable_pendulum", ZERO, Wish(effort=60, period_s=PERIOD_S, holds=read_holds("zero"))),
         ("double_integrator", ("network.mansd=2",), Wish("transmissions", period_s=1, effort=60)),
     ],
 )
@@ -125,14 +130,19 @@ def test_the_search_is_deterministic() -> None:
 
 def test_quick_bounds_are_those_of_the_exact_maps() -> None:
     settings = ("network.impairments=[{kind='delay', delay_s=0.0333}]", "controller.rate_hz=40")
-    for more in ((), settings, (*settings, "mode=zoh")):
+    timeouts = [
+        ("mode=zoh", "controller.update_timeout_s=0.31"),
+        (*settings, "controller.update_timeout_s=0.65", 'controller.timeout_input="hold"'),
+        (*settings, "controller.update_timeout_s=0.62", "controller.phase=0.9"),
+    ]
+    for more in ((), settings, (*settings, "mode=zoh"), *timeouts):
         given = shipped("double_integrator", *more)
         search = NetworkSearch(given, Wish(period_s=0.31, most=5))
         exact = LossMargin(resolve(search.scenario))
-        bursts = list_bursts(search.ladder[4].guarantee, exact.loop.times.slots)
+        bursts = exact.bursts(search.ladder[4].guarantee)
         quick = search.quick_loop(search.original, exact.longest_ns).maps(bursts)
-        maps = np.array([exact.maps(one.slot, one.losses).middle for one in bursts])
-        if not more:
+        maps = np.array([exact.maps(one.slot, one.usable_ns, one.losses).middle for one in bursts])
+        if not more or more == timeouts[0]:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
         stability = exact.coarse_bounds(search.ladder[4].guarantee)
         lower = np.exp(PatternGraph(bursts).growth(quick).logarithm)
@@ -159,6 +169,31 @@ def test_the_written_scenario_is_checked_and_decided_as_claimed(tmp_path: Path) 
     pasted = tmp_path / "pasted.toml"
     pasted.write_text(found["lines"])
     assert f"gain = [\n  {list(found['best']['K'][0])},\n]".replace("[[", "[") in found["lines"]
+
+
+@pytest.mark.parametrize(
+    ("word", "mode", "timeout_s", "timeout_input"),
+    [
+        ("zero", "zoh", 0.252, "safe"),
+        ("predictions:2", "model", 0.502, "safe"),
+        ("predictions:1:hold", "model", 0.252, "hold"),
+    ],
+)
+def test_each_hold_strategy_is_written_decided_and_run_as_claimed(
+    word: str, mode: str, timeout_s: float, timeout_input: str
+) -> None:
+    """Repeated patterns of the M that is proven vanish in a run, one of the next M grows."""
+    scenario = shipped("unstable_pendulum", "mode=zoh", "controller.safe_input=[0.1]")
+    found = searched(scenario, Wish(period_s=PERIOD_S, effort=0, holds=read_holds(word), cost=50))
+    best, written = found.best, validate(tomllib.loads(found.shown.written()), "written")
+    assert best.candidate.hold in read_holds(word)
+    assert (written.mode, written.controller.update_timeout_s) == (mode, timeout_s)
+    assert (written.controller.timeout_input, written.controller.safe_input) == (timeout_input, None)
+    assert LossMargin(resolve(written)).coarse_bounds().verdict == "stable"
+    assert best.stability is not None
+    assert best.beyond is not None
+    assert final_size(written, best.stability.pattern) < 0.3
+    assert final_size(written, best.beyond.pattern) > 1e2
 
 
 @pytest.fixture(scope="module")

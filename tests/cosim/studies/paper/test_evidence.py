@@ -16,7 +16,7 @@ from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.paper import paper_page
 from cosim.studies.paper.paper_evidence import Numbers, evidence, resolved_draw
 from cosim.studies.paper.paper_page import _rounded, render
-from noack.scenario.named_models import lane_following
+from noack.plants.linear import lane_following
 from noack.scenario.resolution import loop_of
 from tests.command_line import invoke
 

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
+from scipy.optimize import minimize
 
 from cosim.studies.paper.published_result import stored
-from cosim.studies.paper.results import NAMES, demirel, named, reproduce, selivanov_fridman
+from cosim.studies.paper.results import NAMES, demirel, named, reproduce, selivanov_fridman, umsonst_barbosa
 from noack.core.errors import ExitStatus
 from tests.command_line import invoke
 from tests.pages import ROOT
@@ -91,3 +92,52 @@ def test_the_scaled_eigenvalue_is_that_of_the_matrix() -> None:
     matrix = selivanov_fridman.symmetric(blocks)
     assert selivanov_fridman.smallest_eigenvalue(matrix) == pytest.approx(0.5)  # 1 − 3/√(4·9)
     assert selivanov_fridman.smallest_eigenvalue(-one) < 0
+
+
+@pytest.fixture(scope="module")
+def optimisation() -> umsonst_barbosa.Optimisation:
+    return umsonst_barbosa.Optimisation(umsonst_barbosa.cart_pole())
+
+
+def test_predicted_inputs_are_the_best_within_the_limits(optimisation: umsonst_barbosa.Optimisation) -> None:
+    """Against another solver, with the cost and the limits written out step by step."""
+    plant, N = optimisation.plant, umsonst_barbosa.N
+    most = plant.most_x - [plant.tube(optimisation.K, unit) for unit in np.eye(4)]
+    most_u = plant.most_u - plant.tube(optimisation.K, optimisation.K[0])
+
+    def states(v: np.ndarray, start: np.ndarray) -> np.ndarray:
+        z = [start]
+        for u in v[:N]:
+            z.append(plant.A @ z[-1] + plant.B[:, 0] * u)
+        return np.array(z)
+
+    def room(v: np.ndarray, start: np.ndarray) -> np.ndarray:
+        return np.append(np.ravel(most - np.abs(states(v, start)[1:])), most_u - np.abs(v[:N]))
+
+    def cost(v: np.ndarray, start: np.ndarray) -> float:
+        off = states(v, start) - v[N] * np.eye(4)[0]
+        steps = np.einsum("ki,ij,kj", off[:-1], plant.Q, off[:-1]) + plant.R[0, 0] * v[:N] @ v[:N]
+        target = 10 * optimisation.P[0, 0] * (v[N] - umsonst_barbosa.TARGET_M) ** 2
+        return float(steps + off[-1] @ optimisation.P @ off[-1] + target)
+
+    for start in (np.zeros(4), np.array([0.2, 0.3, -0.02, 0.1]), np.array([0.4, 0.0, 0.05, -0.3])):
+        solution = optimisation.inputs(start)
+        assert solution is not None
+        found = np.append(*solution)
+        assert room(found, start).min() > -1e-9
+        limits = {"type": "ineq", "fun": room, "args": (start,)}
+        other = minimize(
+            cost, np.zeros(N + 1), (start,), "SLSQP", constraints=limits, options={"ftol": 1e-12}
+        )
+        assert cost(found, start) <= other.fun * (1 + 1e-6)
+    assert optimisation.inputs(np.array([0.0, 0.0, 0.07, 1.1])) is None
+
+
+def test_without_the_gain_at_the_plants_side_the_tube_is_left(
+    optimisation: umsonst_barbosa.Optimisation,
+) -> None:
+    drawn, worst = umsonst_barbosa.disturbances_of(optimisation)
+    own = optimisation.K[0]
+    assert umsonst_barbosa.run(optimisation, 0.5, drawn, own).tube < 1
+    assert umsonst_barbosa.run(optimisation, 0.5, drawn, 0 * own).tube > 1
+    assert umsonst_barbosa.run(optimisation, 0.5, 1.01 * worst, own).tube == pytest.approx(1.01, rel=1e-4)

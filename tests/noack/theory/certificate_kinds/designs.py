@@ -170,6 +170,11 @@ def _given_gain(found: Design) -> Design:
     return found._replace(best=found.best._replace(candidate=found.given.candidate, beyond=None))
 
 
+def _given_hold(found: Design) -> Design:
+    candidate = found.best.candidate._replace(hold=found.given.candidate.hold)
+    return found._replace(best=found.best._replace(candidate=candidate, beyond=None))
+
+
 def _no_cost_of_inputs(found: Design) -> Design:
     Q, R = found.search.weights
     with patch.object(found.search, "weights", (Q, 0 * R)):
@@ -191,6 +196,7 @@ DESIGNS = Kind(
         for mistake, change, draw in (
             ("one rung further", _one_rung_further, partial(_random_periodic, rate_per_s=1.0)),
             ("the gain of the given loop", _given_gain, _random_periodic),
+            ("the hold of the given loop", _given_hold, _random_periodic),
             ("no cost of inputs", _no_cost_of_inputs, _random_periodic),
             ("one loss less, with events", _one_loss_less, partial(_random_events, **FAR)),
         )

@@ -17,7 +17,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.margins import loss_margin
 from noack.theory.margins.joint_spectral_radius import JointSpectralRadius
-from noack.theory.margins.loss_margin import LossMargin, Stability, capped, intervals_ns
+from noack.theory.margins.loss_margin import LossMargin, Stability, capped, intervals_ns, without_timeout
 from noack.theory.margins.switched_system import Edge, SwitchedSystem, find_cycle
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.policies import scenario_of
@@ -32,6 +32,8 @@ def random_scenario(rng: np.random.Generator, **fixed: Any) -> tuple[Scenario, i
     """A loop with periodic updates, or events; its unit in ns, least and most units between two."""
     periodic, share = fixed.pop("periodic", rng.random() < 0.75), rng.choice([0.05, 0.2])
     delayed = fixed.pop("delayed", float(rng.choice([0.0, 0.0, 0.3, 0.99])))
+    # For how many units, beyond the delay, the newest update is used; 0: forever.
+    usable = fixed.pop("usable", float(rng.choice([0, 0, 1, 2, rng.uniform(0.3, 4)])))
     given = {
         "n": int(rng.choice([1, 2, 2, 3])), "step_share": share, "mansd": int(rng.integers(0, 5)),
         "window": [(1, 1), (1, 1), (1, 4), (2, 5)][rng.integers(4)],
@@ -60,10 +62,14 @@ def random_scenario(rng: np.random.Generator, **fixed: Any) -> tuple[Scenario, i
     (losses, window), recovery = system.window, system.recovery
     constraints = [{"kind": "at_most", "losses": losses, "window": window}] * (losses < window)
     constraints += [{"kind": "recovery", "deliveries": recovery}] * (recovery > 0)
+    timeout = {"update_timeout_s": round(usable * unit_ns + delay_s * 1e9) * 1e-9} if usable else {}
     scenario = scenario_of(
         system, trigger, model={"allow_unstable": True},
         plant={"rate_hz": 1e9 / step_ns, "measure_every": every},
-        controller={"rate_hz": 1e9 / tick_ns, "phase": float(rng.choice([0.0, 0.25, 0.5]))},
+        controller={
+            "rate_hz": 1e9 / tick_ns, "phase": float(rng.choice([0.0, 0.25, 0.5])),
+            "timeout_input": str(rng.choice(["safe", "hold"])), **timeout,
+        },
         network={
             "constraints": constraints,
             "impairments": [{"kind": "delay", "delay_s": delay_s}] * (delay_s > 0),
@@ -91,6 +97,10 @@ def _one_loss_less(loop: LoopMaps) -> Stability:
 def _no_delay(loop: LoopMaps) -> Stability:
     network = loop.resolved.network.model_copy(update={"impairments": ()})
     return bounded(loop.resolved.model_copy(update={"network": network}))
+
+
+def _used_forever(loop: LoopMaps) -> Stability:
+    return bounded(without_timeout(loop.resolved))
 
 
 def _soon(loop: LoopMaps) -> Stability:
@@ -140,6 +150,7 @@ MARGINS = Kind(
             ("no delay", _no_delay, {"delayed": 0.99}),
             ("each burst alone, repeated", _each_burst_alone, _BURSTS | _ONE_SLOT),
             ("the pattern begins an update late", _late_pattern, {"periodic": True, "ticks": (36, 60)}),
+            ("an update is used however old it is", _used_forever, {"usable": 1.0} | _BURSTS),
             ("events are the shortest time apart", _soon, {"periodic": False, "apart": (1, 3)}),
         )
     },

@@ -1,4 +1,4 @@
-"""The metrics of a live run, read while it goes on."""
+"""What follows a live run: callbacks, and its metrics, read while it goes on."""
 
 import json
 import socket
@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import noack
-from cosim.live.monitoring.run_metrics import RunMetrics
-from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
+from cosim.live.monitoring.run_watcher import RunMetrics, Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
 from tests.command_line import invoke
 from tests.netem.control.test_emulator_metrics import exposed, values_of

@@ -14,11 +14,10 @@ from cosim.analysis.summary import network_summary
 from cosim.analysis.summary.network_summary import in_flight
 from cosim.analysis.summary.summary_model import ReplayPart, read_summary
 from cosim.live.finalize import finalize
-from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
 from cosim.record.run_directory import RunEnding, write_environment
 from cosim.record.run_record import RecordedRun, RunRecord, load_record
-from cosim.simulation.virtual_time import Progress, simulate
+from cosim.simulation.virtual_time import Progress, simulate, simulate_run
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.number_format import number as written
 from noack.protocol.record_tables import NETEM_PACKET, tables
@@ -232,7 +231,7 @@ def test_an_interrupted_simulation_leaves_no_run_directory(
     def broken(scenario: Scenario, progress: Progress | None) -> RecordedRun:
         raise error
 
-    monkeypatch.setattr("cosim.live.simulated_run.simulate_loops", broken)
+    monkeypatch.setattr("cosim.simulation.virtual_time.simulate_loops", broken)
     expected = MachineError if isinstance(error, OSError) else type(error)
     with pytest.raises(expected):
         simulate_run(load(ONE_LOOP, SETTINGS), tmp_path)
