@@ -30,6 +30,8 @@ class ContinuousTrace(NamedTuple):
     mismatch: Reals
     """‖E x‖_W with E = A + BK − H."""
     inter_event_s: float
+    error_at_events: Reals
+    """e^(αt) ‖e_c‖_W just before each event, (runs, events); 0 without an event."""
 
 
 def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> ContinuousTrace:
@@ -53,6 +55,7 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
     z, events = np.tile(system.x0, (len(delivered), 3)), np.zeros(len(delivered), dtype=np.int64)
     largest, last_s = np.zeros((len(z), len(signals))), np.full(len(z), -np.inf)
     shortest_s, running = np.inf, np.arange(len(z))
+    at_events = np.zeros(delivered.shape)
 
     def is_above(error: Reals, t_s: Reals | float) -> Flags:
         return np.asarray(norms(error) * np.exp(system.alpha * t_s) >= system.beta)
@@ -84,6 +87,8 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
             crossing, now_s = crossing[more], now_s[more]
             shortest_s = min(shortest_s, (now_s - last_s[crossing]).min(initial=np.inf))
             last_s[crossing] = now_s
+            e_c = norms(z[crossing] @ signals[1].T)
+            at_events[crossing, events[crossing]] = e_c * np.exp(system.alpha * now_s)
             z[crossing, n : 2 * n] = z[crossing, :n]
             received = crossing[delivered[crossing, events[crossing]]]
             z[received, 2 * n :] = z[received, :n]
@@ -92,7 +97,7 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
             crossing = crossing[is_above(following[crossing] @ e_s, end_s)]
         z = following
         note(running, end_s)
-    return ContinuousTrace(*largest.T[..., None], float(shortest_s))
+    return ContinuousTrace(*largest.T[..., None], float(shortest_s), at_events)
 
 
 def _series(F: Reals, z: Reals) -> Reals:

@@ -125,6 +125,23 @@ class TimeTriggeredLoop:
         """
         return self._after(slot, usable_ns, losses).rows(self._kept).interval().scaled(self._given_units)
 
+    def period(self, slot: int, is_delivered: bool) -> IntervalMatrix:
+        """Return the map of (x, x_c, u, w), in units of its own, from one transmission to the next.
+
+        Updates are used without a limit of time.
+
+        Args:
+            slot: number of the first transmission, modulo the number of slots.
+            is_delivered: whether its update arrives.
+
+        Raises:
+            OverflowError: an entry is beyond double precision.
+        """
+        from_ns, start = slot * self.times.period_ns, fixed(np.eye(len(self._latch.entries)))
+        if is_delivered:
+            return self._updated(start, from_ns, NEVER_NS, NEVER_NS).interval()
+        return self._between(from_ns, from_ns + self.times.period_ns, NEVER_NS).interval()
+
     def _after(self, slot: int, usable_ns: int, losses: int) -> FixedPointMatrix:
         period_ns = self.times.period_ns
         timeout_ns = slot * period_ns + self.times.timeout_ns
@@ -134,13 +151,15 @@ class TimeTriggeredLoop:
             if states:
                 states.append(self._between(from_ns, from_ns + period_ns, timeout_ns) @ states[-1])
             else:
-                states.append(self._first_period(from_ns, from_ns + usable_ns, timeout_ns))
+                state = self._state(from_ns)
+                states.append(self._updated(state, from_ns, from_ns + usable_ns, timeout_ns))
         return states[losses]
 
-    def _first_period(self, from_ns: int, old_timeout_ns: int, timeout_ns: int) -> FixedPointMatrix:
-        state, until_ns = self._state(from_ns), from_ns + self.times.period_ns
-        if not self.times.delay_ns:
-            return self._between(from_ns, until_ns, timeout_ns) @ state
+    def _updated(
+        self, state: FixedPointMatrix, from_ns: int, old_timeout_ns: int, timeout_ns: int
+    ) -> FixedPointMatrix:
+        """Return the state a period after the transmission of a delivered update."""
+        until_ns = from_ns + self.times.period_ns
         # Until the update arrives, x_c is that of older ones.
         sent, arrival_ns = state.rows(self._x), from_ns + self.times.delay_ns
         state = self._between(from_ns, arrival_ns, old_timeout_ns) @ state

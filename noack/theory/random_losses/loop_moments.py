@@ -37,18 +37,19 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.contraction import Stack
+from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.loss_margin import intervals_ns, loop_times, require_idle_watchdog
 from noack.theory.margins.time_triggered_loop import LoopTimes
 from noack.theory.random_losses.mean_square_growth import (
     from_triangles,
     mean_square_growth,
+    require_few_slots,
     resolved_by,
     second_moments,
     triangles,
 )
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-_MOST_SLOTS = 100
 _MOST_PERIODS = 100_000
 
 
@@ -209,14 +210,13 @@ class LoopMoments:
     """
 
     def __init__(self, periods: LoopPeriods, outcomes: OutcomeChain) -> None:
-        if periods.times.slots > _MOST_SLOTS:
-            raise NotPredictableError("the times of the loop repeat only after many periods")
+        require_few_slots(periods.times)
         self._periods, self._outcomes = periods, outcomes
         self._slots = [
             (periods.step(slot, delivered=True), periods.step(slot, delivered=False))
             for slot in range(periods.times.slots)
         ]
-        maps = [(delivered.matrix, lost.matrix) for delivered, lost in self._slots]
+        maps = [(exactly(delivered.matrix), exactly(lost.matrix)) for delivered, lost in self._slots]
         self.growth = mean_square_growth(maps, outcomes)
         """Of √E‖z‖² per period."""
 

@@ -10,11 +10,15 @@ X_j = E[z zᵀ; state j] therefore follow
 and E‖z‖² grows exactly like the powers of this operator's spectral radius. Almost surely, ‖z‖ grows
 per period by at most the root of that; :mod:`noack.theory.random_losses.random_growth` has a
 smaller bound.
+
+The spectral radius is computed in double precision, in coordinates of the maps' common range. That
+it is below a bound γ is proven: for some X_j > 0 the operator's image is below γ X_j, with all
+rounding enclosed, in coordinates of all states (:meth:`PeriodMaps.prove_below`).
 """
 
 from collections.abc import Sequence
 from functools import reduce
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -22,22 +26,35 @@ from noack.core.linear_systems import Matrix, Vector, balancing_exponents
 from noack.impairments.loss_prediction import OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.contraction import EPSILON, Stack
-from noack.theory.margins.exact_matrices import exactly
+from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 from noack.theory.margins.switched_system import Edge, SwitchedSystem
+from noack.theory.margins.time_triggered_loop import LoopTimes
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array  # slow to import
 
 _MOST_ENTRIES = 16_000
 """Largest size of the operator's matrix, which is sparse: few states follow a state."""
+_MOST_SLOTS = 100
 _MOST_DENSE = 500
 """Size up to which all eigenvalues are computed."""
 _ABOVE = (1e-7, 1e-6, 1e-5, 1e-4)
-"""The bound of the spectral radius is the first of these shares that the check confirms above the
-computed one."""
+"""The bound of the spectral radius is the first of these shares above the computed one that is proven."""
+_SMALLEST = 1e-30
+"""Smallest bound of a spectral radius that is tried."""
+_OTHERS = 1e-3
+"""X_j in the coordinates beyond the common range, relative to the square of the largest map."""
 
 
-def mean_square_growth(maps: Sequence[tuple[Matrix, Matrix]], outcomes: OutcomeChain) -> float:
+def require_few_slots(times: LoopTimes) -> None:
+    """Raise NotPredictableError if the loop's times repeat only after many periods."""
+    if times.slots > _MOST_SLOTS:
+        raise NotPredictableError("the times of the loop repeat only after many periods")
+
+
+def mean_square_growth(
+    maps: Sequence[tuple[IntervalMatrix, IntervalMatrix]], outcomes: OutcomeChain
+) -> float:
     """Return the growth of √(E‖z‖²) per period, as an upper bound that is exact up to 1e-6.
 
     Args:
@@ -48,62 +65,120 @@ def mean_square_growth(maps: Sequence[tuple[Matrix, Matrix]], outcomes: OutcomeC
     Raises:
         NotPredictableError: there are too many states.
     """
-    turned = balanced_maps(maps)
-    steps = (second_moments(delivered, lost, outcomes) for delivered, lost in turned)
-    operator = reduce(lambda before, step: step @ before, steps)
-    return float(bounded_radius(operator, len(turned[0][0])) ** (0.5 / len(maps)))
+    return float(PeriodMaps.of(maps).radius_bound(outcomes) ** (0.5 / len(maps)))
 
 
-def balanced_maps(maps: Sequence[tuple[Matrix, Matrix]]) -> list[tuple[Matrix, Matrix]]:
-    """Return the maps in coordinates of their common range, to rounding.
+class PeriodMaps(NamedTuple):
+    """M₀ and M₁ for every slot, in coordinates in which no direction grows much more than others."""
 
-    In these coordinates no direction grows much more than others, so that the check of
-    :func:`bounded_radius` is accurate.
+    reduced: list[tuple[Matrix, Matrix]]
+    """Of the first coordinates, which are those of the maps' common range, to rounding."""
+    enclosed: Sequence[tuple[IntervalMatrix, ...]]
+    """Of all coordinates."""
 
-    Raises:
-        NotPredictableError: an entry is infinite.
+    @classmethod
+    def of(cls, maps: Sequence[tuple[IntervalMatrix, IntervalMatrix]]) -> "PeriodMaps":
+        """Find the coordinates.
+
+        Raises:
+            NotPredictableError: an entry is infinite, or the coordinates are not accurate.
+        """
+        stack = np.array([[part.middle for part in slot] for slot in maps])
+        size = stack.shape[-1]
+        if not np.isfinite(stack).all():
+            raise NotPredictableError("the loop grows beyond 1e308 within a period")
+        exponents = balancing_exponents(np.abs(stack).max(axis=(0, 1)))
+        shifts = exponents[:, None] - exponents
+        stack = np.ldexp(stack, shifts)
+        U, singular, _ = np.linalg.svd(stack.transpose(2, 0, 1, 3).reshape(size, -1))
+        rank = max(int((singular > 10 * size * EPSILON * singular[0]).sum()), 1)
+        range_maps = U[:, :rank].T @ stack @ U[:, :rank]
+        edges = tuple(Edge(0, 0, exactly(matrix)) for slot in range_maps for matrix in slot)
+        T = SwitchedSystem(edges).balancing()[0]
+        range_maps = T @ range_maps @ np.linalg.inv(T)
+        turned = U.T.copy()
+        turned[:rank] = T @ turned[:rank]
+        if (undone := inverse(turned)) is None:
+            raise NotPredictableError("the loop's states have too different sizes")
+        enclosed = [
+            (
+                exactly(turned) @ delivered.scaled(shifts) @ undone,
+                exactly(turned) @ lost.scaled(shifts) @ undone,
+            )
+            for delivered, lost in maps
+        ]
+        return cls([(delivered, lost) for delivered, lost in range_maps], enclosed)
+
+    def radius_bound(self, outcomes: OutcomeChain) -> float:
+        """Return an upper bound of the spectral radius of the operator, mostly exact up to 2e-7.
+
+        Raises:
+            NotPredictableError: it cannot be computed.
+        """
+        from scipy.sparse import linalg  # slow to import
+
+        steps = (second_moments(delivered, lost, outcomes) for delivered, lost in self.reduced)
+        operator = reduce(lambda before, step: step @ before, steps)
+        if not np.isfinite(operator.data).all():
+            raise NotPredictableError("the loop's second moments exceed 1e308 within a few periods")
+        if operator.shape[0] <= _MOST_DENSE:
+            radius = float(np.abs(np.linalg.eigvals(operator.toarray())).max())
+        else:
+            start = np.ones(operator.shape[0])
+            try:
+                radius = float(np.abs(linalg.eigs(operator, k=1, v0=start)[0]).max())
+            except linalg.ArpackNoConvergence:
+                raise NotPredictableError("the second moments' growth was not found") from None
+        for above in _ABOVE:
+            bound = max(radius, _SMALLEST) * (1 + above)
+            size = len(self.reduced[0][0])
+            identity = triangles(np.tile(np.eye(size), (len(outcomes.lost), 1, 1)))
+            try:
+                solution = from_triangles(resolved_by(operator, bound, identity), size)
+            except RuntimeError:  # singular by rounding
+                continue
+            if self.prove_below(bound, solution, outcomes):
+                return bound
+        raise NotPredictableError("the second moments could not be bounded numerically")
+
+    def prove_below(self, bound: float, forms: Stack, outcomes: OutcomeChain) -> bool:
+        """Return whether X_j > 0 with operator(X) < bound X prove that a bound is one.
+
+        Args:
+            bound: γ
+            forms: X_j in the first coordinates, (modes, rank, rank); in the others X_j is a small
+                multiple of the identity.
+            outcomes: of the updates.
+        """
+        modes, rank = len(forms), forms.shape[-1]
+        size = self.enclosed[0][0].middle.shape[0]
+        largest = max(float(part.magnitude.max()) for slot in self.enclosed for part in slot)
+        X = np.tile(_OTHERS / (1 + (size * largest) ** 2) * np.eye(size), (modes, 1, 1))
+        X[:, :rank, :rank] = forms
+        moves = exactly(np.vstack([outcomes.delivered, outcomes.lost]).T)
+        image = exactly(X)
+        for slot in self.enclosed:
+            parts = [M @ image @ IntervalMatrix(M.middle.T, M.radius.T) for M in slot]
+            flat = [np.concatenate(part).reshape(2 * modes, -1) for part in zip(*parts, strict=True)]
+            mixed = moves @ IntervalMatrix(*flat)
+            image = IntervalMatrix(*(part.reshape(X.shape) for part in mixed))
+        scaled = exactly(bound * np.eye(size)) @ exactly(X)
+        return _is_positive(exactly(X)) and _is_positive(scaled - image)
+
+
+def _is_positive(forms: IntervalMatrix) -> bool:
+    """Return whether symmetric matrices are proven to be positive definite, (k, N, N).
+
+    R, the inverse of a computed triangular factor, makes each nearly the identity; R X Rᵀ differs
+    from it by less than 1 in the norm of the largest row sum.
     """
-    stack = np.array(maps)
-    size = stack.shape[-1]
-    if not np.isfinite(stack).all():
-        raise NotPredictableError("the loop grows beyond 1e308 within a period")
-    exponents = balancing_exponents(np.abs(stack).max(axis=(0, 1)))
-    stack = np.ldexp(stack, exponents[:, None] - exponents)
-    U, singular, _ = np.linalg.svd(stack.transpose(2, 0, 1, 3).reshape(size, -1))
-    rank = max(int((singular > 10 * size * EPSILON * singular[0]).sum()), 1)
-    stack = U[:, :rank].T @ stack @ U[:, :rank]
-    edges = tuple(Edge(0, 0, exactly(matrix)) for slot in stack for matrix in slot)
-    T = SwitchedSystem(edges).balancing()[0]
-    stack = T @ stack @ np.linalg.inv(T)
-    return [(delivered, lost) for delivered, lost in stack]
-
-
-def bounded_radius(operator: "csc_array[np.float64]", size: int) -> float:
-    """Return an upper bound of the spectral radius of an operator, mostly exact up to 2e-7.
-
-    Args:
-        operator: as :func:`second_moments` returns it.
-        size: of each X_j.
-
-    Raises:
-        NotPredictableError: it cannot be computed.
-    """
-    from scipy.sparse import linalg  # slow to import
-
-    if not np.isfinite(operator.data).all():
-        raise NotPredictableError("the loop's second moments exceed 1e308 within a few periods")
-    if operator.shape[0] <= _MOST_DENSE:
-        radius = float(np.abs(np.linalg.eigvals(operator.toarray())).max())
-    else:
-        start = np.ones(operator.shape[0])
-        try:
-            radius = float(np.abs(linalg.eigs(operator, k=1, v0=start)[0]).max())
-        except linalg.ArpackNoConvergence:
-            raise NotPredictableError("the second moments' growth was not found") from None
-    for above in _ABOVE:
-        if radius == 0 or _is_below(operator, radius * (1 + above), size):
-            return radius * (1 + 2 * above)
-    raise NotPredictableError("the second moments could not be bounded numerically")
+    try:
+        R = np.linalg.inv(np.linalg.cholesky((forms.middle + forms.middle.swapaxes(1, 2)) / 2))
+    except np.linalg.LinAlgError:
+        return False
+    turned = exactly(R) @ forms @ exactly(R.swapaxes(1, 2).copy())
+    defect = (exactly(np.eye(R.shape[-1])) - turned).magnitude.sum(axis=-1)
+    return bool(defect.max() * (1 + 1e-12) < 1)
 
 
 def second_moments(delivered: Matrix, lost: Matrix, outcomes: OutcomeChain) -> "csc_array[np.float64]":
@@ -149,21 +224,3 @@ def resolved_by(operator: "csc_array[np.float64]", value: float, entries: Vector
 
     resolvent = (value * eye_array(operator.shape[0]) - operator).tocsc()
     return np.asarray(linalg.splu(resolvent).solve(entries), dtype=np.float64)
-
-
-def _is_below(operator: "csc_array[np.float64]", bound: float, size: int) -> bool:
-    """Return whether X_j > 0 with operator(X) < bound X prove that a bound is one, to rounding."""
-    entries = operator.shape[0]
-    identity = triangles(np.tile(np.eye(size), (2 * entries // (size * (size + 1)), 1, 1)))
-    try:
-        solution = resolved_by(operator, bound, identity)
-    except RuntimeError:  # singular by rounding
-        return False
-    forms, images = (from_triangles(part, size) for part in (solution, np.asarray(operator @ solution)))
-    longest = int(np.diff(operator.tocsr().indptr).max())
-    sizes = np.abs(solution)
-    carried = float((abs(operator) @ sizes + bound * sizes).max())
-    return all(
-        float(np.linalg.eigvalsh(part).min()) > 1e-13 * longest * size
-        for part, size in ((forms, float(sizes.max())), (bound * forms - images, carried))
-    )

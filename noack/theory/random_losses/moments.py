@@ -13,20 +13,26 @@ A missing event's part of e_c is what E x and B p have added since the event bef
 ever been added is D_C = ∫‖C e^{(H+αI)s} L_E‖ ds m + ∫‖C e^{(H+αI)s} B U‖ ds π, so ℓ_C ≤ ρ D_C. But
 an event has no more than c_i = β sup ‖C e^{(H+αI)τ} W⁻¹‖, and what is added to it after the last
 test, if there have been i − 1 more since; and all i are lost with a probability of at most p̄ⁱ. So
+their sum is at most S_J = c_1 + … + c_J, where J is like a random number with P(J ≥ i) ≤ min(1,
+p̄ⁱ D_C/c_i):
 
-    ℓ_C ≤ Σ_i min(c_i, (c_i^{r−1} p̄ⁱ D_C)^{1/r}) + ρ/(1 − ρ) √(h d_C D_C)
+    ℓ_C ≤ (Σ_i (S_iʳ − S_{i−1}ʳ) min(1, p̄ⁱ D_C/c_i))^{1/r} + ρ/(1 − ρ) √(h d_C D_C)
 
 d_C the rate at which C e_c can grow; the last term is for r = 2, and 0 without a period h of tests.
 This is concave: any tangent bounds it, and then the inequalities are linear. Without h and delay
 there is a bound for every p̄ < 1.
 
-At an event of the continuous trigger, where ‖e_s‖_W = β, the number of missing events is known in
-distribution, and (I1) gives a bound by itself: :func:`moment_at_events`. Almost surely, x decays at
-every rate below that of the moments. Under the paper's conditions it does so for every loss
-probability below 1. :func:`unlimited_losses` says all of this of a scenario.
+At an event of the continuous trigger, where ‖e_s‖_W = β, the distribution of the number of missing
+events is known exactly, and (I1) gives a bound by itself: :func:`moment_at_events`.
+
+A run ends. Up to its horizon the certificates for at most m consecutive losses bound each run by its
+own longest burst: :func:`moments_of_runs` bounds the mean of the largest ‖e_c‖ and ‖x‖ of a run.
+
+Almost surely, x decays at every rate below that of the moments. Under the paper's conditions it does
+so for every loss probability below 1. :func:`unlimited_losses` says all of this of a scenario.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -56,6 +62,8 @@ _A, _PI, _ONE = np.eye(3)
 ORDERS = (1, 2)
 _MOST_BURST = 64
 _CERTAIN = 1 - 1e-9
+_ROUNDING = 1e-9
+"""Above the relative error of a probability, which is a sum of products of numbers that are not negative."""
 _SLOWER = 0.9
 _RATES = (1.0, 0.5, 0.25, 1e-3)
 """Shares of the trigger's rate at which moments are tried, until one of the smaller ones has a loop
@@ -84,8 +92,10 @@ class Moments(NamedTuple):
 def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, order: int) -> float:
     """Bound (E(‖e_c‖_W e^{αt}/β)ʳ)^{1/r} just before an event of the continuous trigger.
 
-    It is Σ_{j≥0} P(the last j updates are lost)^{1/r} sup_{τ≥jδ}‖e^{(H+αI)τ}‖_W. In a norm in
-    which the models contract it is at most 1/(1 − p^{1/r}) for independent losses.
+    If exactly the last J updates are lost, ‖e_c‖_W e^{αt}/β ≤ S_J = 1 + g_1 + … + g_J with g_j =
+    sup_{τ≥jδ}‖e^{(H+αI)τ}‖_W. So the bound is (Σ_j P(J ≥ j) (S_jʳ − S_{j−1}ʳ))^{1/r}, S_{−1} = 0. In
+    a norm in which the models contract, and for independent losses, it is at most 1/(1 − p) for
+    r = 1 and √(1 + p)/(1 − p) for r = 2.
 
     Args:
         error: the gains of the models.
@@ -101,9 +111,11 @@ def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, o
     if not longest < 1:
         raise NoCertificateError("bursts of losses may be arbitrarily long")
     gains = error.kernels[Output.WEIGHTED].sups(spacing_s * np.arange(1.0, _TERMS + 1))
-    powers, ratio = tails ** (1 / order), longest ** (1 / order)
-    beyond = gains[-1] * powers.sum() * ratio / (1 - ratio)  # a burst of N + j: longest · tails[j]
-    return float(1.0 + powers @ gains + beyond)
+    sums = 1.0 + np.cumsum(np.append(0.0, gains))
+    # Number kN + j, j ≤ N, adds at most r g_N ((k + 1) S_N)^{r−1}; P(J ≥ kN + j) ≤ longestᵏ P(J ≥ j).
+    later = (1 - longest) ** -order - 1  # Σ_{k≥1} (k + 1)^{r−1} longestᵏ
+    beyond = order * gains[-1] * sums[-1] ** (order - 1) * tails.sum() * later
+    return float((1.0 + tails @ np.diff(sums**order) + beyond) ** (1 / order)) * (1 + _ROUNDING)
 
 
 def moments(
@@ -255,14 +267,18 @@ class _Missing(NamedTuple):
     """What the i-th last event since the last delivery has at most, without the overshoot."""
 
     def burst(self, probability: float, order: int, whole: float) -> Vector:
-        """Bound Σ_i min(c_i, (c_i^{r−1} p^i D)^{1/r}) by its tangent at a value of the whole, D."""
-        counts = np.arange(1.0, len(self.ceilings) + 1)
-        shares = (self.ceilings ** (order - 1) * whole * probability**counts) ** (1 / order)
-        few = shares < self.ceilings
-        ratio = probability ** (1 / order)
-        total = shares[few].sum() + shares[-1] * ratio / (1 - ratio)
-        constant = self.ceilings[~few].sum() + total * (1 - 1 / order)
-        return np.asarray(total / (order * whole) * self.whole + constant * _ONE)
+        """Bound (Σ_i (S_iʳ − S_{i−1}ʳ) min(1, p^i D/c_i))^{1/r} by its tangent at a value of D."""
+        c, powers = self.ceilings, probability ** np.arange(1.0, len(self.ceilings) + 1)
+        sums = np.cumsum(np.append(0.0, c))
+        weights = np.ones_like(c) if order == 1 else sums[1:] + sums[:-1]
+        few = powers * whole < c
+        # Beyond the last one c_i is not larger, and (S_iʳ − S_{i−1}ʳ)/c_i at most r S_iʳ⁻¹.
+        ratio = probability / (1 - probability)
+        beyond = ratio if order == 1 else 2 * ratio * (sums[-1] + c[-1] / (1 - probability))
+        slope = float((weights * powers)[few].sum() + powers[-1] * beyond)
+        value = float(((weights * c)[~few].sum() + slope * whole) ** (1 / order))
+        tangent = slope / (order * value ** (order - 1)) if slope else 0.0
+        return np.asarray(tangent * self.whole + (value - tangent * whole) * _ONE)
 
 
 class BurstCertificate(NamedTuple):
@@ -276,8 +292,50 @@ class BurstCertificate(NamedTuple):
     """Upper bound of the number of events in a run."""
     delta: float
     """Δ."""
+    rate_per_s: float
+    """ρ; 0 if one of the bounds does not decay."""
+    controller_error: float
+    """Bound of ‖e_c‖_W e^{ρt} at all times."""
     state: float
-    """Bound of ‖x‖ at t = 0, and so at all times."""
+    """Bound of ‖x‖ e^{ρt} at all times."""
+
+
+class RunMoments(NamedTuple):
+    """Bounds of the mean over runs of the r-th power of a run's largest value, to the power 1/r.
+
+    A run with a longer burst than ``most`` counts as 0.
+    """
+
+    order: int
+    """r."""
+    most: int
+    probability: float
+    """Lower bound of the probability of a run without a longer burst."""
+    rate_per_s: float
+    """ρ"""
+    controller_error: float
+    """Of sup ‖e_c‖_W e^{ρt} over a run."""
+    state: float
+    """Of sup ‖x‖ e^{ρt} over a run."""
+
+
+def moments_of_runs(bursts: Sequence[BurstCertificate]) -> list[RunMoments]:
+    """Bound the moments of the largest values of a run, for r = 1 and 2.
+
+    Up to its end, a run whose longest burst is m keeps the bound b_m. So the mean of the r-th power
+    is at most b_0ʳ + Σ_m (b_mʳ − b_{m−1}ʳ) P(longest ≥ m); b_m is increased to b_{m−1} if it is
+    smaller.
+    """
+    if not bursts:
+        return []
+    last, rate_per_s = bursts[-1], min(burst.rate_per_s for burst in bursts)
+    reached = [1.0, *(1 - burst.probability * (1 - _ROUNDING) for burst in bursts[:-1])]
+    sizes = np.array([(0.0, 0.0), *((burst.controller_error, burst.state) for burst in bursts)])
+    return [
+        RunMoments(order, last.most, last.probability, rate_per_s, *map(float, means ** (1 / order)))
+        for order in ORDERS
+        for means in [reached @ np.diff(np.maximum.accumulate(sizes) ** order, axis=0)]
+    ]
 
 
 @dataclass(frozen=True)
@@ -290,6 +348,8 @@ class UnlimitedLosses:
     horizon_s: float
     bursts: tuple[BurstCertificate, ...]
     """For increasing m, as long as there are certificates."""
+    runs: tuple[RunMoments, ...]
+    """For r = 1 and 2; none if there is no certificate."""
     moments: tuple[Moments, ...]
     """For r = 1 and 2, under the schedule's conditions; those that exist."""
     at_events: tuple[float, ...]
@@ -306,6 +366,7 @@ class UnlimitedLosses:
         return {
             **{name: getattr(self, name) for name in self.__dataclass_fields__},
             "bursts": [burst._asdict() for burst in self.bursts],
+            "runs": [moment._asdict() for moment in self.runs],
             "moments": [moment._asdict() for moment in self.moments],
         }
 
@@ -320,12 +381,14 @@ def unlimited_losses(
     """
     losses = loss_process(resolved.network.link)
     bounds, void = _moments(resolved, losses, conditions)
+    bursts = _bursts(resolved, scope, losses, conditions)
     paper_rate, at_events = _paper(resolved, losses)
     return UnlimitedLosses(
         losses.largest_probability,
         losses.is_independent,
         resolved.timing.horizon_ns / NS_PER_S,
-        tuple(_bursts(resolved, scope, losses, conditions)),
+        tuple(bursts),
+        tuple(moments_of_runs(bursts)),
         tuple(bounds),
         at_events,
         bounds[0].rate_per_s if bounds and bounds[0].rate_per_s > 0 else None,
@@ -348,8 +411,12 @@ def _bursts(
             probability = losses.keeps(LossGuarantee((LongestBurst(longest),)), events)
         except NotPredictableError:
             break
-        state = float(certificate.state(np.zeros(1))[0])
-        certificates.append(BurstCertificate(longest, probability, events, constants.delta, state))
+        persists = certificate.floor_constants or certificate.persistent_constants
+        rate_per_s = 0.0 if persists else constants.rate_per_s
+        bounds = (float(bound(np.zeros(1))[0]) for bound in (certificate.controller_error, certificate.state))
+        certificates.append(
+            BurstCertificate(longest, probability, events, constants.delta, rate_per_s, *bounds)
+        )
         if probability > _CERTAIN:
             break
     return certificates

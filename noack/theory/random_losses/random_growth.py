@@ -17,19 +17,27 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.clock import NEVER_NS
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.contraction import Stack
+from noack.theory.bounds.contraction import EPSILON, Stack
+from noack.theory.margins.exact_matrices import IntervalMatrix, inverse
 from noack.theory.margins.loss_margin import intervals_ns, loop_times
-from noack.theory.random_losses.loop_moments import LoopMoments, LoopPeriods
-from noack.theory.random_losses.mean_square_growth import balanced_maps, bounded_radius, second_moments
+from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
+from noack.theory.random_losses.mean_square_growth import (
+    PeriodMaps,
+    mean_square_growth,
+    require_few_slots,
+    second_moments,
+)
 
-_MEMORIES = ((0, 0), (4, 0), (4, 4))
+_MEMORIES = ((0, 0), (4, 0), (4, 4), (12, 0), (12, 4))
 """Lengths up to which the present burst and the one before are told apart."""
+_SHORT, _CLOSE = 4, 1.02
+"""Longer bursts are told apart only if the bound is already below this: that takes seconds."""
 _POWERS = 400
 _PRECISION = 1e-11
 _ITERATIONS = 40
@@ -51,7 +59,9 @@ class RandomGrowth(NamedTuple):
         if self.mean_square < 1:
             return f"{square}: stable in mean square and almost surely"
         sure = f"almost surely ‖z‖ changes by at most the factor {self.almost_sure:.6g}"
-        verdict = "stable" if self.almost_sure < 1 else "not decided"
+        verdict = "stable"
+        if self.almost_sure >= 1:
+            verdict = f"not decided, as this is {self.almost_sure - 1:.2g} too large to prove decay"
         return f"{square}: not stable in mean square; {sure} per period: {verdict}"
 
 
@@ -68,17 +78,20 @@ def random_growth(resolved: Scenario, losses: LossProcess) -> RandomGrowth:
     loop, times = loop_of(resolved), loop_times(resolved, longest_ns)
     if times.timeout_ns < NEVER_NS:
         raise NotPredictableError("controller.update_timeout_s: the input depends on the update's age")
-    nothing = np.zeros_like(loop.A)
-    periods = LoopPeriods(loop, times, nothing, nothing, np.zeros((0, loop.n + loop.m, loop.n + loop.m)))
+    require_few_slots(times)
+    exact = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
+    try:
+        maps = [(exact.period(slot, True), exact.period(slot, False)) for slot in range(times.slots)]
+    except OverflowError:
+        raise NotPredictableError("the loop grows beyond 1e308 within a period") from None
     outcomes = losses.outcomes(LossGuarantee())
-    mean_square = almost_sure = LoopMoments(periods, outcomes).growth
+    mean_square = almost_sure = mean_square_growth(maps, outcomes)
     if times.slots == 1:
-        delivered, lost = (periods.step(0, is_delivered).matrix for is_delivered in (True, False))
-        almost_sure = min(mean_square, sure_growth(delivered, lost, outcomes))
+        almost_sure = min(mean_square, sure_growth(*maps[0], outcomes))
     return RandomGrowth(mean_square, almost_sure)
 
 
-def sure_growth(delivered: Matrix, lost: Matrix, outcomes: OutcomeChain) -> float:
+def sure_growth(delivered: IntervalMatrix, lost: IntervalMatrix, outcomes: OutcomeChain) -> float:
     """Bound the growth of ‖z‖ per period in almost all runs.
 
     Args:
@@ -90,11 +103,12 @@ def sure_growth(delivered: Matrix, lost: Matrix, outcomes: OutcomeChain) -> floa
         NotPredictableError: there are too many states, or what happens in the long run is decided
             by the beginning.
     """
-    ((M0, M1),) = balanced_maps([(delivered, lost)])
-    recurrent, best = outcomes.recurrent(), math.inf
+    maps, recurrent, best = PeriodMaps.of([(delivered, lost)]), outcomes.recurrent(), math.inf
     for present, before in _MEMORIES:
+        if present > _SHORT and best > _CLOSE:
+            break
         try:
-            best = min(best, _Tilts(M0, M1, _remembering(recurrent, present, before)).bound())
+            best = min(best, _Tilts(maps, _remembering(recurrent, present, before)).bound())
         except NotPredictableError:
             if best == math.inf:
                 raise
@@ -119,26 +133,44 @@ def _remembering(chain: OutcomeChain, present: int, before: int) -> OutcomeChain
 class _Tilts:
     """The bound as a function of s, and its minimum."""
 
-    def __init__(self, M0: Matrix, M1: Matrix, chain: OutcomeChain) -> None:
-        self._maps = np.array([M0, M1])
+    def __init__(self, maps: PeriodMaps, chain: OutcomeChain) -> None:
+        self._period, self._chain = maps, chain
+        self._maps = np.array(maps.reduced[0])
         self._chances = np.array([chain.delivered, chain.lost])
         self._steps = np.nonzero(self._chances)
         self._shares = chain.distribution()[self._steps[1]] * self._chances[self._steps]
-        modes, size = len(chain.lost), len(M0)
+        modes, size = len(chain.lost), len(self._maps[0])
         self._forward = self._backward = np.tile(np.eye(size), (modes, 1, 1))
 
     def bound(self) -> float:
         """Return the bound for the best s that is found."""
         from scipy.optimize import minimize  # slow to import
 
-        M0, M1 = self._maps
         start = np.zeros(len(self._shares))
         # Too many states are refused before the search.
+        M0, M1 = self._maps
         second_moments(M0, M1, self._tilted(start))
         s = minimize(self._value, start, jac=True, method="L-BFGS-B", options={"maxiter": _ITERATIONS}).x
-        radius = bounded_radius(second_moments(M0, M1, self._tilted(s)), len(M0))
-        exponent = float(self._shares @ s) + math.log(max(radius, 1e-300))
+        radius = self._period.radius_bound(self._tilted(s))
+        exponent = self._mean(s) + math.log(radius)
         return math.exp(exponent / 2) * (1 + 1e-12)
+
+    def _mean(self, s: Vector) -> float:
+        """Return an upper bound of f · s, with the rounding of the frequencies f.
+
+        The distribution of the states is the last row of the inverse of P − I with ones in its last
+        column. That its entries are rounded moves each share by at most u times a column sum of the inverse.
+        """
+        chances = self._chances[self._steps]
+        by_state = np.bincount(self._steps[1], chances * s, len(self._chain.lost))
+        sizes = np.bincount(self._steps[1], chances * np.abs(s), len(self._chain.lost))
+        moves = self._chain.lost + self._chain.delivered - np.eye(len(by_state))
+        moves[:, -1] = 1.0
+        if (undone := inverse(moves)) is None:
+            raise NotPredictableError("the frequencies of the losses could not be enclosed")
+        shares, radii = undone.middle[-1], undone.radius[-1] + EPSILON * undone.magnitude.sum(axis=0)
+        error = (radii + (len(s) + 4) * EPSILON * np.abs(shares)) @ sizes
+        return float(shares @ by_state + error * (1 + 1e-9))
 
     def _tilted(self, s: Vector) -> OutcomeChain:
         chances = self._chances.copy()

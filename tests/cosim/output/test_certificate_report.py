@@ -194,12 +194,12 @@ def test_without_a_cap_the_mean_at_events_in_the_chosen_norm_is_beta_over_1_minu
     assert found is not None
     mean, root_mean_square = found.at_events
     assert mean == pytest.approx(1 / (1 - P), rel=1e-6)
-    assert root_mean_square == pytest.approx(1 / (1 - P**0.5), rel=1e-6)
+    assert root_mean_square == pytest.approx((1 + P) ** 0.5 / (1 - P), rel=1e-6)
     for shorter, longer in pairwise(found.bursts):
         assert shorter.probability < longer.probability
         assert shorter.state < longer.state
     gain = "the loop gain of the moments is 1.32, not below 1"
-    void, *_ = sentences(replace(found, moments=(), void=gain, sure_rate_per_s=None))
+    void, *_ = sentences(replace(found, runs=(), moments=(), void=gain, sure_rate_per_s=None))
     assert void == f"Without the guarantee no mean is certified: {gain}."
 
 

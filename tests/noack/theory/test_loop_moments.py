@@ -15,7 +15,9 @@ from noack.impairments.constraints import join_guarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
+from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.loss_margin import loop_times
+from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
 from noack.theory.random_losses.loop_moments import (
     LoopMoments,
     LoopPeriods,
@@ -141,6 +143,24 @@ def test_without_losses_the_moments_solve_a_lyapunov_equation() -> None:
     assert found is not None
     expected = solve_discrete_lyapunov(period.matrix, period.noise)
     assert found[0].moments.sum(axis=0) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.07])
+def test_the_maps_with_all_rounding_contain_those_of_the_moments(delay: float) -> None:
+    """Traces of products are the same in all units; the ticks drift against the transmissions."""
+    given = scenario(network={"mansd": 2, "loss": BURSTS}, **{"controller.rate_hz": 16.0})
+    loop, times = loop_of(given), loop_times(given, 250_000_000)._replace(delay_ns=round(delay * 1e9))
+    nothing = np.zeros((2, 2))
+    periods = LoopPeriods(loop, times, nothing, nothing, np.zeros((0, 3, 3)))
+    exact = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
+    for slot, outcomes in product(range(times.slots), product([True, False], repeat=3)):
+        products = np.eye(6), exactly(np.eye(6))
+        for delivered in outcomes:
+            enclosed = exact.period(slot, delivered)
+            products = periods.step(slot, delivered).matrix @ products[0], enclosed @ products[1]
+        rounded, enclosed = products
+        assert np.trace(rounded) == pytest.approx(np.trace(enclosed.middle), rel=1e-11, abs=1e-11)
+        assert np.trace(enclosed.radius) < 1e-11
 
 
 def test_the_moments_in_other_units_of_the_states() -> None:

@@ -11,10 +11,21 @@ from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.random_losses.mean_square_growth import mean_square_growth
-from noack.theory.random_losses.moments import moment_at_events, moments
-from noack.theory.random_losses.random_growth import sure_growth
+from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
+from noack.theory.random_losses import mean_square_growth as mean_square_module
+from noack.theory.random_losses import moments as moments_module
+from noack.theory.random_losses import random_growth as random_growth_module
+from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments, moments_of_runs
 from tests.noack.theory.certificate_kinds.random_losses import certify, draw, simulate_runs
+
+
+def mean_square_growth(maps: list[tuple[Array, Array]], chain: OutcomeChain) -> float:
+    exact = [(exactly(delivered), exactly(lost)) for delivered, lost in maps]
+    return mean_square_module.mean_square_growth(exact, chain)
+
+
+def sure_growth(delivered: Array, lost: Array, chain: OutcomeChain) -> float:
+    return random_growth_module.sure_growth(exactly(delivered), exactly(lost), chain)
 
 
 def independent(p: float) -> LossProcess:
@@ -28,17 +39,42 @@ def scalar(rate: float, gain: float, mismatch: float) -> PlantGains:
     return PlantGains(error, (gain - rate - mismatch) * one, one, one, 0.0)
 
 
-@pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("p", [0.1, 0.5, 0.9])
-def test_in_a_contracting_norm_the_moment_at_events_is_the_geometric_series(p: float, order: int) -> None:
+def test_in_a_contracting_norm_the_moments_at_events_are_those_of_the_geometric_law(p: float) -> None:
     error = scalar(2.0, 3.0, 0.0).error
-    found = moment_at_events(error, independent(p), 0.0, order)
-    assert found == pytest.approx(1 / (1 - p ** (1 / order)), rel=1e-6)
-    assert moment_at_events(error, independent(p), 0.5, order) < found
+    for order, expected in (1, 1 / (1 - p)), (2, (1 + p) ** 0.5 / (1 - p)):
+        found = moment_at_events(error, independent(p), 0.0, order)
+        assert found == pytest.approx(expected, rel=1e-6)
+        assert moment_at_events(error, independent(p), 0.5, order) < found
 
 
 @pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("p", [0.01, 0.3, 0.9])
+def test_moments_at_events_include_longer_bursts_than_are_counted(
+    order: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With three terms, the rest is bounded from above, and not far."""
+    error, process = scalar(2.0, 3.0, 0.0).error, losses([0.8, 0.2], [[0.9, 0.1], [0.4, 0.6]], [0.05, 0.8])
+    exact = moment_at_events(error, process, 0.0, order)
+    monkeypatch.setattr(moments_module, "_TERMS", 3)
+    assert exact <= moment_at_events(error, process, 0.0, order) < 1.5 * exact
+
+
+def test_the_mean_of_the_largest_values_of_runs_by_hand() -> None:
+    """Runs whose longest burst is 0, 1 or 2 with probabilities 0.5, 0.3 and 0.2 keep 1, 3 and 4."""
+    bursts = [
+        BurstCertificate(most, probability, 9, 0.0, 0.5, bound, 10 * bound)
+        for most, probability, bound in [(0, 0.5, 1.0), (1, 0.8, 3.0), (2, 1.0, 4.0)]
+    ]
+    mean, root_mean_square = moments_of_runs(bursts)
+    assert mean.controller_error == pytest.approx(0.5 * 1 + 0.3 * 3 + 0.2 * 4)
+    assert root_mean_square.controller_error == pytest.approx((0.5 * 1 + 0.3 * 9 + 0.2 * 16) ** 0.5)
+    assert root_mean_square.state == pytest.approx(10 * root_mean_square.controller_error)
+    assert (mean.most, mean.probability, mean.rate_per_s) == (2, 1.0, 0.5)
+    assert moments_of_runs([]) == []
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("p", [0.0, 0.01, 0.3, 0.9])
 def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand(
     p: float, order: int
 ) -> None:
@@ -50,8 +86,10 @@ def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand
     for _ in range(2000):
         x = 1.0 + gain * e_c / (rate + mismatch)
         whole = (mismatch * x + gain * e_c) / rate
+        tails = np.minimum(1, powers * whole / beta)
+        numbers = np.arange(len(tails))
         burst = [
-            np.minimum(beta, (beta ** (r - 1) * powers * whole) ** (1 / r)).sum() for r in range(order, 3)
+            beta * (tails @ (numbers**0 if r == 1 else 2 * numbers + 1)) ** (1 / r) for r in range(order, 3)
         ]
         e_c = beta + min(p ** (1 / order) * whole, *burst)
     assert found.controller_error == pytest.approx(e_c, rel=0.02)
@@ -179,3 +217,27 @@ def test_a_spectral_radius_that_was_computed_too_small_is_not_accepted(
     monkeypatch.setattr(np.linalg, "eigvals", lambda matrix: 0.999 * values(matrix))
     with pytest.raises(NotPredictableError, match="bounded numerically"):
         mean_square_growth(maps, chain)
+
+
+@pytest.mark.parametrize("radius", [0.0, 1e-9])
+def test_a_bound_of_the_second_moments_is_proven_with_all_rounding(radius: float) -> None:
+    """x becomes ax with |a| ≤ 0.7 + radius, and has another state that nothing moves."""
+    size, chain = 0.7 + radius, unlimited(independent(0.4)).recurrent()
+    M = IntervalMatrix(np.diag([0.7, 0.0]), np.diag([radius, 1e-16]))
+    maps = mean_square_module.PeriodMaps([(np.array([[0.7]]), np.array([[0.7]]))], [(M, M)])
+    forms = np.ones((len(chain.lost), 1, 1))
+    assert maps.prove_below(size**2 * (1 + 1e-12), forms, chain)
+    assert not maps.prove_below(size**2 * (1 - 1e-15), forms, chain)
+
+
+def test_a_tilted_bound_contains_the_rounding_of_the_frequencies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An inverse that is known to 1e-6 only makes the bound larger by as much times the weights."""
+    delivered, lost, chain = np.array([[0.2]]), np.array([[2.5]]), unlimited(BURSTY)
+    exact, inverse = sure_growth(delivered, lost, chain), random_growth_module.inverse
+
+    def inaccurate(matrix: Array) -> IntervalMatrix | None:
+        found = inverse(matrix)
+        return found and IntervalMatrix(found.middle, found.radius + 1e-6)
+
+    monkeypatch.setattr(random_growth_module, "inverse", inaccurate)
+    assert 1e-7 < sure_growth(delivered, lost, chain) / exact - 1 < 1e-4

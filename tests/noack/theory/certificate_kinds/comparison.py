@@ -18,15 +18,15 @@ from tests.noack.theory.certificate_kinds.decaying import DECAYING
 from tests.noack.theory.certificate_kinds.designs import DESIGNS
 from tests.noack.theory.certificate_kinds.margins import MARGINS
 from tests.noack.theory.certificate_kinds.policies import POLICIES
-from tests.noack.theory.certificate_kinds.random_losses import RANDOM_LOSSES
+from tests.noack.theory.certificate_kinds.random_losses import MOMENT, RANDOM_LOSSES
 from tests.noack.theory.certificate_kinds.regions import REGIONS
 from tests.noack.theory.certificate_kinds.shares import DISTURBED, KNOWN_STATE, OBSERVED
 
 KINDS: Mapping[str, Kind] = {
     kind.name: kind
     for kind in (
-        DECAYING, CONTINUOUS, SCHEDULED, DISTURBED, OBSERVED, RANDOM_LOSSES, KNOWN_STATE, *POLICIES,
-        MARGINS, REGIONS, DESIGNS,
+        DECAYING, CONTINUOUS, SCHEDULED, DISTURBED, OBSERVED, RANDOM_LOSSES, MOMENT, KNOWN_STATE,
+        *POLICIES, MARGINS, REGIONS, DESIGNS,
     )
 }  # fmt: skip
 

@@ -1,7 +1,8 @@
-"""Losses without a limit: means and mean squares at every fixed time, of many runs of each loop.
+"""Losses without a limit: means and mean squares of many runs of each loop.
 
-A mean over runs is random itself. So the value that is compared with a bound is the mean minus five
-standard errors.
+Those at every fixed time are compared for loops with a schedule; those of a run's largest values,
+and of e_c at events, under the paper's conditions. A mean over runs is random itself. So the value
+that is compared with a bound is the mean minus five standard errors.
 """
 
 from collections.abc import Callable
@@ -11,13 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.terms import NoCertificateError
-from noack.theory.random_losses.moments import moments
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
+from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments, moments_of_runs
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.oracles.lossy_loops import DRIFTING, STEPS, System, random_system, simulate, times_s
+from tests.oracles.continuous_loops import simulate_continuous_time
+from tests.oracles.lossy_loops import DRIFTING, STEPS, Reals, System, random_system, simulate, times_s
 
 _RUNS = 300
+_EVENTS = 64
+_MOST_LOST = 6
 _ERRORS = 5
 _SIGNALS = {
     "e_s": "sensor_error", "e_c": "controller_error", "x": "state", "u − Kx": "input_error",
@@ -64,14 +70,17 @@ def simulate_runs(loop: RandomLoop, rng: np.random.Generator, rate_share: float 
     if rng.uniform() < 0.5:
         delays[:] = system.delay_steps
     trace = simulate(system, ~lost, delays)
-    growth, worst = np.exp(rate_share * system.alpha * times_s(system)), {}
-    for name, field in _SIGNALS.items():
-        powers = (growth * getattr(trace, field)) ** loop.order
-        assert powers.shape == (_RUNS, STEPS)
-        error = powers.std(axis=0, ddof=1) / np.sqrt(_RUNS)
-        least = np.maximum(powers.mean(axis=0) - _ERRORS * error, 0.0)
-        worst[name] = float(least.max()) ** (1 / loop.order)
-    return Observed(_RUNS, worst)
+    growth = np.exp(rate_share * system.alpha * times_s(system))
+    signals = {name: growth * getattr(trace, field) for name, field in _SIGNALS.items()}
+    assert all(values.shape == (_RUNS, STEPS) for values in signals.values())
+    return Observed(_RUNS, {name: _least_moment(values, loop.order) for name, values in signals.items()})
+
+
+def _least_moment(values: Reals, order: int) -> float:
+    """The largest moment over times or events, (runs, k), minus five standard errors."""
+    powers = values**order
+    error = powers.std(axis=0, ddof=1) / np.sqrt(len(powers))
+    return float(np.maximum(powers.mean(axis=0) - _ERRORS * error, 0.0).max()) ** (1 / order)
 
 
 def _broken(certify: Callable[[RandomLoop], Bounds | None], **fixed: Any) -> Broken:
@@ -96,5 +105,57 @@ RANDOM_LOSSES = Kind(
             partial(certify, delay_s=0.0, start_s=0.0), probability=0.01, sample_steps=1,
             delay_steps=4, hold_steps=0, known_start=True, **(_SCALAR | {"beta": 0.001}),
         ),
+    },
+)  # fmt: skip
+
+
+def _draw_continuous(rng: np.random.Generator, **fixed: Any) -> RandomLoop:
+    """Loops with many events; half of them have one state that grows in one direction."""
+    given = {"sample_steps": 1, "delay_steps": 0, "hold_steps": 0, "known_start": True}
+    given |= _SCALAR if rng.uniform() < 0.5 else _EVENTFUL
+    return draw(rng, **(given | fixed))
+
+
+def _certify_runs(loop: RandomLoop, *, share: float = 1.0) -> Bounds | None:
+    """The bounds, or those of a broken copy with fewer losses."""
+    system, order = loop.system, loop.order
+    one, p = np.ones(1), np.array([share * loop.probability])
+    losses = LossProcess(one, one[:, None], p, first_delivered=False)
+    bursts: list[BurstCertificate] = []
+    try:
+        for most in range(_MOST_LOST + 1):
+            found = system.certify(NetworkConditions(most))
+            events = int(STEPS * system.step_s / (found.inter_event_s or np.inf)) + 1
+            probability = losses.keeps(LossGuarantee((LongestBurst(most),)), events)
+            e_c = found.delta * system.beta
+            bursts.append(
+                BurstCertificate(most, probability, events, found.delta, system.alpha, e_c, found.state)
+            )
+        at_events = moment_at_events(system.gains().error, losses, 0.0, order) * system.beta
+    except (NoCertificateError, NotDecayingError):
+        return None
+    run = moments_of_runs(bursts)[order - 1]
+    return {"largest e_c": run.controller_error, "largest x": run.state, "e_c at events": at_events}
+
+
+def _simulate_continuous(loop: RandomLoop, rng: np.random.Generator) -> Observed:
+    delivered = rng.uniform(size=(_RUNS, _EVENTS)) >= loop.probability
+    windows = np.lib.stride_tricks.sliding_window_view(delivered, _MOST_LOST + 1, axis=1)
+    counts = windows.any(axis=2).all(axis=1)[:, None]
+    trace = simulate_continuous_time(loop.system, delivered, delivered)
+    signals = {
+        "largest e_c": counts * trace.controller_error, "largest x": counts * trace.state,
+        "e_c at events": trace.error_at_events,
+    }  # fmt: skip
+    return Observed(_RUNS, {name: _least_moment(values, loop.order) for name, values in signals.items()})
+
+
+MOMENT = Kind(
+    "moment", _draw_continuous, _certify_runs, _simulate_continuous,
+    {
+        name: Broken(
+            partial(_certify_runs, share=share), partial(_draw_continuous, probability=0.5, **_SCALAR)
+        )
+        for name, share in (("no losses", 0.0), ("half of the losses", 0.5))
     },
 )  # fmt: skip
