@@ -7,9 +7,8 @@ pattern of its guarantee is proven stable there.
 1. The given loop is examined; regulators (LQR) over a grid of weights are the further starts.
 2. A quick lower bound of the growth (``loop_growth.py``) excludes what cannot reach a rung. What is
    left is judged: the margin's certified upper bound must be below 1.
-3. From the best starts, and the best one of each hold strategy, the lower bound at the next rung is
-   minimised over K without gradients (Nelder and Mead). As soon as it is below 1, the search aims
-   higher; above the best loop's rung, the loop is judged first.
+3. From the best starts, the lower bound at the next rung is minimised over K without gradients
+   (Nelder and Mead). As soon as it is below 1, the loop is judged, and the search aims higher.
 """
 
 import itertools
@@ -360,20 +359,21 @@ class NetworkSearch:
         pool += [candidate for _, _, candidate in ranked[:_STARTS]]
         pool = list(dict.fromkeys([*pool, *first_of_each.values()]))
         share = max(self.wish.effort // len(pool), 1)
-        for number, candidate in enumerate(pool):
-            top, tries_left = rung if candidate == best else self.climb(candidate, 0)[0], share
-            while tries_left > 0 and top + 1 < len(self.ladder):
+        for number, start in enumerate(pool):
+            candidate = start
+            tries_left = share
+            while tries_left > 0 and rung + 1 < len(self.ladder):
                 tried_before = self.tried
-                improved = self._improve(candidate, top + 1, tries_left)
+                improved = self._improve(candidate, rung + 1, tries_left)
                 tries_left -= max(self.tried - tried_before, 1)
                 if improved is None:
                     break
-                candidate, top = improved, max(self.climb(improved, top + 1)[0], top + 1)
-                if top > rung:
-                    reached, stability = self.reach(candidate, top, rung)
-                    if stability is None:
-                        break
-                    best, rung = candidate, reached
+                candidate = improved
+                top, _ = self.climb(candidate, rung + 1)
+                reached, stability = self.reach(candidate, max(top, rung + 1), rung)
+                if stability is None:
+                    break
+                best, rung = candidate, reached
             progress(0.3 + 0.6 * (number + 1) / len(pool))
         return original, original if best == original.candidate else self.completed(best, rung)
 
