@@ -38,7 +38,7 @@ from tests.noack.runtime.live_loops import KEY, RUN_ID, Rows, scenario
 
 Start = Callable[..., live.Running]
 BUILD = Path(__file__).parents[2] / "native" / "build.py"
-GREETING = "noack node 1 512"
+GREETING = "noack node 1 528"
 EMULATED, TARGET = "arm", "arm-linux-musleabihf"
 """A processor of 32 bits that qemu-user emulates; ziglang builds a C library for it, for a minute."""
 
