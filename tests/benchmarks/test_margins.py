@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.cases.margins import random_loop
+from noack.core.clock import NEVER_NS
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import LossHistory
 from noack.theory.margins.exact_matrices import exponential, fixed, stacked
@@ -17,12 +18,12 @@ def period(loop: TimeTriggeredLoop, slot: int, delivered: bool) -> Matrix:
     from_ns, times = slot * loop.times.period_ns, loop.times
     until_ns, arrival_ns = from_ns + times.period_ns, from_ns + times.delay_ns
     if not delivered:
-        return loop._between(from_ns, until_ns).interval().middle
+        return loop._between(from_ns, until_ns, NEVER_NS).interval().middle
     start = fixed(np.eye(len(loop._latch.entries)))
-    state = loop._between(from_ns, arrival_ns) @ start
+    state = loop._between(from_ns, arrival_ns, NEVER_NS) @ start
     updated = exponential(loop._H, times.delay_ns) @ start.rows(loop._x)
     state = stacked(state.rows(loop._x), updated, state.rows(loop._inputs))
-    return (loop._between(arrival_ns, until_ns) @ state).interval().middle
+    return (loop._between(arrival_ns, until_ns, NEVER_NS) @ state).interval().middle
 
 
 @pytest.mark.parametrize("seed", {*range(16)} - {0, 4, 6, 11})  # those take up to a minute
