@@ -343,9 +343,9 @@ def sentences(unlimited: UnlimitedLosses) -> Iterator[str]:
     for run in unlimited.runs:
         grown = f" e^({run.rate_per_s:.3g}t)" if run.rate_per_s else ""
         yield (
-            f"Runs of {unlimited.horizon_s:g} s without a burst of more than {run.most} losses, all "
-            f"but a share of at most {1 - run.probability:.2g}: the {_MOMENT[run.order]} of a run's "
-            f"largest ‖x‖{grown} is at most {run.state:.4g}, that of ‖e_c‖{grown} at most "
+            f"Runs of {unlimited.horizon_s:g} s, where one with a burst of more than {run.most} losses "
+            f"counts as 0 (a share of at most {1 - run.probability:.2g}): the {_MOMENT[run.order]} of a "
+            f"run's largest ‖x‖{grown} is at most {run.state:.4g}, that of ‖e_c‖{grown} at most "
             f"{run.controller_error:.4g}."
         )
     for moment in unlimited.moments:
