@@ -87,5 +87,8 @@ def read_holds(words: str) -> list[Hold]:
                 holds.append(_predictions(int(number), "hold"))
             case _:
                 names = ", ".join(HOLDS)
-                raise CallerError(f'--holds: {names}, predictions:N, predictions:N:hold, not "{word}"')
+                raise CallerError(
+                    f"--holds: {names}, predictions:N or predictions:N:hold (N from 1 to {_MOST}), "
+                    f'not "{word}"'
+                )
     return list(dict.fromkeys(holds))
