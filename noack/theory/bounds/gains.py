@@ -260,6 +260,17 @@ class ErrorGains:
         kernels = responses.through_each(self.stacked)
         return {output: float(kernel.sup_on_grid()) for output, kernel in kernels.items()}
 
+    def age_gains(self, hold_s: float) -> Mapping[Output, float]:
+        """Return gains g_C: an input of age σ ≤ ``hold_s`` adds at most Σ g_C ‖C x_c‖ to ‖u − Kx‖.
+
+        They are those of Taylor's formula: σ of K H, σ²/2 of K H², and the remainder of W.
+        """
+        return {
+            Output.GAIN_RATE: hold_s,
+            Output.GAIN_CURVATURE: hold_s**2 / 2,
+            Output.WEIGHTED: self.hold_remainder(hold_s),
+        }
+
     @cached_method
     def hold_remainder(self, hold_s: float) -> float:
         """Bound ‖K(e^{−Hσ} − I + Hσ − ½H²σ²) W^{−1}‖ for |σ| ≤ ``hold_s``.

@@ -159,7 +159,7 @@ class ErrorInequalities:
         self._error, self._plant, self._bound, self._estimation = error, plant, bound, _ = part
         self._conditions = conditions
         self._lost: LossAccumulation | None = None
-        self._remainder = error.hold_remainder(conditions.hold_s)
+        self.age_gains = error.age_gains(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
         self._beyond = np.maximum(self._start_error, earlier_error)
         self._states = {
@@ -417,16 +417,6 @@ class ErrorInequalities:
         rows = _rows(*(row for row, _ in all_rows))
         right = _columns(*(right for _, right in all_rows))
         return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
-
-    @property
-    def age_gains(self) -> Mapping[Output, float]:
-        """The part of ‖u − Kx‖ due to the input's age is at most Σ gain_C sup‖C x_c‖."""
-        hold_s = self._conditions.hold_s
-        return {
-            Output.GAIN_RATE: hold_s,
-            Output.GAIN_CURVATURE: hold_s**2 / 2,
-            Output.WEIGHTED: self._remainder,
-        }
 
     def _missing_gain(self, output: Output, events: Counts, spacing_s: Vector) -> Vector:
         if self._error.decays or math.isinf(self._bound.due_s):

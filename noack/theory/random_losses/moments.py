@@ -1,26 +1,6 @@
 """Bounds of a loop without a limit on consecutive losses: bursts, and moments.
 
-Each update is lost with a probability of at most p̄, whatever happened before. |v| is the r-th
-moment norm, (E‖v‖ʳ)^{1/r}, r = 1 or 2, and ρ = p̄^{1/r}. With all signals scaled by e^{αt}, at
-every fixed time
-
-    |C e_c| ≤ ‖C W⁻¹‖ a + f_C(a, m, π) + ℓ_C(m, π)            (I1): in flight, and lost
-    |C x|   ≤ free_C + gain_C π
-    π = |p| ≤ |K e_c| + σ (|KH x| + |KH e_c|) + r(σ) (|x|_W + |e_c|_W)
-    a = |e_s|_W ≤ ḡβ + I_E m + I_B π,    m = |R_E x|
-
-A missing event's part of e_c is what E x and B p have added since the event before it. All that has
-ever been added is D_C = ∫‖C e^{(H+αI)s} L_E‖ ds m + ∫‖C e^{(H+αI)s} B U‖ ds π, so ℓ_C ≤ ρ D_C. But
-an event has no more than c_i = β sup ‖C e^{(H+αI)τ} W⁻¹‖, and what is added to it after the last
-test, if there have been i − 1 more since; and all i are lost with a probability of at most p̄ⁱ. So
-their sum is at most S_J = c_1 + … + c_J, where J is like a random number with P(J ≥ i) ≤ min(1,
-p̄ⁱ D_C/c_i):
-
-    ℓ_C ≤ (Σ_i (S_iʳ − S_{i−1}ʳ) min(1, p̄ⁱ D_C/c_i))^{1/r} + ρ/(1 − ρ) √(h d_C D_C)
-
-d_C the rate at which C e_c can grow; the last term is for r = 2, and 0 without a period h of tests.
-This is concave: any tangent bounds it, and then the inequalities are linear. Without h and delay
-there is a bound for every p̄ < 1.
+At every fixed time: :mod:`~noack.theory.random_losses.fixed_times`.
 
 At an event of the continuous trigger, where ‖e_s‖_W = β, the distribution of the number of missing
 events is known exactly, and (I1) gives a bound by itself: :func:`moment_at_events`.
@@ -32,34 +12,28 @@ Almost surely, x decays at every rate below that of the moments. Under the paper
 so for every loss probability below 1. :func:`unlimited_losses` says all of this of a scenario.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.core.linear_systems import spectral_abscissa
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
-from noack.scenario.resolution import loop_of
+from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.contraction import Stack
-from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
+from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.certificates.assumptions import below
 from noack.theory.certificates.conditions import most_events
-from noack.theory.certificates.inequalities import solve_inequalities
 from noack.theory.certificates.scenario_certificates import CertificateScope
+from noack.theory.random_losses.fixed_times import BOUNDED, ORDERS, Moments, moments, refined_mean_squares
 
 _TERMS = 1024
-_CELLS = 64
-_MOST_LOST, _ROUNDS, _SETTLED, _FIRST = 256, 30, 0.999, 1e6
-_A, _PI, _ONE = np.eye(3)
-"""a, π and 1; every other signal is bounded by a combination of them."""
-ORDERS = (1, 2)
 _MOST_BURST = 64
 _CERTAIN = 1 - 1e-9
 _ROUNDING = 1e-9
@@ -69,24 +43,6 @@ _RATES = (1.0, 0.5, 0.25, 1e-3)
 """Shares of the trigger's rate at which moments are tried, until one of the smaller ones has a loop
 gain that is clearly below 1: near 1 the bounds are large."""
 _CLEARLY = 0.9
-
-
-class Moments(NamedTuple):
-    """Bounds of (E‖·‖ʳ)^{1/r}, each multiplied by e^{−rate·t}, at every fixed time t."""
-
-    order: int
-    """r."""
-    rate_per_s: float
-    sensor_error: float
-    """Of ‖e_s‖_W."""
-    controller_error: float
-    """Of ‖e_c‖_W."""
-    input_error: float
-    """Of ‖u − Kx‖, from the first applied input on."""
-    state: float
-    """Of ‖x‖."""
-    loop_gain: float
-    """Spectral radius of the inequalities; below 1."""
 
 
 def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, order: int) -> float:
@@ -116,169 +72,6 @@ def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, o
     later = (1 - longest) ** -order - 1  # Σ_{k≥1} (k + 1)^{r−1} longestᵏ
     beyond = order * gains[-1] * sums[-1] ** (order - 1) * tails.sum() * later
     return float((1.0 + tails @ np.diff(sums**order) + beyond) ** (1 / order)) * (1 + _ROUNDING)
-
-
-def moments(
-    error: ErrorGains,
-    plant: PlantGains,
-    conditions: NetworkConditions,
-    beta: float,
-    largest_probability: float,
-    order: int,
-) -> Moments:
-    """Bound the moments of all signals at every fixed time; ``conditions.dropouts`` has no effect.
-
-    Args:
-        error: the gains of the models.
-        plant: the gains of the plant.
-        conditions: of the schedule.
-        beta: β: after a test, ‖e_s‖_W ≤ βe^{−αt}.
-        largest_probability: p̄, the largest probability of a loss, given the past.
-        order: r.
-
-    Raises:
-        NoCertificateError: the spectral radius of the inequalities is not below 1.
-        NotDecayingError: α is not below the decay rate of the models, or of A + BK.
-    """
-    candidates = [
-        _Inequalities(error, plant, conditions, beta, largest_probability, higher_order).solve()
-        for higher_order in ORDERS[order - 1 :]  # a mean is at most the root mean square
-    ]
-    if not any(np.isfinite(candidate.state) for candidate in candidates):
-        loop_gain = min(candidate.loop_gain for candidate in candidates)
-        raise NoCertificateError(f"the loop gain of the moments is {loop_gain:.3g}, not below 1")
-    return Moments(order, *map(min, zip(*(candidate[1:] for candidate in candidates), strict=True)))
-
-
-class _Inequalities:
-    """The inequalities; every signal is bounded by a row: multiples of a and π, and a constant."""
-
-    def __init__(
-        self,
-        error: ErrorGains,
-        plant: PlantGains,
-        conditions: NetworkConditions,
-        beta: float,
-        probability: float,
-        order: int,
-    ) -> None:
-        if not error.scaled_H.any():
-            raise NotDecayingError("a hold does not decay")
-        self._error, self._plant, self._conditions = error, plant, conditions
-        self._beta, self._probability, self._order = beta, probability, order
-        self._start_error, self._start = plant.start_up(conditions.start_s)
-        columns, delay_s = (plant.split_mismatch[0], plant.input_matrix), conditions.delay_s
-        self._drive = [response(error.scaled_H, D) for D in columns]
-        self._recent = [response_until(error.scaled_H, D, delay_s) for D in columns if delay_s > 0]
-        self._signals = self._state(Output.MISMATCH), _PI + self._start_error * _ONE
-        self._missing = {output: self._missing_events(output) for output in error.outputs}
-
-    def solve(self) -> Moments:
-        """Return the bounds, infinite ones with a loop gain if there are none.
-
-        Each round bounds the concave terms by their tangents at the bounds that hold already.
-        """
-        rate_per_s, state = self._error.alpha_per_s, self._state(Output.STATE)
-        best = Moments(self._order, rate_per_s, *(np.inf,) * 5)
-        values = np.array([*(_FIRST * self._beta,) * 2, 1.0])
-        for _ in range(_ROUNDS):
-            controller = {output: self._controller_error(output, values) for output in self._missing}
-            rows = self._rows(controller)
-            solution = solve_inequalities(rows[:, :2], rows[:, 2])
-            values = np.append(solution.bound, 1.0)
-            loop_gain = float(solution.loop_gain)
-            if not np.isfinite(values).all():
-                return best._replace(loop_gain=min(best.loop_gain, loop_gain))
-            signals = (_A, controller[Output.WEIGHTED], _PI, state)
-            a, e_c, pi, x = (float(row @ values) for row in signals)
-            refined = Moments(self._order, rate_per_s, a, e_c, pi, x, loop_gain)
-            if refined.state > _SETTLED * best.state:
-                break
-            best = refined
-        return best
-
-    def _rows(self, controller: Mapping[Output, Vector]) -> Matrix:
-        """Return the rows that bound a and π, (2, 3)."""
-        conditions, error = self._conditions, self._error
-        pi = controller[Output.GAIN] + error.hold_remainder(conditions.hold_s) * (
-            self._state(Output.WEIGHTED) + controller[Output.WEIGHTED]
-        )
-        pi += conditions.hold_s * (self._state(Output.GAIN_RATE) + controller[Output.GAIN_RATE])
-        a = self._beta * error.stretch(conditions.sampling_s) * _ONE
-        if conditions.sampling_s > 0:
-            growth = self._plant.growth(conditions.sampling_s, _CELLS)
-            areas = growth.mismatch.integral_on_grid(), growth.input_error.integral_on_grid()
-            a = a + self._driven(areas)
-        return np.array([a, pi])
-
-    def _driven(self, gains: Iterable[Stack]) -> Vector:
-        """Return the row of what E x and B p do with these gains."""
-        return sum((gain * row for gain, row in zip(gains, self._signals, strict=False)), np.zeros(3))
-
-    def _state(self, output: Output) -> Vector:
-        free, gain = self._plant.states[output]
-        return np.asarray(gain * _PI + (free + self._start[output]) * _ONE)
-
-    def _missing_events(self, output: Output) -> "_Missing":
-        """Return what bounds the missing events' part of C e_c, and the present error."""
-        error, C, conditions = self._error, self._error.outputs[output], self._conditions
-        delay_s, kernels = conditions.delay_s, [drive.through(C) for drive in self._drive]
-        ages_s = delay_s + conditions.spacing_s * np.arange(float(_MOST_LOST))
-        ceilings = self._beta * error.kernels[output].sups(ages_s)
-        present = error.now(output) * _A
-        if delay_s > 0:
-            present = present + error.kernels[output].sup(delay_s) * _A
-        return _Missing(
-            present,
-            self._driven(recent.through(C).integral_on_grid() for recent in self._recent),
-            self._driven(kernel.integral() for kernel in kernels),
-            conditions.sampling_s * self._driven(kernel.sup(delay_s) for kernel in kernels),
-            ceilings,
-        )
-
-    def _controller_error(self, output: Output, values: Vector) -> Vector:
-        """The bound of |C e_c|, as tight as can be where the signals have these values."""
-        share = self._probability ** (1 / self._order)
-        missing = self._missing[output]
-        lost = [share * (missing.whole - missing.recent)]
-        whole, overshoot = missing.whole @ values, missing.overshoot @ values
-        if share < 1 and whole > 0 and (self._order > 1 or overshoot == 0):
-            row = missing.burst(self._probability, self._order, float(whole))
-            if overshoot > 0:
-                ratio = np.sqrt(whole / overshoot)
-                row = row + share / (1 - share) / 2 * (ratio * missing.overshoot + missing.whole / ratio)
-            lost.append(row)
-        best = min(lost, key=lambda row: float(row @ values))
-        return np.asarray(missing.present + missing.recent + best)
-
-
-class _Missing(NamedTuple):
-    """What bounds the part of C e_c that missing events have; rows but for the last."""
-
-    present: Vector
-    """Of e_s, now and when the oldest update in flight was sent."""
-    recent: Vector
-    """What has been added to e_s while updates in flight were sent."""
-    whole: Vector
-    """What has ever been added to e_s."""
-    overshoot: Vector
-    """What is added to e_s between two tests, at most."""
-    ceilings: Vector
-    """What the i-th last event since the last delivery has at most, without the overshoot."""
-
-    def burst(self, probability: float, order: int, whole: float) -> Vector:
-        """Bound (Σ_i (S_iʳ − S_{i−1}ʳ) min(1, p^i D/c_i))^{1/r} by its tangent at a value of D."""
-        c, powers = self.ceilings, probability ** np.arange(1.0, len(self.ceilings) + 1)
-        sums = np.cumsum(np.append(0.0, c))
-        weights = np.ones_like(c) if order == 1 else sums[1:] + sums[:-1]
-        few = powers * whole < c
-        # Beyond the last one c_i is not larger, and (S_iʳ − S_{i−1}ʳ)/c_i at most r S_iʳ⁻¹.
-        ratio = probability / (1 - probability)
-        beyond = ratio if order == 1 else 2 * ratio * (sums[-1] + c[-1] / (1 - probability))
-        slope = float((weights * powers)[few].sum() + powers[-1] * beyond)
-        value = float(((weights * c)[~few].sum() + slope * whole) ** (1 / order))
-        tangent = slope / (order * value ** (order - 1)) if slope else 0.0
-        return np.asarray(tangent * self.whole + (value - tangent * whole) * _ONE)
 
 
 class BurstCertificate(NamedTuple):
@@ -434,25 +227,43 @@ def _moments(
         alpha = 0.0
     if decay <= 0:
         return [], "the models or A + BK do not decay"
+    level, p = max(trigger.beta, trigger.floor), losses.largest_probability
     bounds: list[Moments] = []
-    level = max(trigger.beta, trigger.floor)
     for order in ORDERS:
-        solutions: list[Moments] = []
-        reason = None
-        for share in _RATES:
-            error = error_gains(loop, share * alpha)
-            plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], share * alpha)
-            p = losses.largest_probability
-            try:
-                solutions.append(moments(error, plant, conditions, level, p, order))
-            except (NoCertificateError, NotDecayingError) as error_found:
-                reason = str(error_found)
-            if solutions and (share == 1 or solutions[-1].loop_gain < _CLEARLY):
-                break
-        if not solutions:
-            return bounds, reason
-        bounds.append(solutions[-1])
-    return bounds, None
+        try:
+            bounds.append(_at_a_rate(loop, alpha, conditions, level, p, order))
+        except (NoCertificateError, NotDecayingError) as error:
+            return bounds, str(error)
+    mean, first = bounds
+    refined = refined_mean_squares(*_gains(loop, first.rate_per_s), conditions, level, p)
+    if refined.rate_per_s >= mean.rate_per_s:  # a mean is at most the root mean square
+        smaller = {name: min(getattr(mean, name), getattr(refined, name)) for name in BOUNDED}
+        mean = mean._replace(**smaller)
+    return [mean, refined], None
+
+
+def _at_a_rate(
+    loop: LoopMatrices, alpha_per_s: float, conditions: NetworkConditions, beta: float, p: float, order: int
+) -> Moments:
+    """Return the moments at the first rate with a small loop gain, or else at the lowest one."""
+    found: Moments | None = None
+    reason: Exception | None = None
+    for share in _RATES:
+        try:
+            found = moments(*_gains(loop, share * alpha_per_s), conditions, beta, p, order)
+        except (NoCertificateError, NotDecayingError) as error:
+            reason = error
+        if found and (share == 1 or found.loop_gain < _CLEARLY):
+            return found
+    if found is None:
+        assert reason is not None
+        raise reason
+    return found
+
+
+def _gains(loop: LoopMatrices, rate_per_s: float) -> tuple[ErrorGains, PlantGains]:
+    error = error_gains(loop, rate_per_s)
+    return error, PlantGains(error, loop.A, loop.B, loop.x0[:, None], rate_per_s)
 
 
 def _paper(resolved: Scenario, losses: LossProcess) -> tuple[float | None, tuple[float, ...]]:

@@ -15,7 +15,8 @@ from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.random_losses import mean_square_growth as mean_square_module
 from noack.theory.random_losses import moments as moments_module
 from noack.theory.random_losses import random_growth as random_growth_module
-from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments, moments_of_runs
+from noack.theory.random_losses.fixed_times import moments
+from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
 from tests.noack.theory.certificate_kinds.random_losses import certify, draw, simulate_runs
 
 

@@ -16,7 +16,8 @@ from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
-from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments, moments_of_runs
+from noack.theory.random_losses.fixed_times import moments, refined_mean_squares
+from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.oracles.continuous_loops import simulate_continuous_time
 from tests.oracles.lossy_loops import DRIFTING, STEPS, Reals, System, random_system, simulate, times_s
@@ -49,9 +50,12 @@ def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds
     """The bounds, or those of a broken copy: fewer losses, other conditions."""
     system = loop.system
     gains, conditions = system.gains(), system.conditions._replace(**changes)
-    p = share * loop.probability
+    network = conditions, system.beta, share * loop.probability
     try:
-        found = moments(gains.error, gains, conditions, system.beta, p, loop.order)
+        if loop.order == 2:
+            found = refined_mean_squares(gains.error, gains, *network)
+        else:
+            found = moments(gains.error, gains, *network, loop.order)
     except (NoCertificateError, NotDecayingError):
         return None
     return {

@@ -1,0 +1,325 @@
+"""Moments at every fixed time, without a limit on consecutive losses.
+
+Each update is lost with a probability of at most p̄, whatever happened before. |v| is the r-th
+moment norm, (E‖v‖ʳ)^{1/r}, r = 1 or 2, and ρ = p̄^{1/r}. With all signals scaled by e^{αt}, at
+every fixed time
+
+    |C e_c| ≤ ‖C W⁻¹‖ a + f_C(a, m, π) + ℓ_C(m, π)            (I1): in flight, and lost
+    |C x|   ≤ free_C + gain_C π
+    π = |p| ≤ |K e_c| + σ (|KH x| + |KH e_c|) + r(σ) (|x|_W + |e_c|_W)
+    a = |e_s|_W ≤ ḡβ + I_E m + I_B π,    m = |R_E x|
+
+A missing event's part of e_c is what E x and B p have added since the event before it. All that has
+ever been added is D_C = ∫‖C e^{(H+αI)s} L_E‖ ds m + ∫‖C e^{(H+αI)s} B U‖ ds π, so ℓ_C ≤ ρ D_C. But
+an event has no more than c_i = β sup ‖C e^{(H+αI)τ} W⁻¹‖, and what is added to it after the last
+test, if there have been i − 1 more since; and all i are lost with a probability of at most p̄ⁱ. So
+their sum is at most S_J = c_1 + … + c_J, where J is like a random number with P(J ≥ i) ≤ min(1,
+p̄ⁱ D_C/c_i):
+
+    ℓ_C ≤ (Σ_i (S_iʳ − S_{i−1}ʳ) min(1, p̄ⁱ D_C/c_i))^{1/r} + ρ/(1 − ρ) √(h d_C D_C)
+
+d_C the rate at which C e_c can grow; the last term is for r = 2, and 0 without a period h of tests.
+This is concave: any tangent bounds it, and then the inequalities are linear. Without h and delay
+there is a bound for every p̄ < 1.
+
+Mean squares are made smaller afterwards, by quadratic functions of the loop's state
+(:mod:`~noack.theory.random_losses.quadratic_moments`), which need bounds of ‖e_s‖ and of what the
+input's age does to p: a first bound is that of the inequalities, and each one makes others smaller.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from noack.core.linear_systems import Matrix, Vector, exponential
+from noack.theory.bounds.contraction import Stack
+from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
+from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
+from noack.theory.certificates.inequalities import solve_inequalities
+from noack.theory.random_losses.quadratic_moments import (
+    Known,
+    LossyFlow,
+    QuadraticFunction,
+    quadratic_functions,
+)
+
+ORDERS = (1, 2)
+BOUNDED = ("sensor_error", "controller_error", "input_error", "state")
+"""The bounds of :class:`Moments`."""
+_CELLS = 64
+_MOST_LOST, _ROUNDS, _SETTLED, _FIRST = 256, 30, 0.999, 1e6
+_A, _PI, _ONE = np.eye(3)
+"""a, π and 1; every other signal is bounded by a combination of them."""
+
+
+_Signals = tuple[Vector, Vector]
+"""Rows that bound R_E x and p."""
+_Term = TypeVar("_Term", float, Vector)
+
+
+class Moments(NamedTuple):
+    """Bounds of (E‖·‖ʳ)^{1/r}, each multiplied by e^{−rate·t}, at every fixed time t."""
+
+    order: int
+    """r."""
+    rate_per_s: float
+    sensor_error: float
+    """Of ‖e_s‖_W."""
+    controller_error: float
+    """Of ‖e_c‖_W."""
+    input_error: float
+    """Of ‖u − Kx‖, from the first applied input on."""
+    state: float
+    """Of ‖x‖."""
+    loop_gain: float
+    """Spectral radius of the inequalities; below 1."""
+
+
+def moments(
+    error: ErrorGains,
+    plant: PlantGains,
+    conditions: NetworkConditions,
+    beta: float,
+    largest_probability: float,
+    order: int,
+) -> Moments:
+    """Bound the moments of all signals at every fixed time; ``conditions.dropouts`` has no effect.
+
+    Args:
+        error: the gains of the models.
+        plant: the gains of the plant.
+        conditions: of the schedule.
+        beta: β: after a test, ‖e_s‖_W ≤ βe^{−αt}.
+        largest_probability: p̄, the largest probability of a loss, given the past.
+        order: r.
+
+    Raises:
+        NoCertificateError: the spectral radius of the inequalities is not below 1.
+        NotDecayingError: α is not below the decay rate of the models, or of A + BK.
+    """
+    candidates = [
+        _Inequalities(error, plant, conditions, beta, largest_probability, higher_order).solve()
+        for higher_order in ORDERS[order - 1 :]  # a mean is at most the root mean square
+    ]
+    if not any(np.isfinite(candidate.state) for candidate in candidates):
+        loop_gain = min(candidate.loop_gain for candidate in candidates)
+        raise NoCertificateError(f"the loop gain of the moments is {loop_gain:.3g}, not below 1")
+    return Moments(order, *map(min, zip(*(candidate[1:] for candidate in candidates), strict=True)))
+
+
+def refined_mean_squares(
+    error: ErrorGains,
+    plant: PlantGains,
+    conditions: NetworkConditions,
+    beta: float,
+    largest_probability: float,
+) -> Moments:
+    """Bound root mean squares at every fixed time, also by quadratic functions, which takes longer.
+
+    Arguments and errors are those of :func:`moments`.
+    """
+    inequalities = _Inequalities(error, plant, conditions, beta, largest_probability, 2)
+    first = inequalities.solve()
+    if not np.isfinite(first.state):
+        raise NoCertificateError(f"the loop gain of the moments is {first.loop_gain:.3g}, not below 1")
+    return inequalities.refine(first)
+
+
+class _Bounds(NamedTuple):
+    """Root mean squares that hold already."""
+
+    states: Mapping[str, float]
+    """Of ‖C x‖."""
+    errors: Mapping[str, float]
+    """Of ‖C e_c‖."""
+    sensor_error: float
+    input_error: float
+    """From the first applied input on."""
+
+
+class _Inequalities:
+    """The inequalities; every signal is bounded by a row: multiples of a and π, and a constant."""
+
+    def __init__(
+        self,
+        error: ErrorGains,
+        plant: PlantGains,
+        conditions: NetworkConditions,
+        beta: float,
+        probability: float,
+        order: int,
+    ) -> None:
+        if not error.scaled_H.any():
+            raise NotDecayingError("a hold does not decay")
+        self._error, self._plant, self._conditions = error, plant, conditions
+        self._beta, self._probability, self._order = beta, probability, order
+        self._start_error, self._start = plant.start_up(conditions.start_s)
+        columns, delay_s = (plant.split_mismatch[0], plant.input_matrix), conditions.delay_s
+        self._drive = [response(error.scaled_H, D) for D in columns]
+        self._recent = [response_until(error.scaled_H, D, delay_s) for D in columns if delay_s > 0]
+        self._ages = error.age_gains(conditions.hold_s)
+        self._signals = self._state(Output.MISMATCH), _PI + self._start_error * _ONE
+        self._missing = {str(output): self._missing_events(output, self._signals) for output in error.outputs}
+
+    def solve(self) -> Moments:
+        """Return the bounds, infinite ones with a loop gain if there are none.
+
+        Each round bounds the concave terms by their tangents at the bounds that hold already.
+        """
+        rate_per_s, state = self._error.alpha_per_s, self._state(Output.STATE)
+        best = Moments(self._order, rate_per_s, *(np.inf,) * 5)
+        values = np.array([*(_FIRST * self._beta,) * 2, 1.0])
+        for _ in range(_ROUNDS):
+            controller = {C: self._controller_error(values, missing) for C, missing in self._missing.items()}
+            rows = self._rows(controller)
+            solution = solve_inequalities(rows[:, :2], rows[:, 2])
+            values = np.append(solution.bound, 1.0)
+            loop_gain = float(solution.loop_gain)
+            if not np.isfinite(values).all():
+                return best._replace(loop_gain=min(best.loop_gain, loop_gain))
+            signals = (_A, controller[Output.WEIGHTED], _PI, state)
+            a, e_c, pi, x = (float(row @ values) for row in signals)
+            refined = Moments(self._order, rate_per_s, a, e_c, pi, x, loop_gain)
+            if refined.state > _SETTLED * best.state:
+                break
+            best = refined
+        return best
+
+    def refine(self, first: Moments) -> Moments:
+        """Make bounds of mean squares smaller; each one that is used holds already."""
+        values = np.array([first.sensor_error, first.input_error, 1.0])
+        controller = {C: self._controller_error(values, missing) for C, missing in self._missing.items()}
+        bounds = _Bounds(
+            {C: float(self._state(C) @ values) for C in self._plant.outputs},
+            {C: float(row @ values) for C, row in controller.items()},
+            first.sensor_error,
+            first.input_error,
+        )
+        flow = LossyFlow(self._error, self._plant, self._conditions, self._probability)
+        functions = quadratic_functions(flow, self._known(bounds))
+        for _ in range(_ROUNDS):
+            before, bounds = bounds, self._improved(bounds, functions)
+            if bounds.states[Output.STATE] > _SETTLED * before.states[Output.STATE]:
+                break
+        return first._replace(
+            sensor_error=bounds.sensor_error,
+            controller_error=bounds.errors[Output.WEIGHTED],
+            input_error=bounds.input_error,
+            state=bounds.states[Output.STATE],
+        )
+
+    def _known(self, bounds: _Bounds) -> Known:
+        at_start = float(self._start_error) + bounds.errors[Output.GAIN] if self._conditions.start_s else 0.0
+        return Known(bounds.sensor_error, self._with_age(0.0, bounds.states, bounds.errors), at_start)
+
+    def _improved(self, bounds: _Bounds, functions: Sequence[QuadraticFunction]) -> _Bounds:
+        """Bound every signal by what is known of the others."""
+        known, delay_s = self._known(bounds), self._conditions.delay_s
+        mismatch, driving = bounds.states[Output.MISMATCH], max(bounds.input_error, float(self._start_error))
+        signals = mismatch * _ONE, driving * _ONE
+        values = np.array([bounds.sensor_error, bounds.input_error, 1.0])
+        propagated = exponential(self._error.scaled_H * delay_s)
+        errors: dict[str, float] = {}
+        for output, C in self._error.outputs.items():
+            missing = self._missing_events(output, signals)
+            by_missing = float(self._controller_error(values, missing) @ values)
+            recent = float(missing.recent @ values)
+            by_functions = (V.bound_error(C @ propagated, known) + recent for V in functions)
+            errors[output] = min(bounds.errors[output], by_missing, *by_functions)
+        states = {
+            output: min(bounds.states[output], *(V.bound_state(C, known) for V in functions))
+            for output, C in self._plant.outputs.items()
+        }
+        input_error = self._with_age(errors[Output.GAIN], states, errors)
+        tested = float(self._tested(signals) @ values)
+        return _Bounds(states, errors, min(bounds.sensor_error, tested), min(bounds.input_error, input_error))
+
+    def _with_age(self, total: _Term, states: Mapping[str, _Term], errors: Mapping[str, _Term]) -> _Term:
+        """Add to a bound what the input's age adds to p."""
+        for C, gain in self._ages.items():
+            total = total + gain * (states[C] + errors[C])
+        return total
+
+    def _rows(self, controller: Mapping[str, Vector]) -> Matrix:
+        """Return the rows that bound a and π, (2, 3)."""
+        states = {str(C): self._state(C) for C in self._ages}
+        pi = self._with_age(controller[Output.GAIN], states, controller)
+        return np.array([self._tested(self._signals), pi])
+
+    def _tested(self, signals: _Signals) -> Vector:
+        """Return the row that bounds a: β, grown until the next test, and what enters before it."""
+        sampling_s = self._conditions.sampling_s
+        a = self._beta * self._error.stretch(sampling_s) * _ONE
+        if sampling_s > 0:
+            growth = self._plant.growth(sampling_s, _CELLS)
+            a = a + _driven(
+                (growth.mismatch.integral_on_grid(), growth.input_error.integral_on_grid()), signals
+            )
+        return np.asarray(a)
+
+    def _state(self, output: str) -> Vector:
+        free, gain = self._plant.states[output]
+        return np.asarray(gain * _PI + (free + self._start[output]) * _ONE)
+
+    def _missing_events(self, output: Output, signals: _Signals) -> "_Missing":
+        """Return what bounds the missing events' part of C e_c, and the present error."""
+        error, C, conditions = self._error, self._error.outputs[output], self._conditions
+        delay_s, kernels = conditions.delay_s, [drive.through(C) for drive in self._drive]
+        ages_s = delay_s + conditions.spacing_s * np.arange(float(_MOST_LOST))
+        return _Missing(
+            (error.kernels[output].sup(delay_s) if delay_s > 0 else error.now(output)) * _A,
+            _driven((recent.through(C).integral_on_grid() for recent in self._recent), signals),
+            _driven((kernel.integral() for kernel in kernels), signals),
+            conditions.sampling_s * _driven((kernel.sup(delay_s) for kernel in kernels), signals),
+            self._beta * error.kernels[output].sups(ages_s),
+        )
+
+    def _controller_error(self, values: Vector, missing: "_Missing") -> Vector:
+        """The bound of |C e_c|, as tight as can be where the signals have these values."""
+        share = self._probability ** (1 / self._order)
+        lost = [share * (missing.whole - missing.recent)]
+        whole, overshoot = missing.whole @ values, missing.overshoot @ values
+        if share < 1 and whole > 0 and (self._order > 1 or overshoot == 0):
+            row = missing.burst(self._probability, self._order, float(whole))
+            if overshoot > 0:
+                ratio = np.sqrt(whole / overshoot)
+                row = row + share / (1 - share) / 2 * (ratio * missing.overshoot + missing.whole / ratio)
+            lost.append(row)
+        best = min(lost, key=lambda row: float(row @ values))
+        return np.asarray(missing.present + missing.recent + best)
+
+
+def _driven(gains: Iterable[Stack], signals: _Signals) -> Vector:
+    """Return the row of what E x and B p do with these gains."""
+    return sum((gain * row for gain, row in zip(gains, signals, strict=False)), np.zeros(3))
+
+
+class _Missing(NamedTuple):
+    """What bounds the part of C e_c that missing events have; rows but for the last."""
+
+    present: Vector
+    """Of e_s, now and when the oldest update in flight was sent."""
+    recent: Vector
+    """What has been added to e_s while updates in flight were sent."""
+    whole: Vector
+    """What has ever been added to e_s."""
+    overshoot: Vector
+    """What is added to e_s between two tests, at most."""
+    ceilings: Vector
+    """What the i-th last event since the last delivery has at most, without the overshoot."""
+
+    def burst(self, probability: float, order: int, whole: float) -> Vector:
+        """Bound (Σ_i (S_iʳ − S_{i−1}ʳ) min(1, p^i D/c_i))^{1/r} by its tangent at a value of D."""
+        c, powers = self.ceilings, probability ** np.arange(1.0, len(self.ceilings) + 1)
+        sums = np.cumsum(np.append(0.0, c))
+        weights = np.ones_like(c) if order == 1 else sums[1:] + sums[:-1]
+        few = powers * whole < c
+        # Beyond the last one c_i is not larger, and (S_iʳ − S_{i−1}ʳ)/c_i at most r S_iʳ⁻¹.
+        ratio = probability / (1 - probability)
+        beyond = ratio if order == 1 else 2 * ratio * (sums[-1] + c[-1] / (1 - probability))
+        slope = float((weights * powers)[few].sum() + powers[-1] * beyond)
+        value = float(((weights * c)[~few].sum() + slope * whole) ** (1 / order))
+        tangent = slope / (order * value ** (order - 1)) if slope else 0.0
+        return np.asarray(tangent * self.whole + (value - tangent * whole) * _ONE)

@@ -1,0 +1,396 @@
+"""Mean squares at every fixed time without a limit on the losses, by one quadratic function.
+
+All signals are scaled by e^{αt}. Let q be what the lost events since the last delivered one have
+left in x_s, by (I1): had every delivered update arrived at once, e_c would be ê_c = q + e_s. With
+v = p − K ê_c, between events
+
+    x' = (A+BK+αI) x + B (K ê_c + v),   q' = (H+αI) q,   e_s' = (H+αI) e_s − E x − B (K ê_c + v)
+
+At an event e_s becomes 0, and q becomes q + e_s if it is lost, with a probability of at most p̄
+whatever happened before, and 0 else. Let y = (q, e_s) and V = xᵀX x + yᵀP y. If
+
+    P ⪰ p̄ (I I)ᵀ P_qq (I I) + ζ' N (I I)ᵀ D (I I)         no event increases the mean of V
+    V' + 2λV ≤ μ‖e_s‖_W² + ζ‖v − v'‖² + ζ'‖v'‖²            for all x, y, v and v'
+
+then the mean of V is at most max(V(0), (μ a² + ζ ω²)/2λ) at every fixed time, where a² and ω² bound
+the mean squares of ‖e_s‖_W and of v − v'. v' = K(e_c − ê_c) is the effect of updates in flight. Each
+of them, at most N at a time, is there for d at most. D = ∫₀ᵈ e^{2λτ}‖K e^{(H+αI)τ}·‖² dτ bounds what
+it adds to V while it is in flight, and is counted when it is sent. (V has no product of x and y:
+an event changes y and leaves x, so the first inequality would not hold with one.)
+
+These are linear matrix inequalities. :func:`quadratic_functions` looks for those with the smallest
+bounds by a barrier method, which stays inside of them; that the result is inside is checked with a
+margin for rounding. They can be met for all p̄ < 1 (derivations.md, "Without a limit on the losses").
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
+from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.terms import NetworkConditions
+
+_OF_STATE, _OF_ERROR = (0.1, 0.35), (0.35, 0.75)
+"""λ for small bounds of ‖x‖ and of ‖ê_c‖, as shares of the decay rate that is left at α."""
+_GAP, _HEAVIER, _NEWTON_STEPS = 0.02, 8.0, 60
+_CENTERED, _DECREASE, _SHORTEST = 0.05, 0.1, 1e-10
+_LARGEST = 1e4
+"""Bound of the traces of X and P where ‖e_s‖_W ≤ 1 and V ≤ 1; without one they could be infinite."""
+_ROUNDING = 1e-13
+_INFLATED = 1 + 1e-9
+Blocks = tuple[Vector, *tuple[Matrix, ...]]
+"""Numbers that are to be positive, and symmetric matrices that are to be positive definite."""
+
+
+class Known(NamedTuple):
+    """Root mean squares that hold already, scaled by e^{αt}."""
+
+    sensor_error: float
+    """a, of ‖e_s‖_W at every fixed time."""
+    aged: float
+    """ω, of what the input's age adds to p from the first applied input on."""
+    start: float
+    """Of ‖p − K e_c‖ before the first applied input."""
+
+
+class QuadraticFunction(NamedTuple):
+    """V, of W x, W q and W e_s."""
+
+    state: Matrix
+    """X, (n, n)."""
+    errors: Matrix
+    """P, (2n, 2n), with P_ss + ν I in the place of P_ss: then it is positive definite, too."""
+    added: float
+    """ν."""
+    rate_per_s: float
+    """λ."""
+    of_sensor_error: float
+    """μ."""
+    of_age: float
+    """ζ."""
+    loop: "LossyFlow"
+
+    def level(self, known: Known) -> float:
+        """Bound of the mean of xᵀXx + yᵀPy, at every fixed time."""
+        loop, squares = self.loop, np.square(known)
+        entering = self.of_sensor_error * squares[0] + self.of_age * squares[1]
+        first = loop.start @ self.state @ loop.start
+        begun = self.of_age * squares[2] * loop.start_s
+        return float(max(first, entering / (2 * self.rate_per_s)) + begun + self.added * squares[0])
+
+    def bound_state(self, C: Matrix, known: Known) -> float:
+        """Bound of the root mean square of ‖C x‖."""
+        return _root(self.state, C @ self.loop.inverse_weight, self.level(known))
+
+    def bound_error(self, C: Matrix, known: Known) -> float:
+        """Bound of the root mean square of ‖C ê_c‖."""
+        turned = C @ self.loop.inverse_weight
+        return _root(self.errors, np.hstack([turned, turned]), self.level(known))
+
+
+def _root(form: Matrix, C: Matrix, level: float) -> float:
+    """√(level · sup‖C z‖²/zᵀ form z)."""
+    root = np.linalg.solve(np.linalg.cholesky(form), C.T)
+    return float(np.linalg.norm(root, 2) * np.sqrt(level)) * _INFLATED
+
+
+class LossyFlow:
+    """The flow of (x, q, e_s) in the coordinates of W, of one loop under a schedule.
+
+    Args:
+        error: the gains of the models.
+        plant: the gains of the plant; α of both is the same.
+        conditions: of the schedule; ``dropouts`` has no effect.
+        probability: p̄.
+    """
+
+    def __init__(
+        self, error: ErrorGains, plant: PlantGains, conditions: NetworkConditions, probability: float
+    ) -> None:
+        generators = plant.closed_loop, error.scaled_H
+        self.decay_per_s = -max(spectral_abscissa(M) for M in generators)
+        W, self.inverse_weight = error.weight, error.inverse_weight
+        self.closed_loop, self.model = (W @ M @ self.inverse_weight for M in generators)
+        self.probability, self.delay_s = probability, conditions.delay_s
+        self.start_s, self.start = conditions.start_s, W @ plant.start[:, 0]
+        self.has_aged_input = conditions.hold_s > 0 or conditions.start_s > 0
+        self.in_flight = conditions.delay_s and np.ceil(conditions.delay_s / conditions.spacing_s * _INFLATED)
+        self.input, self.gain = W @ plant.input_matrix, error.split_K[1] @ self.inverse_weight
+        BK, E = self.input @ self.gain, self.closed_loop - self.model
+        zero = np.zeros_like(E)
+        self.flow = np.block([
+            [self.closed_loop, BK, BK],
+            [zero, self.model, zero],
+            [-E, -BK, self.model - BK],
+        ])  # fmt: skip
+        self.inputs = np.vstack([self.input, 0 * self.input, -self.input])
+
+    def flight(self, rate_per_s: float) -> Matrix:
+        """N D, (n, n), enlarged by the rounding of an exponential."""
+        n, M = len(self.model), self.model + rate_per_s * np.eye(len(self.model))
+        square = self.gain.T @ self.gain
+        both = exponential(np.block([[-M.T, square], [np.zeros((n, n)), M]]) * self.delay_s)
+        D = both[n:, n:].T @ both[:n, n:]
+        return np.asarray(self.in_flight * (D + D.T) / 2 * _INFLATED)
+
+
+def quadratic_functions(loop: LossyFlow, known: Known) -> list[QuadraticFunction]:
+    """Return functions V for several λ, each for a small bound of ‖x‖ or of ‖ê_c‖_W."""
+    if loop.decay_per_s <= 0 or not np.isfinite(loop.in_flight):
+        return []
+    zero = np.zeros_like(loop.model)
+    searches = [_Search(loop, known, share, loop.inverse_weight, zero) for share in _OF_STATE]
+    searches += [_Search(loop, known, share, zero, np.eye(len(zero))) for share in _OF_ERROR]
+    return [function for search in searches for function in search.functions()]
+
+
+class _Unknowns(NamedTuple):
+    """X, P and the multipliers, where V ≤ 1 at all times and ‖e_s‖_W ≤ 1."""
+
+    X: Matrix
+    P: Matrix
+    mu: float
+    nu: float
+    zeta: float
+    """ζ, 0 without an aged input."""
+    in_flight: float
+    """ζ', 0 without a delay."""
+    gain: float
+    """The bound of the output is its root's inverse."""
+
+
+class _Search:
+    """The inequalities for one λ, in a vector of unknowns."""
+
+    def __init__(
+        self, loop: LossyFlow, known: Known, share: float, of_state: Matrix, of_error: Matrix
+    ) -> None:
+        self._loop, self._rate = loop, share * loop.decay_per_s
+        n = len(loop.model)
+        self._n, self._triangle, self._larger = n, np.triu_indices(n), np.triu_indices(2 * n)
+        self._sum, self._sensor = np.hstack([np.eye(n)] * 2), np.diag(np.repeat([0.0, 1.0], n))
+        self._of_state, self._of_error = of_state, of_error @ self._sum
+        unit = known.sensor_error
+        self._aged, self._begun = known.aged**2 / unit**2, known.start**2 / unit**2 * loop.start_s
+        self._start = loop.start / unit
+        self._flight = loop.flight(self._rate) if loop.delay_s > 0 else None
+
+    def functions(self) -> Iterator[QuadraticFunction]:
+        """The function for the smallest bound that was found; none if it cannot be confirmed."""
+        first = self._first()
+        if first is None:
+            return
+        found = _Inequalities(self._blocks, len(first)).maximise_last(first)
+        if found is not None:
+            X, P, mu, nu, zeta, *_ = self._unknowns(found)
+            yield QuadraticFunction(X, P + nu * self._sensor, nu, self._rate, mu, zeta, self._loop)
+
+    def _unknowns(self, values: Vector) -> _Unknowns:
+        n, first = self._n, len(self._triangle[0])
+        last = first + len(self._larger[0])
+        mu, nu, *others, gain = values[last:]
+        zeta = others.pop(0) if self._loop.has_aged_input else 0.0
+        in_flight = others.pop(0) if self._flight is not None else 0.0
+        X = _symmetric(values[:first], self._triangle, n)
+        P = _symmetric(values[first:last], self._larger, 2 * n)
+        return _Unknowns(X, P, mu, nu, zeta, in_flight, gain)
+
+    def _values(self, unknowns: _Unknowns) -> Vector:
+        X, P, mu, nu, zeta, in_flight, gain = unknowns
+        others = [zeta] * self._loop.has_aged_input + [in_flight] * (self._flight is not None)
+        return np.array([*X[self._triangle], *P[self._larger], mu, nu, *others, gain])
+
+    def _blocks(self, values: Vector) -> Blocks:
+        """What is to be positive definite; affine in the values."""
+        X, P, mu, nu, zeta, in_flight, gain = unknowns = self._unknowns(values)
+        n, rest = self._n, 1 - nu
+        at_event = P - self._loop.probability * self._sum.T @ P[:n, :n] @ self._sum
+        if self._flight is not None:
+            at_event = at_event - in_flight * self._sum.T @ self._flight @ self._sum
+        below = 2 * self._rate * (rest - zeta * self._begun) - mu - zeta * self._aged
+        scalars = [below, rest - zeta * self._begun - self._start @ X @ self._start, mu, nu]
+        scalars += [_LARGEST - np.trace(X), _LARGEST - np.trace(P)]
+        scalars += [zeta] * self._loop.has_aged_input + [in_flight] * (self._flight is not None)
+        return (
+            np.array(scalars),
+            self._between_events(unknowns),
+            at_event,
+            P + nu * self._sensor - gain * self._of_error.T @ self._of_error,
+            X - gain * self._of_state.T @ self._of_state,
+        )
+
+    def _between_events(self, unknowns: _Unknowns) -> Matrix:
+        """μ‖e_s‖² + ζ‖v − v'‖² + ζ'‖v'‖² − V' − 2λV as a form of (x, q, e_s, v − v', v')."""
+        X, P, mu, _, zeta, in_flight, _ = unknowns
+        n, flow, rank = self._n, self._loop.flow, self._loop.inputs.shape[1]
+        V, entering = np.zeros((3 * n, 3 * n)), np.zeros((3 * n, 3 * n))
+        V[:n, :n], V[n:, n:], entering[n:, n:] = X, P, mu * self._sensor
+        form = entering - flow.T @ V - V @ flow - 2 * self._rate * V
+        squares = [zeta] * self._loop.has_aged_input + [in_flight] * (self._flight is not None)
+        if not squares:
+            return np.asarray(form)
+        sides = np.hstack([-V @ self._loop.inputs] * len(squares))
+        return np.asarray(np.block([[form, sides], [sides.T, np.diag(np.repeat(squares, rank))]]))
+
+    def _first(self) -> Vector | None:
+        """Values inside of all inequalities; None if rounding leaves none.
+
+        q decays by itself, so a large P_qq covers what q does to x. A larger P_ss covers the events,
+        ζ' what v' does to x, and large μ and ζ what e_s and v − v' do. Then all is made small.
+        """
+        loop, p = self._loop, self._loop.probability
+        rate_per_s = (self._rate + loop.decay_per_s) / 2
+        X, Q = (_decaying_form(M, rate_per_s) for M in (loop.closed_loop, loop.model))
+        pushed = self._of_decay(loop.closed_loop, X, X @ loop.input)
+        in_flight = 8 * float(np.linalg.norm(pushed, 2)) ** 2
+        coupling = self._of_decay(loop.model, Q, (pushed @ loop.gain).T)
+        size = 8 * float(np.linalg.norm(coupling, 2)) ** 2 + float(np.trace(X) / np.trace(Q))
+        P = np.asarray(np.kron(np.diag([1.0, 2 * p / (1 - p) + 1.0]), Q), np.float64)
+        if self._flight is not None:
+            lost, taken = (self._sum.T @ form @ self._sum for form in (p * Q, self._flight))
+            size += 2 * in_flight * float(np.linalg.norm(np.linalg.solve(P - lost, taken), 2))
+        P, large = P * size, size
+        while not _is_positive(self._between_events(_Unknowns(X, P, large, large, large, in_flight, 0.0))):
+            large *= 4
+            if not np.isfinite(large):
+                return None
+        least = min(float(np.linalg.eigvalsh(form)[0]) for form in (X, P))
+        gain = least / (1 + float(np.linalg.norm(self._of_state) ** 2 + np.linalg.norm(self._of_error) ** 2))
+        level = large * (1 + self._begun + (1 + self._aged) / (2 * self._rate))
+        level += float(self._start @ X @ self._start + np.trace(X) + np.trace(P))
+        first = self._values(_Unknowns(X, P, large, large, large, in_flight, gain)) / (4 * level)
+        return first if all(map(_is_positive, self._blocks(first))) else None
+
+    def _of_decay(self, M: Matrix, form: Matrix, columns: Matrix) -> Matrix:
+        """R^{−T} times columns, RᵀR what is left of the form's decay along z' = M z."""
+        decay = -(M.T @ form + form @ M) - 2 * self._rate * form
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(decay), columns))
+
+
+class _Inequalities:
+    """Numbers and matrices that are affine in a vector, and are to be positive."""
+
+    def __init__(self, blocks: Callable[[Vector], Blocks], size: int) -> None:
+        self._constants = blocks(np.zeros(size))
+        units = zip(*(blocks(unit) for unit in np.eye(size)), strict=True)
+        self._slopes = [
+            np.stack(parts, axis=-1) - c[..., None] for parts, c in zip(units, self._constants, strict=True)
+        ]
+        """What each value adds, (k, size) and (n, n, size)."""
+
+    def _at(self, values: Vector) -> list[Matrix]:
+        return [c + slopes @ values for c, slopes in zip(self._constants, self._slopes, strict=True)]
+
+    def _hold(self, values: Vector) -> bool:
+        """Whether all are positive by more than rounding."""
+        sizes = (
+            np.abs(c) + np.abs(slopes) @ np.abs(values)
+            for c, slopes in zip(self._constants, self._slopes, strict=True)
+        )
+        return all(
+            _is_positive(block - _rounding(size)) for block, size in zip(self._at(values), sizes, strict=True)
+        )
+
+    def maximise_last(self, values: Vector) -> Vector | None:
+        """Return values inside for which the last one is the largest, to a share of _GAP.
+
+        t times the last value plus Σ log det is made large by Newton's method, for larger and larger t.
+        The last values that are inside by more than rounding are returned, None if there are none.
+        """
+        dimension = sum(map(len, self._constants))
+        weight, confirmed = 1.0, None
+        while True:
+            for _ in range(_NEWTON_STEPS):
+                step, decrement = self._newton_step(values, weight)
+                moved = self._moved(values, step, weight, decrement) if decrement > _CENTERED else None
+                if moved is None:
+                    break
+                values = moved
+            if self._hold(values):
+                confirmed = values
+            if dimension < _GAP * weight * values[-1]:
+                return confirmed
+            weight *= _HEAVIER
+
+    def _newton_step(self, values: Vector, weight: float) -> tuple[Vector, float]:
+        """Return Newton's step and its decrement.
+
+        The Hessian is AᵀA, with a column of A for each value: R of A's QR decomposition loses half of
+        the digits that AᵀA would lose.
+        """
+        (numbers, *matrices), (of_numbers, *of_matrices) = self._at(values), self._slopes
+        parts = [of_numbers / numbers[:, None]]
+        gradient = parts[0].sum(axis=0)
+        gradient[-1] += weight
+        for matrix, slopes in zip(matrices, of_matrices, strict=True):
+            undone = np.linalg.inv(np.linalg.cholesky(matrix))
+            turned = undone @ np.moveaxis(slopes, -1, 0) @ undone.T
+            gradient += np.trace(turned, axis1=1, axis2=2)
+            rows, columns = np.tril_indices(len(matrix))
+            parts.append(turned[:, rows, columns].T * np.where(rows > columns, np.sqrt(2), 1.0)[:, None])
+        A = np.vstack(parts)
+        scales = 1 / np.linalg.norm(A, axis=0)
+        R = np.asarray(np.linalg.qr(A * scales, mode="r"))
+        step = scales * np.linalg.solve(R, np.linalg.solve(R.T, scales * gradient))
+        return step, float(gradient @ step)
+
+    def _moved(self, values: Vector, step: Vector, weight: float, decrement: float) -> Vector | None:
+        """Return the values after a step along which the objective grows, shortened if need be."""
+        length, now = 1.0, self._objective(values, weight)
+        while length > _SHORTEST:
+            moved = values + length * step
+            if self._objective(moved, weight) >= now + _DECREASE * length * decrement:
+                return np.asarray(moved)
+            length /= 2
+        return None
+
+    def _objective(self, values: Vector, weight: float) -> float:
+        """Return t times the last value plus Σ log det; −∞ outside."""
+        numbers, *matrices = self._at(values)
+        if not (numbers > 0).all():
+            return -np.inf
+        try:
+            roots = [np.linalg.cholesky(matrix) for matrix in matrices]
+        except np.linalg.LinAlgError:
+            return -np.inf
+        logarithms = np.log(numbers).sum() + 2 * sum(np.log(np.diagonal(root)).sum() for root in roots)
+        return float(weight * values[-1] + logarithms)
+
+
+def _decaying_form(M: Matrix, rate_per_s: float) -> Matrix:
+    """Return a form that decays along z' = M z at a rate of more than twice the given one."""
+    flow, one = (M + rate_per_s * np.eye(len(M))).T, np.eye(len(M))
+    form = np.linalg.solve(np.kron(flow, one) + np.kron(one, flow), -one.ravel()).reshape(M.shape)
+    return np.asarray((form + form.T) / 2)
+
+
+def _symmetric(entries: Vector, triangle: tuple[NDArray[np.intp], NDArray[np.intp]], n: int) -> Matrix:
+    matrix = np.zeros((n, n))
+    matrix[triangle] = matrix.T[triangle] = entries
+    return matrix
+
+
+def _rounding(sizes: Matrix) -> Matrix:
+    """Bound rounding by a share of these sizes: what is above it is positive whatever the rounding.
+
+    A matrix whose entries are at most as large as those of ε S is at most the diagonal one with
+    ε Σ_j S_ij √(S_jj/S_ii).
+    """
+    if sizes.ndim == 1:
+        return _ROUNDING * sizes
+    scales = np.sqrt(np.diagonal(sizes))
+    return np.diag(_ROUNDING * sizes @ scales / scales)
+
+
+def _is_positive(block: Matrix) -> bool:
+    """Whether numbers are positive, or a symmetric matrix is positive definite."""
+    if block.ndim == 1:
+        return bool((block > 0).all())
+    try:
+        np.linalg.cholesky(block)
+    except np.linalg.LinAlgError:
+        return False
+    return True
