@@ -80,6 +80,7 @@ _DOLLAR = re.compile(r"(?<!\\)\$")
 _BOLD = ["cmb10", "DejaVu Serif"]
 _ELSEWHERE = str.maketrans(
     {"_": r"$\_$", "<": "$<$", ">": "$>$", "|": "$|$", "{": r"$\{$", "}": r"$\}$", '"': "''"}
+    | {"µ": r"$\mu$", "°": r"$^\circ$", "¹": "$^1$", "²": "$^2$", "³": "$^3$"}
 )
 """Characters at whose places Computer Modern has others; its mathematical fonts have them."""
 
@@ -400,7 +401,10 @@ class _Plain(ScalarFormatter):
 
 
 class _Numbers(LogFormatter):
-    """Writes 0.2 and 200, but 10⁻⁵ as plain text: typeset powers would be slow."""
+    """Writes 0.2 and 200, but 10⁻⁵ as plain text: typeset powers would be slow.
+
+    The fonts of LaTeX have other characters at the places of ¹, ² and ³.
+    """
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         if not super().__call__(x, pos) or (self._is_crowded() and f"{x:.0e}"[0] not in "13"):
@@ -408,6 +412,9 @@ class _Numbers(LogFormatter):
         if 1e-3 <= x < 1e5:
             return f"{x:g}"
         digits, exponent = f"{x:.0e}".split("e")
+        if layout().latex:
+            factor = "" if digits == "1" else rf"{digits}\cdot"
+            return f"${factor}10^{{{int(exponent)}}}$"
         power = "10" + str(int(exponent)).translate(_RAISED)
         return power if digits == "1" else f"{digits}·{power}"
 

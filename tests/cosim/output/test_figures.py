@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.legend import Legend
+from matplotlib.text import Text
 
 import noack
 from cosim.analysis.value_reduction import QuantileSketch
@@ -28,6 +29,7 @@ from cosim.output.figures.figure_description import (
 from cosim.output.figures.figure_drawing import draw
 from cosim.output.figures.figure_files import inline, save_figure, save_figures
 from cosim.output.figures.figure_format import figure_files
+from cosim.output.figures.figure_layout import figure_width
 from cosim.output.figures.run_figures import Trajectory, Transmissions, run_figures, states_figure
 from cosim.output.figures.timing_figures import later_than
 from cosim.output.run_tables import key_numbers
@@ -189,6 +191,20 @@ def test_the_figure_has_the_bound_the_limit_and_a_cross_where_the_bound_is_lost(
     )
     summary = summary_of(clocked, conditions=conditions | {"clock_error_s": SENSOR_NS * 1e-9})
     assert ("largest bound of a clock's error", "63.2 µs") in key_numbers(summary)
+
+
+@pytest.mark.parametrize("factor", [1e-13, 1e10])
+def test_characters_that_the_fonts_of_latex_replace_are_written_as_mathematics(factor: float) -> None:
+    """Computer Modern has a macron, a ligature and a dotless i in the place of ¹, ² and ³."""
+    y = Axis(label="age [µs], turn [°], force [N/m²]", logarithmic=True)
+    panel = Panel(title="m³", items=[line(T_S, factor * 10 ** (T_S - 2))], x=time_axis(T_S), y=y)
+    with figure_width(3.5, latex=True):
+        figure = draw(one_panel("norms", panel, 2.0))
+        labels = [*figure.axes[0].get_yticklabels(), *figure.findobj(Text)]
+        texts = [text.get_text() for text in labels if isinstance(text, Text)]
+    assert f"$10^{{{round(np.log10(factor))}}}$" in texts
+    plain = "".join(part for text in texts for part in text.split("$")[::2])
+    assert not set(plain) & set("µ°¹²³⁻⁰")
 
 
 def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: Path) -> None:
