@@ -6,8 +6,8 @@
  * send to that after the receiver's recv. PRIORITY is the receiver's SCHED_FIFO priority; with 0
  * the processes have no real-time settings. Standard error names the settings that were refused.
  *
- * ping COUNT PERIOD_NS PRIORITY BURST sends BURST datagrams every PERIOD_NS, as one message that the
- * kernel segments, without a relay and without latencies: the peer of many loops in a run.
+ * ping COUNT PERIOD_NS PRIORITY BURST sends BURST datagrams every PERIOD_NS, as one message that
+ * the kernel segments, without a relay and without latencies: the peer of many loops in a run.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
