@@ -5,12 +5,16 @@
  * latencies, int64_t in ns, to standard output: from the reading of the clock before the sender's
  * send to that after the receiver's recv. PRIORITY is the receiver's SCHED_FIFO priority; with 0
  * the processes have no real-time settings. Standard error names the settings that were refused.
+ *
+ * ping COUNT PERIOD_NS PRIORITY BURST sends BURST datagrams every PERIOD_NS, as one message that
+ * the kernel segments, without a relay and without latencies: the peer of many loops in a run.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <netinet/in.h>
+#include <netinet/udp.h>
 #include <sched.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -23,7 +27,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { PING_BYTES = 72, NS_PER_S = 1000000000, SETTLE_NS = 300000000 };
+enum { PING_BYTES = 72, MOST_BURST = 64, NS_PER_S = 1000000000, SETTLE_NS = 300000000 };
 enum { SENDER = 1, RELAY, RECEIVER }; /* places along the loop: sensor, emulator, controller */
 
 static void require(int succeeded, const char *what) {
@@ -107,6 +111,41 @@ static void receive(int in, long count) {
     require(fflush(stdout) == 0, "write");
 }
 
+static void receive_bursts(int in, long expected) {
+    static char data[MOST_BURST][PING_BYTES];
+    struct iovec parts[MOST_BURST];
+    struct mmsghdr batch[MOST_BURST] = {0};
+    int bytes = 4 * 1024 * 1024;
+    long received = 0;
+    setsockopt(in, SOL_SOCKET, SO_RCVBUFFORCE, &bytes, sizeof bytes);
+    for (int k = 0; k < MOST_BURST; k++) {
+        parts[k] = (struct iovec){data[k], PING_BYTES};
+        batch[k].msg_hdr = (struct msghdr){.msg_iov = &parts[k], .msg_iovlen = 1};
+    }
+    int taken;
+    do {
+        taken = recvmmsg(in, batch, MOST_BURST, MSG_WAITFORONE, NULL);
+        received += taken;
+    } while (taken > 0 && batch[taken - 1].msg_len > 0); /* the last datagram is empty */
+    errno = ENOBUFS;
+    require(received == expected + 1, "receive");
+}
+
+static void send_bursts(int out, long count, int64_t period_ns, int burst) {
+    static char data[MOST_BURST * PING_BYTES];
+    int segment_bytes = PING_BYTES;
+    int64_t begin_ns = now_ns() + SETTLE_NS;
+    require(
+        setsockopt(out, IPPROTO_UDP, UDP_SEGMENT, &segment_bytes, sizeof segment_bytes) == 0,
+        "UDP_SEGMENT");
+    for (long number = 0; number < count; number++) {
+        sleep_until(begin_ns + number * period_ns);
+        send(out, data, (size_t)burst * PING_BYTES, 0);
+    }
+    sleep_until(now_ns() + SETTLE_NS);
+    send(out, data, 0, 0);
+}
+
 static void send_all(int out, long count, int64_t period_ns) {
     int64_t data[PING_BYTES / 8] = {0}, begin_ns = now_ns() + SETTLE_NS;
     for (long number = 0; number < count; number++) {
@@ -119,24 +158,33 @@ static void send_all(int out, long count, int64_t period_ns) {
 }
 
 int main(int argc, char **argv) {
-    require(argc == 4, "usage: ping COUNT PERIOD_NS PRIORITY");
+    int burst = argc == 5 ? atoi(argv[4]) : 0;
+    errno = EINVAL;
+    require(
+        (argc == 4 || burst > 0) && burst <= MOST_BURST, "ping COUNT PERIOD_NS PRIORITY [BURST]");
     long count = atol(argv[1]);
     int64_t period_ns = atoll(argv[2]);
     int priority = atoi(argv[3]), failed = 0;
     int receiver_in = udp_socket(), relay_in = udp_socket(), relay_out = udp_socket();
     int sender_out = udp_socket();
     connect_to(relay_out, receiver_in);
-    connect_to(sender_out, relay_in);
+    connect_to(sender_out, burst ? receiver_in : relay_in);
     for (int place = RECEIVER; place >= SENDER; place--) {
+        if (burst && place == RELAY)
+            continue;
         pid_t child = fork();
         require(child >= 0, "fork");
         if (child > 0)
             continue;
         apply_settings(priority, place);
-        if (place == RECEIVER)
+        if (place == RECEIVER && burst)
+            receive_bursts(receiver_in, count * burst);
+        else if (place == RECEIVER)
             receive(receiver_in, count);
         else if (place == RELAY)
             relay(relay_in, relay_out);
+        else if (burst)
+            send_bursts(sender_out, count, period_ns, burst);
         else
             send_all(sender_out, count, period_ns);
         return 0;

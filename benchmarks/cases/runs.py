@@ -15,7 +15,17 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from benchmarks.programs import NOACK, Observed, Sample, execute, imported_s, noack, observed_run
+from benchmarks.programs import (
+    NOACK,
+    PRIORITY,
+    Observed,
+    Sample,
+    compiled,
+    execute,
+    imported_s,
+    noack,
+    observed_run,
+)
 from benchmarks.report import (
     Figures,
     Goal,
@@ -44,6 +54,8 @@ _STEP_US = {50.0: Goal("<=", 5)}
 steps that share a wake-up would be later than :data:`_LATE_MS`."""
 _LATE_MS = {50.0: Goal("<=", 1.0), 500.0: Goal("<=", 0.3)}
 """By the rate of the loops, Hz."""
+_BARE_S, _GATHERED_S, _MOST_BURST = 5.0, 0.0008, 64
+"""Length of a bare exchange; how long a run gathers steps, at most; datagrams in one message."""
 _LIBRARIES = "import numpy, zenoh; print(); input()"
 _NOTHING = Goal("==", 0)
 
@@ -93,8 +105,31 @@ def cpu_share(samples: Sequence[Sample]) -> float:
     return (last.cpu_s - first.cpu_s) / (last.at_s - first.at_s)
 
 
-def figures(load: Load, run: Observed) -> Iterator[Row]:
-    """Yield the figures of a run."""
+def cpu_s(command: Sequence[str]) -> float:
+    """Return the CPU seconds of a program, which other load changes less than its duration."""
+    before_s = own_cpu_s(children=True)
+    execute(command)
+    return own_cpu_s(children=True) - before_s
+
+
+def bare_step_us(load: Load) -> float:
+    """Return the CPU time in µs that a step takes in C processes that only send and receive.
+
+    A step is a measurement and an actuation. One process sends, and one receives, as many datagrams
+    of 72 bytes at once as a run's processes gather.
+    """
+    steps_per_s = load.loops * load.rate_hz
+    gathered = round(steps_per_s * min(1 / load.rate_hz / 25, _GATHERED_S))
+    burst = min(max(gathered, 1), _MOST_BURST)
+    count = round(_BARE_S * steps_per_s / burst)
+    with tempfile.TemporaryDirectory() as folder:
+        program = compiled("ping.c", Path(folder))
+        arguments = map(str, (count, round(1e9 * burst / steps_per_s), PRIORITY, burst))
+        return 2e6 * cpu_s([str(program), *arguments]) / (count * burst)
+
+
+def figures(load: Load, run: Observed, bare_us: float) -> Iterator[Row]:
+    """Yield the figures of a run; ``bare_us`` is a step of the bare exchange."""
 
     def row(name: str, value: float, unit: str = "", **more: Any) -> Row:
         return Row(f"{load}: {name}", value, unit, **more)
@@ -115,6 +150,7 @@ def figures(load: Load, run: Observed) -> Iterator[Row]:
     note = ", ".join(f"{role} {used:.2f} µs" for role, used in used_us.items())
     step_us = sum(used_us.values())
     yield row("CPU time per loop and step", step_us, "µs", goal=_STEP_US.get(load.rate_hz), note=note)
+    yield row("the same", step_us, "µs", peer=Peer("bare C exchange of its datagrams", bare_us))
     end_s, peer = run.closed_s - run.ended_s, Peer("the run", load.horizon_s)
     yield row("end of the run", end_s, "s", peer=peer, goal=_END_SHARE)
 
@@ -169,7 +205,8 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
 
     for loops, rate_hz in ((options.fleet_loops, 50.0), (20, 500.0)):
         load = Load(loops, rate_hz, options.fleet_s)
-        yield from figures(load, measured(load))
+        before_us, observed, after_us = bare_step_us(load), measured(load), bare_step_us(load)
+        yield from figures(load, observed, (before_us + after_us) / 2)
     alone = Load(1, 500.0, min(options.fleet_s, _SINGLE_S))
     yield from memory(alone, measured(alone))
 
@@ -192,13 +229,6 @@ def started() -> Figures:
     if started_run.first_step_s is None:
         raise MeasurementError("the run showed no progress line")
     return {"first_s": started_run.first_step_s, "launch_s": started_run.summary["startup_s"]}
-
-
-def cpu_s(command: Sequence[str]) -> float:
-    """Return the CPU seconds of a program, which other load changes less than its duration."""
-    before_s = own_cpu_s(children=True)
-    execute(command)
-    return own_cpu_s(children=True) - before_s
 
 
 def demo_rows(summary: Mapping[str, Any]) -> Iterator[Row]:

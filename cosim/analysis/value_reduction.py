@@ -11,6 +11,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.linear_systems import firsts_of_equal
 from noack.scenario.scenario import Scenario
 
 EXACT = 2**20
@@ -142,7 +143,7 @@ def decimate(t: Reals, y: Reals, columns: int) -> Indices:
     span = t[-1] - t[0]
     scale = columns / span if span > 0 else 0.0
     column = np.minimum(((t - t[0]) * scale).astype(np.intp), columns - 1)
-    first = np.flatnonzero(np.diff(column, prepend=-1))
+    first = firsts_of_equal(column)
     last = np.append(first[1:], k) - 1
     low = _where_first(np.fmin.reduceat(y, first), y, column, first, last)
     high = _where_first(np.fmax.reduceat(y, first), y, column, first, last)

@@ -23,7 +23,15 @@ from numpy.typing import NDArray
 from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.linear_systems import ModelFlow, Propagator, all_entries, largest_sizes, row_norms, set_rows
+from noack.core.linear_systems import (
+    ModelFlow,
+    Propagator,
+    all_entries,
+    firsts_of_equal,
+    largest_sizes,
+    row_norms,
+    set_rows,
+)
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -51,6 +59,8 @@ class AlignedRun(NamedTuple):
     """(k, n), after a reset."""
     x_c: Reals
     """(k, n); NaN at times without a recorded controller state."""
+    x_norm: Reals
+    """(k,) ‖x‖."""
     e_s_norm: Reals
     """(k,) ‖e_s‖_W before a reset, as tested by the trigger."""
     threshold: Reals
@@ -111,7 +121,7 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     model_ns = np.concatenate([steps["model_t_ns"], deliveries["model_t_ns"]])[order]
     x_c = np.concatenate([steps["x_c"], deliveries["x_c"]]).take(order, axis=0)
     lives = inputs[order] // GENERATION
-    track, begins = before, np.flatnonzero(np.diff(lives, prepend=-1)).tolist()
+    track, begins = before, firsts_of_equal(lives).tolist()
     for begin, end in pairwise([*begins, len(lives)]):
         own = slice(begin, end)
         track = _continued(track, int(lives[begin]), model_ns[own], x_c[own], newest[own])
@@ -174,6 +184,7 @@ def join(
         measurements["x"],
         x_s,
         x_c,
+        row_norms(measurements["x"]),
         measurements["e_s_norm"],
         _threshold(measurements),
         row_norms(e_c),
@@ -210,7 +221,7 @@ def _at(
         return x_c, received
     older = np.flatnonzero(known & (dt_ns != 0))
     steps_ns = np.sort(dt_ns[older])  # few different ones; np.unique takes longer
-    for step_ns in steps_ns[np.diff(steps_ns, prepend=0) > 0].tolist():
+    for step_ns in steps_ns[firsts_of_equal(steps_ns)].tolist():
         behind = older[dt_ns[older] == step_ns]
         set_rows(x_c, behind, flow.propagate.rows(x_c.take(behind, axis=0), step_ns))
     return x_c, received

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.linear_systems import firsts_of_equal
 from noack.protocol.record_tables import CLOCK_TABLES, LOOP, NETEM_SETTING
 from noack.protocol.roles import GENERATION
 from noack.scenario.resolution import has_loop, is_of_network, network_tables
@@ -56,7 +57,7 @@ def joined(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
 
 def parts_by_loop(rows: Rows, numbers: NDArray[np.integer]) -> Iterator[tuple[int, Rows]]:
     """Yield consecutive rows of the same loop, with its number, from the number of each row."""
-    begins = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] + 1)).tolist()
+    begins = firsts_of_equal(numbers).tolist()
     for begin, end in pairwise([*begins, len(rows)]):
         yield int(numbers[begin]), rows[begin:end]
 

@@ -37,6 +37,7 @@ from cosim.record.run_record import (
 )
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
+from noack.core.linear_systems import firsts_of_equal
 from noack.core.process_limits import be_idle, cores
 from noack.protocol.record_tables import LOOP
 from noack.protocol.roles import LOOP_ROLES, RECORDER
@@ -371,7 +372,7 @@ class _EarlyTable:
         rows = joined([*self._consecutive()], self._dtype)
         rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
         loops, inputs = rows[LOOP].astype(np.int64), rows["input"]
-        firsts = np.flatnonzero(np.diff(loops, prepend=-1))
+        firsts = firsts_of_equal(loops)
         before = np.append(-1, inputs)[:-1]
         before[firsts] = self._newest[loops[firsts]]  # IndexError: damaged
         if not (inputs > before).all():

@@ -24,7 +24,7 @@ def cached_method(
     @wraps(method)
     def found(self: Owner, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         known: dict[object, Result] = self.__dict__.setdefault(results, {})
-        key = (*map(_key, args), tuple(kwargs.items()))
+        key = (*map(_key, args), *kwargs.items())
         if key not in known:
             known[key] = method(self, *args, **kwargs)
         return known[key]

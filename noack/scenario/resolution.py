@@ -7,6 +7,7 @@ noise of its plant and of its observer's model.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import cycle
 from typing import Literal, NamedTuple
 
@@ -129,7 +130,8 @@ def _loops_with_delays(scenario: Scenario) -> list[list[Scenario]]:
     delays = proven_delays(scenario)
     if proven_delay is None and not any(delays):
         return entries
-    sections = iter([scenario.certificate.with_proven_delay(delay) for delay in delays])
+    with_delay = cache(scenario.certificate.with_proven_delay)  # loops with equal delays share it
+    sections = map(with_delay, delays)
     return [[loop.model_copy(update={"certificate": next(sections)}) for loop in loops] for loops in entries]
 
 

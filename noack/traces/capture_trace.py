@@ -21,6 +21,7 @@ from typing import IO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.linear_systems import firsts_of_equal
 from noack.protocol.probe_format import MAGIC, ProbeKind, decode_probe
 from noack.traces.capture_packets import CapturedFlow, CutCaptureError, captured_packets, find_udp, is_capture
 from noack.traces.packet_trace import (
@@ -262,7 +263,7 @@ def _numbered(
 def _first_of_each(numbered: _Numbered, notes: list[str]) -> _Numbered:
     order = np.lexsort((numbered.received_ns, numbered.number))
     number = numbered.number[order]
-    first = order[np.flatnonzero(np.diff(number, prepend=number[0] - 1))]
+    first = order[firsts_of_equal(number)]
     if len(first) < len(order):
         notes.append(f"duplicates: {len(order) - len(first)}; the first counts")
     return _Numbered(*(column[first] for column in numbered))

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from noack.core.errors import CallerError, one_line, shortened, why
 from noack.core.file_access import open_regular
+from noack.core.linear_systems import firsts_of_equal
 
 Int64s = NDArray[np.int64]
 Times = NDArray[np.float64]
@@ -251,7 +252,7 @@ def _lowest_of_each_bucket(t: NDArray[np.int64], y: NDArray[np.int64]) -> NDArra
     width = (int(t[-1]) - int(t[0])) // _BUCKETS + 1
     bucket = (t - t[0]) // width
     order = np.lexsort((y, bucket))
-    return np.sort(order[np.flatnonzero(np.diff(bucket[order], prepend=-1))])
+    return np.sort(order[firsts_of_equal(bucket[order])])
 
 
 def _step(sent_ns: NDArray[np.int64], delay_ns: NDArray[np.int64]) -> tuple[int, int]:

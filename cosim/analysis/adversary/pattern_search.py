@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from cosim.analysis.adversary.loop_flows import Flags, Pattern, PatternFlow, Segments
 from cosim.simulation.continuous import TooManyEventsError
 from cosim.simulation.exact_simulation import MAX_EVENTS
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix, Vector, firsts_of_equal
 from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
 
 Indices = NDArray[np.int64]
@@ -285,7 +285,7 @@ def _turns(score: Vector, kind: Indices, second_score: Vector | None = None) -> 
     """Return indices in selection order: first the best of each kind, then the second best, etc."""
     second_score = score if second_score is None else second_score
     order = np.lexsort((-second_score, -score, kind))
-    starts = np.flatnonzero(np.diff(kind[order], prepend=-1))
+    starts = firsts_of_equal(kind[order])
     rank = np.empty(len(order), int)
     rank[order] = np.arange(len(order)) - np.repeat(starts, np.diff(starts, append=len(order)))
     return np.asarray(np.lexsort((-second_score, -score, rank)))

@@ -31,7 +31,7 @@ from cosim.analysis.claims.observed_conditions import (
 from cosim.analysis.summary.loop_statistics import SampleFacts, SampleFactsReader, signal_statistics
 from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
 from cosim.record.run_record import RunRecord
-from noack.core.linear_systems import Matrix, Propagator, all_entries, row_norms, spectral_abscissa
+from noack.core.linear_systems import Matrix, Propagator, all_entries, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import Scenario
@@ -100,11 +100,6 @@ class Samples:
         return np.asarray(self.joined.t_ns * 1e-9)
 
     @cached_property
-    def x_norm(self) -> Reals:
-        """‖x‖, measured or estimated by the sensor, (k,)."""
-        return row_norms(self.joined.x)
-
-    @cached_property
     def with_x(self) -> NDArray[np.bool_]:
         """Where the plant's own state is known, (k,)."""
         if self.true_x is self.joined.x:
@@ -143,7 +138,7 @@ class RunEvidence:
         for part in aligned_parts(self.record) if self.part.offset else ():
             joined = part.aligned
             compared = joined.threshold > 0  # a periodic trigger compares nothing
-            below = np.flatnonzero(compared & (joined.threshold < self.rounding(row_norms(joined.x))))
+            below = np.flatnonzero(compared & (joined.threshold < self.rounding(joined.x_norm)))
             if len(below):
                 why = "the threshold is below the rounding error of x at the set-point"
                 return VoidFrom(float(joined.t_ns[below[0]]) * 1e-9, why)

@@ -23,7 +23,7 @@ from cosim.record.align import aligned_parts
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
-from noack.core.linear_systems import row_norms
+from noack.core.linear_systems import firsts_of_equal
 from noack.core.number_format import number as shown
 from noack.impairments.feature import Impairment
 from noack.impairments.kinds.duplicate import Duplicate
@@ -247,7 +247,7 @@ def loop_over_time(record: RunRecord, phase_ns: int) -> LoopOverTime:
         aligned = part.aligned
         columns = places(aligned.t_ns + phase_ns, horizon_ns)
         common = aligned.since_delivery(record.scenario)
-        _raise(states, columns, row_norms(aligned.x))
+        _raise(states, columns, aligned.x_norm)
         _raise(errors, columns[common], aligned.e_c_norm[common])
     return LoopOverTime(errors, states)
 
@@ -255,7 +255,7 @@ def loop_over_time(record: RunRecord, phase_ns: int) -> LoopOverTime:
 def _raise(largest: Reals, columns: NDArray[np.int64], values: Reals) -> None:
     """Take the largest values at places, which ascend, into account."""
     if len(columns):
-        first = np.flatnonzero(np.diff(columns, prepend=-1))
+        first = firsts_of_equal(columns)
         at = columns[first]
         largest[at] = np.fmax(largest[at], np.fmax.reduceat(values, first))
 

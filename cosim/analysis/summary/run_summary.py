@@ -173,7 +173,7 @@ def _transmissions(record: RunRecord) -> _Transmissions:
         "loss_expected": None if changes_of(record) else expected_loss(scenario.network.link).rate,
         "drops_by_cause": drops_by_cause(outcomes),
         "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
-        "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),
+        "longest_loss_burst": max([*bursts, longest]),
         "delay_mean_s": _or_none(np.mean, delays_s),
         "delay_max_s": _or_none(np.max, delays_s),
         "loss_bursts": {str(n): count for n, count in sorted(Counter(bursts).items())},

@@ -5,6 +5,7 @@ tests/native/test_same_bits.py compares those of other processors.
 
 import math
 from fractions import Fraction
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from noack.core.linear_systems import (
     Propagator,
     discretise,
     exponential,
+    firsts_of_equal,
     norm,
     product,
     row_norms,
@@ -54,6 +56,12 @@ def test_a_held_input_gives_what_an_integrator_gives(
     )  # fmt: skip
     # The integrator's local errors of 1e-12 grow by at most e^{‖A‖ dt} ≤ e^2.5 over its few steps.
     np.testing.assert_allclose(Ad @ x0 + Bd @ u, solution.y[:, -1], atol=1e-9)
+
+
+@given(st.lists(st.integers(-1, 1)))
+def test_consecutive_equal_values_begin_where_groupby_begins_a_group(values: list[int]) -> None:
+    groups = [[place for place, _ in group] for _, group in groupby(enumerate(values), lambda pair: pair[1])]
+    assert firsts_of_equal(np.array(values, np.int64)).tolist() == [places[0] for places in groups]
 
 
 @given(generators, st.lists(st.integers(1, 10**9), min_size=1, max_size=5))

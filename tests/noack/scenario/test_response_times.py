@@ -18,6 +18,7 @@ from noack.impairments.feature import Scheduler
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario.link_load import link_loads
+from noack.scenario.parameter_changes import settings_key
 from noack.scenario.resolution import loop_named, resolve, resolved_loops
 from noack.scenario.response_times import Sender, response_ns
 from noack.scenario.scenario import Scenario, loop_names
@@ -145,6 +146,13 @@ def test_certificates_allow_for_the_proven_delay_of_the_loop_in_its_run(
     for loop, name in zip(loops, loop_names(run), strict=True):
         assert certified_delay_s(resolve(loop_named(run, name))) == certified_delay_s(loop)
         assert allowed_conditions(loop).delay_s == allowed_conditions(copy_of(loop)).delay_s
+
+
+def test_loops_with_equal_delays_share_their_settings() -> None:
+    """The machines of such loops are filled once, and copied."""
+    loops = resolved_loops(shipped("priority_channel", "loops=[{name='p',count=5}]"))
+    keys = [*map(settings_key, loops)]  # the delays of the first two loops are others
+    assert [keys.index(key) for key in keys] == [0, 1, 2, 2, 2]
 
 
 def copy_of(loop: Scenario) -> Scenario:

@@ -86,7 +86,7 @@ def sensor_error(
 ) -> Findings:
     """‖e_s‖_W before each reset."""
     formula = envelope_formula("‖e_s‖", certificate, "overshoot")
-    slack = run.rounding(samples.x_norm)
+    slack = run.rounding(samples.joined.x_norm)
     shares = upper_shares(samples.joined.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void = run.violation_of(certificate)
     return Findings(Bound(formula, samples.t_s, shares, void, constants.overshoot))

@@ -19,6 +19,7 @@ from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from noack.core.linear_systems import Propagator
 
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
+_EPSILON = float(np.finfo(float).eps)
 _COMPLETE = "a complete record"
 _CONTINUOUS = "a continuous trigger, a network without delay"
 _CAPPED = "at most M − 1 consecutive losses"
@@ -58,10 +59,10 @@ def _margin(run: RunEvidence) -> float:
     loop, period_ns = run.record.loop, run.record.scenario.timing.measurement_period_ns
     longest_ns = run.facts.longest_update_ns
     growth, age_ns, moved = 1.0, period_ns, Propagator(loop.H).transition(period_ns)
-    while age_ns <= longest_ns and growth < 1 / np.finfo(float).eps:
+    while age_ns <= longest_ns and growth < 1 / _EPSILON:
         growth = max(growth, float(np.linalg.norm(moved)))
         age_ns, moved = 2 * age_ns, moved @ moved
-    rounding = loop.n * float(np.finfo(float).eps) * growth
+    rounding = loop.n * _EPSILON * growth
     return max(_LEAST_MARGIN, min(rounding, _LARGEST_MARGIN))
 
 
@@ -124,6 +125,6 @@ def theorem_2_state(run: RunEvidence, samples: Samples) -> Findings:
     if not run.record.scenario.coverage.knows_state:
         return Findings(None, envelope)
     slack = ROUNDING * run.part.offset
-    shares = upper_shares(samples.x_norm, values + slack)
+    shares = upper_shares(samples.joined.x_norm, values + slack)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
     return Findings(Bound(formula, samples.t_s, shares, run.paper_violation), envelope)
