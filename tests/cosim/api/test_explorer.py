@@ -11,8 +11,8 @@ import noack
 
 
 def test_results_are_those_of_the_library() -> None:
-    explorer = noack.explore("double_integrator")
-    certificate = noack.certify("double_integrator").schedule
+    explorer = noack.explore("lane_following")
+    certificate = noack.certify("lane_following").schedule
     assert certificate.constants is not None
     guarantee = explorer.certificate
     assert guarantee.verdict == "certified"
@@ -20,8 +20,7 @@ def test_results_are_those_of_the_library() -> None:
     assert explorer.ensemble is not None
     assert explorer.ensemble.draws == 200
     assert not explorer.margin.defined  # an event trigger has no longest time between events
-    periodic = {"trigger": {"policy": "periodic", "period_s": 0.1}}
-    assert noack.explore("double_integrator", periodic).margin.defined
+    assert noack.explore("lane_periodic").margin.defined
 
 
 def test_settings_change_the_results_and_wrong_ones_change_nothing() -> None:
