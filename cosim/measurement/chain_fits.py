@@ -89,26 +89,30 @@ class ChainRates(NamedTuple):
         total = entry.sum()
 
         def at_least(length: Reals) -> Reals:
-            log_scale, power = _powers(during, np.asarray(length, float) - 1)
+            log_scale, power = _powers(during[..., None], np.asarray(length, float) - 1)
             with np.errstate(under="ignore"):
-                return np.asarray(np.exp(log_scale) * (entry @ power).sum(axis=-1) / total)
+                sums = np.einsum("a,abk->k", entry, power[:, :, 0])
+                return np.asarray(np.exp(log_scale[0]) * sums / total)
 
         return at_least
 
 
-def _powers(matrix: Reals, exponents: Reals) -> tuple[Reals, Reals]:
-    """Return log λ^n, (k,), and (matrix/λ)^n, (k, 2, 2), with λ the largest eigenvalue."""
-    (a, b), (c, d) = matrix
+def _powers(matrices: Reals, exponents: Reals) -> tuple[Reals, Reals]:
+    """Return log λ^n, (j, k), and (matrix/λ)^n, (2, 2, j, k), with λ the largest eigenvalue.
+
+    ``matrices`` is (2, 2, j), ``exponents`` is (k,).
+    """
+    (a, b), (c, d) = matrices[..., None]
     root = np.sqrt((a - d) ** 2 + 4 * b * c)
     high = (a + d + root) / 2
-    if high <= 0:
-        return np.where(exponents > 0, -np.inf, 0.0), np.tile(np.eye(2), (len(exponents), 1, 1))
-    if root < 1e-300:
-        return exponents * np.log(high), np.tile(np.eye(2), (len(exponents), 1, 1))
-    low = (a * d - b * c) / high
-    projector = (matrix - low * np.eye(2)) / root
-    ratio = np.power(low / high, exponents)
-    return exponents * np.log(high), projector + ratio[:, None, None] * (np.eye(2) - projector)
+    identity = np.eye(2)[:, :, None, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logarithms = np.where(high > 0, exponents * np.log(high), np.where(exponents > 0, -np.inf, 0.0))
+        low = (a * d - b * c) / high
+        projector = (matrices[..., None] - low * identity) / root
+        powers = projector + np.power(low / high, exponents) * (identity - projector)
+    is_multiple = (high <= 0) | (root < 1e-300)  # of the identity
+    return logarithms, np.where(is_multiple, identity, powers)
 
 
 class LossLikelihood:
@@ -121,30 +125,37 @@ class LossLikelihood:
 
     def __call__(self, rates: ChainRates) -> float:
         """Return the logarithm of the likelihood; −∞ if the trace is impossible."""
-        start, delivers, loses = rates.matrices()
-        log_d, d = _powers(delivers, self._deliveries.astype(float))
-        log_l, l = _powers(loses, self._losses.astype(float))  # noqa: E741
-        log_loss, loss = log_l[self._loss_of], l[self._loss_of]
+        return float(self.of_chains(np.array([rates]))[0])
+
+    def of_chains(self, rates: Reals) -> Reals:
+        """Return those of several chains, (j,), whose probabilities are the rows of (j, 4)."""
+        to_bad, to_good, *losses = rates.T
+        lost = np.array(losses)
+        moves = np.array([[1 - to_bad, to_bad], [to_good, 1 - to_good]])
+        start = np.array([to_good, to_bad]) / (to_bad + to_good)
+        log_d, d = _powers(moves * (1 - lost), self._deliveries.astype(float))
+        log_l, l = _powers(moves * lost, self._losses.astype(float))  # noqa: E741
+        log_loss, loss = log_l[:, self._loss_of], l[..., self._loss_of]
         if self._left_out is not None:
             log_loss = np.where(self._left_out, 0.0, log_loss)
-            loss[self._left_out] = np.ones((2, 1)) * start
-        factors = _products(d[self._delivery_of[:-1]], loss)
-        total = float(log_d[self._delivery_of].sum() + log_loss.sum())
+            loss = np.where(self._left_out, start[None, :, :, None], loss)
+        factors = _products(d[..., self._delivery_of[:-1]], loss)
+        total = log_d[:, self._delivery_of].sum(axis=1) + log_loss.sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            while len(factors) > 1:
-                odd = factors[len(factors) - len(factors) % 2 :]
-                factors = _products(factors[0 : len(factors) - len(odd) : 2], factors[1::2])
-                scale = factors.max(axis=(1, 2))
-                total += float(np.log(scale).sum())
-                factors = np.concatenate([factors / scale[:, None, None], odd])
-            row = start if not len(factors) else start @ factors[0]
-            total += float(np.log((row @ d[self._delivery_of[-1]]).sum()))
-        return total if np.isfinite(total) else -np.inf
+            while (count := factors.shape[-1]) > 1:
+                odd = factors[..., count - count % 2 :]
+                factors = _products(factors[..., 0 : count - count % 2 : 2], factors[..., 1::2])
+                scale = factors.max(axis=(0, 1))
+                total += np.log(scale).sum(axis=1)
+                factors = np.concatenate([factors / scale, odd], axis=-1)
+            row = start if not count else (start[:, None] * factors[..., 0]).sum(axis=0)
+            total += np.log((row[:, None] * d[..., self._delivery_of[-1]]).sum(axis=(0, 1)))
+        return np.where(np.isfinite(total), total, -np.inf)
 
 
 def _products(left: Reals, right: Reals) -> Reals:
-    """Return the products of pairs of 2×2 matrices, (k, 2, 2)."""
-    return np.asarray(left[:, :, :1] * right[:, :1, :] + left[:, :, 1:] * right[:, 1:, :])
+    """Return the products of pairs of 2×2 matrices, (2, 2, j, k)."""
+    return np.asarray(left[:, :1] * right[:1] + left[:, 1:] * right[1:])
 
 
 SIGNIFICANCE = 0.01
@@ -313,12 +324,13 @@ class ChainFits:
             share = min(max((self.lost / self.packets - good) / (bad - good), 1e-3), 0.9)
             starts += [(leave * share / (1 - share), leave, good, bad) for leave in (r / 3, r / 20)]
         inner = [np.asarray(logit(np.clip(start, [1e-7, 1e-7, 1e-5, 1e-5], 1 - 1e-5))) for start in starts]
-        likeliest = sorted(inner, key=self._cost)[:_SEARCHES]
-        minima = [minimise(self._cost, start, _LIMIT) for start in likeliest]
+        likeliest = np.argsort(self._costs(np.array(inner)), kind="stable")[:_SEARCHES]
+        minima = [minimise(self._costs, inner[start], _LIMIT) for start in likeliest]
         return min(minima, key=lambda minimum: minimum.value)
 
-    def _cost(self, log_odds: Reals) -> float:
-        return min(-self._likelihood(ChainRates(*expit(log_odds).tolist())), 1e300)
+    def _costs(self, log_odds: Reals) -> Reals:
+        """Return minus the log-likelihoods of the rows, (j,)."""
+        return np.minimum(-self._likelihood.of_chains(expit(log_odds)), 1e300)
 
     @cached_property
     def elliott_rates(self) -> ChainRates:
@@ -333,7 +345,7 @@ class ChainFits:
             best = Minimum(best.at[[1, 0, 3, 2]], best.value)
         estimates: dict[str, Estimate | None] = {}
         for index, name in enumerate(ChainRates._fields):
-            ends = profile_interval(self._cost, best, index, _LIMIT)
+            ends = profile_interval(self._costs, best, index, _LIMIT)
             estimates[name] = Estimate(*map(_rounded, (best.at[index], *ends)))
         rates = _ordered(best.at)
         return ChainFit("gilbert_elliott", rates, estimates, -best.value, 4)

@@ -129,6 +129,8 @@ _ALLOWED = float(chdtri(1, 1 - LEVEL)) / 2
 """Loss of log-likelihood at the ends of an interval."""
 _TOLERANCE = 0.01
 _LONGEST_STEP = 4.0
+_DIFFERENCE = 1e-5
+"""Distance of the points from which a gradient is computed."""
 
 
 class Estimate(NamedTuple):
@@ -181,27 +183,41 @@ class Minimum(NamedTuple):
     value: float
 
 
-def minimise(function: Callable[[Reals], float], start: Reals, limit: float) -> Minimum:
-    """Return a local minimum with all parameters within ± ``limit``."""
+def minimise(function: Callable[[Reals], Reals], start: Reals, limit: float) -> Minimum:
+    """Return a local minimum with all parameters within ± ``limit``.
+
+    Args:
+        function: the values, (j,), at the rows of (j, n). A point and its neighbours, from which
+            the gradient follows, are evaluated together.
+        start: where the search starts, (n,).
+        limit: bound of the parameters' sizes.
+    """
     if not len(start):
-        return Minimum(start, function(start))
+        return Minimum(start, float(function(start[None])[0]))
+
+    def with_gradient(at: Reals) -> tuple[float, Reals]:
+        steps = np.where(at + _DIFFERENCE > limit, -_DIFFERENCE, _DIFFERENCE)
+        value, *neighbours = function(np.vstack([at, at + np.diag(steps)]))
+        return float(value), (np.array(neighbours) - value) / steps
+
     result = optimize.minimize(
-        function,
+        with_gradient,
         start,
+        jac=True,
         method="L-BFGS-B",
         bounds=[(-limit, limit)] * len(start),
-        options={"eps": 1e-5, "ftol": 1e-10, "gtol": 1e-5, "maxiter": 200},
+        options={"ftol": 1e-10, "gtol": 1e-5, "maxiter": 200},
     )
     return Minimum(np.asarray(result.x), float(result.fun))
 
 
 def profile_interval(
-    function: Callable[[Reals], float], best: Minimum, index: int, limit: float
+    function: Callable[[Reals], Reals], best: Minimum, index: int, limit: float
 ) -> tuple[float, float]:
     """Return the profile-likelihood interval of a parameter, from its minimum outwards.
 
     Args:
-        function: minus the log-likelihood of n parameters.
+        function: minus the log-likelihoods, (j,), of n parameters each, (j, n).
         best: its minimum.
         index: index of the parameter.
         limit: bound of the parameters' sizes; an interval that reaches it ends there.
@@ -210,7 +226,7 @@ def profile_interval(
     return low, high
 
 
-def _profile_end(function: Callable[[Reals], float], best: Minimum, index: int, outer: float) -> float:
+def _profile_end(function: Callable[[Reals], Reals], best: Minimum, index: int, outer: float) -> float:
     """Return where the profile has lost what an interval allows, or ``outer``.
 
     The profile at a value is searched for from the minimum at the last step inside the interval.
@@ -219,7 +235,7 @@ def _profile_end(function: Callable[[Reals], float], best: Minimum, index: int, 
     """
 
     def profile(value: float, start: Reals) -> Minimum:
-        return minimise(lambda free: function(np.insert(free, index, value)), start, abs(outer))
+        return minimise(lambda free: function(np.insert(free, index, value, axis=1)), start, abs(outer))
 
     def lacking(value: float, start: Reals) -> float:
         return profile(value, start).value - limit

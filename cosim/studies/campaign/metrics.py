@@ -234,6 +234,7 @@ def quantile_interval(values: Vector, share: float) -> tuple[float, float]:
     return float(ordered[low]) if low >= 0 else -math.inf, float(ordered[high])
 
 
+@cache
 def interval_ranks(count: int, share: float) -> tuple[int, int]:
     """Return the ranks, from 0, of the ends of a quantile's 95 % confidence interval.
 

@@ -82,7 +82,8 @@ def test_a_temporary_run_exists_as_long_as_its_object() -> None:
 def test_a_run_of_the_api_has_an_ordinary_run_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenario: noack.Scenario
 ) -> None:
-    run = noack.simulate(scenario, runs=tmp_path / "runs")
+    short = noack.with_settings(scenario, {"horizon_s": 0.1})
+    run = noack.simulate(short, runs=tmp_path / "runs")
     assert (run.directory / "recording.rrd").is_file()
     monkeypatch.chdir(tmp_path)
     opened = noack.open_run()

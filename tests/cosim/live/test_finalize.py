@@ -17,6 +17,7 @@ import pytest
 
 import cosim.live.finalize
 from cosim.analysis.replay import replay
+from cosim.analysis.summary.summary_model import RunSummary
 from cosim.live.finalize import ReplayBeside, finalize, reopen
 from cosim.live.processes import end_helpers
 from cosim.live.processes.end_helpers import EndHelpers, PreparedEnding
@@ -128,7 +129,7 @@ def test_a_run_whose_record_is_not_complete_fails(
     stored = json.loads((run_dir / ENDING_FILE).read_text())
     assert stored["exit"] == {"status": 0, "reason": "horizon"}  # the launcher saw no fault
     stopped = RunEnding(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
-    assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED
+    assert finalize(stopped, report=False, view=False).status == ExitStatus.INTERRUPTED
 
 
 def test_a_run_that_cannot_be_replayed_or_whose_directory_is_deleted_fails(
@@ -214,6 +215,7 @@ def test_an_interrupted_finalisation_is_completed(run_dir: Path) -> None:
 # --- processes that help with the end of a long run -----------------------------------------------
 
 
+JudgedRun = tuple[Path, RunSummary]
 LOOPS = 3
 _NEVER_IDLE = """
 from cosim.live.processes import process_pool
@@ -223,25 +225,41 @@ process_pool.be_idle = spool_conversion.be_idle = lambda: None
 """For a helper: on a busy machine, idle priority can get no time for minutes."""
 
 
+@pytest.fixture(scope="module")
+def judged_alone(tmp_path_factory: pytest.TempPathFactory) -> JudgedRun:
+    """A run of more loops than are prepared at once, and its summary without help."""
+    scenario = shipped("shared_bottleneck", "horizon_s=0.2")
+    assert scenario.loops is not None
+    loops = (scenario.loops[0].model_copy(update={"count": LOOPS}),)
+    folder = tmp_path_factory.mktemp("many")
+    run_dir = simulate_run(scenario.model_copy(update={"loops": loops}), folder).run_dir
+    summary = finalize(ended_well(run_dir), report=False, view=False).summary
+    (run_dir / SUMMARY_FILE).unlink()
+    return run_dir, summary
+
+
 @pytest.fixture
-def many_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A run of more loops than are prepared at once, without a summary."""
+def many_loops(
+    judged_alone: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """A copy of the run, whose end processes help with."""
     monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
     monkeypatch.setattr(end_helpers, "_LOOPS_AT_ONCE", LOOPS - 1)
     monkeypatch.setattr(cosim.live.finalize, "_LEAST_LOOPS", LOOPS - 1)  # helpers judge loops, too
     monkeypatch.setattr(end_helpers, "cores", lambda: 2)
-    scenario = shipped("shared_bottleneck", "horizon_s=0.2")
-    assert scenario.loops is not None
-    loops = (scenario.loops[0].model_copy(update={"count": LOOPS}),)
-    return simulate_run(scenario.model_copy(update={"loops": loops}), tmp_path).run_dir
+    run_dir, _ = judged_alone
+    return Path(shutil.copytree(run_dir, tmp_path / run_dir.name))
 
 
 @pytest.mark.parametrize("is_killed", [False, True])
 def test_a_prepared_end_is_that_of_a_run_without_preparation(
-    many_loops: Path, monkeypatch: pytest.MonkeyPatch, *, is_killed: bool
+    judged_alone: tuple[Path, RunSummary],
+    many_loops: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    is_killed: bool,
 ) -> None:
     given = (many_loops, 0, ExitStatus.OK, "horizon")
-    expected = finalize(RunEnding(*given), report=False, view=False).summary
     helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
     helpers.start()
     helpers.submit(exec, _NEVER_IDLE).result()
@@ -255,6 +273,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
         with pytest.raises(BrokenProcessPool):
             helpers.submit(os._exit, 1).result()
     ending = PreparedEnding(*given, helpers=helpers)
+    _, expected = judged_alone
     assert finalize(ending, report=False, view=not is_killed).summary == expected
 
 
@@ -272,7 +291,8 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
         begun.set()
         waiting.result()
 
-    monkeypatch.setattr(EndHelpers, part, endless)
+    for one in ("_prepare_loops", "_write_early", "_idle"):
+        monkeypatch.setattr(EndHelpers, one, endless if one == part else lambda *_: None)
     monkeypatch.setattr(end_helpers, "_GRACE_S", 0.0)
     helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
     helpers.prepare(many_loops)

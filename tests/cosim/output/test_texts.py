@@ -26,9 +26,14 @@ _ROUNDING = re.compile(r"[ \d]\d?\.?\d*e-(0[7-9]|1\d)")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
     """The paper's example in virtual time: the same bits everywhere."""
-    return noack.simulate("lane_following", runs=tmp_path_factory.mktemp("runs")).directory
+    return noack.simulate("lane_following", runs=tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture
+def run(simulated: noack.Run) -> Path:
+    return simulated.directory
 
 
 @pytest.mark.parametrize(
@@ -53,8 +58,8 @@ def test_the_terminal_shows_what_was_approved(
     compare(f"{name}.txt", done.stdout.replace(str(run), "RUN"))
 
 
-def test_the_report_shows_what_was_approved(run: Path) -> None:
-    page = Page(noack.open_run(run).report().read_text(encoding="utf-8"))
+def test_the_report_shows_what_was_approved(simulated: noack.Run) -> None:
+    page = Page(simulated.report().read_text(encoding="utf-8"))
     _, _, body = page.text.rpartition("}\n")  # without the style
     text, _, _ = body.partition("Scenario and environment")
     compare("report.txt", "\n".join(line for line in text.splitlines() if line.strip()))
@@ -104,14 +109,12 @@ def test_units_move_to_the_heads_and_numbers_are_aligned() -> None:
     assert result_tables.as_csv(rows) == "quantity,value\ndelay [ms],3\nlost,3 (60 %)\n"
 
 
-def test_tables_of_a_run_have_its_numbers(tmp_path: Path) -> None:
-    run = noack.simulate(noack.load("lane_following", {"horizon_s": 5.0}))
-    result_tables.save_tables(summary_tables(run.summary), tmp_path)
-    numbers = dict(rows_of(tmp_path / "numbers.csv"))
-    assert numbers["transmissions"] == str(run.summary.loops[0].events)
-    shortest_s = float(numbers["shortest inter-event time [s]"])
-    assert shortest_s == pytest.approx(run.summary.loops[0].inter_event_min_s, abs=5e-4)
-    assert len(rows_of(tmp_path / "claims.csv")) == 1 + len(run.claims)
+def test_tables_of_a_run_have_its_numbers(simulated: noack.Run, tmp_path: Path) -> None:
+    result_tables.save_tables(summary_tables(simulated.summary), tmp_path)
+    numbers, (loop,) = dict(rows_of(tmp_path / "numbers.csv")), simulated.summary.loops
+    assert numbers["transmissions"] == str(loop.events)
+    assert float(numbers["shortest inter-event time [s]"]) == pytest.approx(loop.inter_event_min_s, abs=5e-4)
+    assert len(rows_of(tmp_path / "claims.csv")) == 1 + len(simulated.claims)
 
 
 def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_a_killed_worker_gives_one_line_and_no_byte_depends_on_the_workers(
     many: Path, tmp_path: Path
 ) -> None:
     _, points = few_of(many)
-    by_two, reverse = (Store(tmp_path / name, points, 80, 1) for name in ("two", "reverse"))
+    by_two, reverse = (Store(tmp_path / name, points, 20, 1) for name in ("two", "reverse"))
     workers: list[psutil.Process] = []
 
     def progress(done: int, total: int) -> None:
@@ -81,8 +81,8 @@ def test_a_killed_worker_gives_one_line_and_no_byte_depends_on_the_workers(
     assert not list(by_two.folder.rglob(".*.partial"))
     run_campaign(reverse, lambda works, chunks: alone(works, reversed(list(chunks))))
     begun = contents(by_two.folder)
-    assert 5 <= len(begun) < RUNS
-    assert run_campaign(by_two, alone) == RUNS - len(begun)
+    assert 5 <= len(begun) < 80
+    assert run_campaign(by_two, alone) == 80 - len(begun)
     assert begun.items() <= contents(by_two.folder).items()
     assert contents(by_two.folder) == contents(reverse.folder)
 
@@ -219,9 +219,9 @@ def test_a_cluster_from_its_first_worker_to_its_end(
     dask: Cluster, tmp_path: Path, write: Write, plan: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    _, points = few_of(write(plan, draws=60, chunk=2))
+    _, points = few_of(write(plan, draws=30, chunk=2))
     here, there, unfinished = (
-        Store(tmp_path / name, points, 60, 2) for name in ("here", "there", "unfinished")
+        Store(tmp_path / name, points, 30, 2) for name in ("here", "there", "unfinished")
     )
     lines: list[str] = []
 
@@ -230,7 +230,7 @@ def test_a_cluster_from_its_first_worker_to_its_end(
         patched.setattr(campaign_workers, "_LOOK_EVERY_S", 0.1)
         patched.setattr(campaign_workers, "_PATIENCE_S", 0.5)
         with (
-            pytest.raises(PeerError, match=r"the cluster has had no worker for 0\.5 s \(.*\); 0 of 240"),
+            pytest.raises(PeerError, match=r"the cluster has had no worker for 0\.5 s \(.*\); 0 of 120"),
             cluster(dask.address, lines.append) as runner,
         ):
             run_campaign(there, runner)
@@ -251,15 +251,15 @@ def test_a_cluster_from_its_first_worker_to_its_end(
     # The bytes are the same if a worker is killed.
     run_campaign(here, alone)
     with cluster(dask.address) as runner:
-        assert run_campaign(there, runner, killing(first, 40)) == 240
+        assert run_campaign(there, runner, killing(first, 20)) == 120
     assert first.wait() != 0
     assert second.poll() is None
     assert contents(there.folder) == contents(here.folder)
-    assert len(contents(there.folder)) == 120
+    assert len(contents(there.folder)) == 60
 
     # A killed scheduler ends the campaign.
     with (
-        pytest.raises(PeerError, match=r"the scheduler has ended; \d+ of 240 runs are in"),
+        pytest.raises(PeerError, match=r"the scheduler has ended; \d+ of 120 runs are in"),
         cluster(dask.address) as runner,
     ):
         run_campaign(unfinished, runner, killing(dask.scheduler, 20))

@@ -99,10 +99,17 @@ def test_the_guarantee_is_used_up_by_a_burst_with_a_full_queue() -> None:
     assert seen == {True, False}
 
 
+@pytest.fixture
+def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands without page and figures, which take longer than small studies."""
+    monkeypatch.setattr("cosim.studies.capacity.capacity_page.write", lambda *_: [])
+
+
 def capacity(*words: str) -> Result:
     return invoke("capacity", *words)
 
 
+@pytest.mark.usefixtures("no_page")
 def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
     tmp_path: Path,
 ) -> None:
@@ -143,6 +150,7 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
     assert "crosses are live runs" in (tmp_path / "capacity.html").read_text()
 
 
+@pytest.mark.usefixtures("no_page")
 def test_a_schedule_carries_as_many_loops_as_its_delay_allows(tmp_path: Path) -> None:
     """Loops that transmit every 60 ms, or every 20 ms, in turn in slots of 10 ms; M = 4, Q = 1."""
     result = capacity(

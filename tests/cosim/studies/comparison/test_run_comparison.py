@@ -22,9 +22,14 @@ SETTINGS: list[dict[str, Any]] = [
 
 @pytest.fixture(scope="module")
 def simulated() -> list[noack.Run]:
-    with pytest.MonkeyPatch.context() as patch:  # nobody looks at their reports
-        patch.setattr("cosim.live.finalize._write_report", lambda *_: None)
-        return [noack.simulate(noack.load("lane_following", settings)) for settings in SETTINGS]
+    return [finalized(noack.load("lane_following", settings)) for settings in SETTINGS]
+
+
+def finalized(scenario: noack.Scenario) -> noack.Run:
+    """A run without report and recording, which `noack compare` would write first."""
+    run = noack.simulate(scenario)
+    assert run.summary
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -94,9 +99,8 @@ def test_the_command_prints_the_table_and_writes_an_escaped_page(runs: list[Path
     assert "distance in x to A, RMS" in repr(mine)
 
 
-@pytest.mark.usefixtures("no_report")
 def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: Path) -> None:
-    other = noack.simulate(noack.load("double_integrator", {"horizon_s": 1.0}))
+    other = finalized(noack.load("double_integrator", {"horizon_s": 0.2}))
     mistakes = {
         (runs[0], other.directory): f"noack: {other.directory}: its plant has 2 states, that of "
         f"{runs[0]} has 4; runs with equally many states can be compared\n",

@@ -100,10 +100,10 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
     [
         ("lane_periodic", (), Wish(effort=0, most=8)),
         ("lane_periodic", (), Wish(effort=0, window=8)),
-        ("unstable_pendulum", (), Wish(effort=200, period_s=PERIOD_S, holds=read_holds("model"))),
-        ("unstable_pendulum", ("mode=zoh",), Wish(effort=60, period_s=PERIOD_S, holds=read_holds("zoh"))),
+        ("unstable_pendulum", (), Wish(effort=80, period_s=PERIOD_S, holds=read_holds("model"))),
+        ("unstable_pendulum", ("mode=zoh",), Wish(effort=30, period_s=PERIOD_S, holds=read_holds("zoh"))),
         ("unstable_pendulum", ZERO, Wish(effort=60, period_s=PERIOD_S, holds=read_holds("zero"))),
-        ("double_integrator", ("network.mansd=2",), Wish("transmissions", period_s=1, effort=60)),
+        ("double_integrator", ("network.mansd=2",), Wish("transmissions", period_s=1, effort=30)),
     ],
 )
 def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
@@ -199,7 +199,7 @@ def test_each_hold_strategy_is_written_decided_and_run_as_claimed(
 @pytest.fixture(scope="module")
 def events() -> FoundEvents:
     """The pendulum's own trigger and gain, and better ones, with a certified bound of ‖x‖."""
-    wish = Wish(most=40, bounds={"state": 1.6}, effort=120)
+    wish = Wish(most=40, bounds={"state": 1.6}, effort=50)
     return searched_events(shipped("unstable_pendulum"), wish, seed=5)
 
 
@@ -225,7 +225,7 @@ def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
 
 def test_fewer_transmissions_of_events_for_the_same_network() -> None:
     given = shipped("double_integrator")
-    found = searched_events(given, Wish("transmissions", effort=120), seed=1)
+    found = searched_events(given, Wish("transmissions", effort=50), seed=1)
     assert found.shown.scenario.network == given.network
     assert found.best.measured.transmissions < 0.9 * found.given.measured.transmissions
     assert found.search.certificate(found.best.loop, given.network.mansd + 1) is not None

@@ -127,7 +127,7 @@ def test_a_scenario_for_each_plant_that_comes_with_noack(name: str) -> None:
         assert made.certificate.constants is not None
         assert made.certificate.constants.loop_gain < 1
     assert made.notes[-1].endswith("the loop returns to 0.")
-    assert noack.simulate("made.toml").ok
+    assert noack.simulate(noack.load("made.toml", {"horizon_s": 0.5})).ok
 
 
 def test_every_key_of_the_file_that_is_chosen_has_a_comment() -> None:
@@ -198,7 +198,7 @@ def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(fol
     assert made.scenario.plant.system.content()["operating_state"] == [1.0, 0.0]
     assert made.scenario.plant.system.content()["operating_input"] == [1.0]
     made.save("made.toml")
-    assert noack.simulate("made.toml").ok
+    assert noack.simulate(noack.load("made.toml", {"horizon_s": 0.5})).ok
 
 
 def test_a_simulator_is_moved() -> None:
