@@ -12,8 +12,10 @@ losses"). The losses are a Markov chain over the packets
 2. Moments. Each update is lost with a probability of at most p̄, whatever happened before. In the
    inequalities of a certificate, (I1) then holds for (E‖·‖ʳ)^{1/r} with ρ = p̄^{1/r} in place of
    the number of missing events, or with a law of this number that follows from what has been added
-   to e_s. They are linear, or concave, and solved in the same way. A moment that decays as e^{−αt}
-   gives almost sure decay at every smaller rate (Borel and Cantelli). 1 and 2 are ``moments.py``.
+   to e_s. They are linear, or concave, and solved in the same way (``fixed_times.py``). Mean squares
+   are bounded once more by a quadratic function of the loop's state, whose mean no event increases
+   (``quadratic_moments.py``). A moment that decays as e^{−αt} gives almost sure decay at every
+   smaller rate (Borel and Cantelli). ``moments.py`` has the rest of 1 and 2.
 3. Time-triggered loops. From one transmission to the next the state becomes M₀z or M₁z. The second
    moments follow a linear map, so its spectral radius decides stability in mean square exactly; its
    bound is proven with all rounding (``mean_square_growth.py``). The same map with weighted outcomes
