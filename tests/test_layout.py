@@ -4,9 +4,9 @@ import ast
 import re
 from collections import Counter
 from collections.abc import Iterator
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import grimp
 import numpy as np
@@ -102,7 +102,8 @@ FILES = {"noack/trigger": 17}
 """Largest numbers of modules of folders that have more; a policy of noack/trigger is a file."""
 
 
-class Module(NamedTuple):
+@dataclass(frozen=True)
+class Module:
     """A file of Python outside the tests."""
 
     path: Path
@@ -132,7 +133,7 @@ class Module(NamedTuple):
             "imports": len(unexplained),
         }
 
-    @property
+    @cached_property
     def functions(self) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
         kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
         return [one for one in statements(self.tree) if isinstance(one, kinds)]
