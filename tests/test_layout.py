@@ -158,10 +158,9 @@ def modules() -> list[Module]:
     )
     texts = ((path, path.read_text(encoding="utf-8")) for path in paths)
     gc.disable()  # of a million new objects none is garbage, and the search for some takes 5 s
-    try:
-        return [Module(path, text, ast.parse(text)) for path, text in texts]
-    finally:
-        gc.enable()
+    found = [Module(path, text, ast.parse(text)) for path, text in texts]
+    gc.enable()
+    return found
 
 
 def test_base_names_of_modules_are_unique() -> None:
