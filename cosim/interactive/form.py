@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 from typing import Any
 
 from cosim.interactive.controls import example_of
@@ -94,7 +95,7 @@ def form_of(draft: Draft) -> Group:
     Raises:
         DraftError: the text is not TOML.
     """
-    return _group("", toml_file.json_schema(Scenario), "", draft.content, {})
+    return _group("", _schema(), "", draft.content, {})
 
 
 def filled(draft: Draft, field: Field, text: str) -> Draft:
@@ -137,12 +138,16 @@ def by_field(form: Group, mistakes: list[Mistake]) -> dict[str, str]:
     return texts
 
 
+@cache
+def _schema() -> Schema:
+    return toml_file.json_schema(Scenario)
+
+
 def _resolved(schema: Schema) -> Schema:
     """Return a schema without reference, and without the alternative null."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
-        named = toml_file.json_schema(Scenario)["$defs"][name]
-        return {**named, **{k: v for k, v in schema.items() if k != "$ref"}}
+        return {**_schema()["$defs"][name], **{k: v for k, v in schema.items() if k != "$ref"}}
     if "anyOf" in schema:
         given = [alternative for alternative in schema["anyOf"] if alternative.get("type") != "null"]
         if len(given) == 1:
