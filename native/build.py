@@ -64,7 +64,7 @@ FLAGS = (
 SANITIZERS = (
     "-fsanitize=address,undefined,float-cast-overflow",
     "-fno-sanitize-recover=all",
-    "-g",
+    "-g1",  # enough for the lines of a stack trace
     "-Werror",
     "-O1",
 )

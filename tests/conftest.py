@@ -23,6 +23,7 @@ from hypothesis.internal.conjecture import providers
 # The workers and the programs that tests start import the same modules hundreds of times.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+gc.disable()  # until everything is loaded, of which nothing is garbage
 
 FIRST = (
     "tests/test_doc_programs.py", "tests/integration/", "tests/cosim/lab/", "tests/native/",
@@ -65,6 +66,7 @@ def pytest_collection_finish() -> None:
     """Spare the garbage collector what is loaded by now: half a million objects that stay."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -64,29 +64,13 @@ def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest
         assert target_exists(command)
         return
     assert program == "noack"
-    if command in blocks("README.md", "sh")[-1]:
-        emulate(words, run_folder)
-        return
     if "--listen" in words or "--links" in words:
-        words.insert(1, "--explain")  # the emulator does not start
+        words.insert(1, "--explain")  # tests/integration/test_netem.py starts an emulator
     monkeypatch.chdir(run_folder)
     finished = invoke(*shorter(words))
     assert finished.exit_code == 0, finished.output
     if "--json" in words:
         json.loads(finished.stdout)
-
-
-def emulate(words: list[str], folder: Path) -> None:
-    """Start the network emulator, wait until it is ready, and end it as Ctrl-C does."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "cosim.cli", *words], cwd=folder,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
-        assert process.stderr is not None
-        assert any("Ctrl-C ends" in line for line in process.stderr)
-        process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=250)
-    assert process.returncode == 0, stderr
 
 
 def snippets() -> list[str]:

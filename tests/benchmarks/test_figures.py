@@ -12,11 +12,14 @@ from tests.oracles.receiver import Limits, outcomes_of, violations
 
 
 @pytest.mark.parametrize("words", bench.COMBINATIONS)
-def test_no_combination_is_violated_and_each_would_be_without_it(words: str) -> None:
+def test_no_combination_is_violated_and_each_would_be_without_it(
+    words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "_BATCH", 200_000)
     for before in ("loss 50%", f"loss 30% {bench.REORDERING}"):
-        found, *rates = bench.check_rows(f"{before} {words}", bench.COMBINATIONS[words], 1_000_000)
+        found, *rates = bench.check_rows(f"{before} {words}", bench.COMBINATIONS[words], 200_000)
         assert found.value == 0
-        assert all(rate.ratio == pytest.approx(1, abs=0.01) for rate in rates)
+        assert all(rate.ratio == pytest.approx(1, abs=0.02) for rate in rates)
         free = outcomes_of(bench.Decider(f"{before} limit 1000000").decide())
         assert violations(free, bench.COMBINATIONS[words]) > 1000
 

@@ -26,7 +26,7 @@ def period(loop: TimeTriggeredLoop, slot: int, delivered: bool) -> Matrix:
     return (loop._between(arrival_ns, until_ns, NEVER_NS) @ state).interval().middle
 
 
-@pytest.mark.parametrize("seed", {*range(16)} - {0, 4, 6, 11})  # those take up to a minute
+@pytest.mark.parametrize("seed", [3, 5, 7, 9, 10, 13, 14, 15])  # others take up to a minute
 def test_patterns_of_random_loops_grow_as_proven(seed: int) -> None:
     """Patterns are played step by step, without the maps between deliveries or their graph."""
     random = random_loop(seed)

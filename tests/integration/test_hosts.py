@@ -175,7 +175,7 @@ def wait_recorded(folder: Path) -> Path:
 
 def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:
     """The link is down until the recorder has given the other host's processes up for lost."""
-    sets = (*live.settings(horizon_s=30.0), "--set", ROOMY)
+    sets = (*live.settings(horizon_s=20.0), "--set", ROOMY)
     recording = record(start, tmp_path, "10.83.3.1", *sets, impatient=True)
     processes = joined(start, "netem", "controller", ahead_s=AHEAD_S)
     wait_recorded(tmp_path)
@@ -191,7 +191,7 @@ def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_
     assert loop["unintended_losses"] > 0
     assert {"void"} <= {one["verdict"] for one in loop["claims"]} <= {"void", "not applicable"}
     found = load_record((tmp_path / "runs" / "latest").resolve())
-    assert len(found["controller_step"]) == 30 * live.RATE_HZ
+    assert len(found["controller_step"]) == 20 * live.RATE_HZ
     # Without the reference of time, the bound of the clock's error is lost, and all claims with it.
     assert (found["controller_clock"]["error_ns"] == LOST_NS).any()
     assert "controller clock lost" in {one["cause"] for one in loop["assumption_violations"]}

@@ -31,8 +31,8 @@ def test_several_links_a_capture_and_statistics(tmp_path: Path) -> None:
         arguments = ["--links", str(links), "--capture", str(capture), "--realtime"]
         arguments += ["--stats", "0.05", "--stats-file", str(lines), "--json"]
         with subprocess.Popen(
-            [sys.executable, "-m", "netem", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True,
+            [sys.executable, "-m", "cosim.cli", "netem", *arguments],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         ) as process:  # fmt: skip
             assert process.stdout is not None
             ready = json.loads(process.stdout.readline())["ready"]

@@ -34,8 +34,8 @@ NAMES = (
     "machines_under_sanitizers", "link_numbers", "wire", "pcapng", "plain_network", "no_network", "in_time",
     "restarted_link", "scripted_network", "different_sizes", "no_simulation", "delay1-ack",
     "queue_overflows", "changed_bit", "report_their_errors", "replayed_bit_for_bit", "runs_end",
-    "restarted_controller", "record_with_any_numbers", "ticks]", "disturbed]", "observed]", "too_early",
-    "one_by_one", "sent_together", "answered[1-True]", "answered[70-True]", "1000000-20]",
+    "restarted_controller", "record_with_any_numbers", "[slow ", "[fast ", "disturbed]", "observed]",
+    "too_early", "one_by_one", "sent_together", "answered[1-True]", "answered[70-True]", "1000000-20]",
     "cannot_act_on", "cannot_be_sent", "counters_of_their_own", "flood", "addresses_survive",
     "many_sources", "[bursts", "any_length", "instances_are", "wrong_time", "no_run_has", "damaged_give",
 )  # fmt: skip
