@@ -19,11 +19,11 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 426
+MOST_MODULES = 428
 LINES = {
-    "noack/scenario": 4075,
+    "noack/scenario": 4080,
     "noack/controllers": 270,
-    "noack/core": 1335,
+    "noack/core": 1345,
     "noack/disturbances": 220,
     "noack/impairments": 4320,
     "noack/machines": 400,
@@ -32,7 +32,7 @@ LINES = {
     "noack/protocol": 1235,
     "noack/runtime": 5665,
     "noack/settings": 600,
-    "noack/theory": 11660,
+    "noack/theory": 12195,
     "noack/traces": 1320,
     "noack/trigger": 1055,
     "netem": 6495,
@@ -43,17 +43,17 @@ LINES = {
     "cosim/interactive": 1625,
     "cosim/lab": 2120,
     "cosim/live": 3935,
-    "cosim/measurement": 2885,
-    "cosim/output": 8550,
-    "cosim/record": 3575,
+    "cosim/measurement": 2910,
+    "cosim/output": 8560,
+    "cosim/record": 3590,
     "cosim/simulation": 1945,
     "cosim/studies": 9315,
     "plant_server": 420,
     "sensor_node": 395,
     "controller_node": 420,
-    "benchmarks": 3640,
+    "benchmarks": 3685,
     "native": 11055,
-    "tests": 47465,
+    "tests": 47630,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
@@ -83,7 +83,7 @@ MARKS = {
     "noack/runtime": (6, 1, 0),
     "noack/scenario": (5, 2, 0),
     "noack/settings": (2, 0, 0),
-    "noack/theory": (5, 3, 0),
+    "noack/theory": (5, 4, 0),
     "noack/traces": (4, 0, 0),
     "noack/trigger": (4, 1, 0),
     "plant_server": (0, 1, 0),

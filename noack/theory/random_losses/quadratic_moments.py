@@ -71,6 +71,8 @@ class QuadraticFunction(NamedTuple):
     """μ."""
     of_age: float
     """ζ."""
+    of_flight: float
+    """ζ'."""
     loop: "LossyFlow"
 
     def level(self, known: Known) -> float:
@@ -185,8 +187,9 @@ class _Search:
             return
         found = _Inequalities(self._blocks, len(first)).maximise_last(first)
         if found is not None:
-            X, P, mu, nu, zeta, *_ = self._unknowns(found)
-            yield QuadraticFunction(X, P + nu * self._sensor, nu, self._rate, mu, zeta, self._loop)
+            X, P, mu, nu, zeta, in_flight, _ = self._unknowns(found)
+            positive = P + nu * self._sensor
+            yield QuadraticFunction(X, positive, nu, self._rate, mu, zeta, in_flight, self._loop)
 
     def _unknowns(self, values: Vector) -> _Unknowns:
         n, first = self._n, len(self._triangle[0])
