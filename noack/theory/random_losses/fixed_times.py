@@ -197,8 +197,10 @@ class _Inequalities:
             first.sensor_error,
             first.input_error,
         )
-        flow = LossyFlow(self._error, self._plant, self._conditions, self._probability)
-        functions = quadratic_functions(flow, self._known(bounds))
+        known, functions = self._known(bounds), list[QuadraticFunction]()
+        for counts_age in (True, False):
+            loop = self._error, self._plant, self._conditions, self._probability
+            functions = functions or quadratic_functions(LossyFlow(*loop, counts_age), known)
         for _ in range(_ROUNDS):
             before, bounds = bounds, self._improved(bounds, functions)
             if bounds.states[Output.STATE] > _SETTLED * before.states[Output.STATE]:
@@ -211,25 +213,42 @@ class _Inequalities:
         )
 
     def _known(self, bounds: _Bounds) -> Known:
-        at_start = float(self._start_error) + bounds.errors[Output.GAIN] if self._conditions.start_s else 0.0
-        return Known(bounds.sensor_error, self._with_age(0.0, bounds.states, bounds.errors), at_start)
+        """What is known of the parts of v; errors[C] bounds both ‖C e_c‖ and ‖C(e_c − ê_c)‖ with a delay."""
+        states, errors, conditions = bounds.states, bounds.errors, self._conditions
+        gains = dict(self._ages)
+        in_flight, by_rate = 0.0, gains.pop(Output.GAIN_RATE)
+        if conditions.delay_s > 0:
+            missing = self._missing_events(Output.GAIN, self._driving(bounds))
+            in_flight = float(missing.recent @ self._values(bounds))
+        other = in_flight + sum(gain * (states[C] + errors[C]) for C, gain in gains.items())
+        if conditions.delay_s > 0:
+            other += by_rate * errors[Output.GAIN_RATE]
+        aged = by_rate * (states[Output.GAIN_RATE] + errors[Output.GAIN_RATE])
+        at_start = float(self._start_error) + errors[Output.GAIN] + in_flight if conditions.start_s else 0.0
+        return Known(bounds.sensor_error, other, aged, at_start)
+
+    def _driving(self, bounds: _Bounds) -> _Signals:
+        """Return rows that bound R_E x, and p at all times."""
+        input_error = max(bounds.input_error, float(self._start_error))
+        return bounds.states[Output.MISMATCH] * _ONE, input_error * _ONE
+
+    def _values(self, bounds: _Bounds) -> Vector:
+        return np.array([bounds.sensor_error, bounds.input_error, 1.0])
 
     def _improved(self, bounds: _Bounds, functions: Sequence[QuadraticFunction]) -> _Bounds:
         """Bound every signal by what is known of the others."""
         known, delay_s = self._known(bounds), self._conditions.delay_s
-        mismatch, driving = bounds.states[Output.MISMATCH], max(bounds.input_error, float(self._start_error))
-        signals = mismatch * _ONE, driving * _ONE
-        values = np.array([bounds.sensor_error, bounds.input_error, 1.0])
+        signals, values = self._driving(bounds), self._values(bounds)
         propagated = exponential(self._error.scaled_H * delay_s)
         errors: dict[str, float] = {}
         for output, C in self._error.outputs.items():
             missing = self._missing_events(output, signals)
             by_missing = float(self._controller_error(values, missing) @ values)
             recent = float(missing.recent @ values)
-            by_functions = (V.bound_error(C @ propagated, known) + recent for V in functions)
-            errors[output] = min(bounds.errors[output], by_missing, *by_functions)
+            by_functions = [V.bound_error(C @ propagated, known) + recent for V in functions]
+            errors[output] = min([bounds.errors[output], by_missing, *by_functions])
         states = {
-            output: min(bounds.states[output], *(V.bound_state(C, known) for V in functions))
+            output: min([bounds.states[output], *(V.bound_state(C, known) for V in functions)])
             for output, C in self._plant.outputs.items()
         }
         input_error = self._with_age(errors[Output.GAIN], states, errors)
@@ -254,9 +273,8 @@ class _Inequalities:
         a = self._beta * self._error.stretch(sampling_s) * _ONE
         if sampling_s > 0:
             growth = self._plant.growth(sampling_s, _CELLS)
-            a = a + _driven(
-                (growth.mismatch.integral_on_grid(), growth.input_error.integral_on_grid()), signals
-            )
+            areas = growth.mismatch.integral_on_grid(), growth.input_error.integral_on_grid()
+            a = a + _driven(areas, signals)
         return np.asarray(a)
 
     def _state(self, output: str) -> Vector:

@@ -7,20 +7,22 @@ v = p − K ê_c, between events
     x' = (A+BK+αI) x + B (K ê_c + v),   q' = (H+αI) q,   e_s' = (H+αI) e_s − E x − B (K ê_c + v)
 
 At an event e_s becomes 0, and q becomes q + e_s if it is lost, with a probability of at most p̄
-whatever happened before, and 0 else. Let y = (q, e_s) and V = xᵀX x + yᵀP y. If
+whatever happened before, and 0 else. v has three parts: v_f of the oldest update in flight, v_h of
+the input's age σ, ‖v_h‖ ≤ σ‖K H (x + ê_c)‖, and w. Let y = (q, e_s) and V = xᵀX x + yᵀP y. If
 
-    P ⪰ p̄ (I I)ᵀ P_qq (I I) + ζ' N (I I)ᵀ D (I I)         no event increases the mean of V
-    V' + 2λV ≤ μ‖e_s‖_W² + ζ‖v − v'‖² + ζ'‖v'‖²            for all x, y, v and v'
+    P ⪰ p̄ (I I)ᵀ P_qq (I I) + ζ_f (I I)ᵀ D (I I)         no event increases the mean of V
+    V' + 2λV ≤ μ‖e_s‖_W² + ζ‖w‖² + ζ_f‖v_f‖² + ζ_h (‖v_h‖² − σ²‖K H (x + q + e_s)‖²)
 
-then the mean of V is at most max(V(0), (μ a² + ζ ω²)/2λ) at every fixed time, where a² and ω² bound
-the mean squares of ‖e_s‖_W and of v − v'. v' = K(e_c − ê_c) is the effect of updates in flight. Each
-of them, at most N at a time, is there for d at most. D = ∫₀ᵈ e^{2λτ}‖K e^{(H+αI)τ}·‖² dτ bounds what
-it adds to V while it is in flight, and is counted when it is sent. (V has no product of x and y:
-an event changes y and leaves x, so the first inequality would not hold with one.)
+for all x, y, w, v_f and v_h, then the mean of V is at most max(V(0), (μ a² + ζ ω²)/2λ) at every
+fixed time, where a² and ω² bound the mean squares of ‖e_s‖_W and of w. An update is in flight for d
+at most. D = ∫₀ᵈ e^{2λτ}‖K e^{(H+αI)τ}·‖² dτ bounds what it adds to V meanwhile, and is counted when it
+is sent. (V has no product of x and y: an event changes y and leaves x, so the first inequality would
+not hold with one.)
 
 These are linear matrix inequalities. :func:`quadratic_functions` looks for those with the smallest
 bounds by a barrier method, which stays inside of them; that the result is inside is checked with a
-margin for rounding. They can be met for all p̄ < 1 (derivations.md, "Without a limit on the losses").
+margin for rounding. Without delay and age they can be met for all p̄ < 1 (derivations.md, "Without a
+limit on the losses").
 """
 
 from collections.abc import Callable, Iterator
@@ -30,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
-from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
 
 _OF_STATE, _OF_ERROR = (0.1, 0.35), (0.35, 0.75)
@@ -41,6 +43,8 @@ _LARGEST = 1e4
 """Bound of the traces of X and P where ‖e_s‖_W ≤ 1 and V ≤ 1; without one they could be infinite."""
 _ROUNDING = 1e-13
 _INFLATED = 1 + 1e-9
+_LEFT = 0.01
+"""Share of the decay of x that the input's age leaves where the search begins."""
 Blocks = tuple[Vector, *tuple[Matrix, ...]]
 """Numbers that are to be positive, and symmetric matrices that are to be positive definite."""
 
@@ -50,10 +54,12 @@ class Known(NamedTuple):
 
     sensor_error: float
     """a, of ‖e_s‖_W at every fixed time."""
+    other: float
+    """ω, of w from the first applied input on."""
     aged: float
-    """ω, of what the input's age adds to p from the first applied input on."""
+    """Of v_h, if it is counted as a part of w."""
     start: float
-    """Of ‖p − K e_c‖ before the first applied input."""
+    """Of w before the first applied input."""
 
 
 class QuadraticFunction(NamedTuple):
@@ -69,19 +75,18 @@ class QuadraticFunction(NamedTuple):
     """λ."""
     of_sensor_error: float
     """μ."""
-    of_age: float
-    """ζ."""
-    of_flight: float
-    """ζ'."""
+    of_inputs: Vector
+    """ζ, ζ_f and ζ_h; 0 for what there is not, (3,)."""
     loop: "LossyFlow"
 
     def level(self, known: Known) -> float:
         """Bound of the mean of xᵀXx + yᵀPy, at every fixed time."""
-        loop, squares = self.loop, np.square(known)
-        entering = self.of_sensor_error * squares[0] + self.of_age * squares[1]
+        loop, of_other = self.loop, self.of_inputs[0]
+        entering = self.of_sensor_error * known.sensor_error**2 + of_other * loop.other(known) ** 2
         first = loop.start @ self.state @ loop.start
-        begun = self.of_age * squares[2] * loop.start_s
-        return float(max(first, entering / (2 * self.rate_per_s)) + begun + self.added * squares[0])
+        begun = of_other * known.start**2 * loop.start_s
+        added = self.added * known.sensor_error**2
+        return float(max(first, entering / (2 * self.rate_per_s)) + begun + added)
 
     def bound_state(self, C: Matrix, known: Known) -> float:
         """Bound of the root mean square of ‖C x‖."""
@@ -107,10 +112,16 @@ class LossyFlow:
         plant: the gains of the plant; α of both is the same.
         conditions: of the schedule; ``dropouts`` has no effect.
         probability: p̄.
+        counts_age: whether the input's age is followed by itself, as v_h.
     """
 
     def __init__(
-        self, error: ErrorGains, plant: PlantGains, conditions: NetworkConditions, probability: float
+        self,
+        error: ErrorGains,
+        plant: PlantGains,
+        conditions: NetworkConditions,
+        probability: float,
+        counts_age: bool = True,
     ) -> None:
         generators = plant.closed_loop, error.scaled_H
         self.decay_per_s = -max(spectral_abscissa(M) for M in generators)
@@ -118,8 +129,11 @@ class LossyFlow:
         self.closed_loop, self.model = (W @ M @ self.inverse_weight for M in generators)
         self.probability, self.delay_s = probability, conditions.delay_s
         self.start_s, self.start = conditions.start_s, W @ plant.start[:, 0]
-        self.has_aged_input = conditions.hold_s > 0 or conditions.start_s > 0
-        self.in_flight = conditions.delay_s and np.ceil(conditions.delay_s / conditions.spacing_s * _INFLATED)
+        delayed, aged = conditions.delay_s > 0, conditions.hold_s > 0
+        self.counts_age = aged and counts_age
+        self.inputs = np.array([delayed or aged or conditions.start_s > 0, delayed, self.counts_age])
+        """Whether there is w, v_f and v_h."""
+        self.age = conditions.hold_s * error.outputs[Output.GAIN_RATE] @ self.inverse_weight
         self.input, self.gain = W @ plant.input_matrix, error.split_K[1] @ self.inverse_weight
         BK, E = self.input @ self.gain, self.closed_loop - self.model
         zero = np.zeros_like(E)
@@ -128,20 +142,24 @@ class LossyFlow:
             [zero, self.model, zero],
             [-E, -BK, self.model - BK],
         ])  # fmt: skip
-        self.inputs = np.vstack([self.input, 0 * self.input, -self.input])
+        self.entering = np.vstack([self.input, 0 * self.input, -self.input])
+
+    def other(self, known: Known) -> float:
+        """Bound ω of w."""
+        return known.other + (0.0 if self.counts_age else known.aged)
 
     def flight(self, rate_per_s: float) -> Matrix:
-        """N D, (n, n), enlarged by the rounding of an exponential."""
+        """D, (n, n), enlarged by the rounding of an exponential."""
         n, M = len(self.model), self.model + rate_per_s * np.eye(len(self.model))
         square = self.gain.T @ self.gain
         both = exponential(np.block([[-M.T, square], [np.zeros((n, n)), M]]) * self.delay_s)
         D = both[n:, n:].T @ both[:n, n:]
-        return np.asarray(self.in_flight * (D + D.T) / 2 * _INFLATED)
+        return np.asarray((D + D.T) / 2 * _INFLATED)
 
 
 def quadratic_functions(loop: LossyFlow, known: Known) -> list[QuadraticFunction]:
     """Return functions V for several λ, each for a small bound of ‖x‖ or of ‖ê_c‖_W."""
-    if loop.decay_per_s <= 0 or not np.isfinite(loop.in_flight):
+    if loop.decay_per_s <= 0:
         return []
     zero = np.zeros_like(loop.model)
     searches = [_Search(loop, known, share, loop.inverse_weight, zero) for share in _OF_STATE]
@@ -156,10 +174,8 @@ class _Unknowns(NamedTuple):
     P: Matrix
     mu: float
     nu: float
-    zeta: float
-    """ζ, 0 without an aged input."""
-    in_flight: float
-    """ζ', 0 without a delay."""
+    zetas: Vector
+    """ζ, ζ_f and ζ_h; 0 for what there is not, (3,)."""
     gain: float
     """The bound of the output is its root's inverse."""
 
@@ -176,7 +192,7 @@ class _Search:
         self._sum, self._sensor = np.hstack([np.eye(n)] * 2), np.diag(np.repeat([0.0, 1.0], n))
         self._of_state, self._of_error = of_state, of_error @ self._sum
         unit = known.sensor_error
-        self._aged, self._begun = known.aged**2 / unit**2, known.start**2 / unit**2 * loop.start_s
+        self._other, self._begun = (loop.other(known) / unit) ** 2, (known.start / unit) ** 2 * loop.start_s
         self._start = loop.start / unit
         self._flight = loop.flight(self._rate) if loop.delay_s > 0 else None
 
@@ -187,38 +203,35 @@ class _Search:
             return
         found = _Inequalities(self._blocks, len(first)).maximise_last(first)
         if found is not None:
-            X, P, mu, nu, zeta, in_flight, _ = self._unknowns(found)
-            positive = P + nu * self._sensor
-            yield QuadraticFunction(X, positive, nu, self._rate, mu, zeta, in_flight, self._loop)
+            X, P, mu, nu, zetas, _ = self._unknowns(found)
+            yield QuadraticFunction(X, P + nu * self._sensor, nu, self._rate, mu, zetas, self._loop)
 
     def _unknowns(self, values: Vector) -> _Unknowns:
         n, first = self._n, len(self._triangle[0])
         last = first + len(self._larger[0])
         mu, nu, *others, gain = values[last:]
-        zeta = others.pop(0) if self._loop.has_aged_input else 0.0
-        in_flight = others.pop(0) if self._flight is not None else 0.0
+        zetas = np.zeros(len(self._loop.inputs))
+        zetas[self._loop.inputs] = others
         X = _symmetric(values[:first], self._triangle, n)
         P = _symmetric(values[first:last], self._larger, 2 * n)
-        return _Unknowns(X, P, mu, nu, zeta, in_flight, gain)
+        return _Unknowns(X, P, mu, nu, zetas, gain)
 
     def _values(self, unknowns: _Unknowns) -> Vector:
-        X, P, mu, nu, zeta, in_flight, gain = unknowns
-        others = [zeta] * self._loop.has_aged_input + [in_flight] * (self._flight is not None)
-        return np.array([*X[self._triangle], *P[self._larger], mu, nu, *others, gain])
+        X, P, mu, nu, zetas, gain = unknowns
+        return np.array([*X[self._triangle], *P[self._larger], mu, nu, *zetas[self._loop.inputs], gain])
 
     def _blocks(self, values: Vector) -> Blocks:
         """What is to be positive definite; affine in the values."""
-        X, P, mu, nu, zeta, in_flight, gain = unknowns = self._unknowns(values)
-        n, rest = self._n, 1 - nu
+        X, P, mu, nu, zetas, gain = unknowns = self._unknowns(values)
+        n, rest = self._n, 1 - nu - zetas[0] * self._begun
         at_event = P - self._loop.probability * self._sum.T @ P[:n, :n] @ self._sum
         if self._flight is not None:
-            at_event = at_event - in_flight * self._sum.T @ self._flight @ self._sum
-        below = 2 * self._rate * (rest - zeta * self._begun) - mu - zeta * self._aged
-        scalars = [below, rest - zeta * self._begun - self._start @ X @ self._start, mu, nu]
-        scalars += [_LARGEST - np.trace(X), _LARGEST - np.trace(P)]
-        scalars += [zeta] * self._loop.has_aged_input + [in_flight] * (self._flight is not None)
+            at_event = at_event - zetas[1] * self._sum.T @ self._flight @ self._sum
+        below = 2 * self._rate * rest - mu - zetas[0] * self._other
+        traces = [_LARGEST - np.trace(X), _LARGEST - np.trace(P)]
+        begin = rest - self._start @ X @ self._start
         return (
-            np.array(scalars),
+            np.array([below, begin, mu, nu, *traces, *zetas[self._loop.inputs]]),
             self._between_events(unknowns),
             at_event,
             P + nu * self._sensor - gain * self._of_error.T @ self._of_error,
@@ -226,51 +239,86 @@ class _Search:
         )
 
     def _between_events(self, unknowns: _Unknowns) -> Matrix:
-        """μ‖e_s‖² + ζ‖v − v'‖² + ζ'‖v'‖² − V' − 2λV as a form of (x, q, e_s, v − v', v')."""
-        X, P, mu, _, zeta, in_flight, _ = unknowns
-        n, flow, rank = self._n, self._loop.flow, self._loop.inputs.shape[1]
+        """What V' + 2λV is below it, as a form of (x, q, e_s) and of w, v_f and v_h."""
+        X, P, mu, _, zetas, _ = unknowns
+        loop, n = self._loop, self._n
         V, entering = np.zeros((3 * n, 3 * n)), np.zeros((3 * n, 3 * n))
         V[:n, :n], V[n:, n:], entering[n:, n:] = X, P, mu * self._sensor
-        form = entering - flow.T @ V - V @ flow - 2 * self._rate * V
-        squares = [zeta] * self._loop.has_aged_input + [in_flight] * (self._flight is not None)
-        if not squares:
+        form = entering - loop.flow.T @ V - V @ loop.flow - 2 * self._rate * V
+        if loop.counts_age:
+            aged = np.hstack([loop.age] * 3)
+            form = form - zetas[2] * aged.T @ aged
+        squares = zetas[loop.inputs]
+        if not len(squares):
             return np.asarray(form)
-        sides = np.hstack([-V @ self._loop.inputs] * len(squares))
-        return np.asarray(np.block([[form, sides], [sides.T, np.diag(np.repeat(squares, rank))]]))
+        sides = np.hstack([-V @ loop.entering] * len(squares))
+        squared = np.diag(np.repeat(squares, loop.entering.shape[1]))
+        return np.asarray(np.block([[form, sides], [sides.T, squared]]))
 
     def _first(self) -> Vector | None:
         """Values inside of all inequalities; None if rounding leaves none.
 
         q decays by itself, so a large P_qq covers what q does to x. A larger P_ss covers the events,
-        ζ' what v' does to x, and large μ and ζ what e_s and v − v' do. Then all is made small.
+        ζ_f and ζ_h what v_f and v_h do to x, and large μ and ζ what e_s and w do. Then all is made small.
         """
         loop, p = self._loop, self._loop.probability
-        rate_per_s = (self._rate + loop.decay_per_s) / 2
-        X, Q = (_decaying_form(M, rate_per_s) for M in (loop.closed_loop, loop.model))
-        pushed = self._of_decay(loop.closed_loop, X, X @ loop.input)
-        in_flight = 8 * float(np.linalg.norm(pushed, 2)) ** 2
-        coupling = self._of_decay(loop.model, Q, (pushed @ loop.gain).T)
-        size = 8 * float(np.linalg.norm(coupling, 2)) ** 2 + float(np.trace(X) / np.trace(Q))
+        X, root = self._state_form()
+        Q = _decaying_form(loop.model, (self._rate + loop.decay_per_s) / 2)
+        if root is None:
+            return None
+        pushed = np.linalg.solve(root, X @ loop.input)
+        of_flight, left = (
+            8 * float(np.linalg.norm(pushed, 2)) ** 2,
+            np.linalg.cholesky(self._decay(loop.model, Q)),
+        )
+        couplings = (pushed @ loop.gain).T, np.linalg.solve(root, loop.age.T @ loop.age).T, loop.age.T
+        size = float(np.trace(X) / np.trace(Q))
+        size += 8 * sum(float(np.linalg.norm(np.linalg.solve(left, C), 2)) ** 2 for C in couplings)
         P = np.asarray(np.kron(np.diag([1.0, 2 * p / (1 - p) + 1.0]), Q), np.float64)
         if self._flight is not None:
             lost, taken = (self._sum.T @ form @ self._sum for form in (p * Q, self._flight))
-            size += 2 * in_flight * float(np.linalg.norm(np.linalg.solve(P - lost, taken), 2))
+            size += 2 * of_flight * float(np.linalg.norm(np.linalg.solve(P - lost, taken), 2))
         P, large = P * size, size
-        while not _is_positive(self._between_events(_Unknowns(X, P, large, large, large, in_flight, 0.0))):
+        while True:
+            zetas = np.where(loop.inputs, [large, of_flight, 1.0], 0.0)
+            begin = _Unknowns(X, P, large, large, zetas, 0.0)
+            if _is_positive(self._between_events(begin)):
+                break
             large *= 4
             if not np.isfinite(large):
                 return None
         least = min(float(np.linalg.eigvalsh(form)[0]) for form in (X, P))
         gain = least / (1 + float(np.linalg.norm(self._of_state) ** 2 + np.linalg.norm(self._of_error) ** 2))
-        level = large * (1 + self._begun + (1 + self._aged) / (2 * self._rate))
+        level = large * (1 + self._begun + (1 + self._other) / (2 * self._rate))
         level += float(self._start @ X @ self._start + np.trace(X) + np.trace(P))
-        first = self._values(_Unknowns(X, P, large, large, large, in_flight, gain)) / (4 * level)
+        first = self._values(begin._replace(gain=gain)) / (4 * level)
         return first if all(map(_is_positive, self._blocks(first))) else None
 
-    def _of_decay(self, M: Matrix, form: Matrix, columns: Matrix) -> Matrix:
-        """R^{−T} times columns, RᵀR what is left of the form's decay along z' = M z."""
-        decay = -(M.T @ form + form @ M) - 2 * self._rate * form
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(decay), columns))
+    def _state_form(self) -> tuple[Matrix, Matrix | None]:
+        """X that decays, and a root of what is left of its decay; ζ_h = 1 covers the input's age.
+
+        It is that of the bounded real lemma, which exists if age and input amplify by less than 1.
+        """
+        loop = self._loop
+        X = _decaying_form(loop.closed_loop, (self._rate + loop.decay_per_s) / 2)
+        left = self._decay(loop.closed_loop, X)
+        if loop.counts_age:
+            from scipy.linalg import solve_continuous_are  # slow to import
+
+            flow = loop.closed_loop + self._rate * np.eye(self._n)
+            aged, one = loop.age.T @ loop.age, np.eye(loop.input.shape[1])
+            remaining = aged + _LEFT * (np.linalg.norm(aged, 2) + 1e-9) * np.eye(self._n)
+            try:
+                X = np.asarray(solve_continuous_are(flow, loop.input, remaining, -one / (1 + _LEFT)))
+            except (np.linalg.LinAlgError, ValueError):
+                return X, None
+            left = self._decay(loop.closed_loop, X) - aged - X @ loop.input @ loop.input.T @ X
+        has_root = _is_positive(left) and _is_positive(X)
+        return X, np.asarray(np.linalg.cholesky(left)) if has_root else None
+
+    def _decay(self, M: Matrix, form: Matrix) -> Matrix:
+        """What is left of a form's decay along z' = M z beside the rate λ."""
+        return np.asarray(-(M.T @ form + form @ M) - 2 * self._rate * form)
 
 
 class _Inequalities:

@@ -18,12 +18,7 @@ from noack.theory.random_losses import moments as moments_module
 from noack.theory.random_losses import random_growth as random_growth_module
 from noack.theory.random_losses.fixed_times import moments
 from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
-from noack.theory.random_losses.quadratic_moments import (
-    Known,
-    LossyFlow,
-    QuadraticFunction,
-    quadratic_functions,
-)
+from noack.theory.random_losses.quadratic_moments import Known, LossyFlow, quadratic_functions
 from tests.noack.theory.certificate_kinds.random_losses import certify, draw, simulate_runs
 
 
@@ -107,52 +102,42 @@ def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand
 
 @pytest.mark.parametrize("late", [False, True], ids=["paper", "schedule"])
 def test_no_event_and_no_flow_raises_the_mean_of_a_quadratic_function(late: bool) -> None:
-    """At random states: the derivative by differences, the losses by their probability.
-
-    While the update is in flight, e_c follows its model from the value before the event, and what
-    that adds to V at most is integrated by sums.
-    """
+    """Both inequalities of the derivation, written once more, in the coordinates of the loop."""
     rng, p, checked = np.random.default_rng(8), 0.4, 0
+    conditions = NetworkConditions(0, 0.01, 0.01, 0.1, 0.05, 0.1) if late else NetworkConditions(0)
     for _ in range(4):
         loop = draw(rng, alpha_share=0.3, probability=p)
-        gains, system = loop.system.gains(), loop.system
-        A, B, K, H, W = system.A, system.B, system.K, system.H, gains.error.weight
-        U = gains.error.split_K[0]
-        conditions = NetworkConditions(0, 0.01, 0.05, 0.1, 0.02) if late else NetworkConditions(0)
-        flow = LossyFlow(gains.error, gains, conditions, p)
-        for V in quadratic_functions(flow, Known(system.beta, system.beta * late, 0.0)):
+        gains, H, K, W = loop.system.gains(), loop.system.H, loop.system.K, loop.system.weight
+        n, flow = len(H), LossyFlow(gains.error, gains, conditions, p)
+        one, zero = np.eye(n), np.zeros((n, n))
+        x, q, e_s, w, v_f, v_h = np.split(np.eye(6 * n), 6)  # v is B (w + v_f + v_h) of the derivation
+        B = loop.system.B @ gains.error.split_K[0]
+        R, pushed = gains.error.split_K[1], np.pad(B, ((0, 0), (0, n - B.shape[1])))
+        G, shift = loop.system.A + loop.system.B @ K, gains.alpha_per_s * one
+        entering = loop.system.B @ K @ (q + e_s) + late * pushed @ (w + v_f + v_h)
+        rates = (
+            (G + shift) @ x + entering, (H + shift) @ q, (H + shift) @ e_s - (G - H) @ x - entering,
+        )  # fmt: skip
+        aged = conditions.hold_s * R @ H @ (x + q + e_s)
+        for V in quadratic_functions(flow, Known(loop.system.beta, loop.system.beta * late, 0.0, 0.0)):
             checked += 1
-            n, shift = len(A), gains.alpha_per_s * np.eye(len(A))
-
-            def value(x: Array, q: Array, e_s: Array, V: QuadraticFunction = V, W: Array = W) -> float:
-                y = np.concatenate([W @ q, W @ e_s])
-                return float(W @ x @ V.state @ W @ x + y @ V.errors @ y - V.added * (W @ e_s) @ (W @ e_s))
-
-            for _ in range(50):
-                x, q, e_s = (np.linalg.solve(W, rng.normal(size=n)) for _ in range(3))
-                w, arriving = (late * U @ rng.normal(size=U.shape[1]) for _ in range(2))
-                u = K @ (q + e_s) + w + arriving
-                rates = (
-                    (A + B @ K + shift) @ x + B @ u,
-                    (H + shift) @ q,
-                    (H + shift) @ e_s - (A + B @ K - H) @ x - B @ u,
-                )
-                step = 1e-6
-                after, before = (
-                    value(*(z + sign * step * rate for z, rate in zip((x, q, e_s), rates, strict=True)))
-                    for sign in (1, -1)
-                )
-                entering = V.of_sensor_error * np.sum((W @ e_s) ** 2)
-                entering += V.of_age * (w @ w) + V.of_flight * (arriving @ arriving)
-                slope = (after - before) / (2 * step) + 2 * V.rate_per_s * value(x, q, e_s)
-                assert slope <= entering + 1e-5 * abs(entering)
-                times, flown = np.linspace(0, conditions.delay_s, 200), 0.0
-                for t in times[1:] if late else []:
-                    moved = K @ expm((H + shift) * t) @ (q + e_s)
-                    flown += np.exp(2 * V.rate_per_s * t) * (moved @ moved) * times[1]
-                lost, delivered = value(x, q + e_s, 0 * x), value(x, 0 * x, 0 * x)
-                flight = V.of_flight * 2 * flown * 0.98
-                assert p * lost + (1 - p) * delivered + flight <= value(x, q, e_s) * (1 + 1e-9)
+            P = np.kron(np.eye(2), W).T @ V.errors @ np.kron(np.eye(2), W)
+            P[n:, n:] -= V.added * W.T @ W
+            form = np.block([[W.T @ V.state @ W, zero, zero], [np.zeros((2 * n, n)), P]])
+            z, moved = np.vstack([x, q, e_s]), np.vstack(rates)
+            grown = z.T @ form @ moved + moved.T @ form @ z + 2 * V.rate_per_s * z.T @ form @ z
+            zeta, zeta_f, zeta_h = V.of_inputs
+            allowed = V.of_sensor_error * e_s.T @ W.T @ W @ e_s + zeta * w.T @ w + zeta_f * v_f.T @ v_f
+            allowed += zeta_h * (v_h.T @ v_h - aged.T @ aged)
+            used = np.flatnonzero(np.abs(grown).sum(axis=0) + np.abs(allowed).sum(axis=0))
+            difference = (allowed - grown)[np.ix_(used, used)]
+            assert np.linalg.eigvalsh(difference)[0] > -1e-9 * np.linalg.norm(difference)
+            both, D = np.hstack([one, one]), zero
+            for t in np.linspace(0, conditions.delay_s, 400)[:-1]:
+                remaining = np.exp(V.rate_per_s * t) * R @ expm((H + shift) * t)
+                D = D + remaining.T @ remaining * conditions.delay_s / 400
+            at_event = P - both.T @ (p * P[:n, :n] + 0.98 * zeta_f * D) @ both
+            assert np.linalg.eigvalsh(at_event)[0] > -1e-9 * np.linalg.norm(at_event)
     assert checked > 8
 
 
