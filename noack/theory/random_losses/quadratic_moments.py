@@ -158,8 +158,11 @@ class LossyFlow:
 
 
 def quadratic_functions(loop: LossyFlow, known: Known) -> list[QuadraticFunction]:
-    """Return functions V for several λ, each for a small bound of ‖x‖ or of ‖ê_c‖_W."""
-    if loop.decay_per_s <= 0:
+    """Return functions V for several λ, each for a small bound of ‖x‖ or of ‖ê_c‖_W.
+
+    There may be none: if nothing decays, each update is lost, there is no input, or because of rounding.
+    """
+    if loop.decay_per_s <= 0 or loop.probability >= 1 or not loop.input.any() or not known.sensor_error > 0:
         return []
     zero = np.zeros_like(loop.model)
     searches = [_Search(loop, known, share, loop.inverse_weight, zero) for share in _OF_STATE]
@@ -198,7 +201,10 @@ class _Search:
 
     def functions(self) -> Iterator[QuadraticFunction]:
         """The function for the smallest bound that was found; none if it cannot be confirmed."""
-        first = self._first()
+        try:
+            first = self._first()
+        except np.linalg.LinAlgError:  # a form that decays in theory does not in floating point
+            first = None
         if first is None:
             return
         found = _Inequalities(self._blocks, len(first)).maximise_last(first)
@@ -267,10 +273,8 @@ class _Search:
         if root is None:
             return None
         pushed = np.linalg.solve(root, X @ loop.input)
-        of_flight, left = (
-            8 * float(np.linalg.norm(pushed, 2)) ** 2,
-            np.linalg.cholesky(self._decay(loop.model, Q)),
-        )
+        of_flight = 8 * float(np.linalg.norm(pushed, 2)) ** 2
+        left = np.linalg.cholesky(self._decay(loop.model, Q))
         couplings = (pushed @ loop.gain).T, np.linalg.solve(root, loop.age.T @ loop.age).T, loop.age.T
         size = float(np.trace(X) / np.trace(Q))
         size += 8 * sum(float(np.linalg.norm(np.linalg.solve(left, C), 2)) ** 2 for C in couplings)
