@@ -299,7 +299,8 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
     states = Trajectory(names, _seconds(run.t_ns), x, run.x_s, run.x_c, x_hat)
     known = "x" if scenario.coverage.knows_state else "x̂"
     return states_figure(scenario.mode, scenario.name, states, sent).captioned(
-        "States, and the times between transmissions and between deliveries. "
+        "States, and the times between transmissions and between deliveries: each stem is the time "
+        "since the one before, so the first packet has none. "
         + scenario.protocol.states_caption.format(known=known)
         + _known(scenario)
         + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",

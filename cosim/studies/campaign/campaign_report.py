@@ -190,8 +190,8 @@ def _verdict(summary: CampaignSummary) -> str:
         return f"{summary.breaches:,} of {runs:,} runs exceed a certified bound."
     if not certified:
         return (
-            f"{runs:,} runs; no grid point has a certified bound "
-            "(a hold, a floor and other policies have none)."
+            f"{runs:,} runs; no grid point has a certified bound: one needs the paper's trigger without a "
+            "floor, models that decay faster than the threshold (a hold does not), and an enforced guarantee."
         )
     extent = "all" if certified == len(summary.results) else f"{certified} of {len(summary.results)}"
     return f"{runs:,} runs; {extent} grid points have a certified bound; none was exceeded."
