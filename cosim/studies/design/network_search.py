@@ -30,7 +30,7 @@ from cosim.studies.design.loop_growth import PatternGraph, QuickLoop
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.core.number_format import NONE
+from noack.core.number_format import NONE, at_least, at_most
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
@@ -442,10 +442,12 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         return search.scenario.timing.measurement_period_ns / period_ns
 
     def cells(reached: Reached) -> dict[str, str]:
-        proven = reached.stability
+        proven, growth = reached.stability, NONE
+        if proven:
+            growth = f"{at_least(proven.lower, decimals=5)} to {at_most(proven.upper, decimals=5)}"
         return {
             "proven stable for": reach(reached),
-            "growth per period there": f"{proven.lower:.5f} to {proven.upper:.5f}" if proven else NONE,
+            "growth per period there": growth,
             "the next one": _beyond(ladder, reached),
             "cost without losses": f"{reached.cost:.4g}",
             "share of measurements sent": f"{100 * sent(reached):.3g} %",
