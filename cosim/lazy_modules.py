@@ -18,7 +18,7 @@ from typing import Any
 
 _IS_LAZY = ContextVar("is_lazy", default=False)
 """Whether this thread imports lazily; not while it loads a module."""
-_KNOWN = ("__class__", "__loader__", "__path__", "__spec__")
+_KNOWN = ("__class__", "__loader__", "__spec__")
 """Attributes that a module has before it is loaded, beside its submodules.
 
 Imports read ``__spec__``, and CPython 3.11 discards an error that this raises, also Ctrl-C.
@@ -28,7 +28,9 @@ Imports read ``__spec__``, and CPython 3.11 discards an error that this raises, 
 class _LazyModule(ModuleType):
     def __getattribute__(self, name: str) -> Any:
         get = super().__getattribute__
-        if name not in _KNOWN and not isinstance(get("__dict__").get(name), ModuleType):
+        is_known = name in _KNOWN or isinstance(get("__dict__").get(name), ModuleType)
+        # An import of a submodule that is not lazy reads __path__, and needs the package.
+        if not is_known and not (name == "__path__" and _IS_LAZY.get()):
             loader = get("__loader__")
             assert isinstance(loader, _LazyLoader)
             loader.load(self)

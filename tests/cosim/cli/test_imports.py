@@ -126,6 +126,12 @@ def test_a_package_is_loaded_before_its_modules(package: str) -> None:
     assert sys.argv == [f"{package}{name}" for name in ("", ".inner", ".inner.one", ".inner.two")]
 
 
+def test_a_package_is_loaded_before_a_module_that_is_not_imported_lazily(package: str) -> None:
+    lazily_imported(package, "inner")
+    importlib.import_module(f"{package}.inner.two")
+    assert sys.argv[:3] == [f"{package}{name}" for name in ("", ".inner", ".inner.one")]
+
+
 def test_another_thread_waits_until_it_is_loaded(package: str) -> None:
     module, found = lazily_imported(package, "slow"), []
     threads = [threading.Thread(target=lambda: found.append(module.second)) for _ in range(3)]
