@@ -239,6 +239,8 @@ def _dependent_defaults(resolved: "scenario.Scenario") -> Iterator[str]:
     """Yield the keys without a value whose default depends on other keys, and what has no effect."""
     if resolved.network.mansd == 0 and resolved.network.loss.model != "lossless":
         yield "network.loss: no effect, since network.mansd = 0 lets every update pass"
+    if resolved.controller.timeout_input == "hold" and resolved.controller.update_timeout_s is None:
+        yield "controller.timeout_input: no effect without controller.update_timeout_s"
     watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:
         yield (f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation")

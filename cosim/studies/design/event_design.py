@@ -84,6 +84,8 @@ class EventSearch:
         scenario.coverage.require_unchanging()
         if not wish.cost > 0:
             raise CallerError(f"--cost: must be positive, not {wish.cost:g}")
+        if wish.holds is not None:
+            raise CallerError("--holds: is for periodic updates; give their --period, too")
         if wish.window is not None:
             raise CallerError("--window: is for periodic updates; give their --period, too")
         resolved = resolve(scenario)
