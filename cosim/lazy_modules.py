@@ -18,16 +18,19 @@ from typing import Any
 
 _IS_LAZY = ContextVar("is_lazy", default=False)
 """Whether this thread imports lazily; not while it loads a module."""
-_KNOWN = ("__class__", "__dict__", "__loader__", "__path__")
-"""Attributes that a module has before it is loaded, beside its submodules."""
+_KNOWN = ("__class__", "__loader__", "__spec__")
+"""Attributes that a module has before it is loaded, beside its submodules.
+
+Imports read ``__spec__``, and CPython 3.11 discards an error that this raises, also Ctrl-C.
+"""
 
 
 class _LazyModule(ModuleType):
     def __getattribute__(self, name: str) -> Any:
         get = super().__getattribute__
         is_known = name in _KNOWN or isinstance(get("__dict__").get(name), ModuleType)
-        # An import that is not lazy reads __spec__, and needs the module.
-        if not is_known and not (name == "__spec__" and _IS_LAZY.get()):
+        # An import of a submodule that is not lazy reads __path__, and needs the package.
+        if not is_known and not (name == "__path__" and _IS_LAZY.get()):
             loader = get("__loader__")
             assert isinstance(loader, _LazyLoader)
             loader.load(self)
@@ -55,7 +58,7 @@ class _LazyLoader(Loader):
         token = _IS_LAZY.set(False)
         try:
             if self._package and not self._loads:
-                import_module(self._package)
+                load_module(self._package)
             with self._lock:
                 if self._loads or module.__class__ is ModuleType:
                     return
@@ -80,6 +83,13 @@ class _LazyFinder(MetaPathFinder):
                 spec.loader = _LazyLoader(spec.loader, name.rpartition(".")[0])
                 return spec
         return None
+
+
+def load_module(name: str) -> ModuleType:
+    """Import a module, and load it if it has been imported lazily."""
+    module = import_module(name)
+    vars(module)
+    return module
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import numpy as np
 
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
-from noack.core.number_format import NONE, Rows, as_html, as_text, number
+from noack.core.number_format import NONE, Rows, as_html, as_text, at_least, at_most
 from noack.impairments.markov_chain import NotPredictableError
 from noack.plants.linear import LinearSettings
 from noack.scenario.resolution import loop_of, resolve
@@ -343,12 +343,13 @@ def in_chosen_norm(
 
 
 _PERSISTENT = {
-    "‖e_c‖": "delta",
-    "‖e_s‖": "overshoot",
-    "‖u − Kx‖": "input_error",
-    "‖x‖": "state",
-    "‖x̂ − x‖": "estimation_error",
+    "e_c": "delta",
+    "e_s": "overshoot",
+    "u − Kx": "input_error",
+    "x": "state",
+    "(x̂ − x)": "estimation_error",
 }
+_WEIGHTED = ("e_c", "e_s", "(x̂ − x)")
 """Rows of the bounds that are added under disturbances, noise or an observer."""
 
 
@@ -362,11 +363,13 @@ def constant_rows(
 ) -> Iterator[tuple[str, list[str], str]]:
     """Yield rows: label, the value of each certificate, the value of Theorem 2."""
 
-    def row(value: Callable[[ScenarioCertificate], float | None]) -> list[str]:
-        return [number(value(c), 4) if c.constants else "void" for c in certificates]
+    def row(
+        value: Callable[[ScenarioCertificate], float | None], text: Callable[[float | None], str] = at_most
+    ) -> list[str]:
+        return [text(value(c)) if c.constants else "void" for c in certificates]
 
-    def constant(name: str) -> list[str]:
-        return row(lambda c: getattr(c.constants, name))
+    def constant(name: str, text: Callable[[float | None], str] = at_most) -> list[str]:
+        return row(lambda c: getattr(c.constants, name), text)
 
     def after(name: str, norm_name: str) -> list[str]:
         return row(lambda c: getattr(getattr(c, norm_name), name, None))
@@ -374,12 +377,12 @@ def constant_rows(
     delta_2 = state_2 = spacing_2 = NONE
     if theorem is not None:
         delta_2 = "(same)"
-        state_2 = number(theorem.state_start + theorem.state_forced, 4)
-        spacing_2 = number(theorem.inter_event_s, 4)
+        state_2 = at_most(theorem.state_start + theorem.state_forced)
+        spacing_2 = at_least(theorem.inter_event_s)
     if not any(c.constants for c in certificates):
         yield "certificate", ["void"] * len(certificates), NONE
         return
-    yield "decay rate, 1/s", constant("rate_per_s"), number(theorem_rate, 4)
+    yield "decay rate, 1/s", constant("rate_per_s", at_least), at_least(theorem_rate)
     yield "undelivered updates", constant("missing_events"), NONE
     unit = next((f"/{certificate.unit}" for certificate in certificates if certificate.unit), "")
     w = "W " if any(certificate.weighted for certificate in certificates) else ""
@@ -388,12 +391,13 @@ def constant_rows(
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE
     yield "· none undelivered", constant("received_input_error"), NONE
     yield "X, bound of ‖x‖", constant("state"), state_2
-    yield "inter-event time, s", row(lambda c: c.inter_event_s), spacing_2
+    yield "inter-event time, s", row(lambda c: c.inter_event_s, at_least), spacing_2
     yield "loop gain (< 1)", constant("loop_gain"), NONE
     if any(c.persistent_constants for c in certificates):
-        for label, name in _PERSISTENT.items():
+        for quantity, name in _PERSISTENT.items():
             if any(getattr(c.persistent_constants, name, None) for c in certificates):
-                yield f"+ without decay: {label}", after(name, "persistent_constants"), NONE
+                norm = f"‖{w}{quantity}‖" if w and quantity in _WEIGHTED else f"‖{quantity.strip('()')}‖"
+                yield f"+ without decay: {norm}", after(name, "persistent_constants"), NONE
     if any(c.floor_constants for c in certificates):
         yield "floor reached at, s", row(lambda c: c.floor_from_s), NONE
         yield f"bound of ‖{w}e_c‖/ε from then on", after("delta", "floor_constants"), NONE

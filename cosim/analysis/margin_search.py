@@ -13,7 +13,7 @@ from typing import NamedTuple
 from netem.tc_words import guarantee_words, settings_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.number_format import duration
+from noack.core.number_format import at_least, at_most, duration
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_guarantee import (
@@ -121,7 +121,9 @@ _NOT_COMPARED = GuaranteeComparison()
 def undecided_text(stability: Stability, effort: float) -> str:
     """Return the bounds of an undecided growth, and what more time would give."""
     lower, upper, needed_effort = stability.lower, stability.upper, max(stability.needed_effort, 2 * effort)
-    text = f"growth between {lower:.6g} and {upper:.6g}, gap {upper - lower:.2g}; if it is the "
+    text = (
+        f"growth between {at_least(lower, 6)} and {at_most(upper, 6)}, gap {upper - lower:.2g}; if it is the "
+    )
     if not needed_effort < _LARGEST_EFFORT:
         return f"{text}lower bound, no effort up to {_LARGEST_EFFORT:g} is estimated to prove it"
     time_text = duration(stability.took_s * needed_effort / effort)

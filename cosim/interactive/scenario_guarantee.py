@@ -9,7 +9,7 @@ from cosim.analysis.margin_search import find_margin
 from cosim.interactive.exploration import Exploration
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.core.number_format import number
+from noack.core.number_format import at_least, at_most, number
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus
@@ -107,7 +107,7 @@ def _reason(certificate: ScenarioCertificate) -> str:
     patterns = "every loss pattern allowed by M"
     if constants.rate_per_s == 0:
         return f"{patterns}: all errors stay bounded"
-    rate = f"decay at the rate {number(constants.rate_per_s)} /s"
+    rate = f"decay at the rate {at_least(constants.rate_per_s, 3)} /s"
     if certificate.persistent_constants is not None:
         return f"{patterns}: all errors stay bounded; what the start causes {rate}"
     return f"{patterns}: all errors {rate}"
@@ -125,7 +125,7 @@ def margin_of(scenario: Scenario) -> Margin:
     except CallerError as error:
         return Margin(str(error), (), defined=False)
     rows = tuple(
-        (str(m), f"{number(stability.lower, 5)} – {number(stability.upper, 5)}", stability.verdict)
+        (str(m), f"{at_least(stability.lower, 5)} – {at_most(stability.upper, 5)}", stability.verdict)
         for m, stability in margin.caps
     )
     return Margin(margin.verdict, rows, defined=True)

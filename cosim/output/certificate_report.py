@@ -16,12 +16,13 @@ from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
 from noack.core.linear_systems import Matrix
-from noack.core.number_format import duration, number
+from noack.core.number_format import at_least, at_most, duration_at_least, number
 from noack.scenario.resolution import loop_of, policy_of
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
 from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
+from noack.theory.margins.loss_margin import Stability
 from noack.theory.random_losses.moments import UnlimitedLosses
 
 
@@ -54,7 +55,8 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
     print_assumptions(console, (results.schedule_region or results.schedule).assumptions)
     console.print("assumptions of the paper's theorems:")
     print_assumptions(console, assumptions(results.scenario))
-    print_unlimited(console, results.unlimited, results.unpredictable)
+    is_weighted = results.scenario.trigger.weight is not None
+    print_unlimited(console, results.unlimited, results.unpredictable, is_weighted=is_weighted)
     for sentence in (*_in_words(results), *_stability_in_words(results)):
         console.print(sentence, markup=False, highlight=False)
     exists = results.schedule.constants is not None
@@ -77,7 +79,7 @@ def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> Non
     if (bound := chosen.error_in_given_norm) is not None:
         console.print(
             "With W below in the trigger, the error in the scenario's own norm is bounded, too "
-            f"(schedule, plant): ‖e_c‖ ≤ {bound:.4g} {chosen.schedule.level}",
+            f"(schedule, plant): ‖e_c‖ ≤ {at_most(bound)} {chosen.schedule.level}",
             markup=False,
         )
     rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in weight)
@@ -104,7 +106,7 @@ def _in_words(results: Certificates) -> Iterator[str]:
         yield (
             f"In words: for {plants}, under the assumptions above and for every pattern of losses "
             f"with {certificate.conditions.guarantee.meaning}: "
-            f"{envelope_formula('‖x‖', certificate, 'state').format(constants.state)}.{apart}"
+            f"{envelope_formula('‖x‖', certificate, 'state').format(at_most(constants.state))}.{apart}"
         )
 
 
@@ -113,7 +115,7 @@ def _stability_in_words(results: Certificates) -> Iterator[str]:
     if (known := results.stability) is None:
         return
     patterns = f"patterns with {results.scenario.network.guarantee.meaning}"
-    growth = f"growth per period {known.lower:.4g} to {known.upper:.4g}"
+    growth = f"growth per period {at_least(known.lower)} to {at_most(known.upper)}"
     text = {
         "stable": f"all {patterns} are stable: {growth}",
         "destabilised": f"the pattern {known.text} (D delivered, L lost), repeated, "
@@ -182,7 +184,7 @@ def _print_notes(console: Console, results: Certificates) -> None:
         if certificate.region is not None:
             loop, region = loop_of(results.scenario), certificate.region
             limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
-            text = ", ".join(f"|{name}| ≤ {limit:.4g}" for name, limit in limits)
+            text = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in limits)
             console.print(f"[green]region[/] ({under}): {escape(text)}", highlight=False)
     policy = results.scenario.trigger.policy
     exists = results.schedule.constants is not None  # else another norm is tried
@@ -196,7 +198,7 @@ LIMIT_HEADINGS = ("", "sampling period", "delay of updates", "age of inputs")
 def _limit(value_s: float) -> str:
     if value_s <= 0:
         return "none"
-    return "any" if value_s >= MOST_S else duration(value_s)
+    return "any" if value_s >= MOST_S else duration_at_least(value_s)
 
 
 _MARGIN_STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}
@@ -221,7 +223,11 @@ def margin_title(margin: MarginResult) -> str:
 def margin_rows(margin: MarginResult) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of the bounds."""
     for m, growth in margin.caps:
-        yield str(m), str(m - 1), f"{growth.lower:.9f}", f"{growth.upper:.9f}", growth.verdict
+        yield str(m), str(m - 1), *_growth(growth), growth.verdict
+
+
+def _growth(growth: Stability) -> tuple[str, str]:
+    return at_least(growth.lower, decimals=9), at_most(growth.upper, decimals=9)
 
 
 def print_margin(console: Console, margin: MarginResult) -> None:
@@ -247,7 +253,7 @@ def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
     yield ResultTable("margin", margin_title(margin), MARGIN_HEADINGS, rows)
     if margin.compared.guarantees:
         rows = [
-            (meaning, f"{growth.lower:.9f}", f"{growth.upper:.9f}", growth.text, growth.verdict)
+            (meaning, *_growth(growth), growth.text, growth.verdict)
             for meaning, growth in margin.compared.guarantees
         ]
         title = f"{margin.scenario}: the scenario's guarantee, and others"
@@ -302,7 +308,9 @@ _RARE = 1e-4
 _MOMENT = {1: "mean", 2: "root mean square"}
 
 
-def print_unlimited(console: Console, unlimited: UnlimitedLosses | None, unpredictable: str | None) -> None:
+def print_unlimited(
+    console: Console, unlimited: UnlimitedLosses | None, unpredictable: str | None, *, is_weighted: bool
+) -> None:
     """Print what holds although the network does not limit the losses."""
     if unpredictable is not None:
         console.print(f"[yellow]no statement without the guarantee:[/] {unpredictable}")
@@ -321,53 +329,54 @@ def print_unlimited(console: Console, unlimited: UnlimitedLosses | None, unpredi
             [
                 (
                     f"{burst.most}",
-                    f"≤ {number(1 - burst.probability, 3)}",
+                    f"≤ {at_most(1 - burst.probability, 3)}",
                     f"≤ {burst.events}",
-                    number(burst.delta, 4),
-                    number(burst.state, 4),
+                    at_most(burst.delta),
+                    at_most(burst.state),
                 )
                 for burst in shown
             ],
         )
         console.print(terminal_table(table, left=()))
-    for sentence in sentences(unlimited):
+    for sentence in sentences(unlimited, is_weighted=is_weighted):
         console.print(sentence, markup=False, highlight=False)
 
 
-def sentences(unlimited: UnlimitedLosses) -> Iterator[str]:
-    """Yield what is certified about moments, and almost surely."""
-    p = f"{unlimited.largest_probability:.4g}"
-    losses = f"independent losses with probability {p}"
+def sentences(unlimited: UnlimitedLosses, *, is_weighted: bool) -> Iterator[str]:
+    """Yield what is certified about moments, and almost surely; e_c is in the trigger's norm."""
+    error, p = "‖W e_c‖" if is_weighted else "‖e_c‖", unlimited.largest_probability
+    losses = f"independent losses with probability {p:.4g}"
     if not unlimited.is_independent:
-        losses = f"losses with probability at most {p} given any past"
+        losses = f"losses with probability at most {at_most(p)} given any past"
     for run in unlimited.runs:
-        grown = f" e^({run.rate_per_s:.3g}t)" if run.rate_per_s else ""
+        grown = f" e^({at_least(run.rate_per_s, 3)}t)" if run.rate_per_s else ""
+        left_out = at_most(1 - run.probability, 2)
         yield (
             f"Runs of {unlimited.horizon_s:g} s, where one with a burst of more than {run.most} losses "
-            f"counts as 0 (a share of at most {1 - run.probability:.2g}): the {_MOMENT[run.order]} of a "
-            f"run's largest ‖x‖{grown} is at most {run.state:.4g}, that of ‖e_c‖{grown} at most "
-            f"{run.controller_error:.4g}."
+            f"counts as 0 (a share of at most {left_out}): the {_MOMENT[run.order]} of a run's "
+            f"largest ‖x‖{grown} is at most {at_most(run.state)}, that of {error}{grown} at most "
+            f"{at_most(run.controller_error)}."
         )
     for moment in unlimited.moments:
-        decay = f" e^(−{moment.rate_per_s:.3g}t)" if moment.rate_per_s else ""
+        decay = f" e^(−{at_least(moment.rate_per_s, 3)}t)" if moment.rate_per_s else ""
         yield (
             f"Without the guarantee, {losses}: at every time t, the {_MOMENT[moment.order]} of ‖x‖ is "
-            f"at most {moment.state:.4g}{decay}, that of ‖e_c‖ at most "
-            f"{moment.controller_error:.4g}{decay}."
+            f"at most {at_most(moment.state)}{decay}, that of {error} at most "
+            f"{at_most(moment.controller_error)}{decay}."
         )
     if unlimited.void is not None:
         order = _MOMENT[len(unlimited.moments) + 1]
         yield f"Without the guarantee no {order} is certified: {unlimited.void}."
     if unlimited.sure_rate_per_s is not None:
-        yield f"x decays almost surely: decay rate {unlimited.sure_rate_per_s:.3g} /s."
+        yield f"x decays almost surely: decay rate {at_least(unlimited.sure_rate_per_s, 3)} /s."
     if unlimited.paper_rate_per_s is not None:
         at = ", ".join(
-            f"{_MOMENT[order]} at most {value:.4g}"
+            f"{_MOMENT[order]} at most {at_most(value)}"
             for order, value in enumerate(unlimited.at_events, start=1)
         )
         yield (
-            f"Under the paper's conditions ‖e_c‖ e^(αt)/β at events has a {at}, and x decays "
-            f"almost surely, at every rate below {unlimited.paper_rate_per_s:.3g} /s."
+            f"Under the paper's conditions {error} e^(αt)/β at events has a {at}, and x decays "
+            f"almost surely, at every rate below {at_least(unlimited.paper_rate_per_s, 3)} /s."
         )
     if unlimited.moments or unlimited.bursts:
         yield (

@@ -26,7 +26,7 @@ from cosim.analysis.summary.summary_model import (
 from cosim.output.result_tables import KEY_VALUE, ResultTable
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
-from noack.core.number_format import NONE, duration, number, percent, ratio, seconds, whole
+from noack.core.number_format import NONE, duration, duration_at_least, number, percent, ratio, seconds, whole
 from noack.scenario.runtime_parameters import MANSD
 
 Numbers = tuple[tuple[str, str], ...]
@@ -328,7 +328,8 @@ def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
     for name, words in _SCHEDULE.items():
         times_s = [getattr(part, name) if part else None for part in (allowed, observed, covered)]
         # After a change a certificate needs no first input: it is 0 there.
-        cells = [duration(time_s) if time_s else NONE for time_s in times_s]
+        texts = (duration, duration, duration_at_least)
+        cells = [text(time_s) if time_s else NONE for text, time_s in zip(texts, times_s, strict=True)]
         if (times_s[1] or 0.0) > (times_s[0] or 0.0):
             cells[1] += " (late)"
         rows.append((words, *cells))

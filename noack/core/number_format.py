@@ -7,14 +7,18 @@ import html
 import math
 import unicodedata
 from collections.abc import Sequence
-from decimal import Decimal
+from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 NONE = "-"
 """Text for a missing number."""
 _DIGITS = 2  # significant digits of the half-width
 _ALONE = 4
 """Significant digits of a mean without an interval, or with an interval in exponent notation."""
+_NOISE = 12
+"""Significant digits of a bound that are used; later ones are rounding errors."""
+_WIDE = Context(prec=400, Emin=MIN_EMIN, Emax=MAX_EMAX)
 _FIXED = range(-5, 7)  # powers of ten that are written without exponent notation
+_TIME_DIGITS = 3
 _SIZES = (1e9, 1e6, 1e3)
 Rows = Sequence[Sequence[str]]
 """The first entry of a row is its name."""
@@ -25,6 +29,25 @@ _CELL = 'style="text-align: left; vertical-align: top; line-height: 1.4"'
 def number(value: float | None, digits: int = 3) -> str:
     """Write a number with ``digits`` significant digits."""
     return NONE if value is None or math.isnan(value) else f"{value:.{digits}g}"
+
+
+def at_most(value: float | None, digits: int = 4, decimals: int | None = None) -> str:
+    """Write an upper bound, rounded up to ``digits`` significant digits, or to ``decimals``."""
+    return _bound(value, digits, decimals, ROUND_CEILING)
+
+
+def at_least(value: float | None, digits: int = 4, decimals: int | None = None) -> str:
+    """Write a lower bound, rounded down to ``digits`` significant digits, or to ``decimals``."""
+    return _bound(value, digits, decimals, ROUND_FLOOR)
+
+
+def _bound(value: float | None, digits: int, decimals: int | None, rounding: str) -> str:
+    if value is None or value == 0 or not math.isfinite(value):
+        return number(value, digits)
+    exact = Decimal(f"{value:.{_NOISE}g}") if decimals is None else Decimal(value)
+    last = exact.adjusted() - digits + 1 if decimals is None else -decimals
+    rounded = exact.quantize(Decimal(1).scaleb(last), rounding, _WIDE)
+    return f"{float(rounded):.{digits}g}" if decimals is None else f"{rounded:.{decimals}f}"
 
 
 def whole(value: float | None) -> str:
@@ -40,6 +63,11 @@ def seconds(value_s: float | None) -> str:
 def duration(value_s: float) -> str:
     """Write a time with up to three digits, in s, ms, µs or ns."""
     return _without_zeros(with_unit(value_s * 1e9, ("s", "ms", "µs", "ns")))
+
+
+def duration_at_least(value_s: float) -> str:
+    """Write a lower bound of a time as :func:`duration` does, rounded down."""
+    return duration(float(at_least(value_s, _TIME_DIGITS)))
 
 
 def byte_size(value: float) -> str:

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
+from noack.core.number_format import at_least, at_most
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.feature import Scheduler
@@ -426,12 +427,11 @@ def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str
     delay = update_delay(scenario)
     unknown = [key for key, impairment_s in delay.impairments_s.items() if math.isinf(impairment_s)]
     source = "that of full queues" if scenario.certificate.network_delay_s is None else "as given"
-    covered = (
-        f"the certificates cover {delay.certified_s:.3g} s, {source}; certificate.network_delay_s changes it"
-    )
+    covered = f"the certificates cover {at_least(delay.certified_s, 3)} s, {source}"
+    covered += "; certificate.network_delay_s changes it"
     if not unknown and not delay.is_certified:
         parts = ", ".join(f"{key} {impairment_s:.3g} s" for key, impairment_s in delay.impairments_s.items())
-        yield f"updates may be delayed by up to {delay.largest_s:.3g} s ({parts}), {covered}"
+        yield f"updates may be delayed by up to {at_most(delay.largest_s, 3)} s ({parts}), {covered}"
     elif set(unknown) - {load.key for load in overloaded}:
         yield f"no bound of the delay of updates is known ({', '.join(unknown)}), {covered}"
 

@@ -253,7 +253,7 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
     H = A_model + B_model @ K if resolved.mode == "model" else np.zeros_like(A_model)
     weight = resolved.trigger.weight
     setpoint = setpoint_of(resolved)
-    return LoopMatrices(
+    matrices = LoopMatrices(
         A_model=A_model,
         B_model=B_model,
         K=K,
@@ -266,6 +266,10 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
         state_names=model.state_names or (),
         input_names=model.input_names or (),
     )
+    for array in vars(matrices).values():
+        if isinstance(array, np.ndarray):
+            array.flags.writeable = False
+    return matrices
 
 
 @cached_method

@@ -19,7 +19,7 @@ from rich.table import Table
 from cosim.analysis.adversary.loop_flows import Measure, Objective, Pattern, SampledFlow, SampledRun, Valued
 from cosim.simulation.sampled_loop import Numbers, Runs, SampledLoop, Scales, noise_of, pushes_of, through_of
 from noack.core.linear_systems import Matrix, Vector
-from noack.core.number_format import number
+from noack.core.number_format import at_least, at_most, number
 from noack.disturbances.uniform import UniformDisturbance
 from noack.impairments.loss_guarantee import outcome_letters
 from noack.scenario.scenario import Scenario
@@ -292,10 +292,12 @@ def print_worst(
     for heading in ("", "no loss", "scenario's seed", "worst", "certified", "share of bound used"):
         table.add_column(heading, justify="right" if heading else "left")
     for worst in results:
-        values = (worst.lossless, worst.own, worst.value, worst.certified)
+        is_lower = worst.objective is Objective.INTER_EVENT
+        certified = at_least(worst.certified) if is_lower else at_most(worst.certified)
         table.add_row(
             _quantity(worst.objective, certificate, trigger),
-            *(number(value, 4) for value in values),
+            *(number(value, 4) for value in (worst.lossless, worst.own, worst.value)),
+            certified,
             "[bold red]exceeded[/]" if worst.breaches else number(worst.tightness, 4),
         )
     console.print(table)

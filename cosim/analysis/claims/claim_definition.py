@@ -28,7 +28,7 @@ class Bound(NamedTuple):
     """The bound that a claim sets for a run, and the share of it that the run reached."""
 
     formula: str
-    """The bound in words of mathematics; ``{:.4g}`` stands for the constant."""
+    """The bound in words of mathematics; ``{}`` stands for the constant."""
     t_s: Reals
     """(k,)"""
     shares: Reals
@@ -115,7 +115,7 @@ def least_inter_event_time(
 ) -> Findings:
     """Return a lower bound of the inter-event time, and the same as a line over the run."""
     t_s, passed_s = samples.inter_event_s
-    formula = "t_(i+1) − t_i ≥ {:.4g} s"
+    formula = "t_(i+1) − t_i ≥ {} s"
     void = earliest([void, run.lost_in_rounding])
     bound = Bound(formula, t_s, least_s / passed_s, void, least_s, is_lower=True)
     ends_s = np.array([0.0, run.record.scenario.horizon_s])

@@ -35,6 +35,7 @@ from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector, row_norms
+from noack.core.number_format import at_least, at_most
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     CONTROLLER_DELIVERY,
@@ -141,10 +142,10 @@ class ClaimCheck:
             observed = constant * ratio
             if bound.is_lower:
                 observed = constant / ratio if ratio else None
-        formula = bound.formula if constant is None else bound.formula.format(constant)
+        text = at_least(constant) if bound.is_lower else at_most(constant)
         from_s = self._part.from_s
         return Claim(
-            what=self._statement, source=self._source, bound=formula, certified=constant,
+            what=self._statement, source=self._source, bound=bound.formula.format(text), certified=constant,
             observed=observed, ratio=ratio, verdict=verdict,
             since_s=None if since_s is None else since_s + from_s, why=why, from_s=from_s,
             until_s=_end_s(self._part),

@@ -16,6 +16,7 @@ from pydantic import (
 )
 
 from noack.core.errors import ExitStatus
+from noack.core.number_format import at_least, at_most
 
 
 def _or_none(value: object) -> object:
@@ -245,6 +246,13 @@ class Claim(SummaryPart):
     """The claim begins here: at the start of the run, or after a change of settings."""
     until_s: Real
     """The claim ends here, at a change of settings; None: at the end of the run."""
+
+    @property
+    def certified_text(self) -> str | None:
+        """The claimed constant, rounded up, or down if it is a lower bound."""
+        if self.certified is None:
+            return None
+        return at_least(self.certified) if "≥" in self.bound else at_most(self.certified)
 
 
 class ConditionsPart(SummaryPart):

@@ -18,6 +18,7 @@ from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, ExitStatus, MachineError, why
 from noack.core.file_access import new_file
+from noack.core.number_format import at_least, at_most
 
 with lazy_modules():
     from controller_node import controller
@@ -209,7 +210,7 @@ def _check_loops(loaded: "scenario.Scenario", *, json: bool) -> None:
     is_less = updates.largest_s < 0.99 * updates.certified_s
     print(
         f"{_COMMENT}delay of updates in the network: {_bound(updates.largest_s)} in virtual time; "
-        f"the certificates cover {updates.certified_s:.4g} s"
+        f"the certificates cover {at_least(updates.certified_s)} s"
         + ("; with a smaller certificate.network_delay_s they have smaller bounds" if is_less else "")
     )
     for line in link_load.load_warnings(loads, loaded):
@@ -217,7 +218,7 @@ def _check_loops(loaded: "scenario.Scenario", *, json: bool) -> None:
 
 
 def _bound(delay_s: float) -> str:
-    return f"at most {delay_s:.4g} s" if math.isfinite(delay_s) else "no bound"
+    return f"at most {at_most(delay_s)} s" if math.isfinite(delay_s) else "no bound"
 
 
 def _print_plant(console: "Console", resolved: "scenario.Scenario") -> None:
@@ -238,6 +239,8 @@ def _dependent_defaults(resolved: "scenario.Scenario") -> Iterator[str]:
     """Yield the keys without a value whose default depends on other keys, and what has no effect."""
     if resolved.network.mansd == 0 and resolved.network.loss.model != "lossless":
         yield "network.loss: no effect, since network.mansd = 0 lets every update pass"
+    if resolved.controller.timeout_input == "hold" and resolved.controller.update_timeout_s is None:
+        yield "controller.timeout_input: no effect without controller.update_timeout_s"
     watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:
         yield (f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation")

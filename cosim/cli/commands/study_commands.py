@@ -221,7 +221,8 @@ class NetworkOptions:
         holds: What to try between two updates: `zero`, `zoh` to hold the last input, `model`, or
             `predictions:N`: the model for N periods, then zero (`predictions:N:hold`: the last
             input); `predictions`: N = 2, 4 and 8.
-        effort: Number of loops that the search may try.
+            By default all of these, and what the given loop does.
+        effort: Number of loops that the search may try; 1,500 by default.
     """
 
     aim: Annotated[DesignAim, Option("--for")] = DesignAim.SETTLING
@@ -230,8 +231,14 @@ class NetworkOptions:
     most: Annotated[int | None, Option(min=1, max=10_000)] = None
     cost: float = 1.2
     share: float = 1.0
-    holds: str = "model,zoh,zero,predictions"
-    effort: Annotated[int, Option(min=0)] = 1500
+    holds: str | None = None
+    effort: Annotated[int | None, Option(min=0)] = None
+
+    def refuse(self) -> None:
+        """Raise CallerError for an option that has no effect for --for settling."""
+        for option in ("period", "window", "most", "holds", "effort"):
+            if getattr(self, option) is not None:
+                raise CallerError(f"--{option}: is for --for network and --for transmissions only")
 
     def wish(
         self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]", bounds: "design_search.Bounds"
@@ -250,8 +257,8 @@ class NetworkOptions:
             cost=self.cost,
             bounds=bounds,
             weights=weights,
-            holds=hold_strategies.read_holds(self.holds),
-            effort=self.effort,
+            holds=None if self.holds is None else hold_strategies.read_holds(self.holds),
+            **({} if self.effort is None else {"effort": self.effort}),
         )
 
 
@@ -291,9 +298,18 @@ class DesignFiles:
     page: Path | None = None
 
     def page_of(self, name: str) -> Path:
-        """Return the file of the page; raise CallerError if there is no folder for the scenario."""
+        """Return the file of the page.
+
+        Raise CallerError if the scenario has no folder, or would replace a file that is none.
+        """
         if self.out is not None and not self.out.parent.is_dir():
             raise CallerError(f"--out {self.out}: there is no folder {self.out.parent}")
+        if self.out is not None and self.out.exists():
+            try:
+                scenario_file.load(self.out)
+            except CallerError:
+                message = f"--out {self.out}: exists, and is no scenario; give another name"
+                raise CallerError(message) from None
         return self.page or cli.DEFAULT_RUNS / "design" / f"{name}.html"
 
     def write(self, scenario_toml: str) -> list[Path]:
@@ -348,6 +364,7 @@ def design(
         written += files.write(outcome.written()) if outcome.is_certified else []
         cli.show_with_files(json, outcome.to_json(), written, design_page.print_design, outcome)
         return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
+    network.refuse()
     page = files.page_of(loaded.name)
     result = _trigger_of(loaded, requirements.limits(), weights, feedback, draws, seed)
     written = design_page.write_page(result, page, figure_files)

@@ -24,7 +24,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from cosim.lazy_modules import lazy_modules
+from cosim.lazy_modules import lazy_modules, load_module
 from noack.core.errors import MachineError
 from noack.core.process_limits import python_command, require_limits
 from noack.runtime.command_line import TICKET_ON_STDIN
@@ -300,7 +300,7 @@ def main() -> None:
 
 def _import(modules: Sequence[str]) -> None:
     for module in modules:
-        import_module(module)
+        load_module(module)
 
 
 def _run(connection: socket.socket) -> None:

@@ -19,7 +19,7 @@ from cosim.studies.campaign.metrics import estimate, interval_ranks, quantile_in
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.design.design_space import Candidate, DesignSpace, space_of
 from noack.core.errors import CallerError
-from noack.core.number_format import plus_minus
+from noack.core.number_format import at_most, plus_minus
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -383,7 +383,7 @@ def certified(name: Bounded, value: float) -> str:
     """Return a certified bound as text."""
     if not math.isfinite(value):
         return f"no certified bound of {WORDS[name]}"
-    return f"{WORDS[name]} ≤ {value:.4g}"
+    return f"{WORDS[name]} ≤ {at_most(value)}"
 
 
 def design(

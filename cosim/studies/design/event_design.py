@@ -33,7 +33,7 @@ from cosim.studies.design.network_search import (
 )
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector, spectral_abscissa
-from noack.core.number_format import NONE
+from noack.core.number_format import NONE, at_most
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows, rows_of
@@ -84,6 +84,8 @@ class EventSearch:
         scenario.coverage.require_unchanging()
         if not wish.cost > 0:
             raise CallerError(f"--cost: must be positive, not {wish.cost:g}")
+        if wish.holds is not None:
+            raise CallerError("--holds: is for periodic updates; give their --period, too")
         if wish.window is not None:
             raise CallerError("--window: is for periodic updates; give their --period, too")
         resolved = resolve(scenario)
@@ -316,7 +318,7 @@ def _reach(search: EventSearch, certified: Certified) -> str:
 def _cells(search: EventSearch, certified: Certified) -> dict[str, str]:
     def bound(m: int) -> str:
         value = search.state_bound(certified.loop, m) if m else math.inf
-        return f"{value:.4g}" if value < math.inf else NONE
+        return at_most(value) if value < math.inf else NONE
 
     own_m = search.scenario.network.mansd + 1
     return {

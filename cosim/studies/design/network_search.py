@@ -30,7 +30,7 @@ from cosim.studies.design.loop_growth import PatternGraph, QuickLoop
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.core.number_format import NONE
+from noack.core.number_format import NONE, at_least, at_most
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
@@ -97,7 +97,8 @@ class Wish:
     """Q and R of the cost; None: identities."""
     bounds: Bounds = field(default_factory=dict)
     """Upper limits of the certified bounds of a loop with events."""
-    holds: Sequence[Hold] = tuple(itertools.chain(*HOLDS.values()))
+    holds: Sequence[Hold] | None = None
+    """Hold strategies; None: all of :data:`HOLDS`, and that of the given loop."""
     effort: int = 1500
     """Number of loops that the search without gradients may try."""
 
@@ -196,12 +197,15 @@ class NetworkSearch:
         scenario.coverage.require_unchanging()
         if wish.bounds:
             raise CallerError("--bound: is for a loop with events, not for periodic updates")
+        if wish.most is not None and (wish.goal == "transmissions" or wish.window is not None):
+            raise CallerError("--most: is for --for network without --window")
         if not wish.cost >= 1:
             raise CallerError(f"--cost: 1 or more times that of the given loop, not {wish.cost:g}")
         self.wish, self.scenario = wish, time_triggered(scenario, wish.period_s)
         resolved = resolve(self.scenario)
         self.plant, margin = loop_of(resolved), LossMargin(resolved)
         self._times, self._resolved = margin.loop.times, resolved
+        self.period_ns = margin.longest_ns
         if margin.shortest_ns < margin.longest_ns:
             raise CallerError(
                 f'trigger.policy = "{scenario.trigger.policy}": the search is for periodic '
@@ -211,6 +215,7 @@ class NetworkSearch:
         n, m = self.plant.n, self.plant.m
         self.weights = wish.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
+        self.holds = tuple(itertools.chain(*HOLDS.values())) if wish.holds is None else tuple(wish.holds)
         self.original = Candidate(given_hold(self.scenario), rows_of(self.plant.K))
         base = self.quick_loop(self.original, margin.longest_ns).cost(self.plant.x0)
         self.limit = wish.cost * base
@@ -333,16 +338,25 @@ class NetworkSearch:
         """Return LQR gains of the model with all hold strategies."""
         plant, (Q, R) = self.plant, self.weights
         gains = [lqr_gain(plant.A_model, plant.B_model, Q, c * R) for c in COSTS_OF_INPUT]
-        return [_rounded(hold, K) for hold in self.wish.holds for K in gains]
+        return [_rounded(hold, K) for hold in self.holds for K in gains]
+
+    @property
+    def keeps_given_hold(self) -> bool:
+        """Whether the hold strategy of the given loop may be chosen."""
+
+        def behaviour(hold: Hold) -> tuple[str, LoopTimes]:
+            return hold.mode, self.times(hold, self.period_ns)
+
+        return self.wish.holds is None or behaviour(self.original.hold) in map(behaviour, self.holds)
 
     def run(self, progress: Progress = lambda share: None) -> tuple[Reached, Reached]:
         """Return what the given loop reaches, and the best loop found."""
         original = self.first()
         self.tried, best, rung = 0, original.candidate, -1
-        if best.hold in self.wish.holds or best.hold.timeout_s is not None:  # no word has its timeout
+        if self.keeps_given_hold:
             rung = original.rung
         progress(0.1)
-        starts = [Candidate(hold, original.candidate.K) for hold in self.wish.holds]
+        starts = [Candidate(hold, original.candidate.K) for hold in self.holds]
         starts += self.regulators()
         ranked = sorted(
             ((*self.climb(start, max(rung, 0)), start) for start in starts),
@@ -442,14 +456,14 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         return search.scenario.timing.measurement_period_ns / period_ns
 
     def cells(reached: Reached) -> dict[str, str]:
-        proven = reached.stability
+        is_excluded = reached is original and not search.keeps_given_hold
         return {
             "proven stable for": reach(reached),
-            "growth per period there": f"{proven.lower:.5f} to {proven.upper:.5f}" if proven else NONE,
+            "growth per period there": _growth(reached.stability),
             "the next one": _beyond(ladder, reached),
             "cost without losses": f"{reached.cost:.4g}",
             "share of measurements sent": f"{100 * sent(reached):.3g} %",
-            "between updates": reached.candidate.hold.text,
+            "between updates": reached.candidate.hold.text + " (not in --holds)" * is_excluded,
             "K": gain_text(reached.candidate.K),
         }
 
@@ -463,11 +477,6 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
     verdict = f"stable for every loss pattern: {reach(original)} before, {reach(best)} after"
     if best.candidate == original.candidate:
         verdict = f"{reach(best)} for the given loop; no better one was found"
-    limit = f"{search.limit:.4g}" if math.isfinite(search.limit) else "any size"
-    note = (
-        f"the best of {search.tried:,} loops tried, with a cost of at most {limit}; what it "
-        "tolerates is proven, that it is the best is not"
-    )
     document: dict[str, object] = {
         "goal": wish.goal,
         "window": wish.window,
@@ -478,7 +487,7 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
     return DesignOutcome(
         search.scenario.name,
         verdict,
-        [note],
+        list(_notes(search, original, best)),
         (cells(original), cells(best)),
         search.scenario_of(best.candidate, best.rung),
         best.rung >= 0,
@@ -488,6 +497,27 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         entry(best),
         _figure(search, original, best),
     )
+
+
+def _growth(proven: Stability | None) -> str:
+    if proven is None:
+        return NONE
+    return f"{at_least(proven.lower, decimals=5)} to {at_most(proven.upper, decimals=5)}"
+
+
+def _notes(search: NetworkSearch, original: Reached, best: Reached) -> Iterator[str]:
+    """Yield what the reader should know of a search."""
+    limit = f"{search.limit:.4g}" if math.isfinite(search.limit) else "any size"
+    yield (
+        f"the best of {search.tried:,} loops tried, with a cost of at most {limit}; what it "
+        "tolerates is proven, that it is the best is not"
+    )
+    if best.rung < original.rung:
+        hold = original.candidate.hold.text
+        yield f"the given loop tolerates more than the designed one; --holds excludes its strategy, {hold}"
+    period_s = search.period_ns / NS_PER_S
+    if search.wish.period_s is not None and round(search.wish.period_s * NS_PER_S) != search.period_ns:
+        yield f"--period {search.wish.period_s:g}: updates are sent at measurements, every {period_s:g} s"
 
 
 def _beyond(ladder: Sequence[Rung], reached: Reached) -> str:

@@ -31,6 +31,7 @@ from cosim.studies.new_loop.linear_model import (
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix, Vector, norm
+from noack.core.number_format import at_most
 from noack.plants.fmu import FmuSettings
 from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.linear import LinearSettings
@@ -314,7 +315,7 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
             "gain (a larger --r of noack gain) or a smaller network.mansd may have one."
         )
     else:
-        bound = envelope_formula("‖x‖", certificate, "state").format(certificate.constants.state)
+        bound = envelope_formula("‖x‖", certificate, "state").format(at_most(certificate.constants.state))
         losses = certificate.conditions.guarantee.meaning
         yield f"Certified for {plant}, for every pattern of losses with {losses}: {bound}."
     if not is_linear:

@@ -12,6 +12,7 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.core.number_format import at_least
 from noack.scenario.resolution import LoopMatrices, SteadyState, loop_of, policy_of, steady_state
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
@@ -259,7 +260,7 @@ def certificate_assumptions(
         holds = below(alpha, decay[matrix])
         why = f"α = {alpha:g} /s, {_decays(decay[matrix])}"
         if slower and not holds:
-            why += f"; certified instead: bounds with decay rate {slower:.3g} /s"
+            why += f"; certified instead: bounds with decay rate {at_least(slower, 3)} /s"
         elif constants is not None and not holds:
             why += "; certified instead: constant bounds"
         if math.isinf(decay[matrix]):
@@ -300,7 +301,7 @@ def _conditions(
     if probability is not None:
         horizon_s = resolved.timing.horizon_ns / NS_PER_S
         known = (
-            f"with probability {probability:.4g} or more"
+            f"with probability {at_least(probability)} or more"
             if probability > 0
             else "with a probability that may be 0"
         )

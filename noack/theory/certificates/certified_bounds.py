@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.number_format import at_least, at_most
 from noack.plants.systems.jacobian_enclosure import Inclusion
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
@@ -119,7 +120,7 @@ class ScenarioCertificate:
     def level(self) -> str:
         """The unit of the error bounds at all times: βe^{−αt}; without decay β or ε."""
         rate = 0.0 if self.constants is None else self.constants.rate_per_s
-        return f"{self.unit}e^(−{rate:.3g}t)" if rate else self.unit
+        return f"{self.unit}e^(−{at_least(rate, 3)}t)" if rate else self.unit
 
     def sensor_error(self, t_s: Matrix) -> Matrix:
         """Bound of ‖e_s‖_W at times (k,); NaN without a certificate."""
@@ -180,20 +181,22 @@ def envelope_formula(
     certificate: ScenarioCertificate,
     constant: Literal["delta", "overshoot", "state", "estimation_error"],
 ) -> str:
-    """Return a certificate's bound of a quantity; ``{:.4g}`` stands for its first constant."""
+    """Return a certificate's bound of a quantity; ``{}`` stands for its first constant."""
     in_levels = constant in {"delta", "overshoot"}
     parts: list[str] = []
     present: ScenarioCertificate | None = certificate
     while present is not None and present.constants is not None:
         rate = present.constants.rate_per_s
-        decay = f"e^(−{rate:.3g}t)" if rate else ""
-        formula = f"{getattr(present.constants, constant):.4g}" if parts else "{:.4g}"
+        decay = f"e^(−{at_least(rate, 3)}t)" if rate else ""
+        formula = at_most(getattr(present.constants, constant)) if parts else "{}"
         formula += f" {level}" if (level := present.level if in_levels else decay) else ""
         if (late := present.floor_constants) is not None:
             unit = " ε" if in_levels else ""
-            formula += f", from {present.floor_from_s:.4g} s on ≤ {getattr(late, constant):.4g}{unit}"
+            formula += (
+                f", from {at_most(present.floor_from_s)} s on ≤ {at_most(getattr(late, constant))}{unit}"
+            )
         if (persistent := present.persistent_constants) is not None:
-            formula += f" + {getattr(persistent, constant):.4g}"
+            formula += f" + {at_most(getattr(persistent, constant))}"
         parts.append(formula)
         present = present.other
     return f"{quantity} ≤ {' and ≤ '.join(parts)}"

@@ -325,7 +325,7 @@ def require_covered(resolved: Scenario) -> None:
     if not np.allclose(resolved.controller.safe_input or np.zeros(m), at_rest, rtol=1e-9, atol=0):
         raise CallerError(
             "controller.safe_input: with update_timeout_s the margin needs the input at rest, "
-            f"{at_rest.tolist()}"
+            f"{[float(f'{u:.10g}') for u in at_rest]}"
         )
 
 

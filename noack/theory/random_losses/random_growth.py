@@ -18,6 +18,7 @@ import numpy as np
 
 from noack.core.clock import NEVER_NS
 from noack.core.linear_systems import Vector
+from noack.core.number_format import at_most
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array, NotPredictableError
@@ -58,10 +59,10 @@ class RandomGrowth(NamedTuple):
         square = f"√E‖z‖² of the loop's state z changes by the factor {factor} per period"
         if self.mean_square < 1:
             return f"{square}: stable in mean square and almost surely"
-        sure = f"almost surely ‖z‖ changes by at most the factor {self.almost_sure:.6g}"
+        sure = f"almost surely ‖z‖ changes by at most the factor {at_most(self.almost_sure, 6)}"
         verdict = "stable"
         if self.almost_sure >= 1:
-            verdict = f"not decided, as this is {self.almost_sure - 1:.2g} too large to prove decay"
+            verdict = f"not decided, as this is {at_most(self.almost_sure - 1, 2)} too large to prove decay"
         return f"{square}: not stable in mean square; {sure} per period: {verdict}"
 
 

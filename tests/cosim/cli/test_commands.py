@@ -30,10 +30,12 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(tmp_path: Path, con
     assert "watchdog: policy hold" in silent
     assert "rejoin_within_s: 0" in silent
     content["plant"]["watchdog"] = {"timeout_s": 0.2}
-    content["controller"] = {"safe_input": [0.1]}
+    assert "timeout_input: no effect" not in silent
+    content["controller"] = {"safe_input": [0.1], "timeout_input": "hold"}
     content["recovery"] = {"rejoin_within_s": 5.0}
     content["start_within_s"] = 60.0
     explicit = message()
+    assert "timeout_input: no effect without controller.update_timeout_s" in explicit
     assert not any(key in explicit for key in ("watchdog:", "safe_input:", "_within_s:"))
 
 

@@ -79,6 +79,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         ("__init__", ""),
         ("slow", "import time\nfirst = 1\ntime.sleep(0.2)\nsecond = 2\n"),
         ("wrong", "raise RuntimeError\n"),
+        ("stopped", "if sys.argv.count(__name__) == 1:\n    raise KeyboardInterrupt\nname = 1\n"),
         (
             "outer",
             "from cosim.lazy_modules import lazy_modules\nwith lazy_modules():\n"
@@ -125,6 +126,12 @@ def test_a_package_is_loaded_before_its_modules(package: str) -> None:
     assert sys.argv == [f"{package}{name}" for name in ("", ".inner", ".inner.one", ".inner.two")]
 
 
+def test_a_package_is_loaded_before_a_module_that_is_not_imported_lazily(package: str) -> None:
+    lazily_imported(package, "inner")
+    importlib.import_module(f"{package}.inner.two")
+    assert sys.argv[:3] == [f"{package}{name}" for name in ("", ".inner", ".inner.one")]
+
+
 def test_another_thread_waits_until_it_is_loaded(package: str) -> None:
     module, found = lazily_imported(package, "slow"), []
     threads = [threading.Thread(target=lambda: found.append(module.second)) for _ in range(3)]
@@ -134,6 +141,16 @@ def test_another_thread_waits_until_it_is_loaded(package: str) -> None:
         thread.join()
     assert found == [2, 2, 2]
     assert sys.argv == [package, f"{package}.slow"]
+
+
+@pytest.mark.parametrize(
+    "statement", ["from some_package.stopped import name", "import some_package.stopped"]
+)
+def test_ctrl_c_while_a_module_is_loaded_is_not_lost(package: str, statement: str) -> None:
+    lazily_imported(package, "stopped")
+    with pytest.raises(KeyboardInterrupt):
+        exec(f"{statement}\nsome_package.stopped.name", {"some_package": sys.modules[package]})
+    assert sys.argv == [package, f"{package}.stopped"]
 
 
 def test_an_error_is_raised_at_each_use(package: str) -> None:

@@ -212,8 +212,17 @@ def test_without_a_cap_the_mean_at_events_in_the_chosen_norm_is_beta_over_1_minu
         assert shorter.probability < longer.probability
         assert shorter.state < longer.state
     gain = "the loop gain of the moments is 1.32, not below 1"
-    void, *_ = sentences(replace(found, runs=(), moments=(), void=gain, sure_rate_per_s=None))
+    void, *_ = sentences(
+        replace(found, runs=(), moments=(), void=gain, sure_rate_per_s=None), is_weighted=False
+    )
     assert void == f"Without the guarantee no mean is certified: {gain}."
+    run = found.runs[0]._replace(controller_error=1.00001)
+    moment = found.moments[0]._replace(controller_error=2.00001)
+    found = replace(found, runs=(run,), moments=(moment,))
+    of_run, of_moment, *_ = sentences(found, is_weighted=True)
+    assert re.search(r"‖W e_c‖.* at most 1\.001\.$", of_run)
+    assert re.search(r"‖W e_c‖ at most 2\.001( e|\.)", of_moment)
+    assert not any("‖W" in sentence for sentence in sentences(found, is_weighted=False))
 
 
 def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_stated(

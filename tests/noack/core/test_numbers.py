@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from noack.core.core_library import CoreMemory, core, ffi, reals_at
-from noack.core.number_format import plus_minus
+from noack.core.number_format import at_least, at_most, duration_at_least, plus_minus
 from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
 
 
@@ -109,3 +109,21 @@ def test_models_with_the_same_matrix_share_its_exponentials() -> None:
     matrix = core.noack_transition(one, 5)
     assert matrix - one.matrices in range(0, 4 * one.places, 4)  # kept, where it was
     assert sorted(known[known != 0]) == [5, 7]
+
+
+@pytest.mark.parametrize(("value", "most", "least"), [
+    (1.23401, "1.235", "1.234"), (1.23399, "1.234", "1.233"), (0.1, "0.1", "0.1"),
+    (-1.23401, "-1.234", "-1.235"),
+    (1 + 2e-16, "1", "1"), (99999.5, "1e+05", "9.999e+04"), (0.0, "0", "0"), (math.inf, "inf", "inf"),
+    (None, "-", "-"),
+])  # fmt: skip
+def test_a_bound_is_rounded_away_from_what_it_bounds(value: float | None, most: str, least: str) -> None:
+    assert (at_most(value), at_least(value)) == (most, least)
+
+
+def test_a_bound_with_decimals_and_a_time() -> None:
+    assert (at_most(0.99999999901, decimals=9), at_least(1e40 / 3, decimals=1)[:3]) == ("1.000000000", "333")
+    assert at_least(0.99999999999, decimals=9) == "0.999999999"
+    assert [duration_at_least(time_s) for time_s in (0.0499999, 0.05, 1.0096, 2.5e-6)] == [
+        "49.9 ms", "50 ms", "1 s", "2.5 µs",
+    ]  # fmt: skip

@@ -123,6 +123,14 @@ def test_states_that_are_equilibria_by_construction_are_taken(seed: int) -> None
     assert A @ x_r + B @ found == pytest.approx(np.zeros(n), abs=1e-9 * np.abs(A).max() * 10)
 
 
+def test_the_matrices_that_are_kept_cannot_be_changed() -> None:
+    matrices = loop_of(resolve(load(SCENARIOS / "lane_weighted.toml")))
+    for array in (matrices.A, matrices.H, matrices.x0, matrices.weight):
+        assert array is not None
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
 def test_the_lane_model_is_the_papers() -> None:
     """The equations of Section V, written out, with its numbers: U = −12, d = 40, gain 1."""
     model = lane_following()

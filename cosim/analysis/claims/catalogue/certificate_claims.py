@@ -17,6 +17,7 @@ from cosim.analysis.claims.claim_definition import (
 )
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from noack.core.linear_systems import row_norms
+from noack.core.number_format import at_most
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 
@@ -118,7 +119,7 @@ def region(
     here, limits = samples.with_x, np.array(certificate.region.x)
     shares = (np.abs(samples.true_x.compress(here, axis=0)) / limits).max(axis=1)
     names = run.record.loop.state_names
-    formula = ", ".join(f"|{name}| ≤ {limit:.4g}" for name, limit in zip(names, limits, strict=True))
+    formula = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in zip(names, limits, strict=True))
     return Findings(Bound(formula, samples.t_s[here], shares, run.violation_of(certificate)))
 
 

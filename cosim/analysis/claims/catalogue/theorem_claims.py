@@ -46,7 +46,7 @@ def i1_model_difference(run: RunEvidence, samples: Samples) -> Findings:
     residual = samples.residual[here]
     # Use the larger model state, since a missed update may have moved x_c far from x_s.
     scale = max(run.facts.largest_state + run.part.offset, float(np.finfo(float).tiny))
-    formula = "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), relative residual ≤ {:.0e}"
+    formula = "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), relative residual ≤ {}"
     shares = residual / (margin * scale)
     return Findings(Bound(formula, samples.t_s[here], shares, run.first_gap, margin))
 
@@ -91,7 +91,7 @@ def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> Findings:
     if not is_covered or scenario.decaying.floor > 0 or (delta := run.trajectory_delta) is None:
         return Findings()
     level = scenario.decaying.beta * np.exp(-scenario.decaying.alpha_per_s * samples.t_s)
-    formula, void = "‖e_c‖ ≤ {:.4g} βe^(−αt)", run.paper_violation
+    formula, void = "‖e_c‖ ≤ {} βe^(−αt)", run.paper_violation
     return Findings(controller_error_bound(run, samples, formula, delta * level, delta, void))
 
 

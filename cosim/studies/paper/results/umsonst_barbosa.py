@@ -172,6 +172,8 @@ class Outcome(NamedTuple):
     """Optimisations without a solution; the plant's side goes on with older inputs."""
     distance_m: float
     """Of the nominal position from its target, after 5 s."""
+    plant_distance_m: float
+    """Of the plant's position from the target, after 5 s."""
 
 
 def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vector) -> Outcome:
@@ -208,7 +210,8 @@ def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vect
         if answered:
             assumed, heard = z, k
     tube, state, most_input = shares.tolist()
-    return Outcome(tube, state, most_input, unsolved, abs(float(z[0]) - TARGET_M))
+    distance_m, plant_distance_m = abs(float(z[0]) - TARGET_M), abs(float(x[0]) - TARGET_M)
+    return Outcome(tube, state, most_input, unsolved, distance_m, plant_distance_m)
 
 
 def disturbances_of(optimisation: Optimisation) -> tuple[Matrix, Matrix]:
@@ -231,7 +234,7 @@ def _rows() -> list[Row]:
         for lost in LOSSES
         for disturbances in disturbances_of(optimisation)
     ]
-    tube, state, most_input, unsolved, distance_m = map(max, zip(*outcomes, strict=True))
+    tube, state, most_input, unsolved, distance_m, _ = map(max, zip(*outcomes, strict=True))
     largest = (
         ("share of the tube that x − z reaches", _README, tube),
         ("share of the limits that x reaches", _ABSTRACT, state),
@@ -244,8 +247,9 @@ def _rows() -> list[Row]:
             for quantity, where, share in largest
         ),
         Row(
-            "distance from the target after 5 s", _ABSTRACT, "=", "0 in the limit",
-            f"{1000 * distance_m:.1f} mm", _HOW, distance_m < _NEAR_M,
+            "distance of the nominal position from the target after 5 s", _ABSTRACT, "<",
+            f"{1000 * _NEAR_M:.0f} mm (0 in the limit)", f"{1000 * distance_m:.1f} mm", _HOW,
+            distance_m < _NEAR_M,
         ),
     ]  # fmt: skip
 
@@ -258,7 +262,11 @@ RESULT = PublishedResult(
     rows=_rows,
     notes=(
         "published are statements and figures, no numbers; plant, costs, limits, disturbances and "
-        "horizon are those of the authors' program",
+        "horizon are those of the authors' program, except the limit of the steady position: here it "
+        "is 0.99999 times that of the nominal position, in the program it is divided by 0.99999",
+        "published is that the nominal position tends to the target; 10 mm after 5 s are noack's "
+        "limit. The disturbances keep the plant away from the nominal position: here it ends up to "
+        "333 mm from the target, within the tube, which reaches 558 mm",
         "differs: the tube is computed exactly in the directions of the limits, where the program "
         "has a polytope around it; the terminal set follows from it",
         "not shown: the nonlinear cart-pole, the extension that also uses the plant's state, and "

@@ -196,6 +196,32 @@ def test_each_hold_strategy_is_written_decided_and_run_as_claimed(
     assert final_size(written, best.beyond.pattern) > 1e2
 
 
+def test_the_holds_that_are_named_decide_also_about_the_given_timeout() -> None:
+    given = ("controller.update_timeout_s=0.752", "mode=model")
+    wish = Wish(period_s=PERIOD_S, effort=0, holds=read_holds("zero"), cost=50)
+    found = searched(shipped("unstable_pendulum", *given), wish)
+    assert found.best.candidate.hold in read_holds("zero")
+    assert found.best.rung < found.given.rung
+    assert any("--holds excludes its strategy" in note for note in found.shown.notes)
+    assert found.shown.cells[0]["between updates"].endswith(" (not in --holds)")
+    same = searched(shipped("unstable_pendulum", *ZERO), wish)
+    assert same.search.keeps_given_hold
+    assert same.best.rung >= same.given.rung
+
+
+def test_a_period_between_two_measurements_is_said_to_be_longer() -> None:
+    found = searched(shipped("unstable_pendulum"), Wish(period_s=0.2503, effort=0))
+    assert "--period 0.2503: updates are sent at measurements, every 0.252 s" in found.shown.notes
+
+
+def test_a_file_that_is_no_scenario_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "notes.toml"
+    path.write_text("mine = 1")
+    result = invoke("design", "lane_periodic", "--for", "network", "--out", path)
+    assert result.stderr == f"noack: --out {path}: exists, and is no scenario; give another name\n"
+    assert path.read_text() == "mine = 1"
+
+
 @pytest.fixture(scope="module")
 def events() -> FoundEvents:
     """The pendulum's own trigger and gain, and better ones, with a certified bound of ‖x‖."""

@@ -141,3 +141,16 @@ def test_without_the_gain_at_the_plants_side_the_tube_is_left(
     assert umsonst_barbosa.run(optimisation, 0.5, drawn, own).tube < 1
     assert umsonst_barbosa.run(optimisation, 0.5, drawn, 0 * own).tube > 1
     assert umsonst_barbosa.run(optimisation, 0.5, 1.01 * worst, own).tube == pytest.approx(1.01, rel=1e-4)
+
+
+def test_the_plant_is_farther_from_the_target_than_the_nominal_position(
+    optimisation: umsonst_barbosa.Optimisation,
+) -> None:
+    farthest_m = max(
+        umsonst_barbosa.run(optimisation, lost, disturbances, optimisation.K[0]).plant_distance_m
+        for lost in umsonst_barbosa.LOSSES
+        for disturbances in umsonst_barbosa.disturbances_of(optimisation)
+    )
+    reach_m = optimisation.plant.tube(optimisation.K, np.eye(4)[0])
+    for metres in (farthest_m, reach_m):
+        assert f"{1000 * metres:.0f} mm" in umsonst_barbosa.RESULT.notes[1]
