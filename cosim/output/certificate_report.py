@@ -103,9 +103,12 @@ def _in_words(results: Certificates) -> Iterator[str]:
         spacing_s = certificate.inter_event_s
         if spacing_s is not None and spacing_s < MOST_S:  # else there is no second event
             apart = f" The inter-event time is at least {_limit(spacing_s)}."
+        meaning = certificate.conditions.guarantee.meaning
+        losses = f"for every pattern of losses with {meaning}"
+        if not results.scenario.network.enforce_mansd:
+            losses = f"as long as there are {meaning}, which nothing enforces"
         yield (
-            f"In words: for {plants}, under the assumptions above and for every pattern of losses "
-            f"with {certificate.conditions.guarantee.meaning}: "
+            f"In words: for {plants}, under the assumptions above and {losses}: "
             f"{envelope_formula('‖x‖', certificate, 'state').format(at_most(constants.state))}.{apart}"
         )
 
@@ -352,18 +355,22 @@ def sentences(unlimited: UnlimitedLosses, *, is_weighted: bool) -> Iterator[str]
         grown = f" e^({at_least(run.rate_per_s, 3)}t)" if run.rate_per_s else ""
         left_out = at_most(1 - run.probability, 2)
         yield (
-            f"Runs of {unlimited.horizon_s:g} s, where one with a burst of more than {run.most} losses "
-            f"counts as 0 (a share of at most {left_out}): the {_MOMENT[run.order]} of a run's "
-            f"largest ‖x‖{grown} is at most {at_most(run.state)}, that of {error}{grown} at most "
-            f"{at_most(run.controller_error)}."
+            f"Over runs of {unlimited.horizon_s:g} s, the {_MOMENT[run.order]} of a run's largest "
+            f"‖x‖{grown} is at most {at_most(run.state)}, that of {error}{grown} at most "
+            f"{at_most(run.controller_error)}. Runs with a burst of more than {run.most} losses, a share of "
+            f"at most {left_out}, count as 0 in it."
         )
+    texts: dict[str, str] = {}
     for moment in unlimited.moments:
         decay = f" e^(−{at_least(moment.rate_per_s, 3)}t)" if moment.rate_per_s else ""
-        yield (
-            f"Without the guarantee, {losses}: at every time t, the {_MOMENT[moment.order]} of ‖x‖ is "
-            f"at most {at_most(moment.state)}{decay}, that of {error} at most "
+        bounds = (
+            f"of ‖x‖ is at most {at_most(moment.state)}{decay}, that of {error} at most "
             f"{at_most(moment.controller_error)}{decay}."
         )
+        both = f"{texts[bounds]} and the " if bounds in texts else ""
+        texts[bounds] = f"{both}{_MOMENT[moment.order]}"
+    for bounds, names in texts.items():
+        yield f"Without the guarantee, {losses}: at every time t, the {names} {bounds}"
     if unlimited.void is not None:
         order = _MOMENT[len(unlimited.moments) + 1]
         yield f"Without the guarantee no {order} is certified: {unlimited.void}."
@@ -375,7 +382,7 @@ def sentences(unlimited: UnlimitedLosses, *, is_weighted: bool) -> Iterator[str]
             for order, value in enumerate(unlimited.at_events, start=1)
         )
         yield (
-            f"Under the paper's conditions {error} e^(αt)/β at events has a {at}, and x decays "
+            f"Under the paper's conditions {error} e^(αt)/β just before an event has a {at}, and x decays "
             f"almost surely, at every rate below {at_least(unlimited.paper_rate_per_s, 3)} /s."
         )
     if unlimited.moments or unlimited.bursts:

@@ -223,7 +223,7 @@ class DesignOutcome:
     def written(self) -> str:
         """Return the scenario of the best loop as TOML, under a new name."""
         name = f"{self.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}"
-        description = f"{self.name} with another gain: {self.verdict}."
+        description = f"{self.name}{', designed' * self.is_better}: {self.verdict}."
         return dumps(self.scenario.model_copy(update={"name": name, "description": description}))
 
 

@@ -295,6 +295,11 @@ def event_outcome(search: EventSearch, original: Certified, best: Certified) -> 
         f"the best of {search.tried:,} loops tried with {limit}; {proven}",
         "costs and transmissions are means over fresh draws with the scenario's own network",
     ]
+    before, after = original.loop.alpha_per_s, best.loop.alpha_per_s
+    if after < before:
+        notes.append(
+            f"the threshold and the certified bounds decay at {after:.4g} /s instead of {before:.4g} /s"
+        )
     return DesignOutcome(
         search.scenario.name,
         verdict,
