@@ -99,10 +99,13 @@ def moments(
         NoCertificateError: the spectral radius of the inequalities is not below 1.
         NotDecayingError: α is not below the decay rate of the models, or of A + BK.
     """
-    candidates = [
-        _Inequalities(error, plant, conditions, beta, largest_probability, higher_order).solve()
-        for higher_order in ORDERS[order - 1 :]  # a mean is at most the root mean square
-    ]
+    try:
+        candidates = [
+            _Inequalities(error, plant, conditions, beta, largest_probability, higher_order).solve()
+            for higher_order in ORDERS[order - 1 :]  # a mean is at most the root mean square
+        ]
+    except (np.linalg.LinAlgError, OverflowError):
+        raise NoCertificateError("numbers overflow: an input is too old for the fastest mode") from None
     if not any(np.isfinite(candidate.state) for candidate in candidates):
         loop_gain = min(candidate.loop_gain for candidate in candidates)
         raise NoCertificateError(f"the loop gain of the moments is {loop_gain:.3g}, not below 1")
@@ -228,8 +231,11 @@ class _Inequalities:
         return Known(bounds.sensor_error, other, aged, at_start)
 
     def _driving(self, bounds: _Bounds) -> _Signals:
-        """Return rows that bound R_E x, and p at all times."""
-        input_error = max(bounds.input_error, float(self._start_error))
+        """Return rows that bound R_E x, and p at all times: before and after the first input, at t_a.
+
+        E‖p‖² ≤ π² + sup‖p‖² P(t < t_a), as t_a may depend on the losses.
+        """
+        input_error = float(np.hypot(bounds.input_error, self._start_error))
         return bounds.states[Output.MISMATCH] * _ONE, input_error * _ONE
 
     def _values(self, bounds: _Bounds) -> Vector:
@@ -248,7 +254,11 @@ class _Inequalities:
             by_functions = [V.bound_error(C @ propagated, known) + recent for V in functions]
             errors[output] = min([bounds.errors[output], by_missing, *by_functions])
         states = {
-            output: min([bounds.states[output], *(V.bound_state(C, known) for V in functions)])
+            output: min(
+                bounds.states[output],
+                float(self._state(output) @ values),
+                *(V.bound_state(C, known) for V in functions),
+            )
             for output, C in self._plant.outputs.items()
         }
         input_error = self._with_age(errors[Output.GAIN], states, errors)

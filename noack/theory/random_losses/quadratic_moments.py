@@ -43,6 +43,8 @@ _LARGEST = 1e4
 """Bound of the traces of X and P where ‖e_s‖_W ≤ 1 and V ≤ 1; without one they could be infinite."""
 _ROUNDING = 1e-13
 _INFLATED = 1 + 1e-9
+_MOST_STATES = 8
+"""With 8 the four searches take some 10 s, with 12 a minute."""
 _LEFT = 0.01
 """Share of the decay of x that the input's age leaves where the search begins."""
 Blocks = tuple[Vector, *tuple[Matrix, ...]]
@@ -149,20 +151,30 @@ class LossyFlow:
         return known.other + (0.0 if self.counts_age else known.aged)
 
     def flight(self, rate_per_s: float) -> Matrix:
-        """D, (n, n), enlarged by the rounding of an exponential."""
+        """D, (n, n), enlarged by the rounding of an exponential.
+
+        The delay is halved until the models hardly move, then D(2t) = D(t) + e^{Mᵀt} D(t) e^{Mt}. One
+        exponential would also have the growing e^{−Mᵀt}, in which D of a fast mode is lost.
+        """
         n, M = len(self.model), self.model + rate_per_s * np.eye(len(self.model))
+        halvings = int(np.ceil(np.log2(np.linalg.norm(M) * self.delay_s + 1)))
         square = self.gain.T @ self.gain
-        both = exponential(np.block([[-M.T, square], [np.zeros((n, n)), M]]) * self.delay_s)
-        D = both[n:, n:].T @ both[:n, n:]
+        both = exponential(np.block([[-M.T, square], [np.zeros((n, n)), M]]) * (self.delay_s / 2**halvings))
+        moved = both[n:, n:]
+        D = moved.T @ both[:n, n:]
+        for _ in range(halvings):
+            D, moved = D + moved.T @ D @ moved, moved @ moved
         return np.asarray((D + D.T) / 2 * _INFLATED)
 
 
 def quadratic_functions(loop: LossyFlow, known: Known) -> list[QuadraticFunction]:
     """Return functions V for several λ, each for a small bound of ‖x‖ or of ‖ê_c‖_W.
 
-    There may be none: if nothing decays, each update is lost, there is no input, or because of rounding.
+    There may be none: if nothing decays, each update is lost, there is no input, or because of rounding;
+    and with many states, for which the search would take too long.
     """
-    if loop.decay_per_s <= 0 or loop.probability >= 1 or not loop.input.any() or not known.sensor_error > 0:
+    possible = loop.decay_per_s > 0 and loop.probability < 1 and loop.input.any() and known.sensor_error > 0
+    if not possible or len(loop.model) > _MOST_STATES:
         return []
     zero = np.zeros_like(loop.model)
     searches = [_Search(loop, known, share, loop.inverse_weight, zero) for share in _OF_STATE]
@@ -203,11 +215,9 @@ class _Search:
         """The function for the smallest bound that was found; none if it cannot be confirmed."""
         try:
             first = self._first()
-        except np.linalg.LinAlgError:  # a form that decays in theory does not in floating point
-            first = None
-        if first is None:
+            found = None if first is None else _Inequalities(self._blocks, len(first)).maximise_last(first)
+        except np.linalg.LinAlgError:  # a matrix is singular to rounding
             return
-        found = _Inequalities(self._blocks, len(first)).maximise_last(first)
         if found is not None:
             X, P, mu, nu, zetas, _ = self._unknowns(found)
             yield QuadraticFunction(X, P + nu * self._sensor, nu, self._rate, mu, zetas, self._loop)
