@@ -131,11 +131,19 @@ class LossyFlow:
         self.inputs = np.vstack([self.input, 0 * self.input, -self.input])
 
     def flight(self, rate_per_s: float) -> Matrix:
-        """N D, (n, n), enlarged by the rounding of an exponential."""
+        """N D, (n, n), enlarged by the rounding of an exponential.
+
+        The delay is halved until the models hardly move, then D(2t) = D(t) + e^{Mᵀt} D(t) e^{Mt}. One
+        exponential would also have the growing e^{−Mᵀt}, in which D of a fast mode is lost.
+        """
         n, M = len(self.model), self.model + rate_per_s * np.eye(len(self.model))
+        halvings = int(np.ceil(np.log2(np.linalg.norm(M) * self.delay_s + 1)))
         square = self.gain.T @ self.gain
-        both = exponential(np.block([[-M.T, square], [np.zeros((n, n)), M]]) * self.delay_s)
-        D = both[n:, n:].T @ both[:n, n:]
+        both = exponential(np.block([[-M.T, square], [np.zeros((n, n)), M]]) * (self.delay_s / 2**halvings))
+        moved = both[n:, n:]
+        D = moved.T @ both[:n, n:]
+        for _ in range(halvings):
+            D, moved = D + moved.T @ D @ moved, moved @ moved
         return np.asarray(self.in_flight * (D + D.T) / 2 * _INFLATED)
 
 

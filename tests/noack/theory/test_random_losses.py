@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
@@ -154,6 +154,20 @@ def test_no_event_and_no_flow_raises_the_mean_of_a_quadratic_function(late: bool
                 flight = V.of_flight * 2 * flown * 0.98
                 assert p * lost + (1 - p) * delivered + flight <= value(x, q, e_s) * (1 + 1e-9)
     assert checked > 8
+
+
+def test_the_effect_of_updates_in_flight_is_that_of_its_equation_for_fast_modes() -> None:
+    """MᵀD + DM = e^{Mᵀd} KᵀK e^{Md} − KᵀK, with a mode whose e^{−Mᵀd} is near 10⁴³."""
+    modes = np.array([[1.0, 1.0], [0.3, 1.0]])
+    H = modes @ np.diag([-1.0, -1000.0]) @ np.linalg.inv(modes)
+    K, B, delay_s, rate_per_s = np.array([[-0.15, -0.09]]), np.array([[0.3], [1.0]]), 0.1, 0.3
+    error = ErrorGains(H, K, np.eye(2), 0.2)
+    plant = PlantGains(error, H - B @ K, B, np.ones((2, 1)), 0.2)
+    flow = LossyFlow(error, plant, NetworkConditions(0, 0.01, 0.01, delay_s), 0.3)
+    M = H + (0.2 + rate_per_s) * np.eye(2)
+    moved = K @ expm(M * delay_s)
+    expected = solve_continuous_lyapunov(M.T, moved.T @ moved - K.T @ K)
+    assert flow.flight(rate_per_s) / flow.in_flight == pytest.approx(expected, rel=1e-6)
 
 
 def test_moments_at_a_lower_rate_than_the_triggers() -> None:
