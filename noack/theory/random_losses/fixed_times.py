@@ -229,7 +229,11 @@ class _Inequalities:
             by_functions = (V.bound_error(C @ propagated, known) + recent for V in functions)
             errors[output] = min(bounds.errors[output], by_missing, *by_functions)
         states = {
-            output: min(bounds.states[output], *(V.bound_state(C, known) for V in functions))
+            output: min(
+                bounds.states[output],
+                float(self._state(output) @ values),
+                *(V.bound_state(C, known) for V in functions),
+            )
             for output, C in self._plant.outputs.items()
         }
         input_error = self._with_age(errors[Output.GAIN], states, errors)

@@ -119,7 +119,9 @@ class LossyFlow:
         self.probability, self.delay_s = probability, conditions.delay_s
         self.start_s, self.start = conditions.start_s, W @ plant.start[:, 0]
         self.has_aged_input = conditions.hold_s > 0 or conditions.start_s > 0
-        self.in_flight = conditions.delay_s and np.ceil(conditions.delay_s / conditions.spacing_s * _INFLATED)
+        spacing_s = conditions.spacing_s
+        most = self.delay_s / spacing_s * _INFLATED if spacing_s > 0 else np.inf
+        self.in_flight = np.ceil(most) if self.delay_s > 0 else 0.0
         self.input, self.gain = W @ plant.input_matrix, error.split_K[1] @ self.inverse_weight
         BK, E = self.input @ self.gain, self.closed_loop - self.model
         zero = np.zeros_like(E)
@@ -148,8 +150,8 @@ class LossyFlow:
 
 
 def quadratic_functions(loop: LossyFlow, known: Known) -> list[QuadraticFunction]:
-    """Return functions V for several λ, each for a small bound of ‖x‖ or of ‖ê_c‖_W."""
-    if loop.decay_per_s <= 0 or not np.isfinite(loop.in_flight):
+    """Return functions V for several λ, each for a small bound of ‖x‖ or of ‖ê_c‖_W; none if none is found."""
+    if loop.decay_per_s <= 0 or loop.probability >= 1 or not np.isfinite(loop.in_flight):
         return []
     zero = np.zeros_like(loop.model)
     searches = [_Search(loop, known, share, loop.inverse_weight, zero) for share in _OF_STATE]

@@ -16,7 +16,7 @@ from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.random_losses import mean_square_growth as mean_square_module
 from noack.theory.random_losses import moments as moments_module
 from noack.theory.random_losses import random_growth as random_growth_module
-from noack.theory.random_losses.fixed_times import moments
+from noack.theory.random_losses.fixed_times import moments, refined_mean_squares
 from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
 from noack.theory.random_losses.quadratic_moments import (
     Known,
@@ -168,6 +168,29 @@ def test_the_effect_of_updates_in_flight_is_that_of_its_equation_for_fast_modes(
     moved = K @ expm(M * delay_s)
     expected = solve_continuous_lyapunov(M.T, moved.T @ moved - K.T @ K)
     assert flow.flight(rate_per_s) / flow.in_flight == pytest.approx(expected, rel=1e-6)
+
+
+CONTINUOUS_LATE = NetworkConditions(0, delay_s=0.04)
+
+
+@pytest.mark.parametrize(
+    ("gain", "unit", "p", "conditions"),
+    [
+        (-1.5, 1.0, 0.3, CONTINUOUS_LATE),
+        (0.0, 1.0, 1.0, NetworkConditions(0)),
+        (-1.5, 1e8, 0.3, NetworkConditions(0, 0.02, 0.02, 0.04, 0.04, 0.04)),
+    ],
+    ids=["events may be arbitrarily close", "all updates are lost", "no function is found"],
+)
+def test_mean_squares_without_a_quadratic_function_are_those_of_the_inequalities(
+    gain: float, unit: float, p: float, conditions: NetworkConditions
+) -> None:
+    error = ErrorGains(-np.eye(1), np.array([[gain / unit]]), np.eye(1), 0.2)
+    plant = PlantGains(error, np.array([[-1.2 - gain]]), np.array([[unit]]), np.array([[unit]]), 0.2)
+    args = error, plant, conditions, 0.1 * unit, p
+    found, first = refined_mean_squares(*args), moments(*args, 2)
+    assert found.state <= first.state
+    assert found.controller_error <= first.controller_error
 
 
 def test_moments_at_a_lower_rate_than_the_triggers() -> None:
