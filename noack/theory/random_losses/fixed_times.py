@@ -99,10 +99,13 @@ def moments(
         NoCertificateError: the spectral radius of the inequalities is not below 1.
         NotDecayingError: α is not below the decay rate of the models, or of A + BK.
     """
-    candidates = [
-        _Inequalities(error, plant, conditions, beta, largest_probability, higher_order).solve()
-        for higher_order in ORDERS[order - 1 :]  # a mean is at most the root mean square
-    ]
+    try:
+        candidates = [
+            _Inequalities(error, plant, conditions, beta, largest_probability, higher_order).solve()
+            for higher_order in ORDERS[order - 1 :]  # a mean is at most the root mean square
+        ]
+    except (np.linalg.LinAlgError, OverflowError):
+        raise NoCertificateError("numbers overflow: an input is too old for the fastest mode") from None
     if not any(np.isfinite(candidate.state) for candidate in candidates):
         loop_gain = min(candidate.loop_gain for candidate in candidates)
         raise NoCertificateError(f"the loop gain of the moments is {loop_gain:.3g}, not below 1")

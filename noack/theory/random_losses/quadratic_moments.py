@@ -150,7 +150,7 @@ class LossyFlow:
 
 
 def quadratic_functions(loop: LossyFlow, known: Known) -> list[QuadraticFunction]:
-    """Return functions V for several λ, each for a small bound of ‖x‖ or of ‖ê_c‖_W; none if none is found."""
+    """Return functions V for several λ, each for a small bound of ‖x‖ or ‖ê_c‖_W, if any are found."""
     if loop.decay_per_s <= 0 or loop.probability >= 1 or not np.isfinite(loop.in_flight):
         return []
     zero = np.zeros_like(loop.model)
@@ -192,10 +192,11 @@ class _Search:
 
     def functions(self) -> Iterator[QuadraticFunction]:
         """The function for the smallest bound that was found; none if it cannot be confirmed."""
-        first = self._first()
-        if first is None:
+        try:
+            first = self._first()
+            found = None if first is None else _Inequalities(self._blocks, len(first)).maximise_last(first)
+        except np.linalg.LinAlgError:  # a matrix is singular to rounding
             return
-        found = _Inequalities(self._blocks, len(first)).maximise_last(first)
         if found is not None:
             X, P, mu, nu, zeta, in_flight, _ = self._unknowns(found)
             positive = P + nu * self._sensor

@@ -11,7 +11,7 @@ from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.random_losses import mean_square_growth as mean_square_module
 from noack.theory.random_losses import moments as moments_module
@@ -191,6 +191,14 @@ def test_mean_squares_without_a_quadratic_function_are_those_of_the_inequalities
     found, first = refined_mean_squares(*args), moments(*args, 2)
     assert found.state <= first.state
     assert found.controller_error <= first.controller_error
+
+
+def test_inputs_that_are_too_old_for_the_fastest_mode_have_no_moments() -> None:
+    """e^{−Hσ} overflows."""
+    error = ErrorGains(-np.diag([1.0, 1e6]), np.array([[-0.1, -0.1]]), np.eye(2), 0.2)
+    plant = PlantGains(error, -np.diag([1.0, 1e6]), np.zeros((2, 1)), np.ones((2, 1)), 0.2)
+    with np.errstate(all="ignore"), pytest.raises(NoCertificateError, match="overflow"):
+        moments(error, plant, NetworkConditions(0, hold_s=0.007), 0.1, 0.3, 2)
 
 
 def test_moments_at_a_lower_rate_than_the_triggers() -> None:
