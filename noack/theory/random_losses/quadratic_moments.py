@@ -44,7 +44,7 @@ _LARGEST = 1e4
 _ROUNDING = 1e-13
 _INFLATED = 1 + 1e-9
 _MOST_STATES = 8
-"""With 8 the four searches take some 10 s, with 12 a minute."""
+"""With 7 the four searches took up to 12 s of CPU on a busy machine, with 12 about a minute."""
 _LEFT = 0.01
 """Share of the decay of x that the input's age leaves where the search begins."""
 Blocks = tuple[Vector, *tuple[Matrix, ...]]

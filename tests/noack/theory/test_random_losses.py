@@ -5,18 +5,18 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.random_losses import mean_square_growth as mean_square_module
 from noack.theory.random_losses import moments as moments_module
 from noack.theory.random_losses import random_growth as random_growth_module
-from noack.theory.random_losses.fixed_times import moments
+from noack.theory.random_losses.fixed_times import moments, refined_mean_squares
 from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
 from noack.theory.random_losses.quadratic_moments import Known, LossyFlow, quadratic_functions
 from tests.noack.theory.certificate_kinds.random_losses import certify, draw, simulate_runs
@@ -139,6 +139,51 @@ def test_no_event_and_no_flow_raises_the_mean_of_a_quadratic_function(late: bool
             at_event = P - both.T @ (p * P[:n, :n] + 0.98 * zeta_f * D) @ both
             assert np.linalg.eigvalsh(at_event)[0] > -1e-9 * np.linalg.norm(at_event)
     assert checked > 8
+
+
+def test_the_effect_of_updates_in_flight_is_that_of_its_equation_for_fast_modes() -> None:
+    """MᵀD + DM = e^{Mᵀd} KᵀK e^{Md} − KᵀK, with a mode whose e^{−Mᵀd} is near 10⁴³."""
+    modes = np.array([[1.0, 1.0], [0.3, 1.0]])
+    H = modes @ np.diag([-1.0, -1000.0]) @ np.linalg.inv(modes)
+    K, B, delay_s, rate_per_s = np.array([[-0.15, -0.09]]), np.array([[0.3], [1.0]]), 0.1, 0.3
+    error = ErrorGains(H, K, np.eye(2), 0.2)
+    plant = PlantGains(error, H - B @ K, B, np.ones((2, 1)), 0.2)
+    flow = LossyFlow(error, plant, NetworkConditions(0, 0.01, 0.01, delay_s), 0.3)
+    M = H + (0.2 + rate_per_s) * np.eye(2)
+    moved = K @ expm(M * delay_s)
+    expected = solve_continuous_lyapunov(M.T, moved.T @ moved - K.T @ K)
+    assert flow.flight(rate_per_s) / flow.in_flight == pytest.approx(expected, rel=1e-6)
+
+
+CONTINUOUS_LATE = NetworkConditions(0, delay_s=0.04)
+
+
+@pytest.mark.parametrize(
+    ("gain", "unit", "p", "conditions"),
+    [
+        (-1.5, 1.0, 0.3, CONTINUOUS_LATE),
+        (0.0, 1.0, 1.0, NetworkConditions(0)),
+        (-1.5, 1e8, 0.3, NetworkConditions(0, 0.02, 0.02, 0.04, 0.04, 0.04)),
+    ],
+    ids=["events may be arbitrarily close", "all updates are lost", "no function is found"],
+)
+def test_mean_squares_without_a_quadratic_function_are_those_of_the_inequalities(
+    gain: float, unit: float, p: float, conditions: NetworkConditions
+) -> None:
+    error = ErrorGains(-np.eye(1), np.array([[gain / unit]]), np.eye(1), 0.2)
+    plant = PlantGains(error, np.array([[-1.2 - gain]]), np.array([[unit]]), np.array([[unit]]), 0.2)
+    args = error, plant, conditions, 0.1 * unit, p
+    found, first = refined_mean_squares(*args), moments(*args, 2)
+    assert found.state <= first.state
+    assert found.controller_error <= first.controller_error
+
+
+def test_inputs_that_are_too_old_for_the_fastest_mode_have_no_moments() -> None:
+    """e^{−Hσ} overflows."""
+    error = ErrorGains(-np.diag([1.0, 1e6]), np.array([[-0.1, -0.1]]), np.eye(2), 0.2)
+    plant = PlantGains(error, -np.diag([1.0, 1e6]), np.zeros((2, 1)), np.ones((2, 1)), 0.2)
+    with np.errstate(all="ignore"), pytest.raises(NoCertificateError, match="overflow"):
+        moments(error, plant, NetworkConditions(0, hold_s=0.007), 0.1, 0.3, 2)
 
 
 def test_moments_at_a_lower_rate_than_the_triggers() -> None:
