@@ -32,7 +32,7 @@ LINES = {
     "noack/protocol": 1235,
     "noack/runtime": 5665,
     "noack/settings": 600,
-    "noack/theory": 12270,
+    "noack/theory": 12290,
     "noack/traces": 1320,
     "noack/trigger": 1055,
     "netem": 6495,
@@ -53,7 +53,7 @@ LINES = {
     "controller_node": 420,
     "benchmarks": 3685,
     "native": 11055,
-    "tests": 47705,
+    "tests": 47750,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

@@ -220,7 +220,7 @@ def test_without_a_cap_the_mean_at_events_in_the_chosen_norm_is_beta_over_1_minu
     moment = found.moments[0]._replace(controller_error=2.00001)
     found = replace(found, runs=(run,), moments=(moment,))
     of_run, of_moment, *_ = sentences(found, is_weighted=True)
-    assert re.search(r"‖W e_c‖.* at most 1\.001\.$", of_run)
+    assert re.search(r"‖W e_c‖.* at most 1\.001\. Runs", of_run)
     assert re.search(r"‖W e_c‖ at most 2\.001( e|\.)", of_moment)
     assert not any("‖W" in sentence for sentence in sentences(found, is_weighted=False))
 
