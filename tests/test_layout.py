@@ -38,7 +38,7 @@ LINES = {
     "netem": 6495,
     "cosim/analysis": 8160,
     "cosim/api": 1675,
-    "cosim/cli": 3375,
+    "cosim/cli": 3380,
     "cosim/doctor": 810,
     "cosim/interactive": 1625,
     "cosim/lab": 2120,
@@ -53,7 +53,7 @@ LINES = {
     "controller_node": 420,
     "benchmarks": 3685,
     "native": 11055,
-    "tests": 47750,
+    "tests": 47755,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

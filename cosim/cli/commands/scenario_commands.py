@@ -241,6 +241,11 @@ def _dependent_defaults(resolved: "scenario.Scenario") -> Iterator[str]:
         yield "network.loss: no effect, since network.mansd = 0 lets every update pass"
     if resolved.controller.timeout_input == "hold" and resolved.controller.update_timeout_s is None:
         yield "controller.timeout_input: no effect without controller.update_timeout_s"
+    if resolved.trigger.policy == "periodic":
+        period_s, measured_ns = resolved.trigger.period_s, resolved.timing.measurement_period_ns
+        sent_ns = -(-round(period_s * NS_PER_S) // measured_ns) * measured_ns
+        if sent_ns != round(period_s * NS_PER_S):
+            yield f"trigger.period_s: updates are sent at measurements, every {sent_ns / NS_PER_S:g} s"
     watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:
         yield (f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation")

@@ -34,7 +34,9 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(tmp_path: Path, con
     content["controller"] = {"safe_input": [0.1], "timeout_input": "hold"}
     content["recovery"] = {"rejoin_within_s": 5.0}
     content["start_within_s"] = 60.0
+    content["trigger"] = {"policy": "periodic", "period_s": 0.0031}
     explicit = message()
+    assert "trigger.period_s: updates are sent at measurements, every 0.004 s" in explicit
     assert "timeout_input: no effect without controller.update_timeout_s" in explicit
     assert not any(key in explicit for key in ("watchdog:", "safe_input:", "_within_s:"))
 

@@ -70,8 +70,9 @@ def _random_periodic(rng: Rng, **fixed: Any) -> Wanted:
     weights = np.diag(10 ** rng.uniform(-1, 1, n)), np.diag(10 ** rng.uniform(-1, 1, m))
     fewest = rng.random() < 0.2
     window = None if fewest or rng.random() < 0.7 else int(rng.integers(2, 6))
+    most = int(rng.integers(2, 7))
     wish = Wish(
-        "transmissions" if fewest else "network", window, most=int(rng.integers(2, 7)),
+        "transmissions" if fewest else "network", window, most=None if fewest or window else most,
         weights=weights, cost=float(rng.choice([1.0, 1.2, 3.0])), effort=int(rng.integers(16)),
     )  # fmt: skip
     horizon_s = 4e-9 * unit_ns if fewest else 1.0  # the longest period
