@@ -32,7 +32,7 @@ with lazy_modules():
     from netem import tc_words
     from noack.scenario import link_load, resolution, scenario, scenario_file, toml_file
     from noack.theory.certificates import assumptions
-    from noack.trigger import trigger_rule
+    from noack.trigger import periodic_trigger, trigger_rule
     from plant_server import plant
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def _dependent_defaults(resolved: "scenario.Scenario") -> Iterator[str]:
         yield "network.loss: no effect, since network.mansd = 0 lets every update pass"
     if resolved.controller.timeout_input == "hold" and resolved.controller.update_timeout_s is None:
         yield "controller.timeout_input: no effect without controller.update_timeout_s"
-    if resolved.trigger.policy == "periodic":
+    if isinstance(resolved.trigger, periodic_trigger.PeriodicSettings):
         period_s, measured_ns = resolved.trigger.period_s, resolved.timing.measurement_period_ns
         sent_ns = -(-round(period_s * NS_PER_S) // measured_ns) * measured_ns
         if sent_ns != round(period_s * NS_PER_S):
