@@ -201,7 +201,7 @@ class _Inequalities:
             first.input_error,
         )
         known, functions = self._known(bounds), list[QuadraticFunction]()
-        for counts_age in (True, False):
+        for counts_age in (True, False)[: 1 + (self._conditions.hold_s > 0)]:
             loop = self._error, self._plant, self._conditions, self._probability
             functions = functions or quadratic_functions(LossyFlow(*loop, counts_age), known)
         for _ in range(_ROUNDS):
