@@ -59,7 +59,8 @@ def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     (sdist,) = out.glob("*.tar.gz")
     with tarfile.open(sdist) as file:
-        file.extractall(into, filter="data")
+        file.extraction_filter = getattr(tarfile, "data_filter", None)  # Python 3.11.4 and later have it
+        file.extractall(into)
     (sources,) = into.iterdir()
     for name in (LIBRARY, HEADER):
         shutil.copyfile(INTO / name, sources / "noack" / "core" / name)

@@ -200,10 +200,10 @@ class _Inequalities:
             first.sensor_error,
             first.input_error,
         )
-        known, functions = self._known(bounds), list[QuadraticFunction]()
-        for counts_age in (True, False)[: 1 + (self._conditions.hold_s > 0)]:
-            loop = self._error, self._plant, self._conditions, self._probability
-            functions = functions or quadratic_functions(LossyFlow(*loop, counts_age), known)
+        known, loop = self._known(bounds), (self._error, self._plant, self._conditions, self._probability)
+        functions = quadratic_functions(LossyFlow(*loop), known)
+        if not functions and self._conditions.hold_s > 0:
+            functions = quadratic_functions(LossyFlow(*loop, counts_age=False), known)
         for _ in range(_ROUNDS):
             before, bounds = bounds, self._improved(bounds, functions)
             if bounds.states[Output.STATE] > _SETTLED * before.states[Output.STATE]:
