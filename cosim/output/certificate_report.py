@@ -29,7 +29,6 @@ from noack.theory.random_losses.moments import UnlimitedLosses
 
 def print_certificates(console: Console, results: Certificates, chosen: Certificates | None = None) -> None:
     """Print the tables, and what is certified in a norm that noack chose instead."""
-    constants, *limits = certificate_tables(results)
     if results.nonlinear is not None:
         region = results.schedule_region
         if region is None or region.constants is None:
@@ -41,7 +40,11 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
             f"[yellow]the plant is not linear[/] ({escape(results.nonlinear)}): what follows is "
             f"certified for the linear plant ẋ = Âx + B̂u in its place{escape(own)}"
         )
-    console.print(terminal_table(constants))
+    constants, *limits = [*certificate_tables(results)] or [None]
+    if constants is None:
+        console.print(f"{_title(results)}: none", markup=False, highlight=False)
+    else:
+        console.print(terminal_table(constants))
     _print_notes(console, results)
     if any(results.setpoint or ()):
         console.print(
@@ -128,18 +131,26 @@ def _stability_in_words(results: Certificates) -> Iterator[str]:
     yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
 
 
-def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
-    """Yield the certified constants, and the largest certified times of the schedule."""
+def _title(results: Certificates) -> str:
     trigger = results.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
-    # A void region has a line below the table, and no column.
-    columns = [entry for entry in results if entry[1].constants or entry[1].scope != REGION]
-    certificates = [certificate for _, certificate in columns]
-    guarantee = certificates[0].conditions.guarantee  # its longest burst counts all rules
-    title = (
+    guarantee = results.paper.conditions.guarantee  # its longest burst counts all rules
+    return (
         f"{results.scenario.name}: certified bounds, "
         f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
+
+
+def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
+    """Yield the constants of the certificates that exist, and the largest times of the schedule.
+
+    Plants and conditions without a certificate have neither a column nor a row. Nothing is yielded
+    if there is none.
+    """
+    columns = [(under, certificate) for under, certificate in results if certificate.constants]
+    if not columns:
+        return
+    certificates = [certificate for _, certificate in columns]
     headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in columns)]
     printed = results.theorem_2 is not None
     headings += ["paper's\nTheorem 2"] if printed else []
@@ -149,18 +160,20 @@ def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
             certificates, results.theorem_2, policy_of(results.scenario).fading_per_s
         )
     ]
-    yield ResultTable("certificates", title, headings, rows)
-    if any(certificate.constants for certificate in certificates):
-        caption = (
-            f"{results.scenario.name}: how far each setting of the {SCHEDULE} can go alone before "
-            "the certificate is lost"
-        )
-        limits = [(scope, *map(_limit, limits)) for scope, limits in results.limits_by_scope.items()]
+    yield ResultTable("certificates", _title(results), headings, rows)
+    caption = (
+        f"{results.scenario.name}: how far each setting of the {SCHEDULE} can go alone before "
+        "the certificate is lost"
+    )
+    limits = [
+        (scope, *map(_limit, limits)) for scope, limits in results.limits_by_scope.items() if any(limits)
+    ]
+    if limits:
         yield ResultTable("limits", caption, LIMIT_HEADINGS, limits)
 
 
 def _print_notes(console: Console, results: Certificates) -> None:
-    """Explain the rows of the constants, and say why certificates are void."""
+    """Explain the rows of the constants, and say why there are no other certificates."""
     certificates = [certificate for _, certificate in results]
     if any(certificate.constants for certificate in certificates):
         console.print(
@@ -181,9 +194,13 @@ def _print_notes(console: Console, results: Certificates) -> None:
             "[dim]More than one bound holds at all times. The table has the one that tends to the "
             "smallest value; all are in the words below.[/]"
         )
+    reasons: dict[tuple[str, str], list[str]] = {}
     for under, certificate in results:
         if certificate.void:
-            console.print(f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}")
+            reasons.setdefault((certificate.scope, certificate.void), []).append(under)
+    for (scope, why), conditions in reasons.items():
+        console.print(f"[yellow]no certificate[/] ({' and '.join(conditions)}, {scope}): {escape(why)}")
+    for under, certificate in results:
         if certificate.region is not None:
             loop, region = loop_of(results.scenario), certificate.region
             limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
