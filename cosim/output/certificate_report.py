@@ -68,7 +68,7 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
     if not exists and chosen is None:
         share = "trigger.sigma, " if hasattr(results.scenario.trigger, "sigma") else ""
         console.print(
-            "[yellow]no certificate for the schedule[/], nor in another norm: raise "
+            "[yellow]no certificate for the schedule[/], nor in another norm, so no bound of ‖x‖: raise "
             f"plant.rate_hz and controller.rate_hz, or lower {share}network.mansd, the network's "
             "delay or certificate.late_periods; noack adversary shows what losses can do to it"
         )
@@ -120,15 +120,15 @@ def _stability_in_words(results: Certificates) -> Iterator[str]:
     """Yield what is known exactly about the stability of a time-triggered loop."""
     if (known := results.stability) is None:
         return
-    patterns = f"patterns with {results.scenario.network.guarantee.meaning}"
+    patterns = f"every loss pattern with {results.scenario.network.guarantee.meaning}"
     growth = f"growth per period {at_least(known.lower)} to {at_most(known.upper)}"
     text = {
-        "stable": f"all {patterns} are stable: {growth}",
-        "destabilised": f"the pattern {known.text} (D delivered, L lost), repeated, "
+        "stable": f"Proven stable for {patterns}: {growth}",
+        "destabilised": f"Not stable: the pattern {known.text} (D delivered, L lost), repeated, "
         f"destabilises the loop: {growth}",
-        "undecided": f"{growth} under the worst of all {patterns}",
+        "undecided": f"Not decided whether the loop is stable for {patterns}: {growth} under the worst one",
     }[known.verdict]
-    yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
+    yield f"{text}. This is without lateness; noack margin finds the limits."
 
 
 def _title(results: Certificates) -> str:

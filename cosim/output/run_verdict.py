@@ -325,7 +325,10 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
     if guarantee_of(loop).why.startswith("no certificate: the loop gain"):
-        yield "no bound is certified: noack certify says what would have to change"
+        yield (
+            "no bound of ‖x‖ is certified: noack certify says what would have to change; "
+            "noack margin, whether a time-triggered loop is proven stable"
+        )
     unchecked = any(claim.verdict == "void" and _is_late(loop, claim) for claim in loop.claims)
     if unchecked and not loop.missing_samples and summary.kind == "live" and not loop.restarts:
         culprit = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
