@@ -418,5 +418,6 @@ def sentences(unlimited: UnlimitedLosses) -> Iterator[str]:
     if unlimited.moments or unlimited.bursts:
         yield (
             "These are statements about many runs: one run cannot violate a mean. The "
-            "probabilities are bounds; a campaign shows the frequencies."
+            "probabilities are bounds; a campaign shows the frequencies, and with the metrics "
+            "final_norm and sup_e_c_scaled the means."
         )
