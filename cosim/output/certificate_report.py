@@ -40,18 +40,18 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
             f"[yellow]the plant is not linear[/] ({escape(results.nonlinear)}): what follows is "
             f"certified for the linear plant ẋ = Âx + B̂u in its place{escape(own)}"
         )
-    constants, *limits = [*certificate_tables(results)] or [None]
-    if constants is None:
-        console.print(f"{_title(results)}: none", markup=False, highlight=False)
+    tables = list(certificate_tables(results))
+    if tables:
+        console.print(terminal_table(tables[0]))
     else:
-        console.print(terminal_table(constants))
+        console.print(f"{_title(results)}: none", markup=False, highlight=False)
     _print_notes(console, results)
     if any(results.setpoint or ()):
         console.print(
             "[dim]x is the distance from the set-point, x − x_r. If the plant does not rest there, "
             "A x_r + B u_r is a disturbance: a step at the state.[/]"
         )
-    for table in limits:
+    for table in tables[1:]:
         console.print(terminal_table(table))
     if (outside := outside_box(results.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
