@@ -433,7 +433,8 @@ def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim])
         console.print(
             "[dim]share used: largest share of the bound reached during the run; a bound "
             "computed from the run itself is reached by construction. ε: the trigger's floor; t_k: "
-            "the k-th event; H = Â + B̂K, or 0 with a hold; β̃: bound of ‖e_s‖. Sources: (I1) and "
+            "the k-th event; H = Â + B̂K, or 0 with a hold; β̃: bound of the sensor's error; W: "
+            "trigger.weight. Sources: (I1) and "
             "certificates, docs/theory.md; eq:... and theorems, the paper[/]"
         )
     sources: dict[tuple[str, str], list[str]] = {}
