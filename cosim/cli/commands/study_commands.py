@@ -473,7 +473,7 @@ class StudyOptions(opt.ScenarioOptions):
             depth = depth._replace(draws=self.draws)
         if self.disturbance is not None:
             if not math.isfinite(self.disturbance):
-                raise CallerError(f"--disturbance {self.disturbance}: should be a finite number")
+                raise CallerError(f"--disturbance {self.disturbance}: expected a finite number")
             depth = depth._replace(amplitude=self.disturbance)
         return depth
 
