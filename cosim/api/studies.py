@@ -17,7 +17,7 @@ from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.runs import Run
-from cosim.api.scenarios import Source, load
+from cosim.api.scenarios import Source, load, plain_table
 from cosim.lazy_modules import lazy_modules
 from cosim.measurement.measurement_outputs import write_network
 from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions
@@ -345,7 +345,7 @@ def campaign(
     """
     if isinstance(source, Mapping):
         path = _TABLE
-        plan = toml_file.validated(campaign_file.Campaign, source, str(path))
+        plan = toml_file.validated(campaign_file.Campaign, plain_table(source), str(path))
     else:
         path = find_shipped(str(source), "campaigns")
         plan = campaign_file.load(path)
@@ -354,7 +354,13 @@ def campaign(
     try:
         bar, runs_folder = _runs_bar() if progress else None, Path(folder or temporary or "")
         finished = campaign_report.finish_campaign(
-            plan, path, runs_folder, start, draws=draws, show=lambda text: nullcontext(), bar=bar
+            plan,
+            path,
+            runs_folder,
+            start,
+            draws=None if draws is None else int(draws),  # it may be a number of NumPy
+            show=lambda text: nullcontext(),
+            bar=bar,
         )
     except BaseException:
         if temporary is not None:
