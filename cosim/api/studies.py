@@ -354,13 +354,7 @@ def campaign(
     try:
         bar, runs_folder = _runs_bar() if progress else None, Path(folder or temporary or "")
         finished = campaign_report.finish_campaign(
-            plan,
-            path,
-            runs_folder,
-            start,
-            draws=None if draws is None else int(draws),  # it may be a number of NumPy
-            show=lambda text: nullcontext(),
-            bar=bar,
+            plan, path, runs_folder, start, draws=draws, show=lambda text: nullcontext(), bar=bar
         )
     except BaseException:
         if temporary is not None:

@@ -304,7 +304,7 @@ def finish_campaign(
     with show("preparing the grid"):
         points = grid(plan, path)
     _, base = base_of(plan, path)
-    store = Store(folder, points, draws or plan.draws, plan.chunk)
+    store = Store(folder, points, int(draws or plan.draws), plan.chunk)  # also a number of NumPy
     with stop_requests_raised(), opened(plan, base, store):
         with workers() as runner, bar or nullcontext() as progress:
             new_runs = run_campaign(store, runner, progress)

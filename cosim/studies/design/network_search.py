@@ -398,6 +398,12 @@ class NetworkSearch:
             progress(0.3 + 0.6 * (number + 1) / len(pool))
         return original, original if best == original.candidate else self.completed(best, rung)
 
+    def by_hold(self) -> Iterator[tuple[str, str]]:
+        """Yield the hold strategies with the names of their highest rungs."""
+        for hold in self.holds:
+            rung = self.highest.get(hold, -1)
+            yield hold.text, self.ladder[rung].name if rung >= 0 else "nothing"
+
     def _improve(self, start: Candidate, rung: int, most: int) -> Candidate | None:
         """Return a loop near ``start`` whose lower bound is below 1 on a rung; None: none found."""
         from scipy.optimize import minimize  # slow to import
@@ -481,11 +487,6 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         hold, K = reached.candidate
         return {**figures, "mode": hold.mode, "hold": hold.text, "K": K, **bounds}
 
-    def by_hold() -> Iterator[tuple[str, str]]:
-        for hold in search.holds:
-            rung = search.highest.get(hold, -1)
-            yield hold.text, ladder[rung].name if rung >= 0 else "nothing"
-
     verdict = f"proven stable for every loss pattern: {reach(original)} before, {reach(best)} after"
     if best.candidate == original.candidate:
         verdict = f"{reach(best)} for the given loop; no better one was found"
@@ -495,7 +496,7 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         "cost_limit": search.limit,
         "tried": search.tried,
         "judged": search.judged,
-        "highest_by_hold": dict(by_hold()),
+        "highest_by_hold": dict(search.by_hold()),
     }
     return DesignOutcome(
         search.scenario.name,
@@ -509,7 +510,7 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         entry(original),
         entry(best),
         _figure(search, original, best),
-        tuple(by_hold()),
+        tuple(search.by_hold()),
     )
 
 
