@@ -290,7 +290,7 @@ def print_mean_cost(console: Console, cost: MeanCost) -> None:
     console.print(
         "[dim]The cost is ∫ xᵀQx + uᵀRu dt, between the samples, too; u: of the controller. "
         "Rms: stationary, what the loop tends to from any start, over time. Growth below 1: stable "
-        "in mean square.[/]"
+        "in mean square; z: the loop's state, x, x_c and the inputs in use.[/]"
     )
 
 
