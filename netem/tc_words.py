@@ -14,7 +14,7 @@ from typing import Annotated, NamedTuple, Self, TypeVar
 from pydantic import BeforeValidator, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 
 from netem.relay_links import LinkSpec
-from noack.core.errors import CallerError, shortened
+from noack.core.errors import CallerError, plain_mistake, shortened
 from noack.impairments.constraints import CONSTRAINTS, AnyConstraint
 from noack.impairments.feature import Constraint, Feature, Impairment
 from noack.impairments.kinds import IMPAIRMENTS, AnyImpairment
@@ -169,9 +169,11 @@ def _message(error: ValidationError) -> str:
     first = error.errors()[0]
     if first["type"] == "value_error":
         return str(first["ctx"]["error"])
-    name = next((f"{part} " for part in reversed(first["loc"]) if isinstance(part, str)), "")
-    problem = "is missing" if first["type"] == "missing" else first["msg"]
-    return name + problem.removeprefix("Input ").removeprefix("Tuple ")
+    name = next((part for part in reversed(first["loc"]) if isinstance(part, str)), "")
+    if first["type"] == "missing":
+        return f"{name} is missing"
+    problem = plain_mistake(first["msg"]).removeprefix("Tuple ")
+    return f"{name}: {problem}" if name else problem
 
 
 def _check_place(

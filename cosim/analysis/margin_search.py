@@ -173,13 +173,15 @@ class PeriodLimit(NamedTuple):
         """The limit in words."""
         apart = "updates at most" if self.is_longest else "an update every"
         if self.stability is None:
-            return f"stable for every pattern with {apart} {self.stable_s:g} s, the longest examined"
+            return (
+                f"proven stable for every loss pattern with {apart} {self.stable_s:g} s, the longest examined"
+            )
         longer = f"{apart} {self.unstable_s:g} s: undecided, {undecided_text(self.stability, 1.0)}"
         if self.stability.verdict == "destabilised":
             longer = f"{apart} {self.unstable_s:g} s: this pattern destabilises: {self.stability.text}"
         if self.stable_s is None:
             return f"no stable period was found; {longer}"
-        return f"stable for every pattern with {apart} {self.stable_s:g} s; {longer}"
+        return f"proven stable for every loss pattern with {apart} {self.stable_s:g} s; {longer}"
 
 
 @dataclass(frozen=True)
@@ -238,9 +240,11 @@ class MarginResult:
         stable_m = self.stable_m
         parts = []
         if stable_m is not None and self.every_m:
-            parts = [f"stable for every pattern that the constraints allow, with every M ≥ {stable_m}"]
+            parts = [
+                f"proven stable for every loss pattern that the constraints allow, with every M ≥ {stable_m}"
+            ]
         elif stable_m is not None:
-            parts = [f"stable for every pattern with M ≤ {stable_m}"]
+            parts = [f"proven stable for every loss pattern with M ≤ {stable_m}"]
         parts += [
             f"{guarantee.meaning}: undecided, {undecided_text(guarantee.stability, self.effort)}"
             for guarantee in self.compared.guarantees

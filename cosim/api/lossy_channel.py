@@ -110,9 +110,9 @@ class LossyChannel(
         super().__init__(env)
         scenario = require_stand_alone(_loaded(network))
         self._network, self._step_ns = scenario.network, _step_ns(env, step_s)
-        if seed is not None and (not isinstance(seed, int) or seed < 0):
+        if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
             raise CallerError(f"LossyChannel: seed = {seed!r}: must be a whole number, 0 or more")
-        self._seed = scenario.seeds.loss if seed is None else seed
+        self._seed = scenario.seeds.loss if seed is None else int(seed)
         self._episode, self._step, self._now_ns = -1, 0, 0
         self._sizes = [_size_bytes(env.observation_space), 0]
         self._first_action: UserCode = first_action

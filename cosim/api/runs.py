@@ -178,32 +178,40 @@ class Run:
         Raises:
             NoackError: the run has no such figure.
         """
+        return figure_drawing.draw(self._describe(figure))
+
+    def _describe(self, figure: str) -> "FigureDescription":
+        """Return a figure of the report; raise CallerError if the run has no such figure."""
         known = self._figures(bounded=figure in run_figures.BOUNDED)
         if figure not in known:
             raise CallerError(f'"{figure}": no such figure of this run; it has {", ".join(known)}')
-        return figure_drawing.draw(known[figure]())
+        return known[figure]()
 
     def save_figures(
         self,
         format: str = "pdf",  # noqa: A002
         width: str | float | None = None,
+        figure: str | None = None,
     ) -> list[Path]:
-        """Write all figures of the report into ``report-figures`` in the run directory.
+        """Write the figures of the report into ``report-figures`` in the run directory.
 
         Args:
             format: svg, png or pdf; a PDF has the fonts of LaTeX, which need not be installed.
             width: ``"column"`` (3.5 in), ``"page"`` (7.16 in), or inches; by default a column for
                 pdf, and 10 in for svg and png.
+            figure: only this one; the names are those of :meth:`plot`. By default all.
 
         Returns:
             The paths.
 
         Raises:
-            NoackError: there is no such format or width, or a file cannot be written.
+            NoackError: there is no such format, width or figure, or a file cannot be written.
         """
         page = self.directory / file_of_loop(REPORT_FILE, self._loop)
-        figures = (describe() for describe in self._figures(bounded=True).values())
         files = figure_format.figure_files(format, width)
+        if figure is not None:
+            return figure_files.save_figures([self._describe(figure)], page, files)
+        figures = (describe() for describe in self._figures(bounded=True).values())
         return figure_files.save_figures(figures, page, files)
 
     def save_tables(self, folder: Folder) -> list[Path]:

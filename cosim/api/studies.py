@@ -17,7 +17,7 @@ from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.runs import Run
-from cosim.api.scenarios import Source, load
+from cosim.api.scenarios import Source, load, plain_table
 from cosim.lazy_modules import lazy_modules
 from cosim.measurement.measurement_outputs import write_network
 from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions
@@ -345,7 +345,7 @@ def campaign(
     """
     if isinstance(source, Mapping):
         path = _TABLE
-        plan = toml_file.validated(campaign_file.Campaign, source, str(path))
+        plan = toml_file.validated(campaign_file.Campaign, plain_table(source), str(path))
     else:
         path = find_shipped(str(source), "campaigns")
         plan = campaign_file.load(path)

@@ -12,7 +12,7 @@ from copy import copy
 from dataclasses import fields, is_dataclass
 from functools import wraps
 from importlib import import_module
-from itertools import groupby
+from itertools import groupby, pairwise
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec, TextIO, TypeVar
@@ -25,7 +25,7 @@ from cosim.cli import commands
 from cosim.cli.options import find_scenario as find_scenario
 from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
-from noack.core.errors import ExitStatus, NoackError, printable, why
+from noack.core.errors import ExitStatus, NoackError, plain_mistake, printable, why
 from noack.core.process_limits import cores as cores
 from noack.core.process_limits import exhausted_limit
 from noack.runtime.command_line import StopRequestError, failed, stop_requests_raised
@@ -110,8 +110,8 @@ class Program(TyperGroup):
         message = printable(" ".join(error.format_message().split())).rstrip(".")
         if not message:
             return ""
-        message = message[0].lower() + message[1:].replace("Input should", "should")
-        message = message.replace("Value error, ", "").removeprefix("invalid value: ")
+        message = plain_mistake(message[0].lower() + message[1:]).replace("Value error, ", "")
+        message = _with_value(message.removeprefix("invalid value: "), words)
         name = next((word for word in words if word in self.commands), None)
         where, command = (f"{name}: ", f"{NAME} {name}") if name else ("", NAME)
         if near := getattr(error, "possibilities", None):
@@ -121,6 +121,17 @@ class Program(TyperGroup):
         if name and message.startswith("missing "):
             return f"{where}{message}, e.g. `{examples_of(self.commands[name])[0]}`"
         return f"{where}{message}; see `{command} --help`"
+
+
+def _with_value(message: str, words: Sequence[str]) -> str:
+    """Return a message about an option's value with this value: ``--late x: expected ...``."""
+    match = re.match(r"invalid value for '(-[-\w]+)'[^:]*: ", message)
+    if match is None:
+        return message
+    option = match[1]
+    joined = [word for word in words if word.startswith(f"{option}=")]
+    following = [f"{option} {word}" for before, word in pairwise(words) if before == option]
+    return f"{(joined + following or [option])[0]}: {message[match.end() :]}"
 
 
 def _refuse_empty(words: Sequence[str]) -> None:

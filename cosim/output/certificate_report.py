@@ -5,6 +5,7 @@ losses are not limited, what holds for random ones; :func:`print_margin` prints 
 time-triggered loop, :func:`print_mean_cost` its mean cost under random losses.
 """
 
+import math
 from collections.abc import Iterator
 
 from rich.console import Console
@@ -16,7 +17,7 @@ from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
 from noack.core.linear_systems import Matrix
-from noack.core.number_format import at_least, at_most, duration_at_least, number
+from noack.core.number_format import NONE, at_least, at_most, duration_at_least, number
 from noack.scenario.resolution import loop_of, policy_of
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
@@ -28,7 +29,6 @@ from noack.theory.random_losses.moments import UnlimitedLosses
 
 def print_certificates(console: Console, results: Certificates, chosen: Certificates | None = None) -> None:
     """Print the tables, and what is certified in a norm that noack chose instead."""
-    constants, *limits = certificate_tables(results)
     if results.nonlinear is not None:
         region = results.schedule_region
         if region is None or region.constants is None:
@@ -40,14 +40,18 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
             f"[yellow]the plant is not linear[/] ({escape(results.nonlinear)}): what follows is "
             f"certified for the linear plant ẋ = Âx + B̂u in its place{escape(own)}"
         )
-    console.print(terminal_table(constants))
+    tables = list(certificate_tables(results))
+    if tables:
+        console.print(terminal_table(tables[0]))
+    else:
+        console.print(f"{_title(results)}: none", markup=False, highlight=False)
     _print_notes(console, results)
     if any(results.setpoint or ()):
         console.print(
             "[dim]x is the distance from the set-point, x − x_r. If the plant does not rest there, "
             "A x_r + B u_r is a disturbance: a step at the state.[/]"
         )
-    for table in limits:
+    for table in tables[1:]:
         console.print(terminal_table(table))
     if (outside := outside_box(results.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
@@ -55,8 +59,7 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
     print_assumptions(console, (results.schedule_region or results.schedule).assumptions)
     console.print("assumptions of the paper's theorems:")
     print_assumptions(console, assumptions(results.scenario))
-    is_weighted = results.scenario.trigger.weight is not None
-    print_unlimited(console, results.unlimited, results.unpredictable, is_weighted=is_weighted)
+    _print_unlimited(console, results)
     for sentence in (*_in_words(results), *_stability_in_words(results)):
         console.print(sentence, markup=False, highlight=False)
     exists = results.schedule.constants is not None
@@ -65,7 +68,7 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
     if not exists and chosen is None:
         share = "trigger.sigma, " if hasattr(results.scenario.trigger, "sigma") else ""
         console.print(
-            "[yellow]no certificate for the schedule[/], nor in another norm: raise "
+            "[yellow]no certificate for the schedule[/], nor in another norm, so no bound of ‖x‖: raise "
             f"plant.rate_hz and controller.rate_hz, or lower {share}network.mansd, the network's "
             "delay or certificate.late_periods; noack adversary shows what losses can do to it"
         )
@@ -117,29 +120,37 @@ def _stability_in_words(results: Certificates) -> Iterator[str]:
     """Yield what is known exactly about the stability of a time-triggered loop."""
     if (known := results.stability) is None:
         return
-    patterns = f"patterns with {results.scenario.network.guarantee.meaning}"
+    patterns = f"every loss pattern with {results.scenario.network.guarantee.meaning}"
     growth = f"growth per period {at_least(known.lower)} to {at_most(known.upper)}"
     text = {
-        "stable": f"all {patterns} are stable: {growth}",
-        "destabilised": f"the pattern {known.text} (D delivered, L lost), repeated, "
+        "stable": f"Proven stable for {patterns}: {growth}",
+        "destabilised": f"Not stable: the pattern {known.text} (D delivered, L lost), repeated, "
         f"destabilises the loop: {growth}",
-        "undecided": f"{growth} under the worst of all {patterns}",
+        "undecided": f"Not decided whether the loop is stable for {patterns}: {growth} under the worst one",
     }[known.verdict]
-    yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
+    yield f"{text}. This is without lateness; noack margin finds the limits."
 
 
-def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
-    """Yield the certified constants, and the largest certified times of the schedule."""
+def _title(results: Certificates) -> str:
     trigger = results.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
-    # A void region has a line below the table, and no column.
-    columns = [entry for entry in results if entry[1].constants or entry[1].scope != REGION]
-    certificates = [certificate for _, certificate in columns]
-    guarantee = certificates[0].conditions.guarantee  # its longest burst counts all rules
-    title = (
+    guarantee = results.paper.conditions.guarantee  # its longest burst counts all rules
+    return (
         f"{results.scenario.name}: certified bounds, "
         f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
+
+
+def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
+    """Yield the constants of the certificates that exist, and the largest times of the schedule.
+
+    Plants and conditions without a certificate have neither a column nor a row. Nothing is yielded
+    if there is none.
+    """
+    columns = [(under, certificate) for under, certificate in results if certificate.constants]
+    if not columns:
+        return
+    certificates = [certificate for _, certificate in columns]
     headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in columns)]
     printed = results.theorem_2 is not None
     headings += ["paper's\nTheorem 2"] if printed else []
@@ -149,18 +160,20 @@ def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
             certificates, results.theorem_2, policy_of(results.scenario).fading_per_s
         )
     ]
-    yield ResultTable("certificates", title, headings, rows)
-    if any(certificate.constants for certificate in certificates):
-        caption = (
-            f"{results.scenario.name}: how far each setting of the {SCHEDULE} can go alone before "
-            "the certificate is lost"
-        )
-        limits = [(scope, *map(_limit, limits)) for scope, limits in results.limits_by_scope.items()]
+    yield ResultTable("certificates", _title(results), headings, rows)
+    caption = (
+        f"{results.scenario.name}: how far each setting of the {SCHEDULE} can go alone before "
+        "the certificate is lost"
+    )
+    limits = [
+        (scope, *map(_limit, limits)) for scope, limits in results.limits_by_scope.items() if any(limits)
+    ]
+    if limits:
         yield ResultTable("limits", caption, LIMIT_HEADINGS, limits)
 
 
 def _print_notes(console: Console, results: Certificates) -> None:
-    """Explain the rows of the constants, and say why certificates are void."""
+    """Explain the rows of the constants, and say why there are no other certificates."""
     certificates = [certificate for _, certificate in results]
     if any(certificate.constants for certificate in certificates):
         console.print(
@@ -181,9 +194,13 @@ def _print_notes(console: Console, results: Certificates) -> None:
             "[dim]More than one bound holds at all times. The table has the one that tends to the "
             "smallest value; all are in the words below.[/]"
         )
+    reasons: dict[tuple[str, str], list[str]] = {}
     for under, certificate in results:
         if certificate.void:
-            console.print(f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}")
+            reasons.setdefault((certificate.scope, certificate.void), []).append(under)
+    for (scope, why), conditions in reasons.items():
+        console.print(f"[yellow]no certificate[/] ({' and '.join(conditions)}, {scope}): {escape(why)}")
+    for under, certificate in results:
         if certificate.region is not None:
             loop, region = loop_of(results.scenario), certificate.region
             limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
@@ -273,7 +290,7 @@ def print_mean_cost(console: Console, cost: MeanCost) -> None:
     console.print(
         "[dim]The cost is ∫ xᵀQx + uᵀRu dt, between the samples, too; u: of the controller. "
         "Rms: stationary, what the loop tends to from any start, over time. Growth below 1: stable "
-        "in mean square.[/]"
+        "in mean square; z: the loop's state, x, x_c and the inputs in use.[/]"
     )
 
 
@@ -308,16 +325,14 @@ def mean_cost_tables(costs: MeanCost) -> Iterator[ResultTable]:
 
 _RARE = 1e-4
 """Rows are shown from this probability on, up to the first one that is exceeded less often."""
-_MOMENT = {1: "mean", 2: "root mean square"}
+_MOMENT = {1: "mean", 2: "rms"}
 
 
-def print_unlimited(
-    console: Console, unlimited: UnlimitedLosses | None, unpredictable: str | None, *, is_weighted: bool
-) -> None:
+def _print_unlimited(console: Console, results: Certificates) -> None:
     """Print what holds although the network does not limit the losses."""
-    if unpredictable is not None:
-        console.print(f"[yellow]no statement without the guarantee:[/] {unpredictable}")
-    if unlimited is None:
+    if results.unpredictable is not None:
+        console.print(f"[yellow]no statement without the guarantee:[/] {results.unpredictable}")
+    if (unlimited := results.unlimited) is None:
         return
     likely = [burst for burst in unlimited.bursts if burst.probability < 1 - _RARE]
     if (
@@ -341,52 +356,68 @@ def print_unlimited(
             ],
         )
         console.print(terminal_table(table, left=()))
-    for sentence in sentences(unlimited, is_weighted=is_weighted):
+    error = "‖W e_c‖" if results.scenario.trigger.weight is not None else "‖e_c‖"
+    beta = results.scenario.decaying.beta if unlimited.at_events else math.nan
+    if (table := moments_table(unlimited, error, beta)).rows:
+        console.print(terminal_table(table))
+    for sentence in sentences(unlimited):
         console.print(sentence, markup=False, highlight=False)
 
 
-def sentences(unlimited: UnlimitedLosses, *, is_weighted: bool) -> Iterator[str]:
-    """Yield what is certified about moments, and almost surely; e_c is in the trigger's norm."""
-    error, p = "‖W e_c‖" if is_weighted else "‖e_c‖", unlimited.largest_probability
-    losses = f"independent losses with probability {p:.4g}"
+def moments_table(unlimited: UnlimitedLosses, error: str, beta: float) -> ResultTable:
+    """Return the bounds of means and root mean squares; a bound that does not exist is a dash.
+
+    Args:
+        unlimited: what is certified without a limit of the losses.
+        error: how the norm of e_c is written, in the trigger's norm.
+        beta: β of the trigger, by which the bounds at events are multiplied.
+    """
+    bounds = [
+        *(("at every time", m.rate_per_s, m.order, m.state, m.controller_error) for m in unlimited.moments),
+        *(("largest of a run", m.rate_per_s, m.order, m.state, m.controller_error) for m in unlimited.runs),
+        *(
+            ("before an event", unlimited.paper_rate_per_s or 0.0, order, None, beta * value)
+            for order, value in enumerate(unlimited.at_events, start=1)
+        ),
+    ]
+    cells: dict[tuple[str, str], dict[str, str]] = {}
+    for label, rate_per_s, order, state, controller_error in bounds:
+        row = cells.setdefault((label, at_least(rate_per_s, 3)), {})
+        row[f"{_MOMENT[order]}\n{error}"] = at_most(controller_error)
+        if state is not None:
+            row[f"{_MOMENT[order]}\n‖x‖"] = at_most(state)
+    values = [f"{moment}\n{norm}" for norm in ("‖x‖", error) for moment in _MOMENT.values()]
+    losses = f"independent losses with probability {unlimited.largest_probability:.4g}"
     if not unlimited.is_independent:
-        losses = f"losses with probability at most {at_most(p)} given any past"
-    for run in unlimited.runs:
-        grown = f" e^({at_least(run.rate_per_s, 3)}t)" if run.rate_per_s else ""
-        left_out = at_most(1 - run.probability, 2)
+        losses = f"losses with probability at most {at_most(unlimited.largest_probability)} given any past"
+    return ResultTable(
+        "moments",
+        f"without the guarantee, {losses}: bounds of means over runs, multiplied by e^(−rate·t)",
+        ("", "rate,\n1/s", *values),
+        [(*key, *(row.get(value, NONE) for value in values)) for key, row in cells.items()],
+    )
+
+
+def sentences(unlimited: UnlimitedLosses) -> Iterator[str]:
+    """Yield the conditions of the bounds of means, and what is certified almost surely."""
+    if unlimited.runs:
+        run = unlimited.runs[0]
         yield (
-            f"Over runs of {unlimited.horizon_s:g} s, the {_MOMENT[run.order]} of a run's largest "
-            f"‖x‖{grown} is at most {at_most(run.state)}, that of {error}{grown} at most "
-            f"{at_most(run.controller_error)}. Runs with a burst of more than {run.most} losses, a share of "
-            f"at most {left_out}, count as 0 in it."
+            f"Largest of a run: in {unlimited.horizon_s:g} s. Runs with a burst of more than {run.most} "
+            f"losses, a share of at most {at_most(1 - run.probability, 2)}, count as 0."
         )
-    texts: dict[str, str] = {}
-    for moment in unlimited.moments:
-        decay = f" e^(−{at_least(moment.rate_per_s, 3)}t)" if moment.rate_per_s else ""
-        bounds = (
-            f"of ‖x‖ is at most {at_most(moment.state)}{decay}, that of {error} at most "
-            f"{at_most(moment.controller_error)}{decay}."
-        )
-        both = f"{texts[bounds]} and the " if bounds in texts else ""
-        texts[bounds] = f"{both}{_MOMENT[moment.order]}"
-    for bounds, names in texts.items():
-        yield f"Without the guarantee, {losses}: at every time t, the {names} {bounds}"
+    if unlimited.at_events:
+        yield "Before an event: under the paper's conditions (no sampling, no delay, no hold)."
     if unlimited.void is not None:
         order = _MOMENT[len(unlimited.moments) + 1]
-        yield f"Without the guarantee no {order} is certified: {unlimited.void}."
-    if unlimited.sure_rate_per_s is not None:
-        yield f"x decays almost surely: decay rate {at_least(unlimited.sure_rate_per_s, 3)} /s."
-    if unlimited.paper_rate_per_s is not None:
-        at = ", ".join(
-            f"{_MOMENT[order]} at most {at_most(value)}"
-            for order, value in enumerate(unlimited.at_events, start=1)
-        )
-        yield (
-            f"Under the paper's conditions {error} e^(αt)/β just before an event has a {at}, and x decays "
-            f"almost surely, at every rate below {at_least(unlimited.paper_rate_per_s, 3)} /s."
-        )
+        yield f"At every time no {order} is certified: {unlimited.void}."
+    rates = {"": unlimited.sure_rate_per_s, " under the paper's conditions": unlimited.paper_rate_per_s}
+    for conditions, rate_per_s in rates.items():
+        if rate_per_s is not None:
+            yield f"x decays almost surely{conditions}, at every rate below {at_least(rate_per_s, 3)} /s."
     if unlimited.moments or unlimited.bursts:
         yield (
             "These are statements about many runs: one run cannot violate a mean. The "
-            "probabilities are bounds; a campaign shows the frequencies."
+            "probabilities are bounds; a campaign shows the frequencies, and with the metrics "
+            "final_norm and sup_e_c_scaled the means."
         )

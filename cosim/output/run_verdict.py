@@ -325,7 +325,10 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
     if guarantee_of(loop).why.startswith("no certificate: the loop gain"):
-        yield "no bound is certified: noack certify says what would have to change"
+        yield (
+            "no bound of ‖x‖ is certified: noack certify says what would have to change; "
+            "noack margin, whether a time-triggered loop is proven stable"
+        )
     unchecked = any(claim.verdict == "void" and _is_late(loop, claim) for claim in loop.claims)
     if unchecked and not loop.missing_samples and summary.kind == "live" and not loop.restarts:
         culprit = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
@@ -430,7 +433,8 @@ def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim])
         console.print(
             "[dim]share used: largest share of the bound reached during the run; a bound "
             "computed from the run itself is reached by construction. ε: the trigger's floor; t_k: "
-            "the k-th event; H = Â + B̂K, or 0 with a hold; β̃: bound of ‖e_s‖. Sources: (I1) and "
+            "the k-th event; H = Â + B̂K, or 0 with a hold; β̃: bound of the sensor's error; W: "
+            "trigger.weight. Sources: (I1) and "
             "certificates, docs/theory.md; eq:... and theorems, the paper[/]"
         )
     sources: dict[tuple[str, str], list[str]] = {}

@@ -56,6 +56,32 @@ class NeverStartedError(NoackError):
         self.exit_status = exit_status
 
 
+_PLAIN = {
+    ", unable to parse string as a number": "",
+    ", unable to parse string as an integer": "",
+    "Input should have": "needs",
+    "Input should be": "expected",
+    "expected a valid number": "expected a number",
+    "expected a valid integer": "expected a whole number",
+    "expected a valid boolean": "expected true or false",
+    "expected a valid string": "expected a text, in quotes",
+    "expected greater than or equal to": "expected at least",
+    "expected less than or equal to": "expected at most",
+    "expected greater than": "expected more than",
+    "0.000000000000001": "1e-15",
+    "0.000001": "1e-6",
+}
+"""Words of pydantic, and plain ones, which are replaced in this order."""
+
+
+def plain_mistake(message: str) -> str:
+    """Return a message of pydantic or typer about a value in plain words: what is expected."""
+    message = message.removeprefix("Value error, ")
+    for words, plain in _PLAIN.items():
+        message = message.replace(words, plain)
+    return message
+
+
 def one_line(error: BaseException) -> str:
     """Return the message of a foreign error as one line."""
     return " ".join(str(error).split())

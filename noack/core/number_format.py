@@ -101,12 +101,12 @@ def _without_zeros(text: str) -> str:
 
 
 def plus_minus(mean: float, halfwidth: float) -> str:
-    """Write ``mean ± halfwidth``; only the mean if there is no interval.
+    """Write ``mean ± halfwidth``; only the mean if there is no interval, or only that of rounding.
 
     The half-width has two significant digits. The mean has as many decimals as the half-width:
     ``0.1594 ± 0.016`` is ``0.159 ± 0.016``.
     """
-    if not (math.isfinite(mean) and math.isfinite(halfwidth) and halfwidth > 0):
+    if not (math.isfinite(mean) and math.isfinite(halfwidth) and halfwidth > 10**-_NOISE * abs(mean)):
         return f"{mean:.{_ALONE}g}".replace("-", "−")
     last = _power(float(f"{halfwidth:.{_DIGITS - 1}e}")) - _DIGITS + 1
     if last + _DIGITS - 1 not in _FIXED or _power(mean) not in _FIXED:

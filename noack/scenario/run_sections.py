@@ -214,7 +214,7 @@ class LoopSection(ScenarioSection):
                 raise ValueError(f"{key}: all loops share it; set it at the top level")
         scenario = content.get("scenario") if isinstance(content, dict) else None
         if scenario is not None and not isinstance(scenario, str | dict):
-            raise ValueError("scenario: should be the name of a scenario file, in quotes")
+            raise ValueError("scenario: expected the name of a scenario file, in quotes")
         return content
 
     @model_validator(mode="after")

@@ -70,7 +70,7 @@ def require_finite(settings: ReadTable) -> None:
     """Raise CallerError if a value has a number that is not finite, which no message can carry."""
     for key, value in settings.items():
         if _contains(value, lambda entry: isinstance(entry, float) and not math.isfinite(entry)):
-            raise CallerError(f"{key} = {_text(value)}: should be a finite number")
+            raise CallerError(f"{key} = {_text(value)}: expected a finite number")
 
 
 def put_settings(content: Table, settings: ReadTable) -> None:

@@ -18,7 +18,7 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar, Union, ge
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from noack.core.errors import CallerError, did_you_mean, printable, shortened
+from noack.core.errors import CallerError, did_you_mean, plain_mistake, printable, shortened
 from noack.core.file_access import read_regular
 from noack.settings.section import ReadTable, ScenarioSection, Table
 
@@ -192,14 +192,15 @@ _PATTERNS = {
 _MOST_LINES = 50
 _SIMILAR = 0.8
 """Least similarity of a suggested key, or of its last part, as difflib measures it."""
-_MATRIX = "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]"
+_MATRIX = "expected a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]"
 _LISTS: dict[object, str] = {
-    float: "should be a list of numbers, e.g. [1.0, 0.0]",
-    int: "should be a list of numbers, e.g. [1, 2]",
-    str: 'should be a list of names, e.g. ["a", "b"]',
+    float: "expected a list of numbers, e.g. [1.0, 0.0]",
+    int: "expected a list of numbers, e.g. [1, 2]",
+    str: 'expected a list of names, e.g. ["a", "b"]',
     tuple: _MATRIX,
 }
 """By the type of the list's entries."""
+_WITH_UNIT = re.compile(r"\s*[-+]?\.?[0-9].*")
 _PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
 
 
@@ -249,7 +250,7 @@ def brief(error: ValidationError) -> str:
     """Return the first mistake, ``key: what is wrong``, without the value, which may be secret."""
     first = error.errors(include_url=False, include_input=False)[0]
     place = ".".join(map(str, first["loc"]))
-    message = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    message = plain_mistake(first["msg"])
     return printable(f"{place}: {message}" if place else message)
 
 
@@ -273,16 +274,19 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     if chosen and isinstance(value, Mapping):
         return _choice(key, value, place)
     if chosen or kind in ("model_type", "model_attributes_type", "dict_type"):
-        return f"{assignment}: should be a table{_table_example(value, place)}"
+        return f"{assignment}: expected a table{_table_example(value, place)}"
     if kind == "too_short":
         least = mistake["ctx"]["min_length"]
         return f"{assignment}: needs at least {'one entry' if least == 1 else f'{least} entries'}"
     if kind == "string_pattern_mismatch" and mistake["ctx"]["pattern"] in _PATTERNS:
         return f"{assignment}: {_PATTERNS[mistake['ctx']['pattern']]}"
     if kind == "tuple_type":
-        return f"{assignment}: {_LISTS.get(_entry_of(place), 'should be a list of tables')}"
-    message = mistake["msg"].replace("Input should", "should")
-    return f"{assignment}: {message[0].lower() + message[1:]}{_share(value, place)}"
+        return f"{assignment}: {_LISTS.get(_entry_of(place), 'expected a list of tables')}"
+    message = plain_mistake(mistake["msg"])
+    message = message[0].lower() + message[1:]
+    if isinstance(value, str) and _WITH_UNIT.fullmatch(value) and message.endswith("number"):
+        message += " alone, without a unit or quotes"
+    return f"{assignment}: {message}{_share(value, place)}"
 
 
 class _Place(NamedTuple):

@@ -326,8 +326,9 @@ def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: s
     growth = f" e^({symbol}t)" if rate else ""
     if sampled and _is_shaped(certificate):
         growth = ", scaled"
+    error = "‖W e_c‖" if certificate.weighted else "‖e_c‖"
     return {
-        Objective.ERROR: f"‖e_c‖{growth}" if sampled else f"Δ: ‖e_c‖{growth} / β",
+        Objective.ERROR: f"{error}{growth}" if sampled else f"Δ: {error}{growth} / β",
         Objective.STATE: f"‖x‖{growth}" if sampled else f"X: ‖x‖{growth}",
         Objective.COST: "∫ ‖x‖² dt",
         Objective.INTER_EVENT: "inter-event time, s",

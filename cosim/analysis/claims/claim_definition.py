@@ -83,6 +83,13 @@ def certified(
     return lambda find: CertifiedClaim(statement, find)
 
 
+def norm_text(run: RunEvidence, vector: str) -> str:
+    """Return how a formula writes the norm of an error, in the trigger's norm: ‖e_c‖ or ‖W e_c‖."""
+    if run.record.loop.weight is None:
+        return f"‖{vector}‖"
+    return f"‖W({vector})‖" if " − " in vector else f"‖W {vector}‖"
+
+
 def upper_shares(observed: Reals, bound: Reals) -> Reals:
     """Return the share of an upper bound that was reached, (k,); 0 if both values are 0."""
     shares = np.zeros(len(observed))

@@ -328,7 +328,7 @@ def _share_used(claims: Sequence[Claim]) -> float:
             for claim in claims
             if "certificate" in claim.source
             and claim.ratio is not None
-            and claim.bound.startswith(("‖e_c‖ ≤", "‖x‖ ≤"))
+            and claim.bound.startswith(("‖e_c‖ ≤", "‖W e_c‖ ≤", "‖x‖ ≤"))
         ),
         default=0.0,
     )

@@ -94,25 +94,30 @@ def report(
     *,
     again: Annotated[bool, Option("--again")] = False,
     figures: opt.FigureOptions,
+    figure: Annotated[str | None, Option("--figure", metavar="NAME")] = None,
     json: opt.JsonOption = False,
 ) -> None:
     """Print the path of a run's report (one HTML page with all figures); write it if missing.
 
     Options:
         again: Write the report again, even if there is one.
+        figure: Write only this figure, e.g. states, errors, state-norm, input or inter-event.
 
     Examples:
         noack report   the report of the last run
         noack report --format pdf   with its figures for a paper
+        noack report --format svg --figure errors   with one of its figures
         noack report runs/latest --json   print the path as JSON
     """
     files = figures.files  # refuses a wrong width before anything is drawn
+    if figure is not None and files is None:
+        raise CallerError(f"--figure {figure}: give the format of its file, too, e.g. --format svg")
     with cli.status("writing the report"):
         path, drawn = finalize.run_report(run.path, run.loop, again=again), []
     if files is not None:
         whole_run = run_library.open_run(run.path)
         loop_run = whole_run if run.loop is None else whole_run.loops[run.loop]
-        drawn = loop_run.save_figures(files.kind, files.width_in)
+        drawn = loop_run.save_figures(files.kind, files.width_in, figure)
     written = {"figures": [str(figure) for figure in drawn]} if drawn else {}
     cli.print_lines(json, {"report": str(path)} | written, path, *drawn)
 

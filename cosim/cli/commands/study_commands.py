@@ -358,7 +358,7 @@ def design(
             raise CallerError(f"--settling, --gain: are not for --for {network.aim.value}")
         page = files.page_of(f"{loaded.name}-network")
         wish = network.wish(feedback.matrices(loaded), requirements.bounds())
-        with progress.work_bar("trying gains") as bar:
+        with progress.work_bar("trying gains", lines=True) as bar:
             outcome = event_design.design_for_network(loaded, wish, seed, bar)
         written = design_page.write_outcome(outcome, page, figure_files)
         written += files.write(outcome.written()) if outcome.is_certified else []
@@ -386,9 +386,9 @@ def _trigger_of(
     """Choose the trigger with the fewest transmissions that meets the limits."""
     loaded.decaying  # noqa: B018 - raises for another policy
     norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
-    with progress.work_bar("choosing norms") as bar:
+    with progress.work_bar("choosing norms", lines=True) as bar:
         families = design_space.families_of(loaded, norms, feedback.regulator(loaded), bar)
-    with progress.work_bar("trying candidates") as bar:
+    with progress.work_bar("trying candidates", lines=True) as bar:
         return design_search.design(families, limits, draws=draws, seed=seed, progress=bar)
 
 
@@ -473,7 +473,7 @@ class StudyOptions(opt.ScenarioOptions):
             depth = depth._replace(draws=self.draws)
         if self.disturbance is not None:
             if not math.isfinite(self.disturbance):
-                raise CallerError(f"--disturbance {self.disturbance}: should be a finite number")
+                raise CallerError(f"--disturbance {self.disturbance}: expected a finite number")
             depth = depth._replace(amplitude=self.disturbance)
         return depth
 

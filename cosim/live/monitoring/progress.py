@@ -153,10 +153,27 @@ def _bar(
 
 
 @contextmanager
-def work_bar(description: str) -> Iterator[Callable[[float], None]]:
-    """Show the completed share of some work."""
-    with _bar(error_console(), 1.0, description=description) as update:
-        yield lambda share: update(completed=share)
+def work_bar(description: str, *, lines: bool = False) -> Iterator[Callable[[float], None]]:
+    """Show the completed share of some work, and an estimate of the remaining time.
+
+    Where there is no terminal, print them as a line at intervals if ``lines``.
+    """
+    console, began_s = error_console(), time.monotonic()
+    line_s = began_s
+    columns = TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()
+    with _bar(console, 1.0, *columns, description=description) as update:
+
+        def show(share: float) -> None:
+            nonlocal line_s
+            update(completed=share)
+            now_s = time.monotonic()
+            if lines and not console.is_terminal and 0 < share < 1 and now_s - line_s >= _LINE_EVERY_S:
+                line_s, spent_s = now_s, now_s - began_s
+                left = f"about {spent_s / share - spent_s:.0f} s left"
+                line = f"noack: {description}: {100 * share:.0f} % after {spent_s:.0f} s, {left}"
+                console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+        yield show
 
 
 @contextmanager

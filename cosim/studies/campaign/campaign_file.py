@@ -34,7 +34,7 @@ Settings = Annotated[dict[str, JsonValue], Field(min_length=1)]
 def _require_scalar(value: object) -> object:
     if isinstance(value, list | dict):
         raise ValueError(
-            "should be a number, a text, true or false; for matrices and tables use variants, "
+            "expected a number, a text, true or false; for matrices and tables use variants, "
             'e.g. variants = { "small" = { "trigger.weight" = [[1, 0], [0, 1]] } }'
         )
     return value
@@ -264,7 +264,7 @@ class Term(NamedTuple):
             return cls(None, None, float(text))
         except ValueError:
             names = ", ".join(METRICS)
-            raise ValueError(f"holds: {text.strip()}: should be a number or one of {names}") from None
+            raise ValueError(f"holds: {text.strip()}: expected a number or one of {names}") from None
 
 
 class Claim(ScenarioSection):

@@ -136,7 +136,7 @@ def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
 def _scaled(entries: object, value: int, source: str) -> list[Table]:
     """Return the entries of [[loops]] with so many loops in all, in the same proportions."""
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise CallerError(f"{source}: loops: should be a list of tables")
+        raise CallerError(f"{source}: loops: expected a list of tables")
     if len(entries) == 1:
         return [entries[0] | {"count": value}]
     counts = [entry.get("count", 1) for entry in entries]
@@ -147,7 +147,7 @@ def _scaled(entries: object, value: int, source: str) -> list[Table]:
         pairs = zip(entries, counts, strict=True)
         names = ", ".join(f"{count} {entry.get('name')}" for entry, count in pairs)
         raise CallerError(
-            f"{source}: loops = {value}: should be a multiple of {least}, to keep the proportions "
+            f"{source}: loops = {value}: expected a multiple of {least}, to keep the proportions "
             f"of [[loops]]: {names}"
         )
     total = sum(counts)

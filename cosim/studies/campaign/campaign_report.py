@@ -66,7 +66,7 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
         (*result.point.labels.values(), *(written(result.estimates.get(name)) for name in metric_names))
         for result in summary.results
     ]
-    title = f"{campaign.name}: {summary.draws:,} draws; mean ± half-width"
+    title = f"{campaign.name}: {summary.draws:,} draws; mean ± half-width of its 95 % interval"
     yield ResultTable("campaign", title, headings, means)
     if campaign.compare is not None:
         differences = []
@@ -127,8 +127,9 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
         if full_table.name == "claims":
             console.print(terminal_table(full_table, left=range(3)))
             continue
-        table = full_table._replace(rows=full_table.rows[:_MOST_ROWS])
-        for part in split_table(table, len(campaign.axes), console.width):
+        table, names = without_constants(full_table, len(campaign.axes))
+        table = table._replace(rows=table.rows[:_MOST_ROWS])
+        for part in split_table(table, names, console.width):
             console.print(part)
         if (surplus := len(full_table.rows) - _MOST_ROWS) > 0:
             console.print(f"and {surplus} more grid points: see the page")
@@ -145,6 +146,26 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
     if len(remarks) > _MOST_REMARKS:
         console.print(f"and at {len(remarks) - _MOST_REMARKS} more grid points: see the page")
     console.print(_verdict(summary), style="bold red" if summary.breaches else "bold")
+
+
+def without_constants(table: ResultTable, names: int) -> tuple[ResultTable, int]:
+    """Move columns with the same text in all rows to the caption; return how many labels are left.
+
+    The first ``names`` columns are labels. A table of one row is returned as it is, as is one in
+    which no other column varies.
+    """
+    columns = list(zip(*table.rows, strict=True))
+    varying = [i for i, column in enumerate(columns) if len(set(column)) > 1]
+    if len(varying) == len(columns) or all(i < names for i in varying):
+        return table, names
+    constants = (f"{table.headings[i]} {columns[i][0]}" for i in range(len(columns)) if i not in varying)
+    left = ResultTable(
+        table.name,
+        f"{table.caption}; everywhere {', '.join(constants)}",
+        [table.headings[i] for i in varying],
+        [[row[i] for i in varying] for row in table.rows],
+    )
+    return left, sum(i < names for i in varying)
 
 
 def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
@@ -283,7 +304,7 @@ def finish_campaign(
     with show("preparing the grid"):
         points = grid(plan, path)
     _, base = base_of(plan, path)
-    store = Store(folder, points, draws or plan.draws, plan.chunk)
+    store = Store(folder, points, int(draws or plan.draws), plan.chunk)  # also a number of NumPy
     with stop_requests_raised(), opened(plan, base, store):
         with workers() as runner, bar or nullcontext() as progress:
             new_runs = run_campaign(store, runner, progress)

@@ -405,7 +405,7 @@ def require_counts(counts: Sequence[int], least: int) -> tuple[int, ...]:
             raise CallerError(f"--loops {count}: numbers of loops are at least 1")
         if count % least:
             raise CallerError(
-                f"--loops {count}: should be a multiple of {least}, to keep the proportions of "
+                f"--loops {count}: expected a multiple of {least}, to keep the proportions of "
                 "[[loops]]; or study one kind, e.g. --set 'loops=[{ name = \"p\" }]'"
             )
     return tuple(sorted({*counts, *([1] if least == 1 else [])}))

@@ -46,6 +46,8 @@ _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
 _DESIGNED = "_designed"
 _LOOP_HEADINGS = ("", "given", "designed")
+_HOLD_HEADINGS = ("between updates", "no destabilising pattern found for")
+_HOLD_CAPTION = "best loop tried with each hold strategy (proven is only what the designed loop tolerates)"
 
 
 def write_page(result: DesignResult, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
@@ -185,6 +187,9 @@ class DesignOutcome:
     """The given loop as JSON."""
     best: dict[str, object]
     figure: FigureDescription
+    by_hold: tuple[tuple[str, str], ...] = ()
+    """Hold strategies that were tried, each with the most for which no pattern destabilises its best
+    loop, as far as was searched."""
 
     @property
     def lines(self) -> str:
@@ -244,7 +249,13 @@ def write_outcome(outcome: DesignOutcome, path: Path, figure_files: FigureFiles 
         MachineError: they cannot be written.
     """
     page = templates(Path(__file__).parent).get_template("network.html.jinja")
-    html = page.render(outcome=outcome, headings=_LOOP_HEADINGS, scenario_toml=outcome.written())
+    html = page.render(
+        outcome=outcome,
+        headings=_LOOP_HEADINGS,
+        hold_headings=_HOLD_HEADINGS,
+        hold_caption=_HOLD_CAPTION,
+        scenario_toml=outcome.written(),
+    )
     return [write_whole(path, html), *save_figures([outcome.figure], path, figure_files)]
 
 
@@ -253,6 +264,9 @@ def print_design(console: Console, outcome: DesignOutcome) -> None:
     title = f"{outcome.name}: loops under the worst losses"
     table = ResultTable("design", title, _LOOP_HEADINGS, outcome.rows)
     console.print(terminal_table(table, left=range(3)))
+    if len(outcome.by_hold) > 1:
+        table = ResultTable("holds", _HOLD_CAPTION, _HOLD_HEADINGS, outcome.by_hold)
+        console.print(terminal_table(table))
     lines = [outcome.verdict, *outcome.notes]
     if outcome.is_certified:
         lines.append(f"for the scenario:\n{outcome.lines.rstrip()}")

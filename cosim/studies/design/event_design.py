@@ -212,10 +212,15 @@ class EventSearch:
         order = sorted(range(len(starts)), key=lambda number: values[number])[:_STARTS]
         best, value = starts[order[0]], values[order[0]]
         for number, index in enumerate(order):
-            improved, reached = self._improve(starts[index], self.wish.effort // (10 * _STARTS))
+
+            def improving(share: float, number: int = number) -> None:
+                progress(0.3 + 0.6 * (number + share) / len(order))
+
+            most = self.wish.effort // (10 * _STARTS)
+            improved, reached = self._improve(starts[index], most, improving)
             if reached < value:
                 best, value = improved, reached
-            progress(0.3 + 0.6 * (number + 1) / len(order))
+            improving(1.0)
         if value >= min(values[0], 0.0):  # no better than the given loop, or beyond a limit
             best = self.original
         original, chosen = (
@@ -224,15 +229,17 @@ class EventSearch:
         )
         return original, chosen
 
-    def _improve(self, start: EventLoop, most: int) -> tuple[EventLoop, float]:
+    def _improve(self, start: EventLoop, most: int, progress: Progress) -> tuple[EventLoop, float]:
         from scipy.optimize import minimize  # slow to import
 
         centre = np.array([*np.ravel(start.K), start.alpha_per_s, start.beta])
         scale = np.append(scaled_steps(np.array(start.K)), centre[-2:])
-        best, value = start, math.inf
+        best, value, tries = start, math.inf, 0
 
         def objective(steps: Vector) -> float:
-            nonlocal best, value
+            nonlocal best, value, tries
+            tries += 1
+            progress(min(tries / most, 1.0))
             moved = centre + scale * steps
             moved[-2:] = centre[-2:] * np.exp(steps[-2:])
             loop = _rounded(moved[:-2], start, *moved[-2:].tolist())

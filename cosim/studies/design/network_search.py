@@ -221,6 +221,8 @@ class NetworkSearch:
         self.limit = wish.cost * base
         """Largest cost; infinite if the given loop is unstable without losses."""
         self.tried = self.judged = 0
+        self.highest: dict[Hold, int] = {}
+        """By hold strategy: the highest rung on which a loop was tried and is not excluded."""
         self._graphs: dict[tuple[LossGuarantee, int, Hold, int], PatternGraph] = {}
 
     def quick_loop(self, candidate: Candidate, period_ns: int) -> QuickLoop:
@@ -268,6 +270,8 @@ class NetworkSearch:
             if not math.isfinite(cost) or not math.isfinite(growth):
                 return _UNSTABLE / 2 + min(max(growth, 0.0), _UNSTABLE / 4)
         if cost <= self.limit:
+            if growth < -_SLACK:
+                self.highest[candidate.hold] = max(rung, self.highest.get(candidate.hold, -1))
             return growth
         return max(growth, -_SLACK) + _SLACK + math.log(cost / self.limit)
 
@@ -369,6 +373,9 @@ class NetworkSearch:
                     best, rung = candidate, reached
         progress(0.3)
         first_of_each = {candidate.hold: candidate for _, _, candidate in reversed(ranked)}
+        for hold, candidate in first_of_each.items():
+            if hold not in self.highest:  # it was tried from the given loop's rung on
+                self.climb(candidate, 0)
         pool = [best] if rung >= 0 else []
         pool += [candidate for _, _, candidate in ranked[:_STARTS]]
         pool = list(dict.fromkeys([*pool, *first_of_each.values()]))
@@ -390,6 +397,12 @@ class NetworkSearch:
                 best, rung = candidate, reached
             progress(0.3 + 0.6 * (number + 1) / len(pool))
         return original, original if best == original.candidate else self.completed(best, rung)
+
+    def by_hold(self) -> Iterator[tuple[str, str]]:
+        """Yield the hold strategies with the names of their highest rungs."""
+        for hold in self.holds:
+            rung = self.highest.get(hold, -1)
+            yield hold.text, self.ladder[rung].name if rung >= 0 else "nothing"
 
     def _improve(self, start: Candidate, rung: int, most: int) -> Candidate | None:
         """Return a loop near ``start`` whose lower bound is below 1 on a rung; None: none found."""
@@ -474,7 +487,7 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         hold, K = reached.candidate
         return {**figures, "mode": hold.mode, "hold": hold.text, "K": K, **bounds}
 
-    verdict = f"stable for every loss pattern: {reach(original)} before, {reach(best)} after"
+    verdict = f"proven stable for every loss pattern: {reach(original)} before, {reach(best)} after"
     if best.candidate == original.candidate:
         verdict = f"{reach(best)} for the given loop; no better one was found"
     document: dict[str, object] = {
@@ -483,6 +496,7 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         "cost_limit": search.limit,
         "tried": search.tried,
         "judged": search.judged,
+        "highest_by_hold": dict(search.by_hold()),
     }
     return DesignOutcome(
         search.scenario.name,
@@ -496,6 +510,7 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         entry(original),
         entry(best),
         _figure(search, original, best),
+        tuple(search.by_hold()),
     )
 
 

@@ -404,7 +404,7 @@ def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:
         return model
     gain_rows = document["gain"]
     if not isinstance(gain_rows, list) or not all(isinstance(row, list) for row in gain_rows):
-        raise CallerError(f"{plant}: gain: should be a list of rows")
+        raise CallerError(f"{plant}: gain: expected a list of rows")
     rows = [vector("gain", row, len(model.A), "states") for row in gain_rows]
     if len(rows) != model.plant.m:
         raise CallerError(f"{plant}: gain: {len(rows)} rows; the plant has {model.plant.m} inputs")

@@ -20,7 +20,7 @@ from noack.scenario.scenario_file import load
 if TYPE_CHECKING:
     from rich.console import Console
 
-_STYLES = {"reproduced": "green", "differs": "red"}
+_STYLES = {"reproduced": "green", "agrees": "green", "differs": "red"}
 
 
 class Row(NamedTuple):
@@ -41,8 +41,10 @@ class Row(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """The row's result, in words."""
-        return "reproduced" if self.agrees else "differs"
+        """``reproduced`` (a value), ``agrees`` (with a statement, as an inequality), or ``differs``."""
+        if not self.agrees:
+            return "differs"
+        return "reproduced" if self.relation == "=" else "agrees"
 
     @property
     def as_expected(self) -> bool:
@@ -96,10 +98,12 @@ class Reproduction(NamedTuple):
 
 def print_rows(console: "Console", reproduction: Reproduction) -> None:
     """Print published against computed, and what is to be known about it."""
-    console.print(terminal_table(reproduction.table, left=range(3), styles=_STYLES, dense=True))
+    quantity, where, _, *values = reproduction.table.headings
+    narrow = reproduction.table._replace(headings=[quantity, where, "", *values])
+    console.print(terminal_table(narrow, left=range(3), styles=_STYLES, dense=True))
     for remark in reproduction.remarks():
         console.print(remark, markup=False, highlight=False)
-    verdict = f"{sum(row.agrees for row in reproduction.rows)} of {len(reproduction.rows)} reproduced"
+    verdict = f"{sum(row.agrees for row in reproduction.rows)} of {len(reproduction.rows)} agree"
     console.print(verdict, style="bold" if reproduction.as_expected else "bold red", highlight=False)
 
 

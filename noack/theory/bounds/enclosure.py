@@ -461,7 +461,7 @@ def _ranks(singular: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np
 
 def _propagate(generator: Matrix, state: Matrix, step_s: Stack, cells: int) -> Stack:
     """Return e^{G k s} state for k = 0 … cells, (…, cells + 1, n, r), block by block."""
-    generator, step_s = np.asarray(generator, dtype=np.float64), np.asarray(step_s)
+    generator, step_s = np.asarray(generator, np.float64), np.asarray(step_s, np.float64)
     powers, leap = _powers(
         generator.tobytes(), generator.shape, step_s.tobytes(), step_s.shape, min(_BLOCK, cells)
     )

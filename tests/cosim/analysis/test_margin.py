@@ -89,7 +89,7 @@ def test_events_at_unknown_times() -> None:
     printed = invoke("margin", "double_integrator", *DEADLINE, "--no-period")
     assert "with updates 0.2 to 0.8 s apart" in " ".join(printed.output.split())
     words = ["margin", "lane_periodic", "--no-period", "--most", "2"]
-    assert "stable for every pattern with M ≤ 2" in invoke(*words).output
+    assert "proven stable for every loss pattern with M ≤ 2" in invoke(*words).output
 
 
 def test_a_loop_that_no_m_keeps_stable_and_a_pattern_without_times() -> None:

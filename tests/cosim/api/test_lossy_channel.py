@@ -161,6 +161,7 @@ class NoStep(Clock):
     (Clock, HALF, {"step_s": "x"}, "step_s = 'x': must be a time in seconds"),
     (Clock, HALF, {"step_s": float("nan")}, "step_s = nan: must be a time in seconds"),
     (Clock, HALF, {"seed": 1.5}, "seed = 1.5: must be a whole number"),
+    (Clock, HALF, {"seed": np.int64(-1)}, "must be a whole number, 0 or more"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(env: Any, network: Any, given: Any, why: str) -> None:
     with pytest.raises(CallerError, match=why) as caught:

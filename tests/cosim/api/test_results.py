@@ -56,6 +56,19 @@ def test_the_page_the_summary_and_the_figures_are_there(result: noack.CampaignRe
     assert "<table>" in result._repr_html_()
 
 
+def test_numbers_may_be_those_of_numpy(result: noack.CampaignResult) -> None:
+    axes = [PLAN["axes"][0], PLAN["axes"][1] | {"values": np.array([0.2, 0.8])}]
+    plan = PLAN | {"axes": axes, "settings": {"horizon_s": np.float32(5)}, "draws": np.int64(30)}
+    again = noack.campaign(plan, draws=np.int64(30), workers=np.int64(1))
+    assert again.summary == result.summary
+    assert again.draws(mode="hold", loss=np.float64(0.8)).num_rows == 30
+    found, same = (
+        noack.margin("lane_periodic", most_m=m, accuracy=accuracy, period=False).caps[-1].stability.lower
+        for m, accuracy in ((np.int64(2), np.float64(1e-3)), (2, 1e-3))
+    )
+    assert found == same
+
+
 def test_what_is_not_there_is_named(result: noack.CampaignResult) -> None:
     with pytest.raises(noack.NoackError, match=r"loss is one of 0\.2, 0\.8"):
         result.draws(mode="model", loss=0.3)

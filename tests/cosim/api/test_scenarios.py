@@ -24,7 +24,7 @@ def test_files_are_found_relative_to_the_scenario(
     ("settings", "message"),
     [
         ({"network.loss.probabilty": 0.8}, "did you mean probability?"),
-        ({"network.loss.probability": 1.8}, "settings: network.loss.probability = 1.8: should be"),
+        ({"network.loss.probability": 1.8}, "settings: network.loss.probability = 1.8: expected"),
         ({"horizon_s": None}, "settings: horizon_s: missing (simulated length of the run)"),
         ({"horizon_s.x": 1}, "settings: horizon_s.x: horizon_s is not a table"),
         ({"plant.initial_state": np.zeros(3)}, "plant.initial_state"),

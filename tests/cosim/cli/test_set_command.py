@@ -99,7 +99,7 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
         assert control_plane.find_run(run_dir=Path(ticket.run_dir)).run_dir == ticket.run_dir
         with pytest.raises(CallerError, match="no run is active in session 'none'; active: "):
             control_plane.find_run(session="none")
-        with pytest.raises(CallerError, match="probability = nan: should be a finite number"):
+        with pytest.raises(CallerError, match="probability = nan: expected a finite number"):
             control_plane.request_change(control_plane.find_run(session="lab"), parsed(["loss.p", "nan"]))
     assert list(path.parent.iterdir()) == []
 

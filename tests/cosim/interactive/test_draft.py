@@ -137,9 +137,9 @@ def test_a_wrong_text_stays_as_it_is_typed_and_is_named_at_its_field() -> None:
     with pytest.raises(DraftError) as caught:
         _ = draft.scenario
     assert by_field(form_of(draft), caught.value.mistakes) == {
-        "trigger.beta": "should be a valid number",
-        "plant.initial_state": "should be a valid number",
-        "network.mansd": "should be greater than or equal to 0",
+        "trigger.beta": "expected a number",
+        "plant.initial_state": "expected a number",
+        "network.mansd": "expected at least 0",
     }
 
 

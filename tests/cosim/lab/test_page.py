@@ -84,7 +84,7 @@ def test_a_mistake_in_the_form_is_shown_at_its_field(browser: Browser, address: 
     page.fill("trigger.beta", "abc")
     wrong = "[...document.querySelectorAll('[aria-invalid=true]')].map(e => e.id + ': ' + "
     wrong += "e.nextSibling.innerText).join('|')"
-    page.wait(f"{wrong} === 'lab-field-trigger.beta: should be a valid number'")
+    page.wait(f"{wrong} === 'lab-field-trigger.beta: expected a number'")
     assert page.js("document.getElementById('lab-field-trigger.beta').value") == "abc"
     page.fill("trigger.beta", "0.25")
     page.wait(f"{wrong} === '' && location.search.includes('trigger.beta=0.25')")

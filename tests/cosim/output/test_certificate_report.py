@@ -14,9 +14,10 @@ from scipy.linalg import expm
 
 from cosim.analysis.certificates import Certificates, certificates_of, with_weight
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.output.certificate_report import sentences
+from cosim.output.certificate_report import moments_table, sentences
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
+from noack.core.number_format import at_most
 from noack.scenario.resolution import loop_of
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -212,17 +213,28 @@ def test_without_a_cap_the_mean_at_events_in_the_chosen_norm_is_beta_over_1_minu
         assert shorter.probability < longer.probability
         assert shorter.state < longer.state
     gain = "the loop gain of the moments is 1.32, not below 1"
-    void, *_ = sentences(
-        replace(found, runs=(), moments=(), void=gain, sure_rate_per_s=None), is_weighted=False
-    )
-    assert void == f"Without the guarantee no mean is certified: {gain}."
-    run = found.runs[0]._replace(controller_error=1.00001)
-    moment = found.moments[0]._replace(controller_error=2.00001)
-    found = replace(found, runs=(run,), moments=(moment,))
-    of_run, of_moment, *_ = sentences(found, is_weighted=True)
-    assert re.search(r"‖W e_c‖.* at most 1\.001\. Runs", of_run)
-    assert re.search(r"‖W e_c‖ at most 2\.001( e|\.)", of_moment)
-    assert not any("‖W" in sentence for sentence in sentences(found, is_weighted=False))
+    texts = list(sentences(replace(found, moments=(), void=gain, sure_rate_per_s=None)))
+    assert f"At every time no mean is certified: {gain}." in texts
+
+
+def test_the_bounds_of_means_are_one_table_with_rounding_up(without_a_cap: Certificates) -> None:
+    found = without_a_cap.unlimited
+    assert found is not None
+    runs = tuple(run._replace(controller_error=1.00001 + run.order) for run in found.runs)
+    rare = found.moments[0]._replace(order=2, rate_per_s=0.125, state=7.00001)
+    found = replace(found, runs=runs, moments=(found.moments[0], rare), at_events=(1.5, 2.00001))
+    table = moments_table(found, "‖W e_c‖", beta=0.5)
+    assert table.headings == (
+        "", "rate,\n1/s", "mean\n‖x‖", "rms\n‖x‖", "mean\n‖W e_c‖", "rms\n‖W e_c‖",
+    )  # fmt: skip
+    at_mean_rate, at_rms_rate, of_run, at_event = (tuple(row) for row in table.rows)
+    mean = found.moments[0]
+    assert at_mean_rate == (
+        "at every time", "0.25", at_most(mean.state), "-", at_most(mean.controller_error), "-",
+    )  # fmt: skip
+    assert at_rms_rate[:4] == ("at every time", "0.125", "-", "7.001")
+    assert (of_run[0], *of_run[4:]) == ("largest of a run", "2.001", "3.001")
+    assert at_event == ("before an event", "0.25", "-", "-", "0.75", "1.001")
 
 
 def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_stated(

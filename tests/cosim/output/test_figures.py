@@ -211,6 +211,9 @@ def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: 
     run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}))
     names = {path.stem for path in run.save_figures("svg")}
     assert names == {"errors", "input", "inter-event", "losses", "state-norm", "states"}
+    assert [path.name for path in run.save_figures("png", figure="losses")] == ["losses.png"]
+    with pytest.raises(CallerError, match='"loss": no such figure of this run; it has states, '):
+        run.save_figures("png", figure="loss")
     with pytest.raises(CallerError, match='"eps": a figure is saved as svg, png, pdf'):
         run.save_figures("eps")
     with pytest.raises(CallerError, match=r"figure\.eps: a figure is saved as \.svg"):

@@ -74,6 +74,7 @@ def test_keys_computed_together_equal_single_keys() -> None:
         (9.97, 0.996, "10.0 ± 1.0"),
         (1.23456e9, 2.34e7, "1.235e+09 ± 2.3e+07"),
         (3.14159, math.inf, "3.142"),
+        (0.05, 2.5e-15, "0.05"),  # rounding
         (math.nan, 1.0, "nan"),
     ],
 )

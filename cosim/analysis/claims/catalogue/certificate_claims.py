@@ -13,6 +13,7 @@ from cosim.analysis.claims.claim_definition import (
     certified,
     controller_error_bound,
     least_inter_event_time,
+    norm_text,
     upper_shares,
 )
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
@@ -27,7 +28,7 @@ def controller_error(
     run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
 ) -> Findings:
     """‖e_c‖_W over time."""
-    formula = envelope_formula("‖e_c‖", certificate, "delta")
+    formula = envelope_formula(norm_text(run, "e_c"), certificate, "delta")
     values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
     return Findings(
         controller_error_bound(run, samples, formula, values, constants.delta, void),
@@ -44,7 +45,9 @@ def controller_error_from_events(
     if bounds is None or since is None:
         return Findings()
     values = bounds.controller_error(samples.t_s, since.missing)
-    formula = "‖e_c‖ ≤ (1 + Σ_(i<j) sup_(τ≥iδ) ‖e^((H+αI)τ)‖) β̃e^(−αt), j events missing"
+    growth = "‖e^((H+αI)τ)‖" if run.record.loop.weight is None else "‖W e^((H+αI)τ) W⁻¹‖"
+    missing = f"(1 + Σ_(i<j) sup_(τ≥iδ) {growth}) β̃e^(−αt), j events missing"
+    formula = f"{norm_text(run, 'e_c')} ≤ {missing}"
     void = run.violation_of(certificate)
     label, common = "bound, given the updates missing now", samples.in_common
     return Findings(
@@ -65,7 +68,7 @@ def estimation_error(
     here, void = samples.with_x, run.violation_of(certificate)
     t_s = samples.t_s[here]
     errors = row_norms((samples.joined.x - samples.true_x).compress(here, axis=0) @ weight.T)
-    formula = envelope_formula("‖x̂ − x‖", certificate, "estimation_error")
+    formula = envelope_formula(norm_text(run, "x̂ − x"), certificate, "estimation_error")
     shares = upper_shares(errors, certificate.estimation_error(t_s))
     return Findings(Bound(formula, t_s, shares, void, constants.estimation_error))
 
@@ -86,7 +89,7 @@ def sensor_error(
     run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
 ) -> Findings:
     """‖e_s‖_W before each reset."""
-    formula = envelope_formula("‖e_s‖", certificate, "overshoot")
+    formula = envelope_formula(norm_text(run, "e_s"), certificate, "overshoot")
     slack = run.rounding(samples.joined.x_norm)
     shares = upper_shares(samples.joined.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void = run.violation_of(certificate)

@@ -13,6 +13,7 @@ from cosim.analysis.claims.claim_definition import (
     claim,
     controller_error_bound,
     least_inter_event_time,
+    norm_text,
     upper_shares,
 )
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
@@ -32,7 +33,8 @@ def i1_controller_error(run: RunEvidence, samples: Samples) -> Findings:
         "e_c" if run.record.scenario.coverage.knows_state else "x_c − x̂",
         samples.error_bounds[0],
     )
-    formula = f"‖{error}‖ ≤ ‖e_s‖ + Σ ‖e^(H(t−t_k)) e_s(t_k)‖"
+    jump = norm_text(run, "e^(H(t−t_k)) e_s(t_k)")
+    formula = f"{norm_text(run, error)} ≤ {norm_text(run, 'e_s')} + Σ {jump}"
     return Findings(
         controller_error_bound(run, samples, formula, values),
         Envelope("bound from (I1)", "e_c", samples.t_s, values, "identity"),
@@ -73,7 +75,8 @@ def paper_error_bound(run: RunEvidence, samples: Samples) -> Findings:
     # Estimates and noise jump at every measurement, so no trigger keeps e_s below a threshold.
     if not coverage.is_decaying or not coverage.knows_state:
         return Findings()
-    formula = "‖e_c‖ ≤ βe^(−αt) + Σ βe^(−αt_k) ‖e^(H(t−t_k))‖"
+    growth = "‖e^(H(t−t_k))‖" if run.record.loop.weight is None else "‖W e^(H(t−t_k)) W⁻¹‖"
+    formula = f"{norm_text(run, 'e_c')} ≤ βe^(−αt) + Σ βe^(−αt_k) {growth}"
     return Findings(controller_error_bound(run, samples, formula, samples.error_bounds[1]))
 
 
@@ -91,7 +94,7 @@ def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> Findings:
     if not is_covered or scenario.decaying.floor > 0 or (delta := run.trajectory_delta) is None:
         return Findings()
     level = scenario.decaying.beta * np.exp(-scenario.decaying.alpha_per_s * samples.t_s)
-    formula, void = "‖e_c‖ ≤ {} βe^(−αt)", run.paper_violation
+    formula, void = f"{norm_text(run, 'e_c')} ≤ {{}} βe^(−αt)", run.paper_violation
     return Findings(controller_error_bound(run, samples, formula, delta * level, delta, void))
 
 

@@ -301,6 +301,15 @@ def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance(
     assert identity.verdict is ClaimVerdict.HELD
 
 
+@pytest.mark.parametrize(("name", "norms"), [("lane_weighted", {"W"}), ("double_integrator", {""})])
+def test_formulas_have_the_weight_of_the_triggers_norm(name: str, norms: set[str]) -> None:
+    claims = RunClaims(simulate(resolved(name, "horizon_s=2"))).judge()
+    bounded = [re.match(r"‖(W?) ?e_[cs]‖ ≤", one.bound) for one in claims]
+    found = [match[1] for match in bounded if match]
+    assert len(found) > 5
+    assert set(found) == norms
+
+
 def test_a_part_is_void_with_the_reason() -> None:
     late = run_with((5.995, {"trigger.beta": 0.04}))
     deaf = run_with((2.005, {"trigger.beta": 0.04}))

@@ -9,7 +9,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 import noack
+from cosim.live.monitoring.progress import work_bar
 from cosim.live.monitoring.run_watcher import RunMetrics, Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
 from tests.command_line import invoke
@@ -91,3 +94,17 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
     assert events["run"]["directory"] == events["end"]["directory"] == str(run_dir)
     assert (events["end"]["status"], events["end"]["reason"]) == (0, "horizon")
     assert events["progress"]["events"] <= summary["loops"][0]["events"]
+
+
+def test_long_work_prints_its_share_and_the_remaining_time_as_lines_without_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr("cosim.live.monitoring.progress.time.monotonic", lambda: now_s[0])
+    for lines in (True, False):
+        with work_bar("trying gains", lines=lines) as show:
+            for share in (0.1, 0.2, 0.25, 1.0):
+                now_s[0] += 3
+                show(share)
+        printed = capsys.readouterr().err
+        assert printed == lines * "noack: trying gains: 20 % after 6 s, about 24 s left\n"

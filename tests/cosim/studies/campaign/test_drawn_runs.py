@@ -193,7 +193,7 @@ def test_different_loops_keep_their_proportions(write: Write, plan: dict[str, An
     assert row_type(points) == rows.dtype
     mean = (2 * rows["cost_of_a"] + rows["cost_of_b"]) / 3
     assert rows["cost"] == pytest.approx(mean, rel=1e-12)
-    with pytest.raises(CallerError, match="should be a multiple of 3"):
+    with pytest.raises(CallerError, match="expected a multiple of 3"):
         few_of(write(plan, axes=axes(3, 4), settings=settings, **sampled))
 
 

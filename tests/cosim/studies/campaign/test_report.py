@@ -13,6 +13,7 @@ from scipy.stats import t as student
 
 from cosim.output.figures.figure_description import Band
 from cosim.output.figures.figure_files import inline
+from cosim.output.result_tables import ResultTable
 from cosim.shipped_files import find_shipped
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.studies.campaign import campaign_grid
@@ -26,7 +27,7 @@ from cosim.studies.campaign.campaign_figures import (
 )
 from cosim.studies.campaign.campaign_file import Axis, load
 from cosim.studies.campaign.campaign_grid import Point, base_of
-from cosim.studies.campaign.campaign_report import write_report, written
+from cosim.studies.campaign.campaign_report import without_constants, write_report, written
 from cosim.studies.campaign.campaign_summary import JudgedClaim, judge_claims, summarise
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.metrics import (
@@ -333,6 +334,17 @@ def test_terminal_tables_print_names_literally_and_list_failed_runs(
     assert result.exit_code == 0, result.output
     text = " ".join(result.stdout.split())
     assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in text
+
+
+def test_columns_that_are_the_same_at_all_points_are_named_once() -> None:
+    rows = [("MB", "0.1", "3 ± 1", "–"), ("MB", "0.5", "4 ± 1", "–")]
+    full = ResultTable("campaign", "c", ("policy", "β", "cost", "bound used"), rows)
+    table, names = without_constants(full, 2)
+    assert (table.caption, names) == ("c; everywhere policy MB, bound used –", 1)
+    assert (table.headings, table.rows) == (["β", "cost"], [["0.1", "3 ± 1"], ["0.5", "4 ± 1"]])
+    only_labels = full._replace(rows=[("MB", "0.1", "3", "–"), ("MB", "0.5", "3", "–")])
+    for unchanged in (full._replace(rows=rows[:1]), only_labels, full._replace(rows=[])):
+        assert without_constants(unchanged, 2) == (unchanged, 2)
 
 
 def test_a_caption_says_what_the_means_leave_out() -> None:

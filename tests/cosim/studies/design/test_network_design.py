@@ -122,6 +122,16 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
         assert isinstance(found.shown.scenario.network.guarantee.rules[-1], LossesInWindow)
 
 
+def test_each_hold_strategy_has_the_most_that_its_best_loop_reached() -> None:
+    found = searched(shipped("lane_periodic"), Wish(effort=0, most=8, holds=read_holds("zoh,model")))
+    (hold, of_hold), (model, of_model) = found.shown.by_hold
+    assert (hold, model, of_model) == ("hold", "the model's input", "M = 8")
+    alone = searched(shipped("lane_periodic"), Wish(effort=0, most=8, holds=read_holds("zoh")))
+    assert of_hold == f"M = {alone.best.rung + 1}"
+    assert alone.best.rung < found.best.rung
+    assert found.shown.to_json()["highest_by_hold"] == {hold: of_hold, model: of_model}
+
+
 def test_the_search_is_deterministic() -> None:
     wish = Wish(period_s=PERIOD_S, effort=20)
     first, second = (design_for_network(shipped("cart_pole", LINEAR), wish).to_json() for _ in range(2))

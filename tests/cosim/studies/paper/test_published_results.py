@@ -2,13 +2,15 @@
 
 import json
 from collections.abc import Sequence
+from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
 
-from cosim.studies.paper.published_result import stored
+from cosim.studies.paper.published_result import print_rows, stored
 from cosim.studies.paper.results import NAMES, demirel, named, reproduce, selivanov_fridman, umsonst_barbosa
 from noack.core.errors import ExitStatus
 from tests.command_line import invoke
@@ -23,7 +25,12 @@ def test_rows_are_as_published_and_as_documented(name: str) -> None:
     for row in found.rows:
         assert row.as_expected, row
         assert f"| {' | '.join(found.table.rows[found.rows.index(row)])} |" in PAGE
+        assert row.verdict == ("reproduced" if row.relation == "=" else "agrees") or row.deviation
     assert found.result.about in PAGE
+    printed = StringIO()
+    print_rows(Console(file=printed, width=80), found)
+    lines = printed.getvalue().splitlines()
+    assert sum(line.endswith(("reproduced ", "agrees ", "differs ")) for line in lines) == len(found.rows)
 
 
 def test_a_value_that_differs_fails_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
