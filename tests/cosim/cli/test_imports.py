@@ -160,13 +160,3 @@ def test_an_error_is_raised_at_each_use(package: str) -> None:
             module.name  # noqa: B018
     with pytest.raises(ModuleNotFoundError):
         lazily_imported(package, "missing")
-
-
-@pytest.mark.parametrize(("before", "status"), [("default_int_handler", -2), ("SIG_IGN", 0)])
-def test_ctrl_c_while_the_program_is_imported_prints_nothing(before: str, status: int) -> None:
-    program = (
-        f"import os, signal\nsignal.signal(signal.SIGINT, signal.{before})\n"
-        "import cosim.entry_point\nos.kill(os.getpid(), signal.SIGINT)"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=150)
-    assert (done.returncode, done.stdout, done.stderr) == (status, "", "")
