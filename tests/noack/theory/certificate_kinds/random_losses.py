@@ -24,8 +24,10 @@ from tests.oracles.lossy_loops import DRIFTING, STEPS, Reals, System, random_sys
 
 _RUNS = 300
 _EVENTS = 64
-_MOST_LOST = 6
+_LOST = range(1, 7)
+"""Largest numbers of consecutive losses that count in a run's largest values."""
 _ERRORS = 5
+_MEANS = {1: "mean", 2: "rms"}
 _SIGNALS = {
     "e_s": "sensor_error", "e_c": "controller_error", "x": "state", "u − Kx": "input_error",
 }  # fmt: skip
@@ -33,17 +35,21 @@ _SIGNALS = {
 
 @dataclass(frozen=True)
 class RandomLoop:
-    """A loop, the probability of a loss, and the order r of the moments."""
+    """A loop, the probability of a loss, and what its moments are."""
 
     system: System
     probability: float
     order: int
+    """r, of the moments at every fixed time."""
+    most_lost: int
+    """Only runs with so few consecutive losses count in the moments of a run's largest values."""
 
 
 def draw(rng: np.random.Generator, **fixed: Any) -> RandomLoop:
-    """Draw a loop; half of its means are mean squares."""
+    """Draw a loop; half of the moments at every fixed time are mean squares."""
     probability = fixed.pop("probability", 10 ** rng.uniform(-2.5, -0.1))
-    return RandomLoop(random_system(rng, **fixed), probability, int(rng.integers(1, 3)))
+    system, order = random_system(rng, **fixed), int(rng.integers(1, 3))
+    return RandomLoop(system, probability, order, int(rng.choice(_LOST)))
 
 
 def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds | None:
@@ -122,12 +128,12 @@ def _draw_continuous(rng: np.random.Generator, **fixed: Any) -> RandomLoop:
 
 def _certify_runs(loop: RandomLoop, *, share: float = 1.0) -> Bounds | None:
     """The bounds, or those of a broken copy with fewer losses."""
-    system, order = loop.system, loop.order
+    system = loop.system
     one, p = np.ones(1), np.array([share * loop.probability])
     losses = LossProcess(one, one[:, None], p, first_delivered=False)
     bursts: list[BurstCertificate] = []
     try:
-        for most in range(_MOST_LOST + 1):
+        for most in range(loop.most_lost + 1):
             found = system.certify(NetworkConditions(most))
             events = int(STEPS * system.step_s / (found.inter_event_s or np.inf)) + 1
             probability = losses.keeps(LossGuarantee((LongestBurst(most),)), events)
@@ -135,23 +141,33 @@ def _certify_runs(loop: RandomLoop, *, share: float = 1.0) -> Bounds | None:
             bursts.append(
                 BurstCertificate(most, probability, events, found.delta, system.alpha, e_c, found.state)
             )
-        at_events = moment_at_events(system.gains().error, losses, 0.0, order) * system.beta
+        at_events = [
+            moment_at_events(system.gains().error, losses, 0.0, order) * system.beta for order in _MEANS
+        ]
     except (NoCertificateError, NotDecayingError):
         return None
-    run = moments_of_runs(bursts)[order - 1]
-    return {"largest e_c": run.controller_error, "largest x": run.state, "e_c at events": at_events}
+    return {
+        f"{mean}, {name}": value
+        for (mean, run, of_events) in zip(_MEANS.values(), moments_of_runs(bursts), at_events, strict=True)
+        for name, value in (
+            ("largest e_c", run.controller_error), ("largest x", run.state), ("e_c at events", of_events)
+        )
+    }  # fmt: skip
 
 
 def _simulate_continuous(loop: RandomLoop, rng: np.random.Generator) -> Observed:
     delivered = rng.uniform(size=(_RUNS, _EVENTS)) >= loop.probability
-    windows = np.lib.stride_tricks.sliding_window_view(delivered, _MOST_LOST + 1, axis=1)
+    windows = np.lib.stride_tricks.sliding_window_view(delivered, loop.most_lost + 1, axis=1)
     counts = windows.any(axis=2).all(axis=1)[:, None]
     trace = simulate_continuous_time(loop.system, delivered, delivered)
     signals = {
         "largest e_c": counts * trace.controller_error, "largest x": counts * trace.state,
         "e_c at events": trace.error_at_events,
     }  # fmt: skip
-    return Observed(_RUNS, {name: _least_moment(values, loop.order) for name, values in signals.items()})
+    return Observed(_RUNS, {
+        f"{mean}, {name}": _least_moment(values, order)
+        for order, mean in _MEANS.items() for name, values in signals.items()
+    })  # fmt: skip
 
 
 MOMENT = Kind(
