@@ -221,10 +221,10 @@ def _require_consistent(before_dir: Path, after_dir: Path, source: str) -> None:
             if not _contains(before, after, table):
                 raise PeerError(f"{source}: it has other rows of {table} than were recorded")
         for role in LOOP_ROLES:
-            for life in after.lives(role):
-                reported = {} if life.report is None else life.report["rows"]
-                for table in reported.keys() & life.rows.keys():
-                    if (surplus := life.rows[table] - reported[table]) > 0:
+            for generation in after.generations(role):
+                reported = {} if generation.report is None else generation.report["rows"]
+                for table in reported.keys() & generation.rows.keys():
+                    if (surplus := generation.rows[table] - reported[table]) > 0:
                         raise PeerError(
                             f"{source}: with its rows, {table} has {surplus} more than the {role} reported"
                         )

@@ -333,7 +333,9 @@ class RunClaims:
         for part in self.parts:
             if not isinstance(part, Claim):
                 from_s = part.part.from_s
-                violations += [one._replace(t_s=one.t_s + from_s) for one in part.violations()]
+                violations += [
+                    violation._replace(t_s=violation.t_s + from_s) for violation in part.violations()
+                ]
         return sorted(violations, key=lambda violation: violation.t_s)
 
     def judge(self) -> list[Claim]:
