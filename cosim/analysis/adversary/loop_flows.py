@@ -60,7 +60,7 @@ class Objective(StrEnum):
         """The value of a run without segments."""
         return 0.0 if self.additive else -np.inf
 
-    def joined(self, earlier: Matrix, later: Matrix) -> Matrix:
+    def combine(self, earlier: Matrix, later: Matrix) -> Matrix:
         """Return the value of two successive parts of a run."""
         return np.asarray(earlier + later if self.additive else np.maximum(earlier, later))
 
@@ -450,7 +450,7 @@ def run_of(flow: SampledFlow, delivered: Callable[[int], bool]) -> SampledRun:
         segment_value = float(segment.value[0])
         if segment.at_s is not None and segment_value > value:
             at_s = float(segment.at_s[0])
-        value = float(flow.objective.joined(np.array(value), np.array(segment_value)))
+        value = float(flow.objective.combine(np.array(value), np.array(segment_value)))
         if not segment.is_event[0]:
             break
         fates.append(delivered(len(event_s)))

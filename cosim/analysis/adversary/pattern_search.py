@@ -133,7 +133,7 @@ class PatternSearch:
         """
         objective = self.flow.objective
         segments = self.flow(nodes.t_s, nodes.z)
-        value = objective.joined(nodes.value, segments.value)
+        value = objective.combine(nodes.value, segments.value)
         # A sum is compared only when the run is complete.
         candidates = np.where(segments.is_event & objective.additive, -np.inf, value)
         top = int(candidates.argmax())
@@ -318,7 +318,7 @@ def follow(
     run, value, last = np.arange(count), nodes.value.copy(), nodes.entry.copy()
     for event in range(MAX_EVENTS):
         segments = flow(nodes.t_s, nodes.z)
-        value[run] = flow.objective.joined(nodes.value, segments.value)
+        value[run] = flow.objective.combine(nodes.value, segments.value)
         last[run] = nodes.entry
         going = np.flatnonzero(segments.is_event)
         if not len(going):
