@@ -108,15 +108,15 @@ def launch(
         helpers = stack.enter_context(lasting_helpers(resolved))
         watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
         with _no_directory_if_refused(run_dir):
-            opened = _open_to_others(stack, ticket, session, listening, coordinator)
+            listener = _open_to_others(stack, ticket, session, listening, coordinator)
         remote = None
-        if listening is not None and opened is not None:
+        if listening is not None and listener is not None:
             ticket = ticket.model_copy(update={"host": listening.address[0]})
-            remote = RemoteStart(away, opened.invitation.model_dump_json())
-            watcher.listening(address_text(opened.address), listening)
+            remote = RemoteStart(away, listener.invitation.model_dump_json())
+            watcher.listening(address_text(listener.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
-        run = _Run(ticket, run_dir, coordinator, children, watcher, opened and opened.notices)
+        run = _Run(ticket, run_dir, coordinator, children, watcher, listener and listener.notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
@@ -142,19 +142,19 @@ def _open_to_others(
     session: str | None,
     listening: "remote_access.Listening | None",
     coordinator: Coordinator,
-) -> "remote_access.Opened | None":
+) -> "remote_access.RunListener | None":
     """Let processes join that are started by hand; return how those of other hosts join."""
-    opened = None
+    listener = None
     if listening is not None:
         ticket = ticket.model_copy(update={"host": listening.address[0]})
-        opened = stack.enter_context(remote_access.open_to_hosts(listening, ticket, coordinator))
+        listener = stack.enter_context(remote_access.open_to_hosts(listening, ticket, coordinator))
     if session is not None:
         by_hand = ticket.model_copy(update={"launched": False})
         stack.enter_context(ticket_file(by_hand, session))
-    if opened is not None and listening is not None and listening.invitation is not None:
+    if listener is not None and listening is not None and listening.invitation is not None:
         # last: it replaces that of an earlier run
-        stack.enter_context(invitation_file(listening.invitation, opened.invitation))
-    return opened
+        stack.enter_context(invitation_file(listening.invitation, listener.invitation))
+    return listener
 
 
 @contextlib.contextmanager
