@@ -327,7 +327,8 @@ static void begin_span(const exact_memory *memory, progress *now) {
 }
 
 /* Expand the curves of a piece, of at most *window_s, and find its event as find_event. The first
-   search of a span makes the window as short as the event is expected. p: degree of the curves. */
+   search of a span makes the window as short as the event is expected. p: degree of the curves.
+   This and follow_piece are inlined: with calls a run takes a tenth longer. */
 static inline __attribute__((always_inline)) double search_piece(
     exact_memory *memory, progress *now, comparison *compared, double *window_s, int *p) {
     forecast crossing = UNKNOWN;
