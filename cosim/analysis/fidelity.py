@@ -60,7 +60,7 @@ class IncomparableError(CallerError):
     """The run's record does not allow the comparison; the message has the reason."""
 
 
-class LiveRun(NamedTuple):
+class RecordedLoop(NamedTuple):
     """A live run on the plant's grid, up to its last measurement."""
 
     schedule: StepSchedule
@@ -70,7 +70,7 @@ class LiveRun(NamedTuple):
     """Times of the events."""
 
 
-def live_run(record: RunRecord) -> LiveRun:
+def live_run(record: RunRecord) -> RecordedLoop:
     """Read the schedule of a run.
 
     Raises:
@@ -126,7 +126,7 @@ def live_run(record: RunRecord) -> LiveRun:
         delay_steps=_delays(accepted, acts_at_step - event_ns // period_ns, acts_at_step <= last),
         model_ns=latched.model_ns,
     )
-    return LiveRun(schedule, steps["x"][measured], event_ns * 1e-9)
+    return RecordedLoop(schedule, steps["x"][measured], event_ns * 1e-9)
 
 
 def _require_ideal(record: RunRecord) -> None:
@@ -392,7 +392,7 @@ def _require_stable_events(
 
 
 def _ideal(
-    system: ContinuousLoop, live: LiveRun, horizon_s: float, max_events: int, *, known_start: bool
+    system: ContinuousLoop, live: RecordedLoop, horizon_s: float, max_events: int, *, known_start: bool
 ) -> ContinuousRun:
     try:
         ideal = simulate_continuous(

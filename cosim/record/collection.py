@@ -34,7 +34,7 @@ from noack.runtime.spool import (
     KEPT_KEY,
     KEPT_REPORT,
     SPOOL,
-    Chunk,
+    SpoolBatch,
     SpoolWriter,
     chunks_of,
     kept_run_name,
@@ -165,7 +165,7 @@ def _has_secret(kept: Path, process: _Process, source: str) -> bool:
     return process.writer in map(writer_of, secrets)
 
 
-def _chunks(path: Path, name: str) -> Iterator[Chunk]:
+def _chunks(path: Path, name: str) -> Iterator[SpoolBatch]:
     """Yield the batches of a file; raise PeerError if no process can have written it."""
     if not stat.S_ISREG(path.lstat().st_mode):
         raise PeerError(f"{name} is not a regular file")

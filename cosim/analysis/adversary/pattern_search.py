@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.adversary.loop_flows import Flags, Pattern, PatternFlow, Segments
+from cosim.analysis.adversary.loop_flows import Flags, Pattern, PatternFlow, SegmentEnds
 from cosim.simulation.continuous import TooManyEventsError
 from cosim.simulation.exact_simulation import MAX_EVENTS
 from noack.core.linear_systems import Matrix, Vector, firsts_of_equal
@@ -155,7 +155,7 @@ class PatternSearch:
 def after_events(
     flow: PatternFlow,
     nodes: Nodes,
-    segments: Segments,
+    segments: SegmentEnds,
     value: Vector,
     continued: Indices,
     delivered: Flags,

@@ -75,14 +75,14 @@ def worst_disturbances(
     fixed, drawn = _fixed_disturbances(loop), loop.disturbances
     n, k, j = loop.matrices.n, step, step // loop.every + 1
     linear = loop.with_disturbances(np.zeros((0, n)), np.zeros((0, drawn[1].shape[1])))
-    increments = [_responses_to_disturbance(linear, flow, column, run, step) for column in bounds.columns.T]
+    responses = [_responses_to_disturbance(linear, flow, column, run, step) for column in bounds.columns.T]
     noises = [
         _responses_to_noise(linear, flow, entry, bound, run, step) for entry, bound in enumerate(bounds.noise)
     ]
     axes = np.eye(n)
     for direction in (_vectors(flow, start)[0], *axes, *-axes):
         disturbed, noise = fixed[0].copy(), fixed[1].copy()
-        for column, response in zip(bounds.columns.T, increments, strict=True):
+        for column, response in zip(bounds.columns.T, responses, strict=True):
             disturbed[:k] += np.sign(response @ direction)[:, None] * column
         for entry, response in enumerate(noises):
             noise[:j, entry] += bounds.noise[entry] * np.sign(response @ direction)

@@ -333,9 +333,7 @@ class RunClaims:
         for part in self.parts:
             if not isinstance(part, Claim):
                 from_s = part.part.from_s
-                violations += [
-                    violation._replace(t_s=violation.t_s + from_s) for violation in part.violations()
-                ]
+                violations += [found._replace(t_s=found.t_s + from_s) for found in part.violations()]
         return sorted(violations, key=lambda violation: violation.t_s)
 
     def judge(self) -> list[Claim]:

@@ -336,9 +336,7 @@ class MachineReplay:
     def __init__(self, role: str, record: RunRecord, shared: SharedMachines) -> None:
         self._tables = record.owned_by(role)
         self._begun = record.generation_numbers(role)
-        self._generations = [
-            _GenerationReplay(role, record, generation, shared) for generation in record.row_counts(role)
-        ]
+        self._parts = [_GenerationReplay(role, record, own, shared) for own in record.row_counts(role)]
         self.newest: list[InputReplay] = []
         """The replays of the newest part; they have what was sent."""
 
@@ -346,14 +344,14 @@ class MachineReplay:
         """Replay the next part of the record."""
         self.newest = []
         owned = {table: part[table] for table in self._tables}
-        for own, generation in zip(split_by_generation(owned, self._begun), self._generations, strict=True):
+        for own, part_replay in zip(split_by_generation(owned, self._begun), self._parts, strict=True):
             if any(map(len, own.values())):
-                self.newest += generation.take(own)
+                self.newest += part_replay.take(own)
 
     @property
     def results(self) -> tuple[ProcessReplay, ...]:
         """The result of each generation; final after the last part."""
-        return tuple(generation.result() for generation in self._generations)
+        return tuple(part.result() for part in self._parts)
 
     @property
     def whole(self) -> bool:
@@ -364,19 +362,17 @@ class MachineReplay:
 class _GenerationReplay:
     """The replay of one generation."""
 
-    def __init__(
-        self, role: str, record: RunRecord, generation: ProcessGeneration, shared: SharedMachines
-    ) -> None:
-        self._role, self._record, self._own, self._shared = role, record, generation, shared
+    def __init__(self, role: str, record: RunRecord, own: ProcessGeneration, shared: SharedMachines) -> None:
+        self._role, self._record, self._own, self._shared = role, record, own, shared
         self._run: InputReplay | None = None
-        self._count = sum(generation.rows.values())
-        report = generation.report
-        self._written = None if report is None else sum(report["rows"][table] for table in generation.rows)
+        self._count = sum(own.rows.values())
+        report = own.report
+        self._written = None if report is None else sum(report["rows"][table] for table in own.rows)
         ends_early = self._written is not None and self._written > self._count
         self._missing_from = self._count if ends_early else None
         self._damage: ReplayDifference | None = None
         self._compared = 0
-        self._before = dict.fromkeys(generation.rows, 0)
+        self._before = dict.fromkeys(own.rows, 0)
         """Rows in the parts before, by table."""
         self._stopped = False
 

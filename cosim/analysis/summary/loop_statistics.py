@@ -373,7 +373,7 @@ class SampleFactsReader:
         return self._found._replace(longest_update_ns=longest_ns)
 
 
-class Signals(TypedDict):
+class SignalFields(TypedDict):
     """The fields of a loop's summary about its signals."""
 
     setpoint: list[float] | None
@@ -433,7 +433,7 @@ class SignalStatistics:
         self._errors.add(errors)
         self._late_errors.add(errors[max(self._half - self._read, 0) :])
 
-    def for_summary(self) -> Signals:
+    def for_summary(self) -> SignalFields:
         """Return norms of the state, of the errors, and of the residual of (I1)."""
         first, last, largest = None, None, None
         since_ns, points = _setpoints(self._record)
