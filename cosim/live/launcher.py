@@ -72,7 +72,7 @@ def launch(
     live: bool = False,
     watcher: Watcher | None = None,
     server: ForkServer | None = None,
-    listening: "remote_access.Listening | None" = None,
+    listening: "remote_access.ListenSettings | None" = None,
 ) -> PreparedEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
@@ -140,7 +140,7 @@ def _open_to_others(
     stack: contextlib.ExitStack,
     ticket: Ticket,
     session: str | None,
-    listening: "remote_access.Listening | None",
+    listening: "remote_access.ListenSettings | None",
     coordinator: Coordinator,
 ) -> "remote_access.RunListener | None":
     """Let processes join that are started by hand; return how those of other hosts join."""

@@ -44,7 +44,7 @@ _CALM_S, _MOST_CALM_S = 3, 60
 """Time without a flood, after which it is over; and the longest such time."""
 
 
-class Listening(NamedTuple):
+class ListenSettings(NamedTuple):
     """Where a run listens, and whom it invites."""
 
     address: Address
@@ -66,13 +66,13 @@ class RunListener(NamedTuple):
     """Lines for the person who watches the run: floods."""
 
 
-def listening_for(path: Path) -> Listening:
+def listening_for(path: Path) -> ListenSettings:
     """Return how processes join that the launcher starts on the hosts of a file.
 
     Raise CallerError if the file is wrong, or others cannot reach this host at its address.
     """
     hosts = load_hosts(path)
-    return Listening(listen_address(hosts.listen, f"{path}: listen"), hosts=hosts.by_role)
+    return ListenSettings(listen_address(hosts.listen, f"{path}: listen"), hosts=hosts.by_role)
 
 
 def listen_address(text: str, option: str = "--listen") -> Address:
@@ -119,7 +119,9 @@ def _listen(address: Address) -> socket.socket:
 
 
 @contextmanager
-def open_to_hosts(listening: Listening, ticket: Ticket, coordinator: Coordinator) -> Iterator[RunListener]:
+def open_to_hosts(
+    listening: ListenSettings, ticket: Ticket, coordinator: Coordinator
+) -> Iterator[RunListener]:
     """Listen for processes of other hosts meanwhile, and make their invitation.
 
     Raise CallerError if the address cannot be used.

@@ -56,7 +56,7 @@ from cosim.output.figures.figure_layout import (
 )
 from cosim.record.align import Reals
 
-Shown = tuple[Artist, str]
+LegendItem = tuple[Artist, str]
 """A drawn object and its label in the legend."""
 
 _NARROW_IN = 2.5
@@ -139,7 +139,7 @@ def _axes(figure: Figure, place: Place, beside: Axes | None = None) -> Axes:
     return axes
 
 
-def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[Shown]:
+def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[LegendItem]:
     """Draw a panel; return what its legend shows."""
     panel, drawn = place.panel, dict[str, Artist]()
     for item in panel.items:
@@ -153,7 +153,7 @@ def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[Shown]
     return [(drawn[label], label) for label in panel.labels if label in drawn]
 
 
-def _head(axes: Axes, figure: Figure, box: FigureBox, title: str, shown: Sequence[Shown]) -> None:
+def _head(axes: Axes, figure: Figure, box: FigureBox, title: str, shown: Sequence[LegendItem]) -> None:
     """Write a title and a legend above a box, where there are no data."""
     space, bottom_in = layout(), figure.get_figheight() - box.top
     rows = legend_rows([label for _, label in shown], box.width)
