@@ -106,7 +106,7 @@ class LossCheck:
         allowed = _cap(self._guarantee)
         if losses > allowed and self._schedule is not None:
             scenarios = self._schedule.between(newest_ns, now_ns)
-            allowed = max(_cap(one.network.guarantee) for one in scenarios)
+            allowed = max(_cap(scenario.network.guarantee) for scenario in scenarios)
         if losses <= allowed:
             return ""
         return (

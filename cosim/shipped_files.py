@@ -57,7 +57,7 @@ def find_shipped(name: str, folder: str) -> Path:
         if name in shipped_names(other):
             raise CallerError(f"{name}: a shipped {other.removesuffix('s')}, not a {kind}")
     if path.suffix == ".toml":
-        names += sorted(str(one) for one in Path().glob("*.toml"))
+        names += sorted(map(str, Path().glob("*.toml")))
     hint = did_you_mean(name, names) or _LIST
     raise CallerError(f"{shortened(name)}: no such file, nor a shipped {kind}; {hint}")
 

@@ -151,9 +151,9 @@ void noack_channel_latest(noack_channel *channel, int64_t direction, int64_t *la
         channel->links[direction], channel->waiting, INT64_MAX, channel->heap,
         &channel->heap_count);
     for (int64_t i = 0; i < channel->heap_count; i++) {
-        const noack_datagram *one = &channel->delayed[channel->heap[i].slot].datagram;
-        int64_t row = one->flow % channel->loops;
-        if (one->flow / channel->loops == direction)
+        const noack_datagram *delayed = &channel->delayed[channel->heap[i].slot].datagram;
+        int64_t row = delayed->flow % channel->loops;
+        if (delayed->flow / channel->loops == direction)
             latest_ns[row] = max_of(latest_ns[row], channel->heap[i].due_ns);
     }
 }

@@ -14,7 +14,7 @@ static int is_bottleneck(const noack_stage *stage) {
 
 /* The place of the stage with this random stream and the same kind, or also a bottleneck; -1: none.
  */
-static int64_t place_of(const noack_link *link, const noack_stage *stage) {
+static int64_t find_stage(const noack_link *link, const noack_stage *stage) {
     for (int64_t i = 0; i < link->stage_count; i++) {
         const noack_stage *other = &link->stages[i];
         int alike = other->kind == stage->kind || (is_bottleneck(other) && is_bottleneck(stage));
@@ -48,7 +48,7 @@ static void change_queue(
 
 static void change_stage(const noack_link *before, const noack_link *after, int64_t place) {
     const noack_stage *stage = &after->stages[place];
-    int64_t was = place_of(before, stage);
+    int64_t was = find_stage(before, stage);
     if (was < 0)
         return;
     int same = stage->kind == before->stages[was].kind;

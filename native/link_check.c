@@ -167,10 +167,10 @@ const char *noack_recorded_check(const noack_link *link) {
         if (!in_range(link->decisions_begin[i], link->decisions_begin[i + 1], link->decision_count))
             return "recorded decisions are outside their table";
     for (int64_t i = 0; i < link->decision_count; i++) {
-        const noack_recorded *one = &link->decisions[i];
-        if (one->fate < NOACK_DELIVERED || one->fate > NOACK_BLACKED_OUT)
+        const noack_recorded *recorded = &link->decisions[i];
+        if (recorded->fate < NOACK_DELIVERED || recorded->fate > NOACK_BLACKED_OUT)
             return "a recorded decision has no fate";
-        if (one->delay_ns > FAR_NS || one->copy_delay_ns > FAR_NS)
+        if (recorded->delay_ns > FAR_NS || recorded->copy_delay_ns > FAR_NS)
             return "a recorded delay is longer than 73 years";
     }
     return NULL;

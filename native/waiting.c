@@ -49,12 +49,12 @@ static int64_t merge(noack_waiting *waiting, int64_t a, int64_t b) {
 }
 
 /* Give what waits at a place a smaller key. */
-static void advance(noack_queue *queue, noack_waiting *waiting, int64_t place, int64_t key) {
-    noack_waiting *one = &waiting[place];
-    one->key = key;
-    if (one->parent == 0)
+static void lower_key(noack_queue *queue, noack_waiting *waiting, int64_t place, int64_t key) {
+    noack_waiting *waiter = &waiting[place];
+    waiter->key = key;
+    if (waiter->parent == 0)
         return;
-    noack_waiting *parent = &waiting[one->parent - 1];
+    noack_waiting *parent = &waiting[waiter->parent - 1];
     *(parent->left == place + 1 ? &parent->left : &parent->right) = 0;
     queue->waiting = merge(waiting, queue->waiting, place + 1);
 }
@@ -108,7 +108,7 @@ void wait_for_link(
     queue->waiting = merge(waiting, queue->waiting, place + 1);
     queue->waits++;
     for (int64_t left = flow->waits; left > 0 && waiting[earlier].key > key; left--) {
-        advance(queue, waiting, earlier, key);
+        lower_key(queue, waiting, earlier, key);
         earlier = waiting[earlier].before;
     }
     flow->last_waiting = place;

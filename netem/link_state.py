@@ -157,31 +157,22 @@ class LinkState:
         for row, (stage, key, _) in zip(stages, keyed, strict=False):
             _write_stage(row, stage, key, places)
             places += stage.queue_places
-        rules = [constraint.rule for constraint in settings.constraints]
-        windows = [(rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow)]
+        rule_fields, windows = _rule_fields(settings)
         link = ffi.new(
             "noack_link *",
             {
                 "stages": stages,
                 "stage_count": len(keyed),
                 "recorded_flows": len(self._decisions_begin) - 1,
-                "recovery": max(
-                    (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts)),
-                    default=0,
-                ),
-                "mansd": -1 if settings.longest_burst is None else settings.longest_burst,
                 "limit": settings.limit,
                 "tracks": tracks or any(impairment.delays for impairment in settings.impairments),
                 "rows": rows,
                 "departure_places": places,
                 "scheduler": next((index for index, (stage, *_) in enumerate(keyed) if stage.schedules), -1),
+                **rule_fields,
             },
         )
         link.recent_width = 1 << link.mansd.bit_length() if link.tracks and link.mansd >= 0 else 1
-        link.loss_width = 1
-        if windows or link.recovery:
-            longest = max((packets for _, packets in windows), default=0)
-            link.loss_width = 1 << max(longest + 1, link.mansd + link.recovery + 1).bit_length()
         tables_of = {
             "integers": np.array(tables.integers, np.int64),
             "reals": np.array(tables.reals, np.float64),
@@ -223,6 +214,19 @@ class LinkState:
 def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
     """Return the names of the random streams of a link's stages, in their order."""
     return [stream for *_, stream in _stages(settings, StageTables(), 0, name)]
+
+
+def _rule_fields(settings: LinkSettings) -> tuple[dict[str, int], list[tuple[int, int]]]:
+    """Return the fields of a ``noack_link`` that its rules set, and limit and length of each window."""
+    rules = [constraint.rule for constraint in settings.constraints]
+    windows = [(rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow)]
+    between = (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts))
+    mansd = -1 if settings.longest_burst is None else settings.longest_burst
+    recovery, width = max(between, default=0), 1
+    if windows or recovery:
+        longest = max((packets for _, packets in windows), default=0)
+        width = 1 << max(longest + 1, mansd + recovery + 1).bit_length()
+    return {"mansd": mansd, "recovery": recovery, "loss_width": width}, windows
 
 
 def _stages(

@@ -45,7 +45,7 @@ _SPIN_NS = 50_000
 """Nearly all sleeping threads wake within this time; longer spinning would block the core."""
 
 
-class Program(Protocol):
+class RelayedProgram(Protocol):
     """What a relay is for: it runs as long as this does."""
 
     devices: DeviceLink
@@ -132,7 +132,7 @@ def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
 
 
 def relay(
-    specs: Sequence[LinkSpec], options: argparse.Namespace, program: Program | None = None
+    specs: Sequence[LinkSpec], options: argparse.Namespace, program: RelayedProgram | None = None
 ) -> Statistics:
     """Relay until Ctrl-C, or the program's end; return the totals.
 

@@ -214,7 +214,7 @@ class Plant(MachinePart):
             period_ns=self.period_ns,
             horizon_ns=self.horizon_ns,
         )
-        sources, shown = m + n * shape.disturbed_state, self.measure_every * self.reports_inputs
+        sources, reported = m + n * shape.disturbed_state, self.measure_every * self.reports_inputs
         C = None if self.measuring is None else self.measuring.C
         memory.fill(plant, {
             "internal": shape.internal, "system": core.NOACK_USER, "sources": sources,
@@ -223,7 +223,7 @@ class Plant(MachinePart):
             "predictions": self.predictions, "input_period_ns": self.input_period_ns,
             "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
             "x": np.zeros(n), "z": np.zeros(shape.internal), "u": np.zeros(m),
-            "applied": np.zeros(sources), "held": np.zeros((shown, m)),
+            "applied": np.zeros(sources), "held": np.zeros((reported, m)),
             "inputs": np.zeros((self.predictions, m)), "x_c": np.zeros(n),
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip
@@ -349,7 +349,7 @@ def system_of(resolved: Scenario) -> PlantSystem:
     plant, model = resolved.plant, resolved.model
     A: Matrix = np.array(model.A if plant.A is None else plant.A)
     B: Matrix = np.array(model.B if plant.B is None else plant.B)
-    if any(one.at == "state" for one in plant.disturbances):
+    if any(disturbance.at == "state" for disturbance in plant.disturbances):
         B = np.hstack([B, np.eye(len(A))])
     start = PlantStart(np.array(plant.initial_state), A, B, resolved.timing.plant_period_ns)
     return plant.system.system(start)
@@ -360,10 +360,10 @@ def disturbance_of(resolved: Scenario) -> Disturbance | None:
     if not resolved.plant.disturbances:
         return None
     signals: dict[Place, list[Signal]] = {"input": [], "state": []}
-    for number, one in enumerate(resolved.plant.disturbances):
+    for number, disturbance in enumerate(resolved.plant.disturbances):
         name = ("plant", "disturbance", str(number))
         source = SignalSource(resolved.timing.plant_period_ns, resolved.seeds.disturbance, name)
-        signals[one.at].append(partial(one.signal, source=source))
+        signals[disturbance.at].append(partial(disturbance.signal, source=source))
     n, m = resolved.model.dimensions
     widths = m * bool(signals["input"]), n * bool(signals["state"])
     return Disturbance(signals["input"], signals["state"], widths)

@@ -21,7 +21,7 @@ from benchmarks.programs import NOACK, in_new_process
 from benchmarks.report import Goal, MeasurementError, Peer, Row, benchmark, say
 from cosim.analysis.replay.run_replay import stored_verdict
 from cosim.cli import find_scenario
-from cosim.record.record_source import joined
+from cosim.record.record_source import concatenate_rows
 from cosim.record.run_directory import RECORD, write_environment
 from cosim.record.table_files import TableFile
 from cosim.simulation.virtual_time import simulate_run
@@ -43,7 +43,7 @@ def spooled_run(horizon_s: float, folder: Path) -> Path:
     write_environment(run_dir, "live")
     writer = SpoolWriter(run_dir / SPOOL, RECORDER)
     for table, dtype in run_tables(scenario).items():
-        rows = joined([*TableFile(run_dir / RECORD / f"{table}.parquet", dtype).batches()], dtype)
+        rows = concatenate_rows([*TableFile(run_dir / RECORD / f"{table}.parquet", dtype).batches()], dtype)
         rows = rows.take(np.argsort(rows["now_ns"], kind="stable"))
         ends_ns = np.arange(_BATCH_NS, rows["now_ns"].max(initial=0) + _BATCH_NS, _BATCH_NS)
         first = 0

@@ -15,7 +15,7 @@ its steps. So delays and model times refer to that grid.
 Events that the live run did not have use the network emulator's decisions (which depend only on its
 seed) and the median of the recorded delays.
 
-:func:`live_run` reads from a live run's record, in steps of the plant, when updates and inputs took
+:func:`recorded_loop` reads from a live run's record, in steps of the plant, when updates and inputs took
 effect.
 """
 
@@ -60,7 +60,7 @@ class IncomparableError(CallerError):
     """The run's record does not allow the comparison; the message has the reason."""
 
 
-class LiveRun(NamedTuple):
+class RecordedLoop(NamedTuple):
     """A live run on the plant's grid, up to its last measurement."""
 
     schedule: StepSchedule
@@ -70,7 +70,7 @@ class LiveRun(NamedTuple):
     """Times of the events."""
 
 
-def live_run(record: RunRecord) -> LiveRun:
+def recorded_loop(record: RunRecord) -> RecordedLoop:
     """Read the schedule of a run.
 
     Raises:
@@ -86,23 +86,8 @@ def live_run(record: RunRecord) -> LiveRun:
         record.columns(table, "input", "sequence", "model_t_ns")
         for table in (CONTROLLER_STEP, CONTROLLER_DELIVERY)
     )
-    count = len(sensor)
-    _require(
-        count >= _LEAST_MEASUREMENTS,
-        f"the record holds {count} measurements; {_LEAST_MEASUREMENTS} are needed",
-    )
-    period_ns = record.scenario.timing.plant_period_ns
-    last = int(sensor["t_ns"][-1]) // period_ns
-    steps = steps[: last + 1]
-    whole = len(steps) > last and np.array_equal(steps["sequence"], np.arange(last + 1))
-    _require(whole, "steps of the plant are missing from the record")
-    whole = np.array_equal(sensor["input"], np.arange(count))
-    _require(whole, "measurements are missing from the sensor's record")
-    horizon_ns = record.scenario.timing.horizon_ns
-    _require_times(SENSOR_MEASUREMENT, sensor["t_ns"], horizon_ns)
-    _require_times(CONTROLLER_STEP, ticks["model_t_ns"], horizon_ns)
-    _require_times(CONTROLLER_DELIVERY, deliveries["model_t_ns"], horizon_ns)
-    _require(bool(np.abs(steps["x"]).max() < _LARGEST), "the run diverged")  # also for NaN
+    steps = _whole_steps(record, steps, sensor, ticks, deliveries)
+    period_ns, last = record.scenario.timing.plant_period_ns, len(steps) - 1
     measured = np.zeros(last + 1, dtype=np.bool_)
     measured[sensor["t_ns"] // period_ns] = True
     origins, accepted = _ticks(ticks, deliveries)
@@ -126,7 +111,7 @@ def live_run(record: RunRecord) -> LiveRun:
         delay_steps=_delays(accepted, acts_at_step - event_ns // period_ns, acts_at_step <= last),
         model_ns=latched.model_ns,
     )
-    return LiveRun(schedule, steps["x"][measured], event_ns * 1e-9)
+    return RecordedLoop(schedule, steps["x"][measured], event_ns * 1e-9)
 
 
 def _require_ideal(record: RunRecord) -> None:
@@ -137,6 +122,27 @@ def _require_ideal(record: RunRecord) -> None:
     record.scenario.coverage.require_exact()
     why = f"the ideal loop has no restarts: {restarted} was restarted during the run"
     _require(restarted is None, why)
+
+
+def _whole_steps(record: RunRecord, steps: Rows, sensor: Rows, ticks: Rows, deliveries: Rows) -> Rows:
+    """Require that nothing is missing; return the plant's steps up to the last measurement."""
+    count = len(sensor)
+    _require(
+        count >= _LEAST_MEASUREMENTS,
+        f"the record holds {count} measurements; {_LEAST_MEASUREMENTS} are needed",
+    )
+    last = int(sensor["t_ns"][-1]) // record.scenario.timing.plant_period_ns
+    steps = steps[: last + 1]
+    whole = len(steps) > last and np.array_equal(steps["sequence"], np.arange(last + 1))
+    _require(whole, "steps of the plant are missing from the record")
+    whole = np.array_equal(sensor["input"], np.arange(count))
+    _require(whole, "measurements are missing from the sensor's record")
+    horizon_ns = record.scenario.timing.horizon_ns
+    _require_times(SENSOR_MEASUREMENT, sensor["t_ns"], horizon_ns)
+    _require_times(CONTROLLER_STEP, ticks["model_t_ns"], horizon_ns)
+    _require_times(CONTROLLER_DELIVERY, deliveries["model_t_ns"], horizon_ns)
+    _require(bool(np.abs(steps["x"]).max() < _LARGEST), "the run diverged")  # also for NaN
+    return steps
 
 
 def _require(met: bool, why: str) -> None:
@@ -325,21 +331,16 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
         IncomparableError: the run diverged, its record is too short or incomplete, or rounding
             changes its events.
     """
-    live = live_run(record)
+    live = recorded_loop(record)
     schedule, scenario = live.schedule, record.scenario
     known = scenario.network.initial_sync == "known_state"
     system = continuous_loop_of(scenario)
     period_s = schedule.period_ns * 1e-9
     t_s = np.flatnonzero(schedule.measured).astype(np.float64) * period_s
     ideal = _ideal(system, live, float(t_s[-1]), max_events, known_start=known)
-    states, events_s = [ideal.at(t_s).x], [ideal.event_s]
-    loop = PlantGridLoop(system, schedule, known_start=known)
-    for delay, hold in ((False, False), (True, False), (True, True)):
-        run = loop.run(delay=delay, hold=hold)
-        states.append(run.x[schedule.measured])
-        events_s.append(run.event_steps.astype(np.float64) * period_s)
-    states.append(live.x)
-    events_s.append(live.event_s)
+    simulated, event_times_s = _simulated_stages(system, schedule, known)
+    states = [ideal.at(t_s).x, *simulated, live.x]
+    events_s = [ideal.event_s, *event_times_s, live.event_s]
     if not all(np.abs(x).max() < _LARGEST for x in states):
         raise IncomparableError("a simulation of the run diverges")
     whole, effects = live.x - states[0], [after - before for before, after in pairwise(states)]
@@ -377,6 +378,20 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     )
 
 
+def _simulated_stages(
+    system: ContinuousLoop, schedule: StepSchedule, known_start: bool
+) -> tuple[list[Matrix], list[Vector]]:
+    """Return the measured states and the event times with one more effect of the network each."""
+    loop = PlantGridLoop(system, schedule, known_start=known_start)
+    effects = (False, False), (True, False), (True, True)
+    runs = [loop.run(delay=delay, hold=hold) for delay, hold in effects]
+    period_s = schedule.period_ns * 1e-9
+    return (
+        [run.x[schedule.measured] for run in runs],
+        [run.event_steps.astype(np.float64) * period_s for run in runs],
+    )
+
+
 def _require_stable_events(
     system: ContinuousLoop, schedule: StepSchedule, x: Matrix, limit: float, known_start: bool
 ) -> None:
@@ -392,7 +407,7 @@ def _require_stable_events(
 
 
 def _ideal(
-    system: ContinuousLoop, live: LiveRun, horizon_s: float, max_events: int, *, known_start: bool
+    system: ContinuousLoop, live: RecordedLoop, horizon_s: float, max_events: int, *, known_start: bool
 ) -> ContinuousRun:
     try:
         ideal = simulate_continuous(

@@ -88,7 +88,7 @@ def run_processes(
     spawn: Sequence[str] | None = None,
     session: str | None = None,
     server: "fork_server.ForkServer | None" = None,
-    listening: "remote_access.Listening | None" = None,
+    listening: "remote_access.ListenSettings | None" = None,
     watcher: "run_watcher.Watcher | None" = None,
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.

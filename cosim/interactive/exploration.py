@@ -262,7 +262,7 @@ def of_record(record: RunRecord, kind: str, diverged_at_s: float | None = None) 
 
 
 @dataclass(frozen=True)
-class Band:
+class QuantileBand:
     """Quantiles of a quantity over the draws, at the times of the ensemble, (N,) each."""
 
     low: Vector
@@ -275,10 +275,10 @@ class Ensemble:
     """Bands over draws of the plant, of x(0) and of the losses, at N times."""
 
     t_s: Vector
-    states: tuple[Band, ...]
+    states: tuple[QuantileBand, ...]
     """Of each state."""
-    x_norm: Band
-    e_c_norm: Band
+    x_norm: QuantileBand
+    e_c_norm: QuantileBand
     draws: int
     diverged: int
     """Number of draws that diverged."""
@@ -338,16 +338,16 @@ def _ensemble_setting(scenario: Scenario) -> Setting:
     return replace(setting_of(resolve(scenario)), most_events=_MOST_DRAW_EVENTS)
 
 
-def _band(values: NDArray[np.float64]) -> Band:
+def _band(values: NDArray[np.float64]) -> QuantileBand:
     """Return quantiles over the draws, (k, N) → (N,) each; a diverged draw counts as infinite."""
     if not len(values):
         nothing = np.full(values.shape[1], np.nan)
-        return Band(nothing, nothing, nothing)
+        return QuantileBand(nothing, nothing, nothing)
     # Nearest ranks: no arithmetic with infinities.
     ordered = np.sort(np.where(np.isnan(values), np.inf, values), axis=0)
     places = np.rint(np.array([LOW, 0.5, HIGH]) * (len(values) - 1)).astype(np.intp)
     low, middle, high = ordered[places]
-    return Band(low, middle, high)
+    return QuantileBand(low, middle, high)
 
 
 @np.errstate(all="ignore")  # draws may diverge

@@ -37,8 +37,8 @@ _DECADES = 7
 _HEIGHTS_IN = (1.96, 1.96, 1.4, 1.68)
 
 
-class Shown(NamedTuple):
-    """What the figure shows."""
+class ExploredRun(NamedTuple):
+    """A run, and all that the figure shows with it."""
 
     run: Exploration
     state: int
@@ -49,7 +49,7 @@ class Shown(NamedTuple):
     """A run with other settings, for comparison."""
 
 
-def exploration_figure(shown: Shown) -> FigureDescription:
+def exploration_figure(shown: ExploredRun) -> FigureDescription:
     """Describe the four panels of a run with all that is known of it.
 
     A name that several panels show is in the legend of the first.
@@ -77,7 +77,7 @@ def _has_points(item: Band | Line | Marks) -> bool:
     return bool(np.isfinite(item.low if isinstance(item, Band) else item.y).any())
 
 
-def _state(shown: Shown) -> _Part:
+def _state(shown: ExploredRun) -> _Part:
     run, i, draws, other = shown.run, shown.state, shown.ensemble, shown.reference
     x, x_s = run.x[:, i], run.x_s[:, i]
     x_c = np.where(run.controller_knows, run.x_c[:, i], np.nan)
@@ -97,7 +97,7 @@ def _state(shown: Shown) -> _Part:
     return f"{run.state_names[i]}: plant and both models", items, Axis(about=about)
 
 
-def _errors(shown: Shown) -> _Part:
+def _errors(shown: ExploredRun) -> _Part:
     run, draws, other = shown.run, shown.ensemble, shown.reference
     floor, guarantee = _floor(run), shown.guarantee
     e_s, e_c = _positive(run.e_s_norm, floor), _known_error(run, floor)
@@ -120,7 +120,7 @@ def _errors(shown: Shown) -> _Part:
     return "errors of the models (logarithmic)", items, y
 
 
-def _norm(shown: Shown) -> _Part:
+def _norm(shown: ExploredRun) -> _Part:
     run, draws, other, guarantee = shown.run, shown.ensemble, shown.reference, shown.guarantee
     norm = _positive(run.x_norm, _SMALLEST * _largest(run.x_norm))
     items = [Line(x=run.t_s, y=norm, label="‖x‖", colour=PLANT, width=2.25)]
@@ -134,7 +134,7 @@ def _norm(shown: Shown) -> _Part:
     return "‖x‖ (logarithmic)", items, Axis(logarithmic=True, about=norm, decades=_DECADES)
 
 
-def _events(shown: Shown) -> _Part:
+def _events(shown: ExploredRun) -> _Part:
     t_s, delivered = shown.run.event_s, shown.run.delivered
     since_s = np.diff(t_s, prepend=0.0)
     dots = Marks(x=t_s[delivered], y=since_s[delivered], label="delivered", colour=CONTROLLER)
@@ -271,9 +271,9 @@ class DraftResults:
             ]
         return groups
 
-    def shown(self, state: int) -> Shown:
+    def shown(self, state: int) -> ExploredRun:
         """Return what a figure shows of the results that are computed."""
-        return Shown(
+        return ExploredRun(
             self.run,
             state,
             self.ensemble if ENSEMBLE in self.known else None,

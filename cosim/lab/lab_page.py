@@ -23,7 +23,7 @@ from pyarrow import csv
 from cosim.interactive.controls import Controls, chosen, controls_of, dragged
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
-from cosim.interactive.exploration_figure import CERTIFICATE, Shown, exploration_figure
+from cosim.interactive.exploration_figure import CERTIFICATE, ExploredRun, exploration_figure
 from cosim.interactive.form import by_field, filled, form_of
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.page_parts import PageParts, TextPanel, controls_part, figure_part, form_part, value_text
@@ -221,14 +221,14 @@ class _Page:
             **parts,
         )
 
-    def _drawing(self, shown: Shown | None) -> dict[str, object]:
+    def _drawing(self, shown: ExploredRun | None) -> dict[str, object]:
         """Return what is shown anew while a slider is dragged."""
         parts: dict[str, object] = {"source": self._source, "stale": shown is None}
         if shown is not None:
             parts["figure"] = figure_part(exploration_figure(shown))
         return parts
 
-    def _note(self, shown: Shown | None) -> str:
+    def _note(self, shown: ExploredRun | None) -> str:
         """Return what is wrong with the settings, or what the drawing leaves out."""
         session = self._session
         if self._source != EXPLORE:
@@ -239,16 +239,16 @@ class _Page:
         is_old = note and shown is None and self._parts.has_figure
         return f"{note}. The figure shows the settings before" if is_old else note
 
-    def _shown(self) -> Shown | None:
+    def _shown(self) -> ExploredRun | None:
         """Return what the figure shows; None without a run."""
         view, reference = self._recorded.view, self._reference()
         shown = None
         if self._source == EXPLORE and self._session.results is not None:
             shown = self._session.results.shown(0)
         elif self._source == LIVE and self._live.run is not None:
-            shown = Shown(self._live.run, 0)
+            shown = ExploredRun(self._live.run, 0)
         elif self._source == RECORDED and view is not None:
-            shown = Shown(view.run, 0, guarantee=view.bounds)
+            shown = ExploredRun(view.run, 0, guarantee=view.bounds)
         if shown is None:
             return None
         state = min(self._state, shown.run.x.shape[1] - 1)
@@ -379,7 +379,7 @@ class FileMenu:
         services: LabServices,
         calls: PageCalls,
         session: Session,
-        shown: Callable[[], Shown | None],
+        shown: Callable[[], ExploredRun | None],
     ) -> None:
         self._services, self._calls, self._session = services, calls, session
         self._shown = shown
@@ -456,7 +456,7 @@ def csv_of(run: Exploration) -> bytes:
     return text.getvalue()
 
 
-def figure_file(shown: Shown, kind: FigureFormat) -> bytes:
+def figure_file(shown: ExploredRun, kind: FigureFormat) -> bytes:
     """Return the figure as a file's content; called in the worker process."""
     from cosim.interactive.exploration_figure import exploration_figure  # the worker alone
     from cosim.output.figures.figure_files import file_content  # needs matplotlib

@@ -72,7 +72,7 @@ def launch(
     live: bool = False,
     watcher: Watcher | None = None,
     server: ForkServer | None = None,
-    listening: "remote_access.Listening | None" = None,
+    listening: "remote_access.ListenSettings | None" = None,
 ) -> PreparedEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
@@ -108,15 +108,15 @@ def launch(
         helpers = stack.enter_context(lasting_helpers(resolved))
         watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
         with _no_directory_if_refused(run_dir):
-            opened = _open_to_others(stack, ticket, session, listening, coordinator)
+            listener = _open_to_others(stack, ticket, session, listening, coordinator)
         remote = None
-        if listening is not None and opened is not None:
+        if listening is not None and listener is not None:
             ticket = ticket.model_copy(update={"host": listening.address[0]})
-            remote = RemoteStart(away, opened.invitation.model_dump_json())
-            watcher.listening(address_text(opened.address), listening)
+            remote = RemoteStart(away, listener.invitation.model_dump_json())
+            watcher.listening(address_text(listener.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
-        run = _Run(ticket, run_dir, coordinator, children, watcher, opened and opened.notices)
+        run = _Run(ticket, run_dir, coordinator, children, watcher, listener and listener.notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
@@ -140,21 +140,21 @@ def _open_to_others(
     stack: contextlib.ExitStack,
     ticket: Ticket,
     session: str | None,
-    listening: "remote_access.Listening | None",
+    listening: "remote_access.ListenSettings | None",
     coordinator: Coordinator,
-) -> "remote_access.Opened | None":
+) -> "remote_access.RunListener | None":
     """Let processes join that are started by hand; return how those of other hosts join."""
-    opened = None
+    listener = None
     if listening is not None:
         ticket = ticket.model_copy(update={"host": listening.address[0]})
-        opened = stack.enter_context(remote_access.open_to_hosts(listening, ticket, coordinator))
+        listener = stack.enter_context(remote_access.open_to_hosts(listening, ticket, coordinator))
     if session is not None:
         by_hand = ticket.model_copy(update={"launched": False})
         stack.enter_context(ticket_file(by_hand, session))
-    if opened is not None and listening is not None and listening.invitation is not None:
+    if listener is not None and listening is not None and listening.invitation is not None:
         # last: it replaces that of an earlier run
-        stack.enter_context(invitation_file(listening.invitation, opened.invitation))
-    return opened
+        stack.enter_context(invitation_file(listening.invitation, listener.invitation))
+    return listener
 
 
 @contextlib.contextmanager
@@ -195,6 +195,8 @@ class _Run:
         self._watcher = watcher
         self._by_hand = [role for role in ROLES if role not in children]
         self._missing: tuple[str, ...] = ()
+        self._has_started = self._has_ended = False
+        self._joined = 0
         self._limit = WaitLimit(self._start_within_s())
         """How long the launcher still waits: for the start, for the end, or for the stop."""
         self._policy = RestartPolicy(ticket.scenario, coordinator, children, watcher)
@@ -205,43 +207,24 @@ class _Run:
         ``store`` is called with the result of a run that ends early, before its processes end.
         """
         result: Failure | None = None
-        last_s, started, joined, ends = time.monotonic(), False, 0, False
+        last_s = time.monotonic()
         while not self._is_over(stopping=result is not None):
             self._coordinator.poll()
             now_s = time.monotonic()
             if result is not None or not self._is_in_loop():
                 self._limit.wait(now_s - last_s, os.getloadavg()[0])
             last_s = now_s
-            if self._coordinator.epoch_ns is None:
-                if result is None:
-                    self._notify_missing()
-            elif not started:
-                started = True
-                # Now, as nothing waits for the launcher: the versions of all packages take 0.02 s.
-                write_environment(self._run_dir, "live", run_name(self._run_id))
-                point_to_latest(self._run_dir)
-                self._watcher.started(self._run_dir)
-                self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
-            elif not ends and not self._is_in_loop():
-                ends = True  # while the processes end: the imports take 0.3 s
-                Thread(target=import_module, args=("cosim.live.finalize",), daemon=True).start()
-            if len(self._coordinator.joined) > joined:
-                joined = len(self._coordinator.joined)
-                self._write_processes()
-            self._notify_progress()
+            self._follow_phase(stopping=result is not None)
             if result is None:
                 result = _signalled(signals) or self._policy.check()
                 if result is None and self._limit.is_reached:
                     result = (ExitStatus.FAILED, self._overdue())
                 if result is not None:
                     store(*result)
-                    self._coordinator.stop(result[1])
-                    if started:
-                        self._watcher.stopping(result[1])
-                    self._limit = WaitLimit(_STOP_TIMEOUT_S)
+                    self._stop(result[1])
             elif self._limit.is_reached:
                 break
-            time.sleep(_POLL_S if started else _STARTING_POLL_S)
+            time.sleep(_POLL_S if self._has_started else _STARTING_POLL_S)
         self._notify_progress()  # the last report may have arrived with the end
         return (
             result
@@ -250,6 +233,32 @@ class _Run:
             or self._policy.unfinished()
             or (ExitStatus.OK, HORIZON)
         )
+
+    def _follow_phase(self, *, stopping: bool) -> None:
+        """Do what is due once: when the loop starts, when it has ended, when a process joins."""
+        if self._coordinator.epoch_ns is None:
+            if not stopping:
+                self._notify_missing()
+        elif not self._has_started:
+            self._has_started = True
+            # Now, as nothing waits for the launcher: the versions of all packages take 0.02 s.
+            write_environment(self._run_dir, "live", run_name(self._run_id))
+            point_to_latest(self._run_dir)
+            self._watcher.started(self._run_dir)
+            self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
+        elif not self._has_ended and not self._is_in_loop():
+            self._has_ended = True  # while the processes end: the imports take 0.3 s
+            Thread(target=import_module, args=("cosim.live.finalize",), daemon=True).start()
+        if len(self._coordinator.joined) > self._joined:
+            self._joined = len(self._coordinator.joined)
+            self._write_processes()
+        self._notify_progress()
+
+    def _stop(self, reason: str) -> None:
+        self._coordinator.stop(reason)
+        if self._has_started:
+            self._watcher.stopping(reason)
+        self._limit = WaitLimit(_STOP_TIMEOUT_S)
 
     def _is_over(self, *, stopping: bool) -> bool:
         running = self._children.running()

@@ -40,13 +40,11 @@ _FLOOD_PER_S = 100
 """Connections without an invitation that are a flood."""
 _VALID = datetime.timedelta(days=3650)
 """A run may be long, and the hosts' dates may differ; an invitation ends by its pass."""
-
-
 _CALM_S, _MOST_CALM_S = 3, 60
-"""Seconds without so many, after which it is over."""
+"""Time without a flood, after which it is over; and the longest such time."""
 
 
-class Listening(NamedTuple):
+class ListenSettings(NamedTuple):
     """Where a run listens, and whom it invites."""
 
     address: Address
@@ -59,7 +57,7 @@ class Listening(NamedTuple):
     """Where the launcher starts processes, by role."""
 
 
-class Opened(NamedTuple):
+class RunListener(NamedTuple):
     """A run that is open to other hosts."""
 
     address: Address
@@ -68,13 +66,13 @@ class Opened(NamedTuple):
     """Lines for the person who watches the run: floods."""
 
 
-def listening_for(path: Path) -> Listening:
+def listening_for(path: Path) -> ListenSettings:
     """Return how processes join that the launcher starts on the hosts of a file.
 
     Raise CallerError if the file is wrong, or others cannot reach this host at its address.
     """
     hosts = load_hosts(path)
-    return Listening(listen_address(hosts.listen, f"{path}: listen"), hosts=hosts.by_role)
+    return ListenSettings(listen_address(hosts.listen, f"{path}: listen"), hosts=hosts.by_role)
 
 
 def listen_address(text: str, option: str = "--listen") -> Address:
@@ -121,7 +119,9 @@ def _listen(address: Address) -> socket.socket:
 
 
 @contextmanager
-def open_to_hosts(listening: Listening, ticket: Ticket, coordinator: Coordinator) -> Iterator[Opened]:
+def open_to_hosts(
+    listening: ListenSettings, ticket: Ticket, coordinator: Coordinator
+) -> Iterator[RunListener]:
     """Listen for processes of other hosts meanwhile, and make their invitation.
 
     Raise CallerError if the address cannot be used.
@@ -144,16 +144,16 @@ def open_to_hosts(listening: Listening, ticket: Ticket, coordinator: Coordinator
             **keys.joining._asdict(),
             valid_until=until.isoformat(timespec="seconds"),
         )
-        shown = new_admission_pass()
+        admission_pass = new_admission_pass()
         roles = LOOP_ROLES if listening.role is None else (listening.role,)
-        coordinator.passes[shown] = AdmissionPass(roles, time.monotonic() + listening.valid_s)
+        coordinator.passes[admission_pass] = AdmissionPass(roles, time.monotonic() + listening.valid_s)
         invited = {
             "launched": False,
-            "admission_pass": shown,
+            "admission_pass": admission_pass,
             "remote": remote,
             "time_reference": times.address,
         }
-        yield Opened((host, port), ticket.model_copy(update=invited), floods.lines)
+        yield RunListener((host, port), ticket.model_copy(update=invited), floods.lines)
 
 
 class ConnectionFloodWatch:
@@ -210,7 +210,7 @@ def new_tls_keys(host: str) -> TlsKeys:
     )
 
 
-def _new_key_pair(whose: x509.GeneralName) -> KeyPair:
+def _new_key_pair(owner: x509.GeneralName) -> KeyPair:
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "noack run")])
     now = datetime.datetime.now(datetime.UTC)
@@ -218,7 +218,7 @@ def _new_key_pair(whose: x509.GeneralName) -> KeyPair:
         x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
         .not_valid_before(now - _VALID)
         .not_valid_after(now + _VALID)
-        .add_extension(x509.SubjectAlternativeName([whose]), critical=False)
+        .add_extension(x509.SubjectAlternativeName([owner]), critical=False)
         .sign(key, hashes.SHA256())
     )
     pem = serialization.Encoding.PEM

@@ -37,8 +37,8 @@ from scipy.special import expit, gammaln, logit, xlogy
 
 from cosim.lazy_modules import lazy_modules
 from cosim.measurement.loss_bursts import (
-    Estimate,
     Flags,
+    IntervalEstimate,
     LossBursts,
     Minimum,
     binomial_estimate,
@@ -248,7 +248,7 @@ class ChainFit:
 
     model: ModelName
     rates: ChainRates
-    estimates: dict[str, Estimate | None]
+    estimates: dict[str, IntervalEstimate | None]
     """By parameter; None: the data do not determine it."""
     log_likelihood: float
     parameters: int
@@ -343,10 +343,10 @@ class ChainFits:
         best = self._elliott
         if expit(best.at[2]) > expit(best.at[3]):  # the bad state is the one that loses more
             best = Minimum(best.at[[1, 0, 3, 2]], best.value)
-        estimates: dict[str, Estimate | None] = {}
+        estimates: dict[str, IntervalEstimate | None] = {}
         for index, name in enumerate(ChainRates._fields):
             ends = profile_interval(self._costs, best, index, _LIMIT)
-            estimates[name] = Estimate(*map(_rounded, (best.at[index], *ends)))
+            estimates[name] = IntervalEstimate(*map(_rounded, (best.at[index], *ends)))
         rates = _ordered(best.at)
         return ChainFit("gilbert_elliott", rates, estimates, -best.value, 4)
 
@@ -467,9 +467,9 @@ class OutageFit:
     """Estimates with exact 95 % intervals."""
 
     count: int
-    rate_per_s: Estimate | None
+    rate_per_s: IntervalEstimate | None
     """Outages per second of time without outage; None: no time was observed."""
-    duration_s: Estimate | None
+    duration_s: IntervalEstimate | None
     """Mean duration; None: no outage ended within the trace."""
     p_value: float | None
     """Of the Anderson–Darling test for exponential durations; None: too few outages."""

@@ -41,7 +41,7 @@ _SHORTEST_WAIT_NS = 3 * NS_PER_S
 
 
 @dataclass(frozen=True)
-class LiveOptions:
+class LiveProbeOptions:
     """Options of a live measurement, as written."""
 
     rate: str = "50hz"
@@ -90,13 +90,13 @@ def time_s_of(option: str, text: str) -> float:
     return time_s
 
 
-def receive_live(address: str, options: LiveOptions) -> ProbeResult:
+def receive_live(address: str, options: LiveProbeOptions) -> ProbeResult:
     """Receive one probe."""
     silence_s = time_s_of("--silence", options.silence)
     return listen(parse_address(address, "--listen"), silence_s, options.save, _log)
 
 
-def send_live(address: str, options: LiveOptions) -> ProbeResult:
+def send_live(address: str, options: LiveProbeOptions) -> ProbeResult:
     """Send a probe to a listener."""
     period_ns = period_ns_of(options.rate)
     planned = max(round(time_s_of("--for", options.duration) * NS_PER_S) // period_ns, 1)

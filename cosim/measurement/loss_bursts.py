@@ -133,7 +133,7 @@ _DIFFERENCE = 1e-5
 """Distance of the points from which a gradient is computed."""
 
 
-class Estimate(NamedTuple):
+class IntervalEstimate(NamedTuple):
     """A value with its confidence interval."""
 
     value: float
@@ -141,7 +141,7 @@ class Estimate(NamedTuple):
     high: float
 
 
-def binomial_estimate(successes: int, trials: int) -> Estimate | None:
+def binomial_estimate(successes: int, trials: int) -> IntervalEstimate | None:
     """Return a probability with its likelihood-ratio interval; None without trials."""
     if not trials:
         return None
@@ -155,24 +155,24 @@ def binomial_estimate(successes: int, trials: int) -> Estimate | None:
         return outer if certain else float(optimize.brentq(lacking, share, outer, xtol=1e-15))
 
     low = 0.0 if not successes else end(min(1e-300, share / 2), False)
-    return Estimate(share, low, 1.0 if not failures else end(1 - 1e-16, False))
+    return IntervalEstimate(share, low, 1.0 if not failures else end(1 - 1e-16, False))
 
 
-def poisson_estimate(count: int, exposure: float) -> Estimate:
+def poisson_estimate(count: int, exposure: float) -> IntervalEstimate:
     """Return a rate with its exact interval (Garwood, 1936)."""
     tail = (1 - LEVEL) / 2
     low = float(stats.chi2.ppf(tail, 2 * count)) / 2 if count else 0.0
     high = float(stats.chi2.ppf(1 - tail, 2 * count + 2)) / 2
-    return Estimate(count / exposure, low / exposure, high / exposure)
+    return IntervalEstimate(count / exposure, low / exposure, high / exposure)
 
 
-def exponential_estimate(count: int, total: float) -> Estimate | None:
+def exponential_estimate(count: int, total: float) -> IntervalEstimate | None:
     """Return a mean with its exact interval, from the sum of ``count`` values; None without any."""
     if not count:
         return None
     tail = (1 - LEVEL) / 2
     ends = (2 * total / float(stats.chi2.ppf(probability, 2 * count)) for probability in (1 - tail, tail))
-    return Estimate(total / count, *ends)
+    return IntervalEstimate(total / count, *ends)
 
 
 class Minimum(NamedTuple):

@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from cosim.live.monitoring.progress import error_console
 from cosim.measurement.chain_fits import ChainFit
-from cosim.measurement.loss_bursts import LEVEL, Estimate, histogram, most_losses
+from cosim.measurement.loss_bursts import LEVEL, IntervalEstimate, histogram, most_losses
 from cosim.measurement.network_measurement import CertificateTime, Measurement
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
@@ -316,7 +316,7 @@ def _model_rows(measurement: Measurement) -> Iterator[tuple[str, str, str]]:
         yield "  fit", model.test.verdict, model.test.figures
 
 
-def _estimate(estimate: Estimate | None) -> tuple[str, str]:
+def _estimate(estimate: IntervalEstimate | None) -> tuple[str, str]:
     if estimate is None:
         return "not determined", ""
     return number(estimate.value), f"{number(estimate.low)} to {number(estimate.high)}"
@@ -324,7 +324,7 @@ def _estimate(estimate: Estimate | None) -> tuple[str, str]:
 
 def _outage_rows(measurement: Measurement) -> Iterator[tuple[str, str, str]]:
     fit = measurement.outage_fit
-    per_hour = fit.rate_per_s and Estimate(*(3600 * value for value in fit.rate_per_s))
+    per_hour = fit.rate_per_s and IntervalEstimate(*(3600 * value for value in fit.rate_per_s))
     yield "outages per hour", *_estimate(per_hour)
     if fit.count:
         yield "mean duration in s", *_estimate(fit.duration_s)

@@ -42,8 +42,8 @@ from cosim.measurement.chain_fits import (
 from cosim.measurement.loss_bursts import (
     LEVEL,
     WINDOWS,
-    Estimate,
     Flags,
+    IntervalEstimate,
     LossBursts,
     Outcomes,
     QuantileM,
@@ -335,7 +335,7 @@ class Measurement:
 _FEW_BURSTS = 20
 
 
-def _interval(estimate: Estimate | None) -> dict[str, float] | None:
+def _interval(estimate: IntervalEstimate | None) -> dict[str, float] | None:
     return None if estimate is None else dict(estimate._asdict())
 
 

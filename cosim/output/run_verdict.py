@@ -155,7 +155,7 @@ def transmission_line(events: int, deliveries: int, ideal: int | None = None) ->
     return VerdictLine(f"{sent}{beside}, {deliveries} delivered", NEUTRAL)
 
 
-class Guarantee(NamedTuple):
+class GuaranteeVerdict(NamedTuple):
     """Whether the claims about a loop held."""
 
     style: str
@@ -166,7 +166,7 @@ class Guarantee(NamedTuple):
     """Why it is not; if it is kept, what limits it."""
 
 
-def guarantee_of(loop: LoopSummary) -> Guarantee:
+def guarantee_of(loop: LoopSummary) -> GuaranteeVerdict:
     """Return whether the claims about a loop held, and the guarantee of consecutive losses.
 
     A claim that assumes an ideal loop cannot be broken by a run. Where a certificate covers the
@@ -180,17 +180,17 @@ def guarantee_of(loop: LoopSummary) -> Guarantee:
         since_s = min(claim.since_s or 0.0 for claim in violated)
         broken.append((since_s, "violated: " + "; ".join([*named[:_NAMED], *more])))
     if broken:
-        return Guarantee(BAD, *min(broken))
+        return GuaranteeVerdict(BAD, *min(broken))
     certified = [claim for claim in loop.claims if "certificate" in claim.source]
     if not certified:
         why = next((claim.why for claim in loop.claims if claim.verdict == "void"), "")
-        return Guarantee(DOUBTFUL, 0.0, why or "no certificate covers this loop")
+        return GuaranteeVerdict(DOUBTFUL, 0.0, why or "no certificate covers this loop")
     void = [claim for claim in loop.claims if claim.verdict == "void"]
     late, covered = _lateness(loop), ""
     if late and _covers_lateness(loop):
         covered = f"certificate recomputed for the lateness of this run: {late[0]}"
     if not void:
-        return Guarantee(GOOD, 0.0, covered)
+        return GuaranteeVerdict(GOOD, 0.0, covered)
     # Each part of the run between changes of settings needs a certificate that held.
     parts = {claim.from_s for claim in certified if claim.verdict == "held"}
     rest = [claim for claim in void if claim in certified and claim.from_s not in parts]
@@ -206,8 +206,8 @@ def guarantee_of(loop: LoopSummary) -> Guarantee:
         why = f"at worst {why}; no certificate covers that"
     if parts and not rest:
         unchecked = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {why}"
-        return Guarantee(GOOD, 0.0, "; ".join(filter(None, (covered, unchecked))))
-    return Guarantee(DOUBTFUL, since_s, why)
+        return GuaranteeVerdict(GOOD, 0.0, "; ".join(filter(None, (covered, unchecked))))
+    return GuaranteeVerdict(DOUBTFUL, since_s, why)
 
 
 def _lateness(loop: LoopSummary) -> list[str]:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.record_source import joined
+from cosim.record.record_source import concatenate_rows
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.linear_systems import (
@@ -95,14 +95,14 @@ class ControllerTrack(NamedTuple):
         )
 
 
-def in_common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
+def in_common(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:
     """Return where x_c is recorded, and sensor and controller share an update, (k,).
 
     After a restart of the sensor they share none until an update of the restarted one is delivered.
     """
     known = scenario.network.initial_sync == "known_state"
-    first = np.where(known & (joined.sensor == 0), NO_SEQUENCE, joined.sensor * GENERATION)
-    return np.asarray(all_entries(~np.isnan(joined.x_c)) & (joined.received >= first))
+    first = np.where(known & (aligned.sensor == 0), NO_SEQUENCE, aligned.sensor * GENERATION)
+    return np.asarray(all_entries(~np.isnan(aligned.x_c)) & (aligned.received >= first))
 
 
 def initial_track(scenario: Scenario) -> ControllerTrack:
@@ -120,37 +120,37 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     newest = np.concatenate([np.full(len(steps), NO_SEQUENCE), deliveries["sequence"]])[order]
     model_ns = np.concatenate([steps["model_t_ns"], deliveries["model_t_ns"]])[order]
     x_c = np.concatenate([steps["x_c"], deliveries["x_c"]]).take(order, axis=0)
-    lives = inputs[order] // GENERATION
-    track, begins = before, firsts_of_equal(lives).tolist()
-    for begin, end in pairwise([*begins, len(lives)]):
+    generations = inputs[order] // GENERATION
+    track, begins = before, firsts_of_equal(generations).tolist()
+    for begin, end in pairwise([*begins, len(generations)]):
         own = slice(begin, end)
-        track = _continued(track, int(lives[begin]), model_ns[own], x_c[own], newest[own])
+        track = _continued(track, int(generations[begin]), model_ns[own], x_c[own], newest[own])
     return track
 
 
 def _continued(
-    track: ControllerTrack, life: int, model_ns: Times, x_c: Reals, newest: NDArray[np.int64]
+    track: ControllerTrack, generation: int, model_ns: Times, x_c: Reals, newest: NDArray[np.int64]
 ) -> ControllerTrack:
     """Append the states of one generation of the controller to a track."""
-    if life != track.generation:  # no state between two generations of the controller
+    if generation != track.generation:  # no state between two generations of the controller
         track = ControllerTrack(
             np.append(track.model_ns, track.model_ns[-1] + 1),
             np.vstack([track.x_c, np.full_like(track.x_c[-1:], np.nan)]),
             np.append(track.received, NO_SEQUENCE),
-            life,
+            generation,
         )
     received = np.maximum.accumulate(np.concatenate([track.received[-1:], newest]))[1:]
-    x_c[(received == NO_SEQUENCE) & (life > 0)] = np.nan
+    x_c[(received == NO_SEQUENCE) & (generation > 0)] = np.nan
     return ControllerTrack(
         np.concatenate([track.model_ns, model_ns]),
         np.concatenate([track.x_c, x_c]),
         np.concatenate([track.received, received]),
-        life,
+        generation,
     )
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
-def join(
+def align_measurements(
     loop: LoopMatrices,
     measurements: Rows,
     track: ControllerTrack,
@@ -258,7 +258,7 @@ def _aligned(record: RunRecord) -> Iterator[AlignedPart]:
     tables = (SENSOR_MEASUREMENT, CONTROLLER_STEP, CONTROLLER_DELIVERY)
 
     def part(rows: Rows, until_ns: int) -> AlignedPart:
-        aligned = join(loop, rows, track, until_ns, flow=flow, acknowledged=acknowledged)
+        aligned = align_measurements(loop, rows, track, until_ns, flow=flow, acknowledged=acknowledged)
         true_x = true_states(steps, rows["t_ns"]) if reads_steps else None
         return AlignedPart(rows, aligned, true_x)
 
@@ -271,10 +271,10 @@ def _aligned(record: RunRecord) -> Iterator[AlignedPart]:
             last_ns = waiting["t_ns"][ready - 1]
             keep = max(int(np.searchsorted(track.model_ns, last_ns, "right")) - 1, 0)
             track, steps = track.since(keep), steps.compress(steps["t_ns"] > last_ns)
-        waiting = joined([waiting[ready:], taken[SENSOR_MEASUREMENT]], waiting.dtype)
+        waiting = concatenate_rows([waiting[ready:], taken[SENSOR_MEASUREMENT]], waiting.dtype)
         track = controller_track(track, taken[CONTROLLER_STEP], taken[CONTROLLER_DELIVERY])
         if reads_steps:
-            steps = joined([steps, taken[PLANT_STEP]], steps.dtype)
+            steps = concatenate_rows([steps, taken[PLANT_STEP]], steps.dtype)
     yield part(waiting, int(track.model_ns[-1]) + scenario.timing.controller_period_ns)
 
 

@@ -34,7 +34,7 @@ from noack.runtime.spool import (
     KEPT_KEY,
     KEPT_REPORT,
     SPOOL,
-    Chunk,
+    SpoolBatch,
     SpoolWriter,
     chunks_of,
     kept_run_name,
@@ -165,7 +165,7 @@ def _has_secret(kept: Path, process: _Process, source: str) -> bool:
     return process.writer in map(writer_of, secrets)
 
 
-def _chunks(path: Path, name: str) -> Iterator[Chunk]:
+def _chunks(path: Path, name: str) -> Iterator[SpoolBatch]:
     """Yield the batches of a file; raise PeerError if no process can have written it."""
     if not stat.S_ISREG(path.lstat().st_mode):
         raise PeerError(f"{name} is not a regular file")
@@ -221,10 +221,10 @@ def _require_consistent(before_dir: Path, after_dir: Path, source: str) -> None:
             if not _contains(before, after, table):
                 raise PeerError(f"{source}: it has other rows of {table} than were recorded")
         for role in LOOP_ROLES:
-            for life in after.lives(role):
-                reported = {} if life.report is None else life.report["rows"]
-                for table in reported.keys() & life.rows.keys():
-                    if (surplus := life.rows[table] - reported[table]) > 0:
+            for generation in after.generations(role):
+                reported = {} if generation.report is None else generation.report["rows"]
+                for table in reported.keys() & generation.rows.keys():
+                    if (surplus := generation.rows[table] - reported[table]) > 0:
                         raise PeerError(
                             f"{source}: with its rows, {table} has {surplus} more than the {role} reported"
                         )

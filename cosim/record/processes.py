@@ -1,7 +1,7 @@
 """The processes of a run: their final reports, and their generations.
 
 The reports are written as one file, and read back with care. A generation is a process between two
-restarts; :func:`lives_of` finds out which of its rows are recorded, and when it was active.
+restarts; :func:`read_generations` finds out which of its rows are recorded, and when it was active.
 """
 
 import contextlib
@@ -157,20 +157,20 @@ def valid_reports(
                 continue
             report = report_of(role, json.dumps(entry), tables)
             owned = [table for table in tables if OWNER[table] == role]
-            if report.generation < generations(source, owned)[-1] or role in reports:
+            if report.generation < generation_numbers(source, owned)[-1] or role in reports:
                 earlier.append(report.fields() | {"process": role})
             else:
                 reports[role] = report.fields()
     return reports, earlier
 
 
-LIFE_COLUMNS = ("input", "now_ns")
+GENERATION_COLUMNS = ("input", "now_ns")
 
 
-class Life(NamedTuple):
+class ProcessGeneration(NamedTuple):
     """One generation of a process."""
 
-    generation: int
+    number: int
     rows: Mapping[str, int]
     """Number of recorded rows by table."""
     report: Report | None
@@ -178,14 +178,14 @@ class Life(NamedTuple):
     first_ns: int | None = None
     """Time of the first row; None without rows."""
     last_ns: int | None = None
-    hole_ns: int | None = None
+    gap_ns: int | None = None
     """Time of the last input before a gap in the rows; None if there is no known gap. Rows that are
     missing at the end of a process without a report are unknown."""
     missing_inputs: int = 0
     """Number of inputs without a row, before the last recorded input."""
 
 
-def places_of_lives(rows: Rows, begun: Sequence[int]) -> NDArray[np.intp]:
+def generation_indices(rows: Rows, begun: Sequence[int]) -> NDArray[np.intp]:
     """Return the place of each row's generation among those that began, ascending, (k,).
 
     A row with an unexpected number belongs to the generation before.
@@ -194,7 +194,7 @@ def places_of_lives(rows: Rows, begun: Sequence[int]) -> NDArray[np.intp]:
     return (np.searchsorted(np.array(begun), numbers, side="right") - 1).clip(min=0)
 
 
-def generations(source: RecordSource, tables: Sequence[str]) -> list[int]:
+def generation_numbers(source: RecordSource, tables: Sequence[str]) -> list[int]:
     """Return the generations of a role that wrote rows, from the number of each one's first input.
 
     If that row is missing, the rows of a later generation prove that there were earlier ones.
@@ -218,7 +218,7 @@ class _Counts:
         self.rows = dict.fromkeys(tables, 0)
         self.first_ns: int | None = None
         self.last_ns: int | None = None
-        self.hole_ns: int | None = None
+        self.gap_ns: int | None = None
         self._input, self._now_ns = generation * GENERATION - 1, 0
         self._numbers: dict[int, tuple[int, int]] = {}
         """By generation in the input numbers: the largest number, and the number of rows."""
@@ -236,10 +236,10 @@ class _Counts:
         self.last_ns = high_ns if self.last_ns is None else max(self.last_ns, high_ns)
         order = np.argsort(inputs, kind="stable")
         inputs, now_ns = inputs[order], now_ns[order]
-        holes = np.flatnonzero(np.diff(inputs, prepend=self._input) > 1)
-        if len(holes) and self.hole_ns is None:
-            before = self._now_ns if holes[0] == 0 and self._numbers else now_ns[max(holes[0] - 1, 0)]
-            self.hole_ns = int(before)
+        gaps = np.flatnonzero(np.diff(inputs, prepend=self._input) > 1)
+        if len(gaps) and self.gap_ns is None:
+            before = self._now_ns if gaps[0] == 0 and self._numbers else now_ns[max(gaps[0] - 1, 0)]
+            self.gap_ns = int(before)
         self._input, self._now_ns = int(inputs[-1]), int(now_ns[-1])
         first, last = (int(number) // GENERATION for number in (inputs[0], inputs[-1]))
         for of in [first] if first == last else np.unique(inputs // GENERATION).tolist():
@@ -252,39 +252,39 @@ class _Counts:
         return sum(newest + 1 - count for newest, count in self._numbers.values())
 
 
-def lives_of(
+def read_generations(
     parts: Iterable[Slice],
     tables: Sequence[str],
     begun: Sequence[int],
     reports: Mapping[int, Report],
-) -> list[Life]:
-    """Return the generations of one process from the parts of its tables, with ``LIFE_COLUMNS``.
+) -> list[ProcessGeneration]:
+    """Return the generations of one process from the parts of its tables, with ``GENERATION_COLUMNS``.
 
     ``begun`` has their numbers, ascending; ``reports`` are by generation.
     """
     counts = [_Counts(generation, tables) for generation in begun]
     for part in parts:
-        for count, own in zip(counts, split_by_life(part, begun), strict=True):
+        for count, own in zip(counts, split_by_generation(part, begun), strict=True):
             count.add(own)
     return [
-        Life(
+        ProcessGeneration(
             generation,
             count.rows,
             reports.get(generation),
             count.first_ns,
             count.last_ns,
-            count.hole_ns,
+            count.gap_ns,
             count.missing_inputs,
         )
         for generation, count in zip(begun, counts, strict=True)
     ]
 
 
-def split_by_life(part: Slice, begun: Sequence[int]) -> Iterator[Slice]:
+def split_by_generation(part: Slice, begun: Sequence[int]) -> Iterator[Slice]:
     """Yield the rows of each generation of a process, from rows of its tables."""
     if len(begun) == 1:
         yield part
         return
-    places = {table: places_of_lives(rows, begun) for table, rows in part.items()}
+    places = {table: generation_indices(rows, begun) for table, rows in part.items()}
     for i in range(len(begun)):
         yield {table: rows.compress(places[table] == i) for table, rows in part.items()}

@@ -44,7 +44,7 @@ class Segment(NamedTuple):
         return self._replace(read=read)
 
 
-def joined(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
+def concatenate_rows(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
     """Return rows of one type in one array, as raw bytes: numpy would join column by column."""
     if len(parts) == 1:
         return parts[0]
@@ -72,7 +72,7 @@ class RecordSource(ABC):
     def whole(self, table: str) -> Rows:
         """Return all rows of a table."""
         if table not in self._whole:
-            self._whole[table] = joined([*self._read(table, ())], self.types[table])
+            self._whole[table] = concatenate_rows([*self._read(table, ())], self.types[table])
         return self._whole[table]
 
     def keep(self, table: str, rows: Rows) -> None:
@@ -190,7 +190,7 @@ class _TableReader:
                 break
         if not parts:
             return self._rows[:0]
-        return joined(parts, parts[0].dtype)
+        return concatenate_rows(parts, parts[0].dtype)
 
 
 if TYPE_CHECKING:

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from cosim.lazy_modules import lazy_modules
 from cosim.record.processes import (
-    LIFE_COLUMNS,
-    Life,
+    GENERATION_COLUMNS,
+    ProcessGeneration,
     Report,
     entries_of_loop,
-    generations,
+    generation_numbers,
     joint_reports,
-    lives_of,
+    read_generations,
     report_entries,
     valid_reports,
 )
@@ -34,7 +34,7 @@ from cosim.record.record_source import (
     RecordSource,
     RowsInMemory,
     Slice,
-    joined,
+    concatenate_rows,
     packed,
     slices,
     with_columns,
@@ -128,7 +128,7 @@ class RunRecord:
         self.kind: Kind = kind
         self.source = rows if isinstance(rows, RecordSource) else RowsInMemory(rows)
         self.tables = network_tables() if self.is_network else tables_of(scenario)
-        self._lives: dict[str, list[Life]] = {}
+        self._generations: dict[str, list[ProcessGeneration]] = {}
 
     @cached_property
     def loop(self) -> LoopMatrices:
@@ -201,7 +201,7 @@ class RunRecord:
         batches = self.source.batches(table, names)
         chosen = (rows if where is None else rows.compress(where(rows)) for rows in batches)
         dtype = with_columns(self.tables[table], names)
-        return joined([packed(rows, dtype) for rows in chosen], dtype)
+        return concatenate_rows([packed(rows, dtype) for rows in chosen], dtype)
 
     @cached_method
     def events(self) -> Rows:
@@ -240,21 +240,21 @@ class RunRecord:
         derived.tables = self.tables  # they are those of the run that was recorded
         return derived
 
-    def lives(self, role: str) -> list[Life]:
+    def generations(self, role: str) -> list[ProcessGeneration]:
         """The generations of a process, in order."""
-        if role not in self._lives:
+        if role not in self._generations:
             tables, reports = self.owned_by(role), self._reports_of(role)
-            parts = self.slices(*tables, columns=LIFE_COLUMNS) if tables else ()
-            self._lives[role] = lives_of(parts, tables, self.begun_lives(role), reports)
-        return self._lives[role]
+            parts = self.slices(*tables, columns=GENERATION_COLUMNS) if tables else ()
+            self._generations[role] = read_generations(parts, tables, self.generation_numbers(role), reports)
+        return self._generations[role]
 
     @cached_method
-    def row_counts(self, role: str) -> list[Life]:
+    def row_counts(self, role: str) -> list[ProcessGeneration]:
         """The generations of a process in order, of which only rows and reports may be known."""
-        if role in self._lives or len(self.begun_lives(role)) > 1:
-            return self.lives(role)
+        if role in self._generations or len(self.generation_numbers(role)) > 1:
+            return self.generations(role)
         counts = {table: self.count(table) for table in self.owned_by(role)}
-        return [Life(0, counts, self._reports_of(role).get(0))]
+        return [ProcessGeneration(0, counts, self._reports_of(role).get(0))]
 
     def is_complete(self, role: str) -> bool:
         """Whether the record has all rows that a process reported, of all its generations."""
@@ -270,10 +270,10 @@ class RunRecord:
         return {report.get("generation", 0): report for report in (*newest, *earlier)}
 
     @cached_method
-    def begun_lives(self, role: str) -> list[int]:
+    def generation_numbers(self, role: str) -> list[int]:
         """The numbers of the recorded generations of a process, ascending."""
         again = any((notice["process"], notice["level"]) == (role, RESTART) for notice in self.notices)
-        return generations(self.source, self.owned_by(role)) if again else [0]
+        return generation_numbers(self.source, self.owned_by(role)) if again else [0]
 
     def owned_by(self, role: str) -> list[str]:
         """Return the tables with the inputs of a process's machine."""
@@ -282,7 +282,7 @@ class RunRecord:
 
     def restarted(self) -> str | None:
         """A role whose process was restarted; None if there is none."""
-        return next((role for role in LOOP_ROLES if len(self.begun_lives(role)) > 1), None)
+        return next((role for role in LOOP_ROLES if len(self.generation_numbers(role)) > 1), None)
 
     @property
     def is_network(self) -> bool:
@@ -404,7 +404,7 @@ class StoredLoops(Sequence[RunRecord]):
         for table, dtype in network_tables().items():
             parts = zip(*self._shared.of_loops(table, numbers), strict=True)
             for record, own in zip(records, parts, strict=False):  # none if there are no rows
-                record.source.keep(table, joined(own, dtype))
+                record.source.keep(table, concatenate_rows(own, dtype))
         return records
 
     def _record_of(self, number: int) -> RunRecord:

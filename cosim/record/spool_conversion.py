@@ -24,7 +24,7 @@ import numpy as np
 
 from cosim.lazy_modules import lazy_modules
 from cosim.record.processes import add_kept_reports
-from cosim.record.record_source import BATCH_ROWS, Rows, Segment, joined
+from cosim.record.record_source import BATCH_ROWS, Rows, Segment, concatenate_rows
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import (
     Notice,
@@ -99,7 +99,7 @@ def spool_batches(
 
 
 def _read(path: Path, begin: int, end: int, dtype: np.dtype[np.void]) -> Rows:
-    return joined([rows for _, _, rows in spool_parts(path, dtype, begin, end)], dtype)
+    return concatenate_rows([rows for _, _, rows in spool_parts(path, dtype, begin, end)], dtype)
 
 
 def merged(segments: Iterable[Segment], dtype: np.dtype[np.void]) -> Iterator[Rows]:
@@ -113,7 +113,7 @@ def merged(segments: Iterable[Segment], dtype: np.dtype[np.void]) -> Iterator[Ro
         waiting.append(segment.read())
         if after is not None and sum(map(len, waiting)) < BATCH_ROWS:
             continue
-        rows = in_order(joined(waiting, dtype))
+        rows = in_order(concatenate_rows(waiting, dtype))
         ready = len(rows) if after is None else int(np.searchsorted(rows["input"], after.first))
         if ready:
             yield rows[:ready]
@@ -135,7 +135,7 @@ def by_loop(segments: Iterable[Segment], dtype: np.dtype[np.void], loops: range)
     """Return the rows of each of some loops, each in order and without duplicates."""
     read = (segment.read() for segment in sorted(segments, key=lambda segment: segment.first))
     own = [rows.compress((rows[LOOP] >= loops.start) & (rows[LOOP] < loops.stop)) for rows in read]
-    rows = joined(own, dtype)
+    rows = concatenate_rows(own, dtype)
     del own  # as large as the rows
     rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
     ends = np.searchsorted(rows[LOOP], np.arange(loops.start, loops.stop), "right")
@@ -369,7 +369,7 @@ class _EarlyTable:
 
     def _slice(self) -> Iterator[Rows]:
         """Yield the next rows of the spool, loop after loop."""
-        rows = joined([*self._consecutive()], self._dtype)
+        rows = concatenate_rows([*self._consecutive()], self._dtype)
         rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
         loops, inputs = rows[LOOP].astype(np.int64), rows["input"]
         firsts = firsts_of_equal(loops)

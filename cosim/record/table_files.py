@@ -22,7 +22,7 @@ from cosim.record.record_source import (
     RecordSource,
     Rows,
     Segment,
-    joined,
+    concatenate_rows,
     packed,
     parts_by_loop,
     with_columns,
@@ -110,7 +110,7 @@ class StoredTables(RecordSource):
                     if number in parts_of:
                         parts_of[number].append(part)
             for number, parts in parts_of.items():
-                yield loops.index(number), joined(parts, dtype)
+                yield loops.index(number), concatenate_rows(parts, dtype)
 
     def count_of_loop(self, table: str, number: int) -> int:
         """Return the number of rows of a loop; of a table without loops, of all rows."""
@@ -327,18 +327,18 @@ def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
             continue
         begins = count and LOOP in (dtype.names or ()) and waiting[-1][LOOP][-1] != batch[LOOP][0]
         if count >= _LEAST_GROUP_ROWS and begins:
-            yield joined(waiting, dtype)
+            yield concatenate_rows(waiting, dtype)
             waiting, count = [], 0
         waiting.append(batch)
         count += len(batch)
         if count >= BATCH_ROWS:
-            rows = joined(waiting, dtype)
+            rows = concatenate_rows(waiting, dtype)
             whole = count - count % BATCH_ROWS
             for first in range(0, whole, BATCH_ROWS):
                 yield rows[first : first + BATCH_ROWS]
             waiting, count = [rows[whole:].copy()], count - whole
     if count:
-        yield joined(waiting, dtype)
+        yield concatenate_rows(waiting, dtype)
 
 
 def _arrays(rows: Rows) -> dict[str, Any]:

@@ -55,7 +55,7 @@ class LoopState(NamedTuple):
     e_c: Vector
 
 
-class Samples(NamedTuple):
+class LoopSamples(NamedTuple):
     """The loop at k times; states of shape (k, n)."""
 
     t_s: Vector
@@ -133,11 +133,11 @@ class ContinuousLoop:
         norms: Vector = np.linalg.norm(errors if W is None else errors @ W.T, axis=-1)
         return norms
 
-    def sample(self, state: LoopState, t_s: Vector) -> Samples:
+    def sample(self, state: LoopState, t_s: Vector) -> LoopSamples:
         """Return the states at ascending times ≥ ``state.t_s``, without events in between."""
         return self.follow(np.array([state.t_s]), np.array(state[1:])[None], t_s)
 
-    def follow(self, start_s: Vector, starts: NDArray[np.float64], t_s: Vector) -> Samples:
+    def follow(self, start_s: Vector, starts: NDArray[np.float64], t_s: Vector) -> LoopSamples:
         """Return the states at ascending times, of parts that begin just after events.
 
         Args:
@@ -147,7 +147,7 @@ class ContinuousLoop:
         """
         t_s = np.asarray(t_s, dtype=np.float64)
         states = self._between.sample(self.loop.A, self.loop.B, start_s, starts, t_s)
-        return Samples(t_s, *np.moveaxis(states, 1, 0))
+        return LoopSamples(t_s, *np.moveaxis(states, 1, 0))
 
 
 def reset(state: LoopState, delivered: bool) -> LoopState:
@@ -213,7 +213,7 @@ class ContinuousRun:
         """The run is computed up to this time."""
         return self.horizon_s if self.diverged_at_s is None else self.diverged_at_s
 
-    def at(self, t_s: Vector | Sequence[float]) -> Samples:
+    def at(self, t_s: Vector | Sequence[float]) -> LoopSamples:
         """Return the loop at many times, right-continuous: at an event, the state after the reset.
 
         Raises:
@@ -226,17 +226,17 @@ class ContinuousRun:
             raise ValueError("times must be in ascending order")
         return self.system.follow(np.array([0.0, *self.event_s]), self.starts, t_s)
 
-    def divergence(self, samples: Samples, resolved: Scenario) -> Divergence | None:
+    def divergence(self, samples: LoopSamples, resolved: Scenario) -> Divergence | None:
         """Return how the run diverged, by samples at evenly spaced times; None if it did not."""
         if self.diverged_at_s is not None:
             return Divergence(self.diverged_at_s, f"diverged at {self.diverged_at_s:g} s")
         return divergence([(samples.t_s, samples.x)], len(samples.t_s), [resolved])
 
-    def e_s_norm(self, samples: Samples) -> Vector:
+    def e_s_norm(self, samples: LoopSamples) -> Vector:
         """‖W e_s‖ of samples, (k,)."""
         return self.system.norms(samples.e_s)
 
-    def e_c_norm(self, samples: Samples) -> Vector:
+    def e_c_norm(self, samples: LoopSamples) -> Vector:
         """‖W e_c‖ of samples, (k,)."""
         return self.system.norms(samples.e_c)
 
@@ -399,7 +399,7 @@ def document(run: ContinuousRun, resolved: Scenario) -> dict[str, object]:
     }
 
 
-def _thresholds(run: ContinuousRun, samples: Samples) -> list[float] | None:
+def _thresholds(run: ContinuousRun, samples: LoopSamples) -> list[float] | None:
     if not run.system.trigger.is_decaying:
         return None
     return [run.system.threshold(t_s) for t_s in samples.t_s.tolist()]

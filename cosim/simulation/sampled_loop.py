@@ -30,7 +30,7 @@ _POINTERS = {"i": "int64_t *", "f": "double *", "b": "uint8_t *"}
 
 
 class Scales(NamedTuple):
-    """What the values of a run are multiplied with, by the step, (K + 1,)."""
+    """Factors of the values of a run, by step, (K + 1,)."""
 
     weight: Matrix
     """W, (n, n)."""
@@ -104,30 +104,30 @@ class SampledLoop:
             self._gains = _dense(np.array([*islice(resolved.observer.gains(assumed), measurements)]))
         loops = (resolved,)
         self._machines = (plants_of(loops), sensors_of(loops), controllers_of(loops))
-        self._set_causes(pushes_of(resolved), noise_of(resolved))
+        self._set_disturbances(state_increments(resolved), noise_of(resolved))
 
-    def _set_causes(self, push: Matrix, noise: Matrix) -> None:
+    def _set_disturbances(self, increments: Matrix, noise: Matrix) -> None:
         """Make a plant with these disturbances and noise; it shares the state of the first one."""
         matrices, (n, m) = self.matrices, self.resolved.model.dimensions
-        self._push, self._noise = push, noise
+        self._increments, self._noise = increments, noise
         plant = ffi.new("noack_plant *", self._machines[0].machines[0])
         B = discretise(matrices.A, matrices.B, self.resolved.timing.plant_period_ns)[1]
-        sources, pushes = B, np.zeros((self.last + 1, n))
-        if len(push):
-            sources, pushes[: len(push)] = np.hstack([B, np.eye(n)]), push
+        sources, at_state = B, np.zeros((self.last + 1, n))
+        if len(increments):
+            sources, at_state[: len(increments)] = np.hstack([B, np.eye(n)]), increments
         arrays = {"Bd": _dense(sources), "applied": np.zeros(m + n)}
         for name, array in arrays.items():
             setattr(plant, name, pointer_to(array, "double *"))
         plant.sources, plant.at_input.width = sources.shape[1], 0
         noises = _dense(noise)
         for signal, values, given in (
-            (plant.at_state, pushes, len(push)),
+            (plant.at_state, at_state, len(increments)),
             (plant.noise, noises, len(noise)),
         ):
             signal.width = values.shape[1] if given else 0
             signal.first, signal.rows = 0, len(values)
             signal.values = pointer_to(values, "double *")
-        self._plant, self._kept = plant, (arrays, pushes, noises)
+        self._plant, self._kept = plant, (arrays, at_state, noises)
 
     @property
     def known_start(self) -> bool:
@@ -153,14 +153,14 @@ class SampledLoop:
         return runs
 
     @property
-    def causes(self) -> tuple[Matrix, Matrix]:
+    def disturbances(self) -> tuple[Matrix, Matrix]:
         """The changes of x by the disturbance of each step, and the noise of each measurement."""
-        return self._push, self._noise
+        return self._increments, self._noise
 
-    def with_causes(self, push: Matrix, noise: Matrix) -> "SampledLoop":
+    def with_disturbances(self, increments: Matrix, noise: Matrix) -> "SampledLoop":
         """Return this loop with other disturbances and noise."""
         changed = copy(self)
-        changed._set_causes(push, noise)
+        changed._set_disturbances(increments, noise)
         return changed
 
     def correction(self, numbers: Numbers) -> Stack:
@@ -228,25 +228,25 @@ class SampledLoop:
         core.noack_follow(segments, pointer_to(last, "int64_t *"), tests)
 
 
-def through_of(resolved: Scenario) -> Matrix:
+def disturbance_effect(resolved: Scenario) -> Matrix:
     """Return the effect of disturbances of u and of ẋ, held over a step, on x, (n, m + n)."""
     matrices, period_ns = loop_of(resolved), resolved.timing.plant_period_ns
     sources = np.hstack([matrices.B, np.eye(matrices.n)])
     return discretise(matrices.A, sources, period_ns)[1]
 
 
-def pushes_of(resolved: Scenario) -> Matrix:
+def state_increments(resolved: Scenario) -> Matrix:
     """Return the changes of x by the disturbance of each step, (steps, n); (0, n) for none."""
     disturbance, (n, m) = disturbance_of(resolved), resolved.model.dimensions
     if disturbance is None:
         return np.zeros((0, n))
-    through = through_of(resolved)
-    pushes = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
-    d, w = disturbance.values(range(len(pushes)))
-    for part, at in ((d, through[:, :m]), (w, through[:, m:])):
+    effect = disturbance_effect(resolved)
+    increments = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
+    d, w = disturbance.values(range(len(increments)))
+    for part, at in ((d, effect[:, :m]), (w, effect[:, m:])):
         if part.shape[1]:
-            pushes += part @ at.T
-    return pushes
+            increments += part @ at.T
+    return increments
 
 
 def noise_of(resolved: Scenario) -> Matrix:

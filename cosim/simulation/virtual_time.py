@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, joined, packed
+from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, concatenate_rows, packed
 from cosim.record.run_directory import (
     EndingFile,
     RunEnding,
@@ -122,7 +122,7 @@ class RecordCollector:
         batches = self._batches.pop(table, [])
         if settings := self._settings.pop(table, []):
             batches = [np.array(settings, dtype), *batches]
-        return joined(batches or [np.zeros(0, dtype)], dtype)
+        return concatenate_rows(batches or [np.zeros(0, dtype)], dtype)
 
     def of_loop(self, table: str, number: int) -> Rows:
         """Return the rows of a loop in a table of the machines, without the loop's number."""

@@ -418,10 +418,10 @@ static int64_t call_receive(driver_scratch *own, int fd, int64_t place, int64_t 
 /* The size of the datagrams in a message; only the last one may be smaller. */
 static int64_t segment_bytes(const struct mmsghdr *message) {
     struct msghdr head = message->msg_hdr;
-    for (struct cmsghdr *one = CMSG_FIRSTHDR(&head); one; one = CMSG_NXTHDR(&head, one))
-        if (one->cmsg_level == IPPROTO_UDP && one->cmsg_type == UDP_GRO) {
+    for (struct cmsghdr *part = CMSG_FIRSTHDR(&head); part; part = CMSG_NXTHDR(&head, part))
+        if (part->cmsg_level == IPPROTO_UDP && part->cmsg_type == UDP_GRO) {
             int size_bytes;
-            memcpy(&size_bytes, CMSG_DATA(one), sizeof size_bytes);
+            memcpy(&size_bytes, CMSG_DATA(part), sizeof size_bytes);
             return max_of(size_bytes, 1);
         }
     return message->msg_len;

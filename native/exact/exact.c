@@ -228,7 +228,7 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
             rule->gain_down, &memory->gain_signs);
         memory->w = take(&next, blocks * curve);
     }
-    code->share(memory);
+    code->prepare_shared(memory);
     return count;
 }
 

@@ -86,7 +86,7 @@ typedef struct { /* a run, or a part of one */
 /* The code for a number of states; see states.c. */
 typedef struct {
     int64_t n, stride; /* states; doubles of a vector */
-    void (*share)(exact_memory *memory);
+    void (*prepare_shared)(exact_memory *memory);
     void (*prepare)(exact_memory *memory, const double *A, const double *B);
     void (*follow)(exact_memory *memory, exact_run *run);
     void (*sample)(

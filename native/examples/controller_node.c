@@ -180,7 +180,7 @@ static int64_t due_ns(void) {
 }
 
 /* Give noack the row of a step, and send its message. */
-static void conclude(void) {
+static void report_step(void) {
     static uint8_t datagram[NOACK_DATAGRAM_BYTES];
     put_frame(output.table, output.row, output.words * 8);
     flush(MSG_DONTWAIT); /* the row is on its way before what it tells of */
@@ -206,7 +206,7 @@ static void handle(const uint8_t *datagram, int64_t bytes, int64_t from_peer) {
     if (found != NOACK_ACCEPTED)
         return;
     noack_controller_handle(&controller, &message, now_ns() - machine->phase_ns, &output);
-    conclude();
+    report_step();
 }
 
 static void receive(void) {
@@ -232,7 +232,7 @@ static void do_ticks(void) {
         if (at_ns < due_ns())
             return;
         noack_controller_tick(&controller, at_ns - machine->phase_ns, &output);
-        conclude();
+        report_step();
     }
 }
 

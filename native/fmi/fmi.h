@@ -19,7 +19,7 @@ const char *noack_sources(void);
 /* image.c: read the image of an instance; return NULL, or what is wrong. */
 const char *open_image(fmu *instance, const char *folder);
 /* Set the pointers of an image that is to be at an address. */
-void point(noack_fmu_image *image, uintptr_t address);
+void set_pointers(noack_fmu_image *image, uintptr_t address);
 void tag_image(const noack_fmu_image *image, uint8_t tag[NOACK_TAG_BYTES]);
 
 /* steps.c: go from now_ns to a time; return NULL, or what is wrong. */

@@ -10,7 +10,7 @@
 
 enum { MOST_BYTES = 1 << 30 };
 
-void point(noack_fmu_image *image, uintptr_t address) {
+void set_pointers(noack_fmu_image *image, uintptr_t address) {
     uint8_t *bytes = (uint8_t *)image;
     const noack_fmu_pointer *pointers = (const void *)(bytes + image->pointers_at);
     for (int64_t k = 0; k < image->pointer_count; k++) {
@@ -64,7 +64,7 @@ const char *open_image(fmu *instance, const char *folder) {
     if (image == NULL)
         return "there is no memory";
     instance->image = memcpy(image, initial, (size_t)initial->bytes);
-    point(instance->image, (uintptr_t)image);
+    set_pointers(instance->image, (uintptr_t)image);
     if (initial->channel_at != 0)
         instance->channel = (void *)(image + initial->channel_at);
     if (initial->controller_at != 0)

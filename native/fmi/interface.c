@@ -152,7 +152,7 @@ static status save(const fmu *instance, const void *image, void **state) {
 status fmi3GetFMUState(fmu *instance, void **state) {
     if (instance == NULL || save(instance, instance->image, state) != FMI_OK)
         return FMI_ERROR;
-    point(*state, 0);
+    set_pointers(*state, 0);
     return FMI_OK;
 }
 
@@ -160,7 +160,7 @@ status fmi3SetFMUState(fmu *instance, const void *state) {
     if (instance == NULL || state == NULL)
         return fail(instance, "there is no state");
     memcpy(instance->image, state, (size_t)instance->initial->bytes);
-    point(instance->image, (uintptr_t)instance->image);
+    set_pointers(instance->image, (uintptr_t)instance->image);
     return FMI_OK;
 }
 

@@ -8,10 +8,10 @@
 
 #include "loop.h"
 
-static void swap_rows(int64_t columns, double *one, double *other) {
+static void swap_rows(int64_t columns, double *row, double *other) {
     for (int64_t k = 0; k < columns; k++) {
-        double value = one[k];
-        one[k] = other[k];
+        double value = row[k];
+        row[k] = other[k];
         other[k] = value;
     }
 }
@@ -76,20 +76,20 @@ void noack_observer_gain(noack_observer *observer, int64_t n) {
 /* P <- (I - L C) P (I - L C)' + L R L', made symmetric. */
 static void correct_covariance(noack_observer *observer, int64_t n) {
     int64_t p = observer->p, size = n * n;
-    double *rest = observer->scratch, *half = rest + size, *one = half + size, *LR = one + size;
+    double *rest = observer->scratch, *half = rest + size, *next = half + size, *LR = next + size;
     multiply(n, p, n, observer->gain, observer->C, 0, rest);
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < n; j++)
             rest[i * n + j] = (i == j ? 1.0 : 0.0) - rest[i * n + j];
     multiply(n, n, n, rest, observer->P, 0, half);
-    multiply(n, n, n, half, rest, 1, one);
+    multiply(n, n, n, half, rest, 1, next);
     multiply(n, p, p, observer->gain, observer->R, 0, LR);
     multiply(n, p, n, LR, observer->gain, 1, half);
     for (int64_t k = 0; k < size; k++)
-        one[k] += half[k];
+        next[k] += half[k];
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < n; j++)
-            observer->P[i * n + j] = 0.5 * (one[i * n + j] + one[j * n + i]);
+            observer->P[i * n + j] = 0.5 * (next[i * n + j] + next[j * n + i]);
 }
 
 void noack_observer_correct(noack_observer *observer, int64_t n, const double *y) {

@@ -39,7 +39,7 @@ static int is_full(const noack_process *process, int64_t table) {
 }
 
 /* Write a loop's own row where the columns of a table with longer vectors have it. */
-static void spread(const int64_t *layout, int64_t words, const int64_t *own, uint8_t *row) {
+static void spread_row(const int64_t *layout, int64_t words, const int64_t *own, uint8_t *row) {
     static const double missing = NAN;
     for (int64_t k = 0; k < words; k++, row += sizeof *own) {
         if (layout[k] >= 0)
@@ -62,11 +62,11 @@ static void append_row(noack_process *process, int64_t loop) {
     if (layout == NULL)
         memcpy(row + NOACK_LOOP_BYTES, process->output.row, (size_t)bytes);
     else
-        spread(layout, bytes / 8, process->output.row, row + NOACK_LOOP_BYTES);
+        spread_row(layout, bytes / 8, process->output.row, row + NOACK_LOOP_BYTES);
 }
 
 /* Keep the outputs of a step that is done. */
-static int64_t conclude(noack_process *process, int64_t loop, int64_t question) {
+static int64_t keep_outputs(noack_process *process, int64_t loop, int64_t question) {
     process->asking = loop;
     if (question != NOACK_DONE)
         return question;
@@ -100,7 +100,7 @@ int64_t noack_process_handle(noack_process *process, const noack_message *messag
     if (is_full(process, acknowledges ? NOACK_ACKNOWLEDGEMENTS : NOACK_MESSAGES))
         return NOACK_ROWS_FULL;
     now_ns -= noack_process_machine(process, loop)->phase_ns;
-    return conclude(process, loop, handle_message(process, loop, message, now_ns));
+    return keep_outputs(process, loop, handle_message(process, loop, message, now_ns));
 }
 
 int64_t noack_process_tick(noack_process *process, int64_t now_ns) {
@@ -113,5 +113,5 @@ int64_t noack_process_tick(noack_process *process, int64_t now_ns) {
         heap_pop(process->heap, &process->heap_count);
         push_tick(process, loop);
     }
-    return conclude(process, loop, question);
+    return keep_outputs(process, loop, question);
 }

@@ -1,11 +1,11 @@
 /* The sensor: runs the model x_s in parallel to the plant and transmits at events (eq:ModSensor).
 
-   Its step is noack_sensor_handle, at the end of this file. At a measurement (measured): propagate
-   x_s, test, send at most one state update. x_s is reset at every event, whether or not the network
-   delivers the update: nothing is acknowledged. Its time is the time of the measurements: what it
-   sends does not depend on when a datagram was read. With an observer the estimate x-hat takes the
-   place of x. The trigger compares with x - x_r, the distance from the set point. Where the step
-   needs Python, it returns a question; with the answer it is repeated.
+   Its step is noack_sensor_handle, at the end of this file. At a measurement (handle_measurement):
+   propagate x_s, test, send at most one state update. x_s is reset at every event, whether or not
+   the network delivers the update: nothing is acknowledged. Its time is the time of the
+   measurements: what it sends does not depend on when a datagram was read. With an observer the
+   estimate x-hat takes the place of x. The trigger compares with x - x_r, the distance from the set
+   point. Where the step needs Python, it returns a question; with the answer it is repeated.
 
    In the acknowledgement baseline only an acknowledged update resets x_s: at that of update k,
    x_s <- e^(H(t - t_k)) x(t_k), which equals the controller's model then. After a transmission the
@@ -21,7 +21,7 @@ static double *rule_scratch(const noack_sensor *sensor) {
 }
 
 /* x - x_r at a time. */
-static const double *distance(const noack_sensor *sensor, int64_t t_ns, const double *x) {
+static const double *from_setpoint(const noack_sensor *sensor, int64_t t_ns, const double *x) {
     const double *point = noack_model_point(&sensor->model, t_ns);
     int64_t n = sensor->machine.n;
     double *moved = sensor->scratch + n;
@@ -33,20 +33,21 @@ static const double *distance(const noack_sensor *sensor, int64_t t_ns, const do
 }
 
 /* Whether a measurement is an event, by the rule or by the answer of the user's trigger. */
-static int64_t test(noack_sensor *sensor, int64_t t_ns, double sides[2]) {
+static int64_t test_trigger(noack_sensor *sensor, int64_t t_ns, double sides[2]) {
     if (!sensor->is_user)
         return noack_trigger_test(
             &sensor->rule, &sensor->trigger, sensor->machine.n, t_ns,
-            distance(sensor, t_ns, sensor->x), sensor->e_s, sides, rule_scratch(sensor));
+            from_setpoint(sensor, t_ns, sensor->x), sensor->e_s, sides, rule_scratch(sensor));
     sides[0] = sensor->left;
     sides[1] = sensor->right;
     return sensor->event;
 }
 
-static void start(noack_sensor *sensor, int64_t t_ns, const double *x) {
+/* Restart the condition of the trigger at an event at x. */
+static void start_condition(noack_sensor *sensor, int64_t t_ns, const double *x) {
     int64_t n = sensor->machine.n;
     sensor->trigger.event_ns = t_ns;
-    copy(n, distance(sensor, t_ns, x), sensor->event_x);
+    copy(n, from_setpoint(sensor, t_ns, x), sensor->event_x);
     if (!sensor->is_user)
         noack_trigger_start(
             &sensor->rule, &sensor->trigger, n, t_ns, sensor->event_x, rule_scratch(sensor));
@@ -54,7 +55,7 @@ static void start(noack_sensor *sensor, int64_t t_ns, const double *x) {
 
 /* An error, as a share of its threshold, on the scale of docs/wire.md: 1 to 255, of which 128 is 1,
    and 16 more are twice as much; 0: it is not a number. */
-static int64_t level_of(double share) {
+static int64_t error_level(double share) {
     int exponent;
     if (isnan(share))
         return 0;
@@ -64,8 +65,8 @@ static int64_t level_of(double share) {
     return max_of(96 + 16 * exponent + (int64_t)(32.0 * fraction), 1);
 }
 
-/* Write the row of a measurement; at an event send the update before it. */
-static void answer(
+/* Write the row of a measurement and, at an event, the update. */
+static void write_output(
     noack_sensor *sensor, const noack_message *message, const double *x_s, const double sides[2],
     int64_t event, int64_t now_ns, noack_output *output) {
     int64_t n = sensor->machine.n;
@@ -86,7 +87,7 @@ static void answer(
         if (sensor->reports_error) {
             int compares = sensor->is_user || sensor->rule.up_rows > 0;
             double share = compares ? sides[0] / sides[1] : error;
-            output->message.error_level = sensor->first ? 255 : level_of(share);
+            output->message.error_level = sensor->first ? 255 : error_level(share);
         }
     }
 }
@@ -107,7 +108,7 @@ static void keep_sent(noack_sensor *sensor, int64_t t_ns) {
     sensor->wait_ns = t_ns + sensor->timeout_ns;
 }
 
-static int64_t measured(
+static int64_t handle_measurement(
     noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
     noack_machine *machine = &sensor->machine;
     int64_t n = machine->n, t_ns = message->t_ns, first = !sensor->knows_state;
@@ -122,14 +123,15 @@ static int64_t measured(
     if (sensor->is_user && !machine->answered)
         return NOACK_ASK_DECISION;
     if (first)
-        start(sensor, t_ns, sensor->x);
-    int64_t due = test(sensor, t_ns, sides), waits = sensor->acknowledged && t_ns < sensor->wait_ns;
+        start_condition(sensor, t_ns, sensor->x);
+    int64_t due = test_trigger(sensor, t_ns, sides);
+    int64_t waits = sensor->acknowledged && t_ns < sensor->wait_ns;
     int64_t event = first || (due && !waits), resets = event && !sensor->acknowledged;
     if (resets)
-        start(sensor, t_ns, sensor->x);
+        start_condition(sensor, t_ns, sensor->x);
     else if (event)
         keep_sent(sensor, t_ns);
-    answer(sensor, message, x_s, sides, event, now_ns, output);
+    write_output(sensor, message, x_s, sides, event, now_ns, output);
     copy(n, resets ? sensor->x : x_s, sensor->x_s);
     sensor->model_ns = machine->reached_ns = t_ns;
     sensor->knows_state = 1;
@@ -137,7 +139,7 @@ static int64_t measured(
 }
 
 /* Index of an unacknowledged update; sent_count if there is none with this number. */
-static int64_t place_of(const noack_sensor *sensor, int64_t sequence) {
+static int64_t find_sent(const noack_sensor *sensor, int64_t sequence) {
     int64_t place = 0;
     while (place < sensor->sent_count && sensor->sent[place] != sequence)
         place++;
@@ -156,10 +158,10 @@ static void forget(noack_sensor *sensor, int64_t count) {
 }
 
 /* An acknowledgement is newer than all before it. */
-static int64_t acknowledged(
+static int64_t handle_acknowledgement(
     noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
     noack_machine *machine = &sensor->machine;
-    int64_t n = machine->n, t_ns = message->t_ns, place = place_of(sensor, message->sequence);
+    int64_t n = machine->n, t_ns = message->t_ns, place = find_sent(sensor, message->sequence);
     double *before = sensor->scratch;
     int found = place < sensor->sent_count;
     if (found && sensor->is_user && !machine->answered) {
@@ -192,7 +194,7 @@ int64_t noack_sensor_handle(
         return NOACK_ASK_CHANGE;
     int64_t question;
     if (message->flow == NOACK_ACKNOWLEDGEMENT) {
-        question = acknowledged(sensor, message, now_ns, output);
+        question = handle_acknowledgement(sensor, message, now_ns, output);
     } else {
         if (sensor->observer.kind == NOACK_NO_OBSERVER) {
             copy(machine->n, message->vector, sensor->x);
@@ -201,7 +203,7 @@ int64_t noack_sensor_handle(
             copy(machine->n, sensor->observer.x, sensor->x);
             machine->observed = 1;
         }
-        question = measured(sensor, message, now_ns, output);
+        question = handle_measurement(sensor, message, now_ns, output);
     }
     if (question == NOACK_DONE)
         machine->answered = machine->observed = 0;

@@ -148,44 +148,45 @@ static void write_destination(
     }
 }
 
+/* Fill a message with a datagram and the following ones that the kernel can segment; return the
+   datagram after them, and add to the number of vectors in use. */
+static int64_t fill_message(noack_relay *relay, int header, int64_t number, int64_t *vectors) {
+    relay_scratch *own = scratch_of(relay);
+    const departure *first = &own->leaving[number];
+    struct msghdr *message = &own->out_headers[header].msg_hdr;
+    int64_t begin = *vectors, size_bytes = first->datagram.size_bytes, all_bytes = size_bytes;
+    int64_t end = add_vectors(relay, begin, begin, first), last_bytes = size_bytes, segments = 1;
+    *message = (struct msghdr){.msg_iov = own->out_vectors + begin};
+    own->out_first[header] = (int32_t)number;
+    number = first->next;
+    int can_segment = relay->segment && 0 < size_bytes && size_bytes < relay->segment_below;
+    while (can_segment && number >= 0 && segments < MOST_SEGMENTS && last_bytes == size_bytes) {
+        const departure *other = &own->leaving[number];
+        if (!may_join(relay, first, other, all_bytes) || end + vectors_of(other) > VECTORS)
+            break;
+        last_bytes = other->datagram.size_bytes;
+        end = add_vectors(relay, begin, end, other);
+        all_bytes += last_bytes;
+        segments++;
+        number = other->next;
+    }
+    if (segments > 1)
+        write_segment_size(message, &own->out_controls[header], size_bytes);
+    message->msg_iovlen = (size_t)(end - begin);
+    write_destination(relay, message, first);
+    *vectors = end;
+    return number;
+}
+
 /* Fill messages from a datagram on; return their number, and the datagram after them. */
-static int fill(noack_relay *relay, int64_t number, int64_t *following) {
+static int fill_messages(noack_relay *relay, int64_t number, int64_t *following) {
     relay_scratch *own = scratch_of(relay);
     int64_t vectors = 0;
     int headers = 0;
     own->joined_bytes = 0;
-    while (number >= 0 && headers < LEAVING) {
-        const departure *first = &own->leaving[number];
-        if (vectors + vectors_of(first) > VECTORS)
-            break;
-        struct msghdr *message = &own->out_headers[headers].msg_hdr;
-        *message = (struct msghdr){.msg_iov = own->out_vectors + vectors};
-        own->out_first[headers] = (int32_t)number;
-        int64_t begin = vectors, all_bytes = first->datagram.size_bytes, segments = 1;
-        int64_t last_bytes = first->datagram.size_bytes;
-        vectors = add_vectors(relay, begin, vectors, first);
-        number = first->next;
-        if (relay->segment && 0 < all_bytes && all_bytes < relay->segment_below) {
-            while (number >= 0 && segments < MOST_SEGMENTS
-                   && last_bytes == first->datagram.size_bytes) {
-                const departure *other = &own->leaving[number];
-                if (!may_join(relay, first, other, all_bytes)
-                    || vectors + vectors_of(other) > VECTORS)
-                    break;
-                last_bytes = other->datagram.size_bytes;
-                vectors = add_vectors(relay, begin, vectors, other);
-                all_bytes += last_bytes;
-                segments++;
-                number = other->next;
-            }
-            if (segments > 1)
-                write_segment_size(
-                    message, &own->out_controls[headers], first->datagram.size_bytes);
-        }
-        message->msg_iovlen = (size_t)(vectors - begin);
-        write_destination(relay, message, first);
-        headers++;
-    }
+    while (number >= 0 && headers < LEAVING
+           && vectors + vectors_of(&own->leaving[number]) <= VECTORS)
+        number = fill_message(relay, headers++, number, &vectors);
     *following = number;
     return headers;
 }
@@ -282,7 +283,7 @@ static int64_t send_queued(noack_relay *relay, int32_t place) {
     const noack_socket *socket = &relay->sockets[place];
     int64_t number = socket->head, following, calls = 0;
     for (; number >= 0; number = following) {
-        int headers = fill(relay, number, &following), done = headers;
+        int headers = fill_messages(relay, number, &following), done = headers;
         if (socket->fd >= 0)
             done = transmit(relay, place, headers, following);
         else

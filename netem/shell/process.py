@@ -131,7 +131,7 @@ def guard(parent: int, command: list[str]) -> int:
 
 
 def main() -> None:
-    """Run as the program says."""
+    """Run the role that the first argument names."""
     role, *arguments = sys.argv[1:]
     if role == "inside":
         sys.exit(guard(int(arguments[0]), arguments[1:]))

@@ -272,10 +272,10 @@ class ModelFlow:
         return moved
 
 
-def _same(one: Vector | None, other: Vector | None) -> bool:
-    if one is None or other is None:
-        return one is other
-    return bool(np.array_equal(one, other))
+def _same(a: Vector | None, b: Vector | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return bool(np.array_equal(a, b))
 
 
 def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:

@@ -108,8 +108,8 @@ class _Hash:
         return words
 
 
-def _mixed(one: NDArray[np.uint32], other: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    words = one * np.uint32(0xCA01F9DD) - other * np.uint32(0x4973F715)
+def _mixed(a: NDArray[np.uint32], b: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    words = a * np.uint32(0xCA01F9DD) - b * np.uint32(0x4973F715)
     words ^= words >> np.uint32(16)
     return words
 

@@ -33,7 +33,7 @@ from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import EquationSettings, PlantEquations
 from noack.plants.systems import jump_integrator
 from noack.plants.systems.code_cache import CALLED_BY_CODE, cache_folder, compiler, is_kept, while_compiling
-from noack.plants.systems.jump_integrator import Work, advance, buffers
+from noack.plants.systems.jump_integrator import StepBuffers, advance, buffers
 from noack.settings.section import Positive
 
 _CORE = ("x_position", "y_position", "steering_angle", "speed", "yaw")
@@ -355,7 +355,7 @@ def _integrator(dynamics: FunctionType) -> Callable[..., int]:
         parameters: Parameters,
         duration_s: float,
         tolerances: tuple[float, float],
-        work: Work,
+        work: StepBuffers,
     ) -> int:
         return advance(rates, dynamics, z, v, parameters, duration_s, tolerances, work)
 

@@ -158,7 +158,7 @@ class Node:
         self._tokens.append(self._session.liveliness().declare_token(token))
 
 
-class Exchange:
+class TopicExchange:
     """Asks a node: a message on one topic, the answer with the same stamp on another.
 
     Args:

@@ -57,7 +57,7 @@ def run_machines(process: RunProcess, machines: LoopMachines) -> None:
         process.run(driver, channel, machines)
 
 
-class Ends(TypedDict):
+class FlowAddresses(TypedDict):
     """The other ends of a process's flows; see :class:`LoopChannel`."""
 
     source: Address
@@ -66,7 +66,7 @@ class Ends(TypedDict):
     acknowledges_to: Address | None
 
 
-def ends_of(process: RunProcess, addresses: Mapping[str, Address]) -> Ends:
+def ends_of(process: RunProcess, addresses: Mapping[str, Address]) -> FlowAddresses:
     """Return the other ends of a process's flows, by what the coordinator has sent."""
     role, network, answer = process.role, process.scenario.network.flows, Flow.ACKNOWLEDGEMENT
     answers = answer in network

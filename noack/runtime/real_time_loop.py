@@ -87,7 +87,7 @@ class Driver(Protocol):
         """When the next work is due; None if there is none."""
 
 
-class Channel(Protocol):
+class ProcessSockets(Protocol):
     """The sockets of a process."""
 
     def do_housekeeping(self, now_ns: int, sink: RecordSink) -> None:
@@ -96,7 +96,7 @@ class Channel(Protocol):
 
 def run_loop(
     driver: Driver,
-    channel: Channel,
+    channel: ProcessSockets,
     clock: RunClock,
     telemetry: RecordSink,
     *,

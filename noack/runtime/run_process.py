@@ -63,7 +63,7 @@ from noack.runtime.join_ticket import (
     read_invitation,
 )
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
-from noack.runtime.real_time_loop import Channel, Driver, realtime, run_loop
+from noack.runtime.real_time_loop import Driver, ProcessSockets, realtime, run_loop
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer
 from noack.scenario.parameter_changes import ParameterChange
@@ -273,7 +273,7 @@ class RunProcess:
         )
 
     def _drive(
-        self, driver: Driver, channel: Channel, machine: Reconfigurable, telemetry: TelemetryBuffer
+        self, driver: Driver, channel: ProcessSockets, machine: Reconfigurable, telemetry: TelemetryBuffer
     ) -> int:
         """Run the loop; return the simulated time up to which the machines have done their work."""
         has_table = clock_table(self.role) in run_tables(self.scenario)

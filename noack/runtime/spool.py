@@ -112,7 +112,7 @@ def _write_complete(file: BinaryIO, chunk: bytes) -> None:
         raise
 
 
-class Chunk(NamedTuple):
+class SpoolBatch(NamedTuple):
     """One batch in a file of the spool."""
 
     first: int
@@ -152,7 +152,7 @@ def batch_bytes(data: memoryview) -> int | None:
     return None if len(data) < _CHUNK.size else _CHUNK.size + int(_CHUNK.unpack_from(data)[1])
 
 
-def chunks_of(file: IO[bytes], most_bytes: int | None = None) -> Iterator[Chunk]:
+def chunks_of(file: IO[bytes], most_bytes: int | None = None) -> Iterator[SpoolBatch]:
     """Yield the complete batches of an open file, from its beginning.
 
     Raise ValueError for a batch of more than ``most_bytes``.
@@ -166,10 +166,10 @@ def chunks_of(file: IO[bytes], most_bytes: int | None = None) -> Iterator[Chunk]
             break
         if most_bytes is not None and length > most_bytes:
             raise ValueError(f"a batch of {length} bytes")
-        yield Chunk(first, file.read(length))
+        yield SpoolBatch(first, file.read(length))
 
 
-def read_chunks(folder: Path, table: str) -> Iterator[Chunk]:
+def read_chunks(folder: Path, table: str) -> Iterator[SpoolBatch]:
     """Yield each complete batch of a table, from all writers."""
     for path in spool_files(folder, table):
         with path.open("rb", buffering=_READ_BYTES) as file:

@@ -13,7 +13,7 @@ from noack.protocol.ros2_messages import DEFAULT_ROUTER, Entries
 from noack.settings.section import Positive, ScenarioSection
 
 if TYPE_CHECKING:
-    from noack.protocol.ros2_node import Exchange
+    from noack.protocol.ros2_node import TopicExchange
 
 _AGAIN_S = 0.2
 
@@ -63,7 +63,7 @@ class Ros2Peer(External):
     ) -> None:
         self._settings, self._place, self._topics = settings, place, topics
         self._first, self._count = first, count
-        self._exchange: Exchange | None = None
+        self._exchange: TopicExchange | None = None
         self.first_answer = np.zeros(count)
 
     def connect(self) -> None:
@@ -75,11 +75,11 @@ class Ros2Peer(External):
         if self._exchange is not None:
             return
         # Scenarios without such a part do not wait for zenoh.
-        from noack.protocol.ros2_node import Exchange, Node
+        from noack.protocol.ros2_node import Node, TopicExchange
 
         settings, name = self._settings, self._place.replace(".", "_")
         node = Node(f"noack_{name}", settings.router, settings.domain, listen=settings.listen)
-        exchange = Exchange(node, *self._topics, self._place)
+        exchange = TopicExchange(node, *self._topics, self._place)
         try:
             answer = exchange.ask(self._first, self._count, settings.start_timeout_s, again_s=_AGAIN_S)
         except (TimeoutError, ValueError) as error:

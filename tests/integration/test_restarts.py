@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.record.processes import places_of_lives
+from cosim.record.processes import generation_indices
 from cosim.record.run_record import Rows, RunRecord, load_record
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import GENERATION
@@ -113,7 +113,7 @@ def record(restarted: live.Finished) -> RunRecord:
 
 def rows_of_life(record: RunRecord, table: str, place: int) -> Rows:
     rows = record[table]
-    numbers: Rows = rows[places_of_lives(rows, record.begun_lives(OWNER[table])) == place]
+    numbers: Rows = rows[generation_indices(rows, record.generation_numbers(OWNER[table])) == place]
     return numbers
 
 

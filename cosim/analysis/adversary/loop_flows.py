@@ -60,7 +60,7 @@ class Objective(StrEnum):
         """The value of a run without segments."""
         return 0.0 if self.additive else -np.inf
 
-    def joined(self, earlier: Matrix, later: Matrix) -> Matrix:
+    def combine(self, earlier: Matrix, later: Matrix) -> Matrix:
         """Return the value of two successive parts of a run."""
         return np.asarray(earlier + later if self.additive else np.maximum(earlier, later))
 
@@ -113,7 +113,7 @@ Pattern = tuple[bool, ...]
 Flags = NDArray[np.bool_]
 
 
-class Segments(NamedTuple):
+class SegmentEnds(NamedTuple):
     """The ends of N segments: the next event, or the horizon."""
 
     end_s: Vector
@@ -139,10 +139,10 @@ class PatternFlow(Protocol):
     def horizon_s(self) -> float:
         """End of the runs."""
 
-    def start(self) -> Segments:
+    def start(self) -> SegmentEnds:
         """Return the start of all runs: after the first packet, or with x(0) known."""
 
-    def __call__(self, t_s: Vector, z: Matrix) -> Segments:
+    def __call__(self, t_s: Vector, z: Matrix) -> SegmentEnds:
         """Follow N runs from times (N,), just after events, to their next events."""
 
     def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
@@ -205,11 +205,11 @@ class SegmentFlow:
             fading_until_s=until_s,
         )
 
-    def start(self) -> Segments:
+    def start(self) -> SegmentEnds:
         """As :meth:`PatternFlow.start`: sensor and controller have x(0)."""
         x0, zero = self.system.loop.x0, np.zeros(1)
         z = np.concatenate([x0, np.zeros(2 * len(x0))])[None]
-        return Segments(zero, z, zero > 0, zero + self.objective.nothing)
+        return SegmentEnds(zero, z, zero > 0, zero + self.objective.nothing)
 
     def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
         """As :meth:`PatternFlow.after_events`: e_s ← 0, and e_c ← 0 if the update arrives."""
@@ -230,7 +230,7 @@ class SegmentFlow:
         scaled = z / self.measure.level(t_s)[:, None]
         return np.asarray(np.einsum("ai,ij,aj->a", scaled, self._gramians[window_s], scaled))
 
-    def __call__(self, t_s: Vector, z: Matrix) -> Segments:
+    def __call__(self, t_s: Vector, z: Matrix) -> SegmentEnds:
         """As :meth:`PatternFlow.__call__`, with z = (x, e_s, e_c), (N, 3n).
 
         Raises:
@@ -248,7 +248,7 @@ class SegmentFlow:
         else:
             value = ends.values / (measure.beta if measure.objective is Objective.ERROR else 1.0)
         value = np.where(diverged, math.inf, value)
-        return Segments(ends.t_s, z, is_event & ~diverged, value, ends.at_s)
+        return SegmentEnds(ends.t_s, z, is_event & ~diverged, value, ends.at_s)
 
 
 def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
@@ -335,13 +335,13 @@ class SampledFlow:
             return float((bound[1:] ** 2).sum() * self.loop.step_s)
         return float(bound[0])
 
-    def start(self) -> Segments:
+    def start(self) -> SegmentEnds:
         """As :meth:`PatternFlow.start`."""
         runs = self.loop.start()
         value = self.objective.nothing
         if self.objective is Objective.STATE:
             value = float(np.linalg.norm(runs.x[0]))
-        return Segments(self._time(runs.step), _packed(runs), runs.is_event, np.array([value]))
+        return SegmentEnds(self._time(runs.step), _packed(runs), runs.is_event, np.array([value]))
 
     def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
         """As :meth:`PatternFlow.after_events`."""
@@ -349,7 +349,7 @@ class SampledFlow:
         self.loop.update(runs, delivered)
         return _packed(runs)
 
-    def __call__(self, t_s: Vector, z: Matrix) -> Segments:
+    def __call__(self, t_s: Vector, z: Matrix) -> SegmentEnds:
         """As :meth:`PatternFlow.__call__`."""
         runs = self._runs(t_s, z)
         self.loop.follow(runs, self._scales, np.full(len(t_s), self.loop.last))
@@ -360,7 +360,7 @@ class SampledFlow:
         elif not self.objective.additive:
             of_error = self.objective is Objective.ERROR
             at_s = self._time(runs.error_at if of_error else runs.state_at)
-        return Segments(end_s, _packed(runs), runs.is_event, value, at_s)
+        return SegmentEnds(end_s, _packed(runs), runs.is_event, value, at_s)
 
     def promise(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
         """As :meth:`PatternFlow.promise`: the value over the window without events.
@@ -450,7 +450,7 @@ def run_of(flow: SampledFlow, delivered: Callable[[int], bool]) -> SampledRun:
         segment_value = float(segment.value[0])
         if segment.at_s is not None and segment_value > value:
             at_s = float(segment.at_s[0])
-        value = float(flow.objective.joined(np.array(value), np.array(segment_value)))
+        value = float(flow.objective.combine(np.array(value), np.array(segment_value)))
         if not segment.is_event[0]:
             break
         fates.append(delivered(len(event_s)))

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.adversary.loop_flows import Flags, Pattern, PatternFlow, Segments
+from cosim.analysis.adversary.loop_flows import Flags, Pattern, PatternFlow, SegmentEnds
 from cosim.simulation.continuous import TooManyEventsError
 from cosim.simulation.exact_simulation import MAX_EVENTS
 from noack.core.linear_systems import Matrix, Vector, firsts_of_equal
@@ -133,7 +133,7 @@ class PatternSearch:
         """
         objective = self.flow.objective
         segments = self.flow(nodes.t_s, nodes.z)
-        value = objective.joined(nodes.value, segments.value)
+        value = objective.combine(nodes.value, segments.value)
         # A sum is compared only when the run is complete.
         candidates = np.where(segments.is_event & objective.additive, -np.inf, value)
         top = int(candidates.argmax())
@@ -155,7 +155,7 @@ class PatternSearch:
 def after_events(
     flow: PatternFlow,
     nodes: Nodes,
-    segments: Segments,
+    segments: SegmentEnds,
     value: Vector,
     continued: Indices,
     delivered: Flags,
@@ -318,7 +318,7 @@ def follow(
     run, value, last = np.arange(count), nodes.value.copy(), nodes.entry.copy()
     for event in range(MAX_EVENTS):
         segments = flow(nodes.t_s, nodes.z)
-        value[run] = flow.objective.joined(nodes.value, segments.value)
+        value[run] = flow.objective.combine(nodes.value, segments.value)
         last[run] = nodes.entry
         going = np.flatnonzero(segments.is_event)
         if not len(going):

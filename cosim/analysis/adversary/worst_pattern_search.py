@@ -42,7 +42,7 @@ from cosim.analysis.adversary.worst_run import (
     bounds_of,
     certified_value,
     reported,
-    worst_causes,
+    worst_disturbances,
 )
 from cosim.simulation.continuous import (
     ContinuousLoop,
@@ -171,7 +171,7 @@ def _push(flow: SampledFlow, bounds: Bounds, worst: SampledRun) -> tuple[Sampled
         base_flow, base_run = flow, worst
         some_s = base_run.event_s[:: len(base_run.event_s) // _TIMES + 1]
         for at_s in (base_run.at_s or 0.0, *some_s, flow.horizon_s):
-            for loop in worst_causes(base_flow, bounds, base_run, at_s):
+            for loop in worst_disturbances(base_flow, bounds, base_run, at_s):
                 pushed_flow = replace(flow, loop=loop)
                 candidate = _run(pushed_flow, base_run.delivered[first_event:])
                 if candidate.value > worst.value:

@@ -17,7 +17,15 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.analysis.adversary.loop_flows import Measure, Objective, Pattern, SampledFlow, SampledRun, Valued
-from cosim.simulation.sampled_loop import Numbers, Runs, SampledLoop, Scales, noise_of, pushes_of, through_of
+from cosim.simulation.sampled_loop import (
+    Numbers,
+    Runs,
+    SampledLoop,
+    Scales,
+    disturbance_effect,
+    noise_of,
+    state_increments,
+)
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import at_least, at_most, number
 from noack.disturbances.uniform import UniformDisturbance
@@ -41,20 +49,22 @@ class Bounds(NamedTuple):
 
 def bounds_of(resolved: Scenario) -> Bounds | None:
     """Return the bounds of a scenario; None if nothing has a bound at all times."""
-    through, columns = through_of(resolved), []
+    effect, columns = disturbance_effect(resolved), []
     m = resolved.model.dimensions[1]
     for disturbance in resolved.plant.disturbances:
         if isinstance(disturbance, UniformDisturbance):
-            entry_matrix = through[:, :m] if disturbance.at == "input" else through[:, m:]
+            entry_matrix = effect[:, :m] if disturbance.at == "input" else effect[:, m:]
             columns.append(entry_matrix @ disturbance.extent())
     noise = np.array(resolved.plant.measurement.noise_bound or ())
-    changes = np.hstack([np.zeros((len(through), 0)), *columns])
+    changes = np.hstack([np.zeros((len(effect), 0)), *columns])
     changes = changes[:, changes.any(axis=0)]
     return Bounds(changes, noise) if changes.size or noise.any() else None
 
 
-def worst_causes(flow: SampledFlow, bounds: Bounds, run: SampledRun, at_s: float) -> Iterator[SampledLoop]:
-    """Yield loops with the causes that are worst at a time, for the events of a run.
+def worst_disturbances(
+    flow: SampledFlow, bounds: Bounds, run: SampledRun, at_s: float
+) -> Iterator[SampledLoop]:
+    """Yield loops whose disturbances and noise are worst at a time, for the events of a run.
 
     The norm is largest in some direction: each loop maximises one entry of the vector, with either
     sign, or its part in the direction that it has without the change.
@@ -62,28 +72,28 @@ def worst_causes(flow: SampledFlow, bounds: Bounds, run: SampledRun, at_s: float
     loop, step = flow.loop, round(at_s / flow.loop.step_s)
     start = loop.start()
     _follow_events(loop, start, start.step.copy(), run, step, 0 if loop.known_start else 1)
-    fixed, drawn = _fixed_causes(loop), loop.causes
+    fixed, drawn = _fixed_disturbances(loop), loop.disturbances
     n, k, j = loop.matrices.n, step, step // loop.every + 1
-    linear = loop.with_causes(np.zeros((0, n)), np.zeros((0, drawn[1].shape[1])))
-    pushes = [_responses_to_push(linear, flow, column, run, step) for column in bounds.columns.T]
+    linear = loop.with_disturbances(np.zeros((0, n)), np.zeros((0, drawn[1].shape[1])))
+    responses = [_responses_to_disturbance(linear, flow, column, run, step) for column in bounds.columns.T]
     noises = [
         _responses_to_noise(linear, flow, entry, bound, run, step) for entry, bound in enumerate(bounds.noise)
     ]
     axes = np.eye(n)
     for direction in (_vectors(flow, start)[0], *axes, *-axes):
-        push, noise = fixed[0].copy(), fixed[1].copy()
-        for column, response in zip(bounds.columns.T, pushes, strict=True):
-            push[:k] += np.sign(response @ direction)[:, None] * column
+        disturbed, noise = fixed[0].copy(), fixed[1].copy()
+        for column, response in zip(bounds.columns.T, responses, strict=True):
+            disturbed[:k] += np.sign(response @ direction)[:, None] * column
         for entry, response in enumerate(noises):
             noise[:j, entry] += bounds.noise[entry] * np.sign(response @ direction)
-        push[k:], noise[j:] = drawn[0][k:], drawn[1][j:]
-        yield loop.with_causes(push, noise)
+        disturbed[k:], noise[j:] = drawn[0][k:], drawn[1][j:]
+        yield loop.with_disturbances(disturbed, noise)
 
 
-def _responses_to_push(
+def _responses_to_disturbance(
     linear: SampledLoop, flow: SampledFlow, column: Vector, run: SampledRun, step: int
 ) -> Matrix:
-    """Return what each of the pushes before ``step`` adds to the vector, (step, n)."""
+    """Return what the disturbance of each step before ``step`` adds to the vector, (step, n)."""
     steps = _some(np.arange(1, step + 1))
     runs = linear.empty(len(steps))
     runs.x[:], runs.step[:] = column, steps
@@ -105,7 +115,7 @@ def _responses_to_noise(
     return np.repeat(_vectors(flow, runs), np.diff(numbers, append=last + 1), axis=0)
 
 
-def _fixed_causes(loop: SampledLoop) -> tuple[Matrix, Matrix]:
+def _fixed_disturbances(loop: SampledLoop) -> tuple[Matrix, Matrix]:
     """Return disturbances and noise without their bounded parts."""
     plant, zeros = loop.resolved.plant, np.zeros_like
     disturbances = tuple(
@@ -120,8 +130,8 @@ def _fixed_causes(loop: SampledLoop) -> tuple[Matrix, Matrix]:
         measurement = measurement.model_copy(update={"noise_bound": silent})
     changed = {"disturbances": disturbances, "measurement": measurement}
     fixed = loop.resolved.model_copy(update={"plant": plant.model_copy(update=changed)})
-    push, noise = pushes_of(fixed), noise_of(fixed)
-    return push, noise if len(noise) else np.zeros_like(loop.causes[1])
+    increments, noise = state_increments(fixed), noise_of(fixed)
+    return increments, noise if len(noise) else np.zeros_like(loop.disturbances[1])
 
 
 def _follow_events(

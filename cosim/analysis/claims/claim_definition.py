@@ -107,8 +107,8 @@ def controller_error_bound(
     """Return a bound of ‖e_c‖_W at the measurements, (k,); it is void from a record's first gap."""
     here = samples.in_common
     # Allow for the rounding of x, which matters for a bound of that size.
-    slack = run.rounding(samples.joined.x_norm[here])
-    shares = upper_shares(samples.joined.e_c_norm[here], values[here] + slack)
+    slack = run.rounding(samples.aligned.x_norm[here])
+    shares = upper_shares(samples.aligned.e_c_norm[here], values[here] + slack)
     return Bound(formula, samples.t_s[here], shares, earliest([void, run.first_gap]), constant)
 
 

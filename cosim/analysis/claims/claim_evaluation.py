@@ -333,7 +333,7 @@ class RunClaims:
         for part in self.parts:
             if not isinstance(part, Claim):
                 from_s = part.part.from_s
-                violations += [one._replace(t_s=one.t_s + from_s) for one in part.violations()]
+                violations += [found._replace(t_s=found.t_s + from_s) for found in part.violations()]
         return sorted(violations, key=lambda violation: violation.t_s)
 
     def judge(self) -> list[Claim]:
@@ -508,10 +508,10 @@ def _input_error(own: RunRecord, steps: Rows, alpha_per_s: float) -> float:
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
-    pushes, forcing = 0.0, bound_forcing(own.scenario, loop.B)
+    forced, forcing = 0.0, bound_forcing(own.scenario, loop.B)
     if forcing is not None:
-        pushes = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
-    bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + pushes)
+        forced = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
+    bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + forced)
     return float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
 
 

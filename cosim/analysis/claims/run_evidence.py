@@ -80,7 +80,7 @@ class RunPart(NamedTuple):
 class Samples:
     """Consecutive measurements of a run, (k,), aligned, with bounds of the controller's error."""
 
-    joined: AlignedRun
+    aligned: AlignedRun
     in_common: NDArray[np.bool_]
     """Where sensor and controller share an update, so that ‖e_c‖ is bounded, (k,)."""
     error_bounds: Sequence[Reals]
@@ -97,12 +97,12 @@ class Samples:
     @cached_property
     def t_s(self) -> Reals:
         """Times of the measurements, (k,)."""
-        return np.asarray(self.joined.t_ns * 1e-9)
+        return np.asarray(self.aligned.t_ns * 1e-9)
 
     @cached_property
     def with_x(self) -> NDArray[np.bool_]:
         """Where the plant's own state is known, (k,)."""
-        if self.true_x is self.joined.x:
+        if self.true_x is self.aligned.x:
             return np.ones(len(self.true_x), dtype=bool)
         return np.asarray(all_entries(np.isfinite(self.true_x)))
 
@@ -124,24 +124,24 @@ class RunEvidence:
         if any(map(self.known_state_bounds, self.certificates)):
             follower = EventFollower(scenario)
         for part, shared, both, residual in bounded_parts(self.record):
-            rows, joined = part.rows, part.aligned
+            rows, aligned = part.rows, part.aligned
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
-            true_x = joined.x if part.true_x is None else part.true_x
-            since = None if follower is None else follower.take(rows, joined)
-            yield Samples(joined, shared, both, residual, true_x, passed, since)
+            true_x = aligned.x if part.true_x is None else part.true_x
+            since = None if follower is None else follower.take(rows, aligned)
+            yield Samples(aligned, shared, both, residual, true_x, passed, since)
 
     @cached_property
     def lost_in_rounding(self) -> VoidFrom | None:
         """When the threshold falls below the rounding of x at a set-point: events are chance."""
         for part in aligned_parts(self.record) if self.part.offset else ():
-            joined = part.aligned
-            compared = joined.threshold > 0  # a periodic trigger compares nothing
-            below = np.flatnonzero(compared & (joined.threshold < self.rounding(joined.x_norm)))
+            aligned = part.aligned
+            compared = aligned.threshold > 0  # a periodic trigger compares nothing
+            below = np.flatnonzero(compared & (aligned.threshold < self.rounding(aligned.x_norm)))
             if len(below):
                 why = "the threshold is below the rounding error of x at the set-point"
-                return VoidFrom(float(joined.t_ns[below[0]]) * 1e-9, why)
+                return VoidFrom(float(aligned.t_ns[below[0]]) * 1e-9, why)
         return None
 
     def rounding(self, x_norm: Reals) -> Reals:
@@ -278,7 +278,7 @@ class RunEvidence:
         for role in LOOP_ROLES:
             if whole.is_complete(role):
                 continue
-            gaps_ns = filter(None, (life.hole_ns for life in whole.lives(role)))
+            gaps_ns = filter(None, (generation.gap_ns for generation in whole.generations(role)))
             times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
             why = f"rows of {role} are missing from the record"
             gaps += [VoidFrom(t_s, why) for t_s in times_s if t_s >= 0]
@@ -508,9 +508,9 @@ def _intervals(record: RunRecord, until_s: float) -> Iterator[tuple[_Start, Inte
     start: _Start | None = None
     t_ns, x = np.zeros(0, np.int64), np.zeros((0, record.loop.n))
     for part in aligned_parts(record):
-        joined, event = part.aligned, part.rows["event"]
+        aligned, event = part.aligned, part.rows["event"]
         before = len(t_ns)
-        t_ns, x = np.append(t_ns, joined.t_ns), np.concatenate([x, joined.x])
+        t_ns, x = np.append(t_ns, aligned.t_ns), np.concatenate([x, aligned.x])
         first = 0
         for row in np.flatnonzero(event != NO_SEQUENCE).tolist():
             if start is not None:
@@ -519,9 +519,9 @@ def _intervals(record: RunRecord, until_s: float) -> Iterator[tuple[_Start, Inte
                     interval(t_ns[first : before + row + 1], x[first : before + row + 1]),
                 )
             start, first = None, before + row
-            if joined.t_ns[row] * 1e-9 >= until_s:
+            if aligned.t_ns[row] * 1e-9 >= until_s:
                 return
-            start = _Start(int(event[row]), int(joined.received[row]))
+            start = _Start(int(event[row]), int(aligned.received[row]))
         if start is None:
             first = len(t_ns)
         t_ns, x = t_ns[first:], x[first:]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from controller_node.controller import controllers_of
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
 from cosim.analysis.summary.summary_model import ReplayDifference
-from cosim.record.processes import Life, split_by_life
+from cosim.record.processes import ProcessGeneration, split_by_generation
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import Channel, channel_of
@@ -335,8 +335,8 @@ class MachineReplay:
 
     def __init__(self, role: str, record: RunRecord, shared: SharedMachines) -> None:
         self._tables = record.owned_by(role)
-        self._begun = record.begun_lives(role)
-        self._lives = [_LifeReplay(role, record, life, shared) for life in record.row_counts(role)]
+        self._begun = record.generation_numbers(role)
+        self._parts = [_GenerationReplay(role, record, own, shared) for own in record.row_counts(role)]
         self.newest: list[InputReplay] = []
         """The replays of the newest part; they have what was sent."""
 
@@ -344,14 +344,14 @@ class MachineReplay:
         """Replay the next part of the record."""
         self.newest = []
         owned = {table: part[table] for table in self._tables}
-        for own, life in zip(split_by_life(owned, self._begun), self._lives, strict=True):
+        for own, part_replay in zip(split_by_generation(owned, self._begun), self._parts, strict=True):
             if any(map(len, own.values())):
-                self.newest += life.take(own)
+                self.newest += part_replay.take(own)
 
     @property
     def results(self) -> tuple[ProcessReplay, ...]:
         """The result of each generation; final after the last part."""
-        return tuple(life.result() for life in self._lives)
+        return tuple(part.result() for part in self._parts)
 
     @property
     def whole(self) -> bool:
@@ -359,20 +359,20 @@ class MachineReplay:
         return all(result.whole for result in self.results)
 
 
-class _LifeReplay:
+class _GenerationReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, record: RunRecord, life: Life, shared: SharedMachines) -> None:
-        self._role, self._record, self._life, self._shared = role, record, life, shared
+    def __init__(self, role: str, record: RunRecord, own: ProcessGeneration, shared: SharedMachines) -> None:
+        self._role, self._record, self._own, self._shared = role, record, own, shared
         self._run: InputReplay | None = None
-        self._count = sum(life.rows.values())
-        report = life.report
-        self._written = None if report is None else sum(report["rows"][table] for table in life.rows)
+        self._count = sum(own.rows.values())
+        report = own.report
+        self._written = None if report is None else sum(report["rows"][table] for table in own.rows)
         ends_early = self._written is not None and self._written > self._count
         self._missing_from = self._count if ends_early else None
         self._damage: ReplayDifference | None = None
         self._compared = 0
-        self._before = dict.fromkeys(life.rows, 0)
+        self._before = dict.fromkeys(own.rows, 0)
         """Rows in the parts before, by table."""
         self._stopped = False
 
@@ -392,7 +392,7 @@ class _LifeReplay:
 
     def _begin(self, owned: Slice) -> InputReplay:
         """Return the replay of a new machine."""
-        role, scenario, generation = self._role, self._record.scenario, self._life.generation
+        role, scenario, generation = self._role, self._record.scenario, self._own.number
         start, sizes = _start(generation, owned), _sizes(role, scenario)
         if role == "netem":
             channel = channel_of(scenario, start, loops=len(loops_of(scenario)))
@@ -403,7 +403,7 @@ class _LifeReplay:
         return InputReplay(role, _MACHINES[role]((scenario,), start=start), sizes)
 
     def result(self) -> ProcessReplay:
-        generation = self._life.generation
+        generation = self._own.number
         differs = None if self._run is None else self._run.difference
         differences = [first for first in (differs, self._damage) if first is not None]
         return ProcessReplay(
@@ -411,14 +411,14 @@ class _LifeReplay:
             inputs=self._count,
             compared=self._compared,
             missing_from=self._missing_from,
-            end_known=self._life.report is not None,
+            end_known=self._own.report is not None,
             difference=min(differences, key=lambda difference: difference.now_ns, default=None),
         )
 
     def _in_order(self, owned: Slice) -> Numbers:
         """Return the places of the inputs in order, among the rows of all tables, up to a gap."""
         numbers = np.concatenate([rows["input"] for rows in owned.values()])
-        numbers = numbers - self._life.generation * GENERATION
+        numbers = numbers - self._own.number * GENERATION
         order = np.argsort(numbers, kind="stable")
         numbers = numbers[order]
         unexpected = np.flatnonzero(numbers != self._compared + np.arange(len(numbers)))

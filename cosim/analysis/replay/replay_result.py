@@ -55,9 +55,9 @@ def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> R
 def first_entry(recorded: ArrayLike, replayed: ArrayLike) -> tuple[int, object, object] | None:
     """Return index and values of the first entry in which a column's two values differ."""
     pairs = zip(np.atleast_1d(recorded), np.atleast_1d(replayed), strict=True)
-    for i, (one, other) in enumerate(pairs):
-        if one.tobytes() != other.tobytes():
-            return i, one.item(), other.item()
+    for i, (first, second) in enumerate(pairs):
+        if first.tobytes() != second.tobytes():
+            return i, first.item(), second.item()
     return None
 
 

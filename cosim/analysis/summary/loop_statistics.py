@@ -70,8 +70,8 @@ def lateness_parts(record: RunRecord, role: str) -> Iterator[NDArray[np.float64]
     """Yield the wall time between a process's actions and their nominal times in µs, in order.
 
     The nominal time is the deadline for plant and controller, the time of the measurement for the
-    sensor, and the arrival of the datagram at its socket for the network. The plain engine of the
-    network does not know the arrival; its rows have ``now_ns`` there, and are left out.
+    sensor, and the arrival of the datagram at its socket for the network. A simulated network has
+    no socket; its rows have ``now_ns`` there, and are left out.
     """
     for rows in record.source.batches(_STEPS[role], ("now_ns", "t_ns")):
         late_ns = rows["now_ns"] - rows["t_ns"]
@@ -237,9 +237,9 @@ def missing_rows(record: RunRecord) -> Counter[str]:
     """
     missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
-        for life, counts in enumerate(record.row_counts(role)):
+        for generation, counts in enumerate(record.row_counts(role)):
             if counts.report is None:
-                missing[role] += record.lives(role)[life].missing_inputs
+                missing[role] += record.generations(role)[generation].missing_inputs
                 continue
             for table, count in counts.rows.items():
                 missing[table] += counts.report["rows"][table] - count
@@ -342,25 +342,25 @@ class SampleFactsReader:
         self._fresh_ns: int | None = None
         self._newest, self._last_ns = -1, 0
 
-    def take(self, joined: AlignedRun, common: NDArray[np.bool_] | None = None) -> None:
+    def take(self, aligned: AlignedRun, common: NDArray[np.bool_] | None = None) -> None:
         """Add the next measurements; it may be known where sensor and controller share an update."""
-        if not len(joined.t_ns):
+        if not len(aligned.t_ns):
             return
-        common = shares_update(self._scenario, joined) if common is None else common
-        facts, t_s = self._found, joined.t_ns * 1e-9
+        common = shares_update(self._scenario, aligned) if common is None else common
+        facts, t_s = self._found, aligned.t_ns * 1e-9
         started = np.logical_or.accumulate(common) | facts.any_in_common
         gaps = np.flatnonzero(started & ~common)
         gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
         until = t_s < self._until_s
         both = np.concatenate(
-            [joined.x_s.compress(until, axis=0), joined.x_c.compress(common & until, axis=0)]
+            [aligned.x_s.compress(until, axis=0), aligned.x_c.compress(common & until, axis=0)]
         )
         largest = float(np.abs(both[np.isfinite(both)]).max(initial=facts.largest_state))
-        changes = joined.t_ns[np.flatnonzero(np.diff(joined.received, prepend=self._newest))]
+        changes = aligned.t_ns[np.flatnonzero(np.diff(aligned.received, prepend=self._newest))]
         ends_ns = changes if self._fresh_ns is None else np.append(self._fresh_ns, changes)
         longest_ns = int(np.diff(ends_ns).max(initial=facts.longest_update_ns))
         self._fresh_ns = int(ends_ns[-1]) if len(ends_ns) else None
-        self._newest, self._last_ns = int(joined.received[-1]), int(joined.t_ns[-1])
+        self._newest, self._last_ns = int(aligned.received[-1]), int(aligned.t_ns[-1])
         self._found = SampleFacts(bool(started[-1]), gap_s, largest, longest_ns)
 
     @property
@@ -373,7 +373,7 @@ class SampleFactsReader:
         return self._found._replace(longest_update_ns=longest_ns)
 
 
-class Signals(TypedDict):
+class SignalFields(TypedDict):
     """The fields of a loop's summary about its signals."""
 
     setpoint: list[float] | None
@@ -433,7 +433,7 @@ class SignalStatistics:
         self._errors.add(errors)
         self._late_errors.add(errors[max(self._half - self._read, 0) :])
 
-    def for_summary(self) -> Signals:
+    def for_summary(self) -> SignalFields:
         """Return norms of the state, of the errors, and of the residual of (I1)."""
         first, last, largest = None, None, None
         since_ns, points = _setpoints(self._record)

@@ -263,10 +263,11 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
                 for number, notice in enumerate(notices, 1)
             ]
             continue
-        if not notices and len(record.begun_lives(role)) == 1:
+        if not notices and len(record.generation_numbers(role)) == 1:
             continue
         active_s = {
-            life.generation: (_seconds(life.first_ns), _seconds(life.last_ns)) for life in record.lives(role)
+            generation.number: (_seconds(generation.first_ns), _seconds(generation.last_ns))
+            for generation in record.generations(role)
         }
         # Each restart has one notice. It is lost only if the process ended soon after, so the
         # notices belong to the last generations.

@@ -61,9 +61,9 @@ class ProbeOptions:
     silence: Annotated[str, Option(metavar="TIME")] = "30s"
     save: Path | None = None
 
-    def live(self, deadline_s: float | None) -> "live_measurement.LiveOptions":
+    def live(self, deadline_s: float | None) -> "live_measurement.LiveProbeOptions":
         """Return the options of a live measurement."""
-        return live_measurement.LiveOptions(
+        return live_measurement.LiveProbeOptions(
             self.rate, self.duration, self.size, self.round_trip, self.silence, self.save, deadline_s
         )
 
@@ -204,7 +204,7 @@ def measure(
 def _result(
     sources: list[str],
     listen: str | None,
-    live: "live_measurement.LiveOptions",
+    live: "live_measurement.LiveProbeOptions",
     how: "trace_sources.SourceOptions",
 ) -> tuple["probe_ends.ProbeResult", str]:
     """Return the result of a probe or of reading files, and a name for it."""

@@ -66,7 +66,7 @@ def record(
     else:
         role = None if invite is Invited.ALL else invite.value
         address = remote_access.listen_address(listen)
-        listening = remote_access.Listening(address, invitation, role, 60 * valid_minutes)
+        listening = remote_access.ListenSettings(address, invitation, role, 60 * valid_minutes)
     return run_processes(
         source.load(),
         options,

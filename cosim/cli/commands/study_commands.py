@@ -564,7 +564,7 @@ def _announce(
     print_to_stderr(
         f"noack capacity: {len(plan.sizes) * plan.draws:,} runs of {plan.scenario.horizon_s:g} s "
         f"with {sizes} loops{of_live}; the simulation takes "
-        f"about {capacity_result.time_text(estimated_s)} on {idle}"
-        + ("" if longer == plan else f"; --thorough: {capacity_result.time_text(longer_s)}")
+        f"about {capacity_result.rough_time(estimated_s)} on {idle}"
+        + ("" if longer == plan else f"; --thorough: {capacity_result.rough_time(longer_s)}")
     )
     return estimated_s

@@ -18,7 +18,7 @@ from noack.runtime.join_ticket import DEFAULT_SESSION
 from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:
-    from cosim.live.remote_access import Listening
+    from cosim.live.remote_access import ListenSettings
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
@@ -73,7 +73,7 @@ class _RunProgress:
         if roles:
             self._print(f"waiting for {', '.join(roles)}")
 
-    def listening(self, address: str, how: "Listening") -> None:
+    def listening(self, address: str, how: "ListenSettings") -> None:
         """Say how processes on other hosts join."""
         if how.invitation is None:
             places = (f"{role} on {host.ssh}" for role, host in how.hosts.items())

@@ -14,7 +14,7 @@ from noack.runtime.control_messages import RunProgress
 if TYPE_CHECKING:
     from prometheus_client import Metric
 
-    from cosim.live.remote_access import Listening
+    from cosim.live.remote_access import ListenSettings
     from noack.scenario.scenario import Scenario
 
 _SOURCE, _EVERY_S = "noack", 1.0
@@ -37,7 +37,7 @@ class Watcher:
     """Callbacks of a launched run; each must return at once."""
 
     waiting: Callable[[Sequence[str]], None] = lambda roles: None
-    listening: "Callable[[str, Listening], None]" = lambda address, how: None
+    listening: "Callable[[str, ListenSettings], None]" = lambda address, how: None
     started: Callable[[Path], None] = lambda run_dir: None
     failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
     restarted: Callable[[str, float], None] = lambda role, t_s: None

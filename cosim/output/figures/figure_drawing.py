@@ -43,7 +43,7 @@ from cosim.output.figures.figure_layout import (
     BAR_IN,
     PAPER,
     POINTS_PER_IN,
-    Box,
+    FigureBox,
     NotebookFigure,
     Place,
     layout,
@@ -56,7 +56,7 @@ from cosim.output.figures.figure_layout import (
 )
 from cosim.record.align import Reals
 
-Shown = tuple[Artist, str]
+LegendItem = tuple[Artist, str]
 """A drawn object and its label in the legend."""
 
 _NARROW_IN = 2.5
@@ -139,7 +139,7 @@ def _axes(figure: Figure, place: Place, beside: Axes | None = None) -> Axes:
     return axes
 
 
-def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[Shown]:
+def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[LegendItem]:
     """Draw a panel; return what its legend shows."""
     panel, drawn = place.panel, dict[str, Artist]()
     for item in panel.items:
@@ -153,7 +153,7 @@ def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[Shown]
     return [(drawn[label], label) for label in panel.labels if label in drawn]
 
 
-def _head(axes: Axes, figure: Figure, box: Box, title: str, shown: Sequence[Shown]) -> None:
+def _head(axes: Axes, figure: Figure, box: FigureBox, title: str, shown: Sequence[LegendItem]) -> None:
     """Write a title and a legend above a box, where there are no data."""
     space, bottom_in = layout(), figure.get_figheight() - box.top
     rows = legend_rows([label for _, label in shown], box.width)
@@ -333,7 +333,7 @@ def _colour_bar(figure: Figure, scale: ColourScale, norm: Normalize | None, plac
     height_in = max(box.top + box.height for box in boxes) - top_in
     begin_in = max(box.left + box.width for box in boxes) + BAR_IN
     panel = Panel(items=(), x=Axis(grid=False), y=Axis(grid=False))
-    box = Box(begin_in, top_in, BAR_IN, height_in)
+    box = FigureBox(begin_in, top_in, BAR_IN, height_in)
     bar = _axes(figure, Place(panel, box, has_x=False, has_y=True))
     mappable = ScalarMappable(norm, "viridis")
     extend: Literal["max", "neither"] = "max" if scale.exceeded else "neither"

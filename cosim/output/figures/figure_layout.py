@@ -176,7 +176,7 @@ _IN_SHORT = (
 _MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
 
 
-class Box(NamedTuple):
+class FigureBox(NamedTuple):
     """A rectangle in inches, from the figure's upper left corner."""
 
     left: float
@@ -189,7 +189,7 @@ class Place(NamedTuple):
     """A panel and its axes."""
 
     panel: Panel
-    box: Box
+    box: FigureBox
     has_x: bool
     """Whether the horizontal axis has its label and numbers here."""
     has_y: bool
@@ -241,10 +241,10 @@ def _place_line(
         is_last = first + i + columns >= len(row.panels)
         has_x = panel.x.numbers and (is_last or not row.common)
         has_y = panel.y.numbers and (i == 0 or row.common != "xy")
-        places.append(Place(panel, Box(begin_in, top_in, main_in, height_in), has_x, has_y))
+        places.append(Place(panel, FigureBox(begin_in, top_in, main_in, height_in), has_x, has_y))
         if panel.beside is not None:
             main_in += _BESIDE_GAP_IN
-            box = Box(begin_in + main_in, top_in, width_in - main_in, height_in)
+            box = FigureBox(begin_in + main_in, top_in, width_in - main_in, height_in)
             places.append(Place(panel.beside, box, has_x, has_y=False, is_beside=True))
     return places
 

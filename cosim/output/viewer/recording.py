@@ -17,7 +17,7 @@ import rerun.blueprint as rrb
 
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.network_diagram import DIAGRAM, LEG_S
-from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, joined
+from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, concatenate_frames
 from cosim.record.align import AlignedRun
 from cosim.record.run_directory import Kind
 from noack.core.clock import NS_PER_S
@@ -246,7 +246,7 @@ class LoopView:
         if self._shown.picture is None or not self._waiting:
             return
         t_ns = np.concatenate([times for times, _ in self._waiting])
-        frames = joined([frames for _, frames in self._waiting])
+        frames = concatenate_frames([frames for _, frames in self._waiting])
         self._waiting = []
         for entity, columns in self._shown.picture.frames(frames).items():
             self._send_columns(f"{PICTURE}/{entity}", t_ns, columns)

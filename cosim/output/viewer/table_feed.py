@@ -14,13 +14,13 @@ from cosim.record.align import (
     AlignedRun,
     ControllerTrack,
     EventFollower,
+    align_measurements,
     controller_track,
     in_common,
     initial_track,
-    join,
     true_states,
 )
-from cosim.record.record_source import joined
+from cosim.record.record_source import concatenate_rows
 from cosim.record.run_events import claimed_until_s, model_flow, updates_in
 from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
@@ -155,7 +155,7 @@ class ViewFeed:
         self._deliveries(until_ns)
         taken = self._take(PLANT_STEP, None)
         if self._has_internal_state or not self._scenario.coverage.knows_state:
-            self._steps = joined([self._steps, taken], self._steps.dtype)
+            self._steps = concatenate_rows([self._steps, taken], self._steps.dtype)
         self._lateness("plant", taken)
         self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
         for table in self._clock_tables:
@@ -169,7 +169,7 @@ class ViewFeed:
 
     def _take(self, table: str, until_ns: int | None) -> Rows:
         waiting = self._pending[table]
-        rows = joined(waiting, self._types[table])
+        rows = concatenate_rows(waiting, self._types[table])
         if until_ns is None:
             self._pending[table] = []
             return rows
@@ -181,7 +181,9 @@ class ViewFeed:
         if not len(rows):
             return
         acknowledged = self._scenario.protocol.acknowledges
-        aligned = join(self._loop, rows, self._track, reach_ns, flow=self._flow, acknowledged=acknowledged)
+        aligned = align_measurements(
+            self._loop, rows, self._track, reach_ns, flow=self._flow, acknowledged=acknowledged
+        )
         # If the sensor does not measure x exactly, the plant's own x is shown.
         if not self._scenario.coverage.knows_state:
             aligned = aligned._replace(x=true_states(self._steps, aligned.t_ns))

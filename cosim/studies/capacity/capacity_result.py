@@ -271,7 +271,7 @@ def estimated_s(loops: int, cpu_s: float, workers: int) -> float:
     return _START_S + _OVERLOADED * loops * cpu_s / workers
 
 
-def time_text(seconds: float) -> str:
+def rough_time(seconds: float) -> str:
     """Return a rough time as text."""
     if seconds < 90:
         return f"{max(round(seconds, -1), 10):.0f} s"

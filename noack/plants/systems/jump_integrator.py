@@ -50,7 +50,7 @@ _ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 
 """The result minus that of order 4."""
 
 
-class Work(NamedTuple):
+class StepBuffers(NamedTuple):
     """Buffers for N states and k switching values."""
 
     slopes: Matrix
@@ -69,10 +69,10 @@ class Work(NamedTuple):
     """(k,) The switching values at the last evaluation."""
 
 
-def buffers(states: int, values: int) -> Work:
+def buffers(states: int, values: int) -> StepBuffers:
     """Return new buffers."""
     sizes = states, states, values, values, values, values
-    return Work(np.zeros((7, states)), *map(np.zeros, sizes))
+    return StepBuffers(np.zeros((7, states)), *map(np.zeros, sizes))
 
 
 def advance(
@@ -83,7 +83,7 @@ def advance(
     parameters: object,
     duration_s: float,
     tolerances: tuple[float, float],
-    work: Work,
+    work: StepBuffers,
 ) -> int:
     """Advance z in place under a constant input v; return DONE, or why it ended early.
 
@@ -141,7 +141,7 @@ def attempt(
     parameters: object,
     step_s: float,
     tolerances: tuple[float, float],
-    work: Work,
+    work: StepBuffers,
 ) -> float:
     """Compute all stages of a step; return its error relative to the tolerance, NaN included."""
     relative, absolute = tolerances
@@ -178,7 +178,7 @@ def locate(
     v: Vector,
     parameters: object,
     step_s: float,
-    work: Work,
+    work: StepBuffers,
 ) -> float:
     """Return the part of the step until just after the first change of a sign, at most 1.
 
@@ -217,7 +217,7 @@ def locate(
     return part
 
 
-def turn(work: Work, jumps: int) -> None:
+def turn(work: StepBuffers, jumps: int) -> None:
     """Turn the signs that differ from their values'; after too many jumps, hold none any longer."""
     for k in range(len(work.signs)):
         if work.signs[k] * work.values[k] < 0.0:

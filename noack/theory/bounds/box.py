@@ -82,12 +82,12 @@ class BoxGains(PlantGains):
         R, box = self.error.split_K[1], spectral_norm(self.halfwidth_A)
         # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
         mu = max(float(logarithmic_norm(self.A) + box), 0.0) + self.alpha_per_s
-        pushes = self._forcing.limited
-        size = spectral_norm(self.start) + start_s * np.linalg.norm(pushes, axis=0).sum()
+        limited = self._forcing.limited
+        size = spectral_norm(self.start) + start_s * np.linalg.norm(limited, axis=0).sum()
         size = size * math.exp(mu * start_s)
         rate = spectral_norm(R @ self.A) + spectral_norm(R) * box
         at_start = spectral_norm(R @ self.start) * math.exp(self.alpha_per_s * start_s)
-        error = at_start + start_s * (rate * size + np.linalg.norm(R @ pushes, axis=0).sum())
+        error = at_start + start_s * (rate * size + np.linalg.norm(R @ limited, axis=0).sum())
         impulse = error * start_s
         peaks_of = np.array([peaks.impulse for peaks in self._coordinates])
         return error, impulse, self._bound_of_w(impulse[..., None] * peaks_of)

@@ -114,11 +114,11 @@ class EstimationError:
         self._model = model = assumed_model(resolved)
         Ad, Bd = discretise(A, B, period_ns)
         n = loop.n
-        self._pushes = self._normal_pushes = np.zeros((n, 0))
+        self._state_increments = self._normal_increments = np.zeros((n, 0))
         if forcing is not None:
-            self._pushes = discretise(A, forcing.columns, period_ns)[1]
+            self._state_increments = discretise(A, forcing.columns, period_ns)[1]
             if forcing.normal is not None:
-                self._normal_pushes = discretise(A, forcing.normal.columns, period_ns)[1]
+                self._normal_increments = discretise(A, forcing.normal.columns, period_ns)[1]
         input_basis, _ = factors(loop.K)
         self._from_input = (model.Bd - Bd) @ input_basis
         self._from_state, self.output = factors(model.Ad - Ad + (model.Bd - Bd) @ loop.K)
@@ -177,7 +177,7 @@ class EstimationError:
     @cached_property
     def _persistent_sources(self) -> list[Stack]:
         """The effects of bounded noise and of each bounded disturbance on the measurements."""
-        effects = [self._sources(column[:, None], 0.0) for column in self._pushes.T]
+        effects = [self._sources(column[:, None], 0.0) for column in self._state_increments.T]
         if self._noise.any():
             effects.append((self._gains * self._noise).transpose(0, 2, 1)[..., None])
         return effects
@@ -190,10 +190,10 @@ class EstimationError:
     @cached_property
     def _covariances(self) -> list[tuple[Matrix, Matrix]]:
         """F_k, and the covariance of what each measurement adds to e."""
-        sources, covariances = self._sources(self._normal_pushes, 0.0), []
+        sources, covariances = self._sources(self._normal_increments, 0.0), []
         for k, L in enumerate(self._gains):
-            pushed, noise = np.hstack([*sources[k]]), L * self._noise_deviations
-            covariances.append((self._rest[k] @ self._between, pushed @ pushed.T + noise @ noise.T))
+            effect, noise = np.hstack([*sources[k]]), L * self._noise_deviations
+            covariances.append((self._rest[k] @ self._between, effect @ effect.T + noise @ noise.T))
         return covariances
 
     @cached_property

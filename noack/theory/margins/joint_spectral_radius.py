@@ -322,9 +322,9 @@ def bound_by_products(
     }
     while paths:
         longer: dict[_Ends, list[_Paths]] = {}
-        for (source, target), ones in paths.items():
+        for (source, target), group in paths.items():
             for edge in leaving[target]:
-                following = _continued(ones, edge)
+                following = _continued(group, edge)
                 products += len(following.durations)
                 ended = following.growths <= growth
                 upper = max(upper, float(following.growths[ended].max(initial=0.0)))
@@ -332,12 +332,12 @@ def bound_by_products(
                     longer.setdefault((source, edge.target), []).append(following.where(~ended))
         paths = {ends: _joined(parts) for ends, parts in longer.items()}
         steps += 1
-        count = sum(len(ones.durations) for ones in paths.values())
+        count = sum(len(group.durations) for group in paths.values())
         if paths and products > most_products:
             remaining = list(paths.values())
-            upper = max(upper, *(float(ones.growths.max()) for ones in remaining))
-            durations = np.concatenate([ones.durations for ones in remaining])
-            growths = np.concatenate([ones.growths for ones in remaining])
+            upper = max(upper, *(float(group.growths.max()) for group in remaining))
+            durations = np.concatenate([group.durations for group in remaining])
+            growths = np.concatenate([group.growths for group in remaining])
             further = _further_steps(durations, growths, growth, slowest) * steps
             ratio = count / before if before else float(count)
             return ProductBound(upper, products, products + count * _sum_of_powers(ratio, further))

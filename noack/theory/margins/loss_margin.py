@@ -118,8 +118,8 @@ def _merged(bursts: list[Burst]) -> list[Burst]:
     while len(set(classes.values())) > count:
         count = len(set(classes.values()))
         merged = {
-            node: frozenset((*burst[2:], classes[burst.target]) for burst in ones)
-            for node, ones in leaving.items()
+            node: frozenset((*burst[2:], classes[burst.target]) for burst in group)
+            for node, group in leaving.items()
         }
         numbers = {future: number for number, future in enumerate(dict.fromkeys(merged.values()))}
         classes = {node: numbers[future] for node, future in merged.items()}

@@ -320,10 +320,10 @@ class _Search:
             from scipy.linalg import solve_continuous_are  # slow to import
 
             flow = loop.closed_loop + self._rate * np.eye(self._n)
-            aged, one = loop.age.T @ loop.age, np.eye(loop.input.shape[1])
+            aged, identity = loop.age.T @ loop.age, np.eye(loop.input.shape[1])
             remaining = aged + _LEFT * (np.linalg.norm(aged, 2) + 1e-9) * np.eye(self._n)
             try:
-                X = np.asarray(solve_continuous_are(flow, loop.input, remaining, -one / (1 + _LEFT)))
+                X = np.asarray(solve_continuous_are(flow, loop.input, remaining, -identity / (1 + _LEFT)))
             except (np.linalg.LinAlgError, ValueError):
                 return X, None
             left = self._decay(loop.closed_loop, X) - aged - X @ loop.input @ loop.input.T @ X
@@ -427,8 +427,10 @@ class _Inequalities:
 
 def _decaying_form(M: Matrix, rate_per_s: float) -> Matrix:
     """Return a form that decays along z' = M z at a rate of more than twice the given one."""
-    flow, one = (M + rate_per_s * np.eye(len(M))).T, np.eye(len(M))
-    form = np.linalg.solve(np.kron(flow, one) + np.kron(one, flow), -one.ravel()).reshape(M.shape)
+    flow, identity = (M + rate_per_s * np.eye(len(M))).T, np.eye(len(M))
+    form = np.linalg.solve(np.kron(flow, identity) + np.kron(identity, flow), -identity.ravel()).reshape(
+        M.shape
+    )
     return np.asarray((form + form.T) / 2)
 
 

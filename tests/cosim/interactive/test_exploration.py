@@ -10,7 +10,7 @@ import pytest
 import noack
 from cosim.interactive import exploration
 from cosim.interactive import scenario_guarantee as guarantee
-from cosim.interactive.exploration_figure import Shown, exploration_figure
+from cosim.interactive.exploration_figure import ExploredRun, exploration_figure
 from cosim.lab.page_parts import figure_part
 from cosim.lab.run_views import Reference, compare, verdict_of
 from cosim.simulation.continuous import run_continuous
@@ -34,7 +34,7 @@ def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
         assert found.e_c_norm[first + 1] == pytest.approx(np.linalg.norm(after.e_c))
         assert found.e_s_norm[first + 1] == 0.0
     known = noack.load("lane_following", {"network.initial_sync": "known_state"})
-    shown = Shown(exploration.explore(known), 0)._replace(guarantee=guarantee.certify(known))
+    shown = ExploredRun(exploration.explore(known), 0)._replace(guarantee=guarantee.certify(known))
     figure = exploration_figure(shown)
     errors = figure.rows[1].panels[0].legend or ()
     assert "certified bound" in errors

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.fidelity import live_run
+from cosim.analysis.fidelity import recorded_loop
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.run_summary import summarise
 from cosim.record.align import align_tables, true_states
@@ -152,7 +152,7 @@ def test_exact_simulation_is_refused_in_one_line(
     disturbed = resolved(observed)
     del observed["plant"]["disturbances"]
     observed["observer"] = KALMAN | {"input_std": [0.5]}
-    for take in (continuous_loop_of, setting_of, lambda one: live_run(simulate(one))):
+    for take in (continuous_loop_of, setting_of, lambda one: recorded_loop(simulate(one))):
         for one, key in ((disturbed, r"plant\.disturbances"), (resolved(observed), "observer")):
             with pytest.raises(CallerError, match=key) as refusal:
                 take(one)

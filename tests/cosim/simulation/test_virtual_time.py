@@ -8,7 +8,7 @@ import pytest
 
 from cosim.analysis.certificates import Certificates
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.fidelity import IncomparableError, live_run
+from cosim.analysis.fidelity import IncomparableError, recorded_loop
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.run_summary import summarise
 from cosim.analysis.summary.summary_model import ClaimVerdict
@@ -114,10 +114,10 @@ def test_the_beginning_and_end_of_a_trip_are_reported_and_replayed(run: RunRecor
     }  # fmt: skip
     assert replay(run).bit_exact
     if policy == "hold":
-        live_run(run)
+        recorded_loop(run)
         return
     with pytest.raises(IncomparableError, match="no watchdog and no safe input"):
-        live_run(run)
+        recorded_loop(run)
 
 
 def test_the_table_in_the_documentation_is_the_simulated_one() -> None:

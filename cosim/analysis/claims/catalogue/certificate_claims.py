@@ -67,7 +67,7 @@ def estimation_error(
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     here, void = samples.with_x, run.violation_of(certificate)
     t_s = samples.t_s[here]
-    errors = row_norms((samples.joined.x - samples.true_x).compress(here, axis=0) @ weight.T)
+    errors = row_norms((samples.aligned.x - samples.true_x).compress(here, axis=0) @ weight.T)
     formula = envelope_formula(norm_text(run, "x̂ − x"), certificate, "estimation_error")
     shares = upper_shares(errors, certificate.estimation_error(t_s))
     return Findings(Bound(formula, t_s, shares, void, constants.estimation_error))
@@ -90,8 +90,8 @@ def sensor_error(
 ) -> Findings:
     """‖e_s‖_W before each reset."""
     formula = envelope_formula(norm_text(run, "e_s"), certificate, "overshoot")
-    slack = run.rounding(samples.joined.x_norm)
-    shares = upper_shares(samples.joined.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
+    slack = run.rounding(samples.aligned.x_norm)
+    shares = upper_shares(samples.aligned.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void = run.violation_of(certificate)
     return Findings(Bound(formula, samples.t_s, shares, void, constants.overshoot))
 

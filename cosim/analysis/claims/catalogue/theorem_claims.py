@@ -128,6 +128,6 @@ def theorem_2_state(run: RunEvidence, samples: Samples) -> Findings:
     if not run.record.scenario.coverage.knows_state:
         return Findings(None, envelope)
     slack = ROUNDING * run.part.offset
-    shares = upper_shares(samples.joined.x_norm, values + slack)
+    shares = upper_shares(samples.aligned.x_norm, values + slack)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
     return Findings(Bound(formula, samples.t_s, shares, run.paper_violation), envelope)

@@ -69,7 +69,7 @@ class Frames(NamedTuple):
         return {"plant": self.x, "sensor": self.x_s, "controller": self.x_c}[who]
 
 
-def joined(batches: Sequence[Frames]) -> Frames:
+def concatenate_frames(batches: Sequence[Frames]) -> Frames:
     """Return successive batches of frames as one batch."""
     t_s, x, x_s, x_c = map(np.concatenate, list(zip(*batches, strict=True))[:4])
     own = [frames.z for frames in batches if frames.z is not None]

@@ -200,14 +200,14 @@ def test_no_signs_are_worse_than_those_found(sections: dict[str, Any], objective
     resolved = scenario_of(periodic, horizon_s=0.35, network={"mansd": 0}, **sections)
     certificate = certify(resolved, conditions_of(resolved, continuous=False))
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
-    push, noise = (np.abs(part) for part in flow.loop.causes)
+    push, noise = (np.abs(part) for part in flow.loop.disturbances)
     bounds = bounds_of(resolved)
     assert bounds is not None
     worst = 0.0
     for signs in product((-1.0, 1.0), repeat=len(noise) if len(noise) else len(push)):
         sign = np.array(signs)[:, None]
         causes = (push, sign * bounds.noise) if len(noise) else (sign * bounds.columns.T, noise)
-        run = run_of(replace(flow, loop=flow.loop.with_causes(*causes)), lambda event: True)
+        run = run_of(replace(flow, loop=flow.loop.with_disturbances(*causes)), lambda event: True)
         worst = max(worst, run.value)
     search_result = find_worst(resolved, objective)
     assert search_result.value == pytest.approx(worst, rel=1e-9)
@@ -218,6 +218,6 @@ def test_causes_that_end_too_early_are_refused() -> None:
     """The core checks what Python hands to it."""
     loop = SampledLoop(scenario_of(EXAMPLES["mixed"]))
     runs, ones = loop.start(), np.ones(loop.last + 1)
-    short = loop.with_causes(np.zeros((0, 2)), np.zeros((3, 2)))
+    short = loop.with_disturbances(np.zeros((0, 2)), np.zeros((3, 2)))
     with pytest.raises(ValueError, match="do not reach"):
         short.follow(runs, Scales(loop.weight, ones, ones), np.array([loop.last]))

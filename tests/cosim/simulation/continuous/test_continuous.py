@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from cosim.analysis.fidelity import live_run
+from cosim.analysis.fidelity import recorded_loop
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import (
     POINTS,
@@ -318,7 +318,7 @@ def step_by_step(record: RunRecord, schedule: StepSchedule, *, delay: bool) -> t
 def test_it_is_what_one_exponential_after_another_gives(delay: bool) -> None:
     for number in range(POLICIES.index("decaying"), 120, len(POLICIES)):
         record = simulated(number)
-        whole = live_run(record).schedule
+        whole = recorded_loop(record).schedule
         late = replace(whole, measured=whole.measured & (np.arange(len(whole.measured)) > 3))
         for schedule in (whole, late):
             found = on_the_grid(record, schedule, delay=delay, hold=False)
@@ -334,7 +334,7 @@ def test_with_all_effects_it_is_what_the_machines_do(first: int) -> None:
     """Losses, delays, reordering, all kinds of rates and phases."""
     for number in range(first, 4 * len(POLICIES), len(POLICIES)):
         record = simulated(number)
-        live = live_run(record)
+        live = recorded_loop(record)
         found = on_the_grid(record, live.schedule, delay=True, hold=True)
         expected = record[PLANT_STEP]["x"][: len(found.x)]
         np.testing.assert_allclose(found.x, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
