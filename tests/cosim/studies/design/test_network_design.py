@@ -123,7 +123,7 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
 
 
 def test_the_search_is_deterministic() -> None:
-    wish = Wish(period_s=PERIOD_S, effort=20)
+    wish = Wish(period_s=PERIOD_S, effort=5)
     first, second = (design_for_network(shipped("cart_pole", LINEAR), wish).to_json() for _ in range(2))
     assert first == second
 
