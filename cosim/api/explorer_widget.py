@@ -73,7 +73,6 @@ class ExplorerWidget:
             self._show_controls()
         finally:
             self._quiet = False
-        self._draw()
         if self._pending is not None:
             self._pending.cancel()
         try:
@@ -81,6 +80,7 @@ class ExplorerWidget:
         except RuntimeError:  # no kernel: nothing will ever be dragged while this computes
             self._compute_rest(_REST)
         else:
+            self._draw()
             self._schedule(loop, _QUIET_S, _REST)
 
     def _schedule(self, loop: asyncio.AbstractEventLoop, after_s: float, names: list[str]) -> None:
@@ -94,13 +94,15 @@ class ExplorerWidget:
         self._pending = loop.call_later(after_s, compute)
 
     def _compute_rest(self, names: list[str]) -> None:
+        failure = ""
         try:
             for name in names:
                 getattr(self._results, name)
         except NoackError as error:
-            self._show_message(str(error))
-            return
+            failure = str(error)
         self._draw()
+        if failure:
+            self._show_message(failure)
 
     def _draw(self) -> None:
         try:

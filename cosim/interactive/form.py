@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cache
 from typing import Any
 
 from cosim.interactive.controls import example_of
@@ -138,7 +137,6 @@ def by_field(form: Group, mistakes: list[Mistake]) -> dict[str, str]:
     return texts
 
 
-@cache
 def _schema() -> Schema:
     return toml_file.json_schema(Scenario)
 

@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import date, time
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar, Union, get_args, get_origin
@@ -109,6 +110,7 @@ def validated(model: type[M], content: ReadTable, source: str) -> M:
         raise CallerError("\n".join(explain(error, source, model))) from None
 
 
+@cache
 def json_schema(model: type[ScenarioSection]) -> Table:
     """Return the JSON Schema of a file, for editors."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | model.model_json_schema()

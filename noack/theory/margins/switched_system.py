@@ -245,12 +245,14 @@ def find_cycle(system: SwitchedSystem, most_edges: int, beam: int) -> Cycle:
         leaving.setdefault(edge.source, []).append(step)
     paths = [step for steps in leaving.values() for step in steps]
     for _ in range(most_edges):
-        closed = [path for path in paths if path.source == path.target]
-        for path in closed:
+        closed = [
+            path
+            for path in paths
             # A product cannot grow faster than its norm.
-            if path.norm <= (growth * (1 + 1e-12)) ** path.duration:
-                continue
-            path_growth = float(np.abs(np.linalg.eigvals(path.product)).max()) ** (1 / path.duration)
+            if path.source == path.target and path.norm > (growth * (1 + 1e-12)) ** path.duration
+        ]
+        for path, radius in zip(closed, _radii([path.product for path in closed]), strict=True):
+            path_growth = radius ** (1 / path.duration)
             if path_growth > growth * (1 + 1e-12):
                 best, growth = path.edges, path_growth
         scale = growth or 1.0
@@ -259,6 +261,16 @@ def find_cycle(system: SwitchedSystem, most_edges: int, beam: int) -> Cycle:
     if not best:
         return NO_CYCLE
     return Cycle(best, growth_bounds(system, best)[0])
+
+
+def _radii(matrices: Sequence[Matrix]) -> list[float]:
+    """Return the spectral radii of matrices; those of one size are computed together."""
+    radii = np.zeros(len(matrices))
+    for size in {len(matrix) for matrix in matrices}:
+        which = [k for k, matrix in enumerate(matrices) if len(matrix) == size]
+        values = np.linalg.eigvals(np.array([matrices[k] for k in which]))
+        radii[which] = np.abs(values).max(axis=1)
+    return radii.tolist()
 
 
 def growth_bounds(system: SwitchedSystem, path: Sequence[int]) -> tuple[float, float]:

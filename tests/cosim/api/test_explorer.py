@@ -1,6 +1,7 @@
 """``noack.explore``: without widgets, and with widgets driven from Python."""
 
 import sys
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 
 import noack
+from cosim.interactive import exploration_figure
 
 
 def test_results_are_those_of_the_library() -> None:
-    explorer = noack.explore("lane_following")
-    certificate = noack.certify("lane_following").schedule
+    scenario = noack.load("lane_following", {"horizon_s": 4.0})
+    explorer = noack.explore(scenario)
+    certificate = noack.certify(scenario).schedule
     assert certificate.constants is not None
     guarantee = explorer.certificate
     assert guarantee.verdict == "certified"
@@ -55,7 +58,9 @@ def test_a_saved_scenario_has_the_settings_and_the_comments(tmp_path: Path) -> N
     assert noack.load(noack.explore(table).save(path)).name == "double_integrator"
 
 
-def test_sliders_change_the_explorer_and_the_other_way_round() -> None:
+def test_sliders_change_the_explorer_and_the_other_way_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = partial(exploration_figure.explore_ensemble, draws=20)
+    monkeypatch.setattr(exploration_figure, "explore_ensemble", few)
     ipywidgets = pytest.importorskip("ipywidgets", reason="the extra `notebook` is not installed")
     explorer = noack.explore("lane_following", {"horizon_s": 4.0})
     controls, figure = explorer.widget().children
