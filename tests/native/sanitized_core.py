@@ -17,8 +17,8 @@ ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / ".cache" / "sanitized"
 _OPTIONS = "abort_on_error=1:print_stacktrace=1"
 _QUARANTINE = "quarantine_size_mb=16"
-"""Freed memory is used again only after this much more was freed. With the default, 256 MB, page
-faults take a third of the time."""
+"""Freed memory is used again only after this much more was freed. With the default, 256 MB, the
+kernel needs 3 s more for pages."""
 
 
 class NoSanitizersError(Exception):
