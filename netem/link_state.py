@@ -222,10 +222,8 @@ def _rule_fields(settings: LinkSettings) -> tuple[dict[str, int], list[tuple[int
     windows = [(rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow)]
     between = (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts))
     mansd = -1 if settings.longest_burst is None else settings.longest_burst
-    recovery, width = max(between, default=0), 1
-    if windows or recovery:
-        longest = max((packets for _, packets in windows), default=0)
-        width = 1 << max(longest + 1, mansd + recovery + 1).bit_length()
+    recovery, longest = max(between, default=0), max((packets for _, packets in windows), default=0)
+    width = 1 << max(longest + 1, mansd + recovery + 1).bit_length() if windows or recovery else 1
     return {"mansd": mansd, "recovery": recovery, "loss_width": width}, windows
 
 

@@ -428,9 +428,8 @@ class _Inequalities:
 def _decaying_form(M: Matrix, rate_per_s: float) -> Matrix:
     """Return a form that decays along z' = M z at a rate of more than twice the given one."""
     flow, identity = (M + rate_per_s * np.eye(len(M))).T, np.eye(len(M))
-    form = np.linalg.solve(np.kron(flow, identity) + np.kron(identity, flow), -identity.ravel()).reshape(
-        M.shape
-    )
+    both_sides = np.kron(flow, identity) + np.kron(identity, flow)
+    form = np.linalg.solve(both_sides, -identity.ravel()).reshape(M.shape)
     return np.asarray((form + form.T) / 2)
 
 
