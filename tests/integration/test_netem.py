@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.netem.engine.relays import endpoints
+from tests.netem.relay.relays import endpoints
 
 
 def test_several_links_a_capture_and_statistics(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import exponential
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
-from tests.cosim.simulation.batch.exact import random_population, random_setting
+from tests.cosim.simulation.exact_populations import random_population, random_setting
 from tests.example_rules import TABLES, random_rule
 
 LANES = ("following", "acknowledged", "actuation_loss", "crosswind")

@@ -15,7 +15,7 @@ from noack.core.core_library import core, ffi, load_core
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import TriggerRule
-from tests.cosim.simulation.batch.exact import random_population, random_setting
+from tests.cosim.simulation.exact_populations import random_population, random_setting
 from tests.example_rules import TABLES, area_rule, decaying_rule, random_rule
 from tests.machine_parts import SteppedMachines
 from tests.noack.machines.any_machines import MS, Sizes, controller, plant, sensor, set_number, sizes, text_of

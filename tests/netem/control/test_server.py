@@ -27,8 +27,8 @@ from tests.approved import compare_lines, lines_of_error
 from tests.netem.conftest import Emulate
 from tests.netem.control import relays
 from tests.netem.control.relays import FakeRelay, press_q, read_until, terminal
-from tests.netem.engine.relays import endpoints
 from tests.netem.fates.links import spec_of
+from tests.netem.relay.relays import endpoints
 
 
 @pytest.fixture

@@ -213,7 +213,7 @@ def test_a_loop_that_cannot_be_simulated_to_the_end_is_reported() -> None:
 # --- the output of noack simulate --trigger continuous --------------------------------------------
 
 
-SCENARIOS = Path(__file__).parents[4] / "scenarios"
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
 
 
 @pytest.fixture(scope="module")

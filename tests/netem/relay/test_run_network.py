@@ -31,7 +31,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.machine_parts import Machine
 from tests.netem import any_settings
-from tests.netem.engine.relays import PATIENCE_S, KeepAll, Received, drain, endpoints, name_of, relayed
+from tests.netem.relay.relays import PATIENCE_S, KeepAll, Received, drain, endpoints, name_of, relayed
 from tests.oracles.link import Datagram, Link, network_of
 
 NEVER_NS = 2**61

@@ -18,7 +18,7 @@ from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.runtime import udp_sockets
 from noack.runtime.address import address_text
-from tests.netem.engine.relays import (
+from tests.netem.relay.relays import (
     HOSTS,
     KeepAll,
     Received,

@@ -26,7 +26,7 @@ from netem.tc_words import settings_of
 from noack.core.core_library import core, pointer_to
 from noack.core.errors import CallerError
 from noack.runtime.address import packed_name
-from tests.netem.engine.relays import HOSTS, drain, endpoints, link, name_of, running
+from tests.netem.relay.relays import HOSTS, drain, endpoints, link, name_of, running
 
 
 @given(st.integers(0, 2**44 - 1))

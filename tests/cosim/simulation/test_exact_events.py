@@ -15,7 +15,7 @@ from noack.impairments.kinds.delay import Delay
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario.resolution import loop_of
 from noack.trigger.trigger_rule import TriggerRule
-from tests.cosim.simulation.batch.exact import (
+from tests.cosim.simulation.exact_populations import (
     check_events,
     check_independence,
     compare,
