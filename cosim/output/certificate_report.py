@@ -403,8 +403,9 @@ def sentences(unlimited: UnlimitedLosses) -> Iterator[str]:
     if unlimited.runs:
         run = unlimited.runs[0]
         yield (
-            f"Largest of a run: in {unlimited.horizon_s:g} s. Runs with a burst of more than {run.most} "
-            f"losses, a share of at most {at_most(1 - run.probability, 2)}, count as 0."
+            f"Largest of a run: of e^(rate·t) times the norm, within {unlimited.horizon_s:g} s. Runs with a "
+            f"burst of more than {run.most} losses, a share of at most "
+            f"{at_most(1 - run.probability, 2)}, count as 0."
         )
     if unlimited.at_events:
         yield "Before an event: under the paper's conditions (no sampling, no delay, no hold)."
