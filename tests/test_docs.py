@@ -63,15 +63,17 @@ def test_every_scenario_key_is_documented_and_no_other() -> None:
 
 
 @pytest.mark.parametrize(
-    ("heading", "tables"),
+    ("page", "heading", "tables"),
     [
-        ("Trigger policies", POLICIES.values()),
-        ("Disturbances", (*choices(AnyDisturbance), *choices(AnyObserver))),
-        ("Loss models", (*LOSS_MODELS, *IMPAIRMENTS, *DISCIPLINES, *CONSTRAINTS)),
+        ("scenarios", "Trigger policies", POLICIES.values()),
+        ("scenarios", "Disturbances", (*choices(AnyDisturbance), *choices(AnyObserver))),
+        ("network", "Loss models", (*LOSS_MODELS, *IMPAIRMENTS, *DISCIPLINES, *CONSTRAINTS)),
     ],
 )
-def test_every_key_of_a_kind_is_documented(heading: str, tables: Iterable[type[BaseModel]]) -> None:
-    text = (ROOT / "docs/scenarios.md").read_text().partition(f"## {heading}")[2]
+def test_every_key_of_a_kind_is_documented(
+    page: str, heading: str, tables: Iterable[type[BaseModel]]
+) -> None:
+    text = (ROOT / f"docs/{page}.md").read_text().partition(f"## {heading}")[2]
     for table in tables:
         first, *_ = table.model_fields.values()
         name = get_args(first.annotation)[0]

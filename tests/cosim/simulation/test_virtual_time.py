@@ -122,7 +122,7 @@ def test_the_beginning_and_end_of_a_trip_are_reported_and_replayed(run: RunRecor
 
 def test_the_table_in_the_documentation_is_the_simulated_one() -> None:
     """One number is simulated again; `python -m tests.cosim.live.outage` prints all rows."""
-    lines = (DOCS / "scenarios.md").read_text().splitlines()
+    lines = (DOCS / "network.md").read_text().splitlines()
     rows = [
         [line for line in lines if line.startswith(f"| `{name}`, `{mode}` | {lasts_s:g} s |")]
         for name, mode, lasts_s in CASES
