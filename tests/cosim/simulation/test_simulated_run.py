@@ -80,6 +80,7 @@ def test_the_summary_adds_up(run_dir: Path) -> None:
     assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.02)
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
     loop = (run_dir, "--loop", "periodic")
     for words in ((run_dir,), loop):
