@@ -264,11 +264,13 @@ def _best_rate_per_s(
         NotDecayingError: a number overflows.
     """
     width = fastest_per_s - alpha_per_s
-    sampled = _SampledGrowth(loop.A + loop.B @ loop.K, _LAST_TIME / width)
+    t_s, logarithms = _sampled_norms(loop.A + loop.B @ loop.K, _LAST_TIME / width)
 
     def about_s(share: float) -> float:
         rate = alpha_per_s + share * width
-        return _theorem_2(loop, beta, alpha_per_s, delta, rate, sampled.growth(rate)).inter_event_s
+        with np.errstate(over="ignore"):
+            c = float(np.exp(np.max(logarithms + rate * t_s)))
+        return _theorem_2(loop, beta, alpha_per_s, delta, rate, c).inter_event_s
 
     # At one end of the range c tends to infinity, at the other end 1/(ᾱ − α) does. The larger of
     # two values between leaves a smaller range, whose golden section is the other one.
@@ -287,37 +289,25 @@ def _best_rate_per_s(
     return alpha_per_s + (right if right_s > left_s else left) * width
 
 
-class _SampledGrowth:
-    """‖e^{Gt}‖ at some times, to choose ᾱ: the bounds of c that it gives are not certified.
-
-    Args:
-        generator: G, (n, n).
-        until_s: the last time, or a little less than it.
+def _sampled_norms(generator: Matrix, until_s: float) -> tuple[Vector, Vector]:
+    """Return times from 0 to about ``until_s``, and the logarithms of ‖e^{Gt}‖ there.
 
     Raises:
         NotDecayingError: a number overflows.
     """
-
-    def __init__(self, generator: Matrix, until_s: float) -> None:
-        step_s = _FIRST_STEP / float(np.linalg.norm(generator))
-        step, reached, t_s = exponential(step_s * generator), np.eye(len(generator)), 0.0
-        times_s, matrices = [t_s], [reached]
-        while t_s < until_s:
-            for _ in range(_STEPS_OF_A_LENGTH):
-                reached, t_s = step @ reached, t_s + step_s
-                times_s.append(t_s)
-                matrices.append(reached)
-            step, step_s = step @ step, 2 * step_s
-        if not np.isfinite(matrices).all():
-            raise NotDecayingError("‖e^{Gt}‖ overflows")
-        self._t_s = np.array(times_s)
-        with np.errstate(divide="ignore"):  # norms that underflow
-            self._logarithms = np.log(spectral_norms(np.array(matrices)))
-
-    def growth(self, rate_per_s: float) -> float:
-        """Return about the smallest c with ‖e^{Gt}‖ ≤ c e^{−ᾱt}, for a rate ᾱ."""
-        with np.errstate(over="ignore"):
-            return float(np.exp(np.max(self._logarithms + rate_per_s * self._t_s)))
+    step_s = _FIRST_STEP / float(np.linalg.norm(generator))
+    step, reached, t_s = exponential(step_s * generator), np.eye(len(generator)), 0.0
+    times_s, matrices = [t_s], [reached]
+    while t_s < until_s:
+        for _ in range(_STEPS_OF_A_LENGTH):
+            reached, t_s = step @ reached, t_s + step_s
+            times_s.append(t_s)
+            matrices.append(reached)
+        step, step_s = step @ step, 2 * step_s
+    if not np.isfinite(matrices).all():
+        raise NotDecayingError("‖e^{Gt}‖ overflows")
+    with np.errstate(divide="ignore"):  # norms that underflow
+        return np.array(times_s), np.log(spectral_norms(np.array(matrices)))
 
 
 def _theorem_2(
