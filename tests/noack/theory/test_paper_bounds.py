@@ -10,9 +10,18 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.scenario.resolution import LoopMatrices
+from noack.scenario.resolution import LoopMatrices, loop_of
+from noack.theory.bounds.enclosure import response
 from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.paper import ErrorMonitor, Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
+from noack.theory.paper import (
+    ErrorMonitor,
+    Interval,
+    Theorem2,
+    _theorem_2,
+    longest_interval_s,
+    theorem_1,
+    theorem_2,
+)
 from noack.trigger.trigger_rule import TriggerRule
 from tests.example_rules import decaying_rule
 from tests.noack.theory.certificate_kinds.policies import INSTANT
@@ -27,6 +36,7 @@ from tests.oracles.lossy_loops import (
     systems,
     times_s,
 )
+from tests.shipped import resolved
 
 
 def norm(matrix: Matrix) -> float:
@@ -55,30 +65,20 @@ def test_theorem_2_is_what_its_equations_say(system: System) -> None:
     closed, alpha, bar = loop.A + loop.B @ loop.K, system.alpha, found.alpha_bar_per_s
     assert alpha < bar < -spectral_abscissa(closed)
     fast = float(np.abs(np.linalg.eigvals(closed)).max())
+    t_s = np.concatenate([np.linspace(0, 20 / fast, 300), np.linspace(0, 20 / (bar - alpha), 300)])
+    sampled = np.linalg.norm(expm((closed + bar * np.eye(loop.n)) * t_s[:, None, None]), 2, (1, 2))
+    # ‖e^{(A+BK)t}‖ ≤ c e^{−ᾱt}, and c is close to its smallest possible value.
+    assert sampled.max() / ROUNDING <= found.c <= 1.01 * sampled.max()
     beta, delta, c = system.beta, found.delta, found.c
     BK, gap, x0 = norm(loop.B @ loop.K), bar - alpha, float(np.linalg.norm(system.x0))
     tilde, hat = norm(loop.A + loop.B @ loop.K - loop.H), norm(loop.H)
-
-    def smallest_c(rate: float) -> float:
-        t_s = np.concatenate([np.linspace(0, 20 / fast, 300), np.linspace(0, 20 / (rate - alpha), 300)])
-        sampled = expm((closed + rate * np.eye(loop.n)) * t_s[:, None, None])
-        return float(np.linalg.norm(sampled, 2, (1, 2)).max())
-
-    def inter_event_s(rate: float, c: float) -> float:
-        gap, least_s = rate - alpha, math.inf
-        F_bar = tilde * c * (x0 - beta * delta * BK / gap)
-        F = (1 + tilde * c / gap) * beta * delta * BK
-        for t_i in (0.0, 1.0 / gap, 1e9):
-            bold_F = F_bar * math.exp(-gap * t_i) / (hat + rate) + F / (hat + alpha)
-            least_s = min(least_s, math.log(1 + beta / bold_F) / (hat + rate))
-        return least_s
-
-    # ‖e^{(A+BK)t}‖ ≤ c e^{−ᾱt}, and c is close to its smallest possible value.
-    assert smallest_c(bar) / ROUNDING <= c <= 1.01 * smallest_c(bar)
-    assert found.inter_event_s == pytest.approx(inter_event_s(bar, c), rel=1e-12)
-    for share in np.linspace(0.05, 0.95, 7):  # no other rate allows a longer time
-        rate = alpha + share * (-spectral_abscissa(closed) - alpha)
-        assert inter_event_s(rate, smallest_c(rate)) <= 1.01 * found.inter_event_s
+    F_bar = tilde * c * (x0 - beta * delta * BK / gap)
+    F = (1 + tilde * c / gap) * beta * delta * BK
+    least_s = math.inf
+    for t_i in (0.0, 1.0 / gap, 1e9):
+        bold_F = F_bar * math.exp(-gap * t_i) / (hat + bar) + F / (hat + alpha)
+        least_s = min(least_s, math.log(1 + beta / bold_F) / (hat + bar))
+    assert found.inter_event_s == pytest.approx(least_s, rel=1e-12)
     assert (found.a_hat, found.a_tilde) == pytest.approx((hat, tilde))
     for t in (0.0, 0.3, 5.0):
         right = c * x0 * math.exp(-bar * t) + beta * c * delta * BK / gap * (
@@ -130,6 +130,17 @@ def test_theorem_1_agrees_with_a_hand_calculation() -> None:
     assert theorem_1(-np.eye(1), 0.7, []) == 1.0
     growing = theorem_1(np.eye(1), 0.7, [0.5])
     assert growing == pytest.approx(1 + math.exp(0.35) * math.exp(0.5), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["f16_lateral", "reactor_petc"])
+def test_no_other_rate_gives_theorem_2_a_longer_inter_event_time(name: str) -> None:
+    loop, beta, alpha, delta = loop_of(resolved(name)), 0.5, 0.25, 3.0
+    closed, best = loop.A + loop.B @ loop.K, theorem_2(loop, beta, alpha, delta)
+    assert best is not None
+    for rate in alpha + np.linspace(0.05, 0.95, 10) * (-spectral_abscissa(closed) - alpha):
+        c = response(closed + rate * np.eye(loop.n), np.eye(loop.n)).through(np.eye(loop.n)).sup()
+        other = _theorem_2(loop, beta, alpha, delta, rate, float(c))
+        assert other.inter_event_s <= 1.001 * best.inter_event_s
 
 
 def test_theorem_2_requires_a_threshold_that_decays_more_slowly_than_the_loop() -> None:
