@@ -111,6 +111,12 @@ def no_recording(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write pages whose figures are not drawn, which takes most of their time."""
+    monkeypatch.setattr("cosim.output.page_kit.inline", lambda _: "<svg></svg>")
+
+
+@pytest.fixture
 def usual_signals() -> Iterator[None]:
     """Let signals do what they usually do, also in a process that was started to ignore them."""
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}

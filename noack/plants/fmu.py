@@ -16,11 +16,12 @@ import tempfile
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from contextvars import ContextVar
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from pydantic import Field, FiniteFloat
@@ -119,12 +120,12 @@ class FmuSystem:
         m = len(settings.input_variables)
         self._operating_input = np.array(settings.operating_input or np.zeros(m))
         self._log = _Log()
-        end = contextlib.ExitStack()
+        end = ExitStack()
         weakref.finalize(self, end.close)  # when the object is deleted, or the process ends
         try:
             description = _described(path)
             self.about = _about(description)
-            self._instance = self._load(path, end, description)
+            self._instance = self._load(_unpacked(path, settings, description, end), end, description)
             self._start(settings, x0, description)
         except CallerError:
             end.close()
@@ -153,9 +154,8 @@ class FmuSystem:
     def _wrong(self, message: str) -> NoReturn:
         raise CallerError(f"{self._place}: {message}")
 
-    def _load(self, path: Path, end: contextlib.ExitStack, description: "ModelDescription") -> "_Instance":
-        fmpy, folder = _fmpy(), end.enter_context(temporary_folder())
-        fmpy.extract(str(path), str(folder))
+    def _load(self, folder: Path, end: ExitStack, description: "ModelDescription") -> "_Instance":
+        fmpy = _fmpy()
         self._require_binary(folder, description)
         working_folder = Path.cwd()
         try:
@@ -214,6 +214,39 @@ class FmuSystem:
                 f"plant.initial_state: it is {x0.tolist()}, but the FMU begins at "
                 f"{self.x.tolist()}; name in plant.system.initial_variables the variables to set"
             )
+
+
+class _Kept(NamedTuple):
+    """Folders of unpacked FMUs by path and SHA-256, and when they are removed."""
+
+    folders: dict[tuple[Path, str | None], Path]
+    end: ExitStack
+
+
+_KEPT = ContextVar[_Kept | None]("kept", default=None)
+
+
+@contextmanager
+def unpacked_once() -> Iterator[None]:
+    """Unpack an FMU once for all its instances in this context; otherwise each has its own copy.
+
+    The instances share the FMU's library: they should follow one another.
+    """
+    with ExitStack() as end:
+        end.callback(_KEPT.reset, _KEPT.set(_Kept({}, end)))
+        yield
+
+
+def _unpacked(path: Path, settings: FmuSettings, description: "ModelDescription", end: ExitStack) -> Path:
+    """Return a folder with the content of an FMU; without a context for it, it is removed at the end."""
+    kept, key = _KEPT.get(), (path, settings.sha256)
+    if kept is None or description.coSimulation.canBeInstantiatedOnlyOncePerProcess:
+        kept = _Kept({}, end)
+    if key not in kept.folders:
+        folder = kept.end.enter_context(temporary_folder())
+        _fmpy().extract(str(path), str(folder))
+        kept.folders[key] = folder
+    return kept.folders[key]
 
 
 def variables_of(path: Path) -> dict[str, list[str]]:

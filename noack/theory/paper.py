@@ -52,6 +52,7 @@ from noack.core.linear_systems import (
     MatrixKey,
     Propagator,
     Vector,
+    exponential,
     matrix_key,
     matrix_of,
     row_norms,
@@ -59,6 +60,7 @@ from noack.core.linear_systems import (
     transition,
 )
 from noack.scenario.resolution import LoopMatrices
+from noack.theory.bounds.contraction import spectral_norms
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.trigger.trigger_rule import Policy, TriggerRule
 
@@ -199,6 +201,10 @@ def _growths(H: MatrixKey, weight: MatrixKey, period_ns: int) -> _Growths:
 
 
 _SHARE, _NEAREST = 1e-2, 0.98
+_FIRST_STEP, _STEPS_OF_A_LENGTH = 1 / 64, 64
+"""Times at which ‖e^{Gt}‖ is sampled: the first step, times ‖G‖; steps until it is doubled."""
+_LAST_TIME = 50.0
+"""The last of them, times the difference between the decay rates of loop and threshold."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
 _CELLS = 256
 
@@ -236,37 +242,78 @@ def theorem_2(loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float)
     """
     closed = loop.A + loop.B @ loop.K
     fastest = -spectral_abscissa(closed)
-    if not 0 < alpha_per_s < fastest:
+    if not 0 < alpha_per_s < fastest or not math.isfinite(np.linalg.norm(closed)):
         return None
-
-    def at(share: float) -> Theorem2:
-        rate = alpha_per_s + share * (fastest - alpha_per_s)
-        return _theorem_2(loop, beta, alpha_per_s, delta, rate)
-
-    # At one end of the range c tends to infinity, at the other end 1/(ᾱ − α) does. The larger of
-    # two values between leaves a smaller range, whose golden section is the other one.
-    low, high = 0.0, _NEAREST
     try:
-        left, right = at(high - _GOLDEN * (high - low)), at(low + _GOLDEN * (high - low))
-        while high - low > _SHARE:
-            if left.inter_event_s > right.inter_event_s:
-                high = low + _GOLDEN * (high - low)
-                left, right = at(high - _GOLDEN * (high - low)), left
-            else:
-                low = high - _GOLDEN * (high - low)
-                left, right = right, at(low + _GOLDEN * (high - low))
+        rate = _best_rate_per_s(loop, beta, alpha_per_s, delta, fastest)
+        identity = np.eye(loop.n)
+        c = float(response(closed + rate * identity, identity).through(identity).sup())
     except NotDecayingError:  # the decay is too slow to compute c in floating point
         return None
-    best = max(left, right, key=lambda theorem: theorem.inter_event_s)
+    best = _theorem_2(loop, beta, alpha_per_s, delta, rate, c)
     sizes = (best.c, best.state_start, best.state_forced)
     return None if math.isnan(best.inter_event_s) or not all(map(math.isfinite, sizes)) else best
 
 
+def _best_rate_per_s(
+    loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float, fastest_per_s: float
+) -> float:
+    """Return the ᾱ between α and the loop's decay rate that gives about the longest inter-event time.
+
+    Raises:
+        NotDecayingError: a number overflows.
+    """
+    width = fastest_per_s - alpha_per_s
+    t_s, logarithms = _sampled_norms(loop.A + loop.B @ loop.K, _LAST_TIME / width)
+
+    def about_s(share: float) -> float:
+        rate = alpha_per_s + share * width
+        with np.errstate(over="ignore"):
+            c = float(np.exp(np.max(logarithms + rate * t_s)))
+        return _theorem_2(loop, beta, alpha_per_s, delta, rate, c).inter_event_s
+
+    # At one end of the range c tends to infinity, at the other end 1/(ᾱ − α) does. The larger of
+    # two values between leaves a smaller range, whose golden section is the other one.
+    low, high = 0.0, _NEAREST
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    left_s, right_s = about_s(left), about_s(right)
+    while high - low > _SHARE:
+        if left_s > right_s:
+            high, right, right_s = right, left, left_s
+            left = high - _GOLDEN * (high - low)
+            left_s = about_s(left)
+        else:
+            low, left, left_s = left, right, right_s
+            right = low + _GOLDEN * (high - low)
+            right_s = about_s(right)
+    return alpha_per_s + (right if right_s > left_s else left) * width
+
+
+def _sampled_norms(generator: Matrix, until_s: float) -> tuple[Vector, Vector]:
+    """Return times from 0 to about ``until_s``, and the logarithms of ‖e^{Gt}‖ there.
+
+    Raises:
+        NotDecayingError: a number overflows.
+    """
+    step_s = _FIRST_STEP / float(np.linalg.norm(generator))
+    step, reached, t_s = exponential(step_s * generator), np.eye(len(generator)), 0.0
+    times_s, matrices = [t_s], [reached]
+    while t_s < until_s:
+        for _ in range(_STEPS_OF_A_LENGTH):
+            reached, t_s = step @ reached, t_s + step_s
+            times_s.append(t_s)
+            matrices.append(reached)
+        step, step_s = step @ step, 2 * step_s
+    if not np.isfinite(matrices).all():
+        raise NotDecayingError("‖e^{Gt}‖ overflows")
+    with np.errstate(divide="ignore"):  # norms that underflow
+        return np.array(times_s), np.log(spectral_norms(np.array(matrices)))
+
+
 def _theorem_2(
-    loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float, alpha_bar_per_s: float
+    loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float, alpha_bar_per_s: float, c: float
 ) -> Theorem2:
-    closed, identity = loop.A + loop.B @ loop.K, np.eye(loop.n)
-    c = float(response(closed + alpha_bar_per_s * identity, identity).through(identity).sup())
+    closed = loop.A + loop.B @ loop.K
     x0, BK = float(np.linalg.norm(loop.x0)), float(np.linalg.norm(loop.B @ loop.K, 2))
     a_hat, gap = float(np.linalg.norm(loop.H, 2)), alpha_bar_per_s - alpha_per_s
     a_tilde = float(np.linalg.norm(closed - loop.H, 2))

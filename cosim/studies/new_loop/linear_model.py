@@ -14,6 +14,7 @@ from cosim.studies.new_loop.plant_reference import PlantReference, plant_referen
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.number_format import Rows, as_text
+from noack.plants.fmu import unpacked_once
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
 from noack.scenario.sections import instability
@@ -183,6 +184,7 @@ class LoopGain:
         )
 
 
+@unpacked_once()
 def linearise(
     plant: str,
     *,

@@ -79,6 +79,7 @@ def test_a_temporary_run_exists_as_long_as_its_object() -> None:
     assert not folder.parent.exists()
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_a_run_of_the_api_has_an_ordinary_run_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenario: noack.Scenario
 ) -> None:

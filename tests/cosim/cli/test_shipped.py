@@ -42,6 +42,7 @@ def test_a_shipped_scenario_runs_from_the_command_line_and_in_the_library(name: 
     assert json.loads(simulated.stdout)["exit"]["status"] == 0
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_each_command_runs_a_trigger_of_ones_own_or_says_why_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -184,7 +184,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def address(folder: Path) -> Iterator[str]:
-    with Served(folder) as server:
+    with Served(folder, viewer=False) as server:
         yield server.address
 
 

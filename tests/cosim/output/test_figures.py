@@ -133,6 +133,12 @@ def test_signal_names_are_drawn_literally() -> None:
     assert "<script" not in inline(figure.captioned(HOSTILE))
 
 
+def test_a_curve_of_zeros_is_not_drawn_on_a_logarithmic_axis() -> None:
+    drawn, zeros = draw(norms(line(T_S, T_S), line(T_S, 0 * T_S))).axes[0].lines
+    assert np.isnan(zeros.get_ydata()).all()
+    np.testing.assert_array_equal(drawn.get_ydata(), T_S)
+
+
 def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
     late_us = np.random.default_rng(1).lognormal(3, 1, 5000)
     found_us, share = later_than(QuantileSketch.of([late_us]))

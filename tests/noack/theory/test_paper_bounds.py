@@ -10,9 +10,18 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.scenario.resolution import LoopMatrices
+from noack.scenario.resolution import LoopMatrices, loop_of
+from noack.theory.bounds.enclosure import response
 from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.paper import ErrorMonitor, Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
+from noack.theory.paper import (
+    ErrorMonitor,
+    Interval,
+    Theorem2,
+    _theorem_2,
+    longest_interval_s,
+    theorem_1,
+    theorem_2,
+)
 from noack.trigger.trigger_rule import TriggerRule
 from tests.example_rules import decaying_rule
 from tests.noack.theory.certificate_kinds.policies import INSTANT
@@ -27,6 +36,7 @@ from tests.oracles.lossy_loops import (
     systems,
     times_s,
 )
+from tests.shipped import resolved
 
 
 def norm(matrix: Matrix) -> float:
@@ -120,6 +130,17 @@ def test_theorem_1_agrees_with_a_hand_calculation() -> None:
     assert theorem_1(-np.eye(1), 0.7, []) == 1.0
     growing = theorem_1(np.eye(1), 0.7, [0.5])
     assert growing == pytest.approx(1 + math.exp(0.35) * math.exp(0.5), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["f16_lateral", "reactor_petc"])
+def test_no_other_rate_gives_theorem_2_a_longer_inter_event_time(name: str) -> None:
+    loop, beta, alpha, delta = loop_of(resolved(name)), 0.5, 0.25, 3.0
+    closed, best = loop.A + loop.B @ loop.K, theorem_2(loop, beta, alpha, delta)
+    assert best is not None
+    for rate in alpha + np.linspace(0.05, 0.95, 10) * (-spectral_abscissa(closed) - alpha):
+        c = response(closed + rate * np.eye(loop.n), np.eye(loop.n)).through(np.eye(loop.n)).sup()
+        other = _theorem_2(loop, beta, alpha, delta, rate, float(c))
+        assert other.inter_event_s <= 1.001 * best.inter_event_s
 
 
 def test_theorem_2_requires_a_threshold_that_decays_more_slowly_than_the_loop() -> None:

@@ -123,15 +123,10 @@ def is_left(group: int) -> bool:
 
 @contextlib.contextmanager
 def another_process(code: str, path: Path) -> Iterator[subprocess.Popen[str]]:
-    """Run code with this module as ``t`` and a path as ``path``, and kill it at the end."""
-    head = (
-        "import importlib.util, pathlib, sys;"
-        f"spec = importlib.util.spec_from_file_location('t', {__file__!r});"
-        "t = importlib.util.module_from_spec(spec); spec.loader.exec_module(t);"
-        "path = pathlib.Path(sys.argv[1]);"
-    )
+    """Run code with a path as ``path``, and kill it at the end."""
     with subprocess.Popen(
-        [sys.executable, "-c", head + code, str(path)],
+        [sys.executable, "-c", "import pathlib, sys; path = pathlib.Path(sys.argv[1]);" + code, str(path)],
+        cwd=Path(__file__).parents[4],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env={name: value for name, value in os.environ.items() if "DISPLAY" not in name},
@@ -219,7 +214,7 @@ def test_a_file_that_cannot_be_created_is_named(tmp_path: Path) -> None:
 def test_a_disk_that_fills_during_the_run_is_reported_by_the_closing(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     code = (
-        "import resource; view = t.new_view(path);"
+        "import resource; from tests.cosim.output.viewer import test_viewer as t; view = t.new_view(path);"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000));"
         "t.add_samples(view, 50); view.close()"
     )
@@ -284,7 +279,8 @@ def test_a_live_view_ends_when_the_recorder_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     path.write_bytes(b"RRF2")
     code = (
-        "import time; live = t.LiveView(native=False); live.show(path);"
+        "import time; from cosim.output.viewer.live_viewer import LiveView;"
+        "live = LiveView(native=False); live.show(path);"
         "print(live.pid, flush=True); time.sleep(1000)"
     )
     with another_process(code, path) as child:

@@ -75,6 +75,7 @@ def paper_certificate(path: Path) -> dict[str, Any]:
     return [one for one in found if one["under"] == "paper"][-1]
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_check_and_certify_accept_the_written_scenario(
     mass: Path, tmp_path: Path, run_design: Design
 ) -> None:
@@ -103,6 +104,7 @@ def test_check_and_certify_accept_the_written_scenario(
     assert certificate["constants"]["state"] == pytest.approx(best["bounds"]["state"])
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_a_chosen_norm_is_certified_as_written(one: Path, tmp_path: Path, run_design: Design) -> None:
     out = tmp_path / "chosen.toml"
     result = run_design(
@@ -157,6 +159,7 @@ def test_the_lines_about_mistakes_are_those_that_were_approved(
     compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_a_loop_without_a_certificate_is_reported(one: Path, run_design: Design) -> None:
     result = run_design(
         one, "--settling", "4", "--bound", "error=1", "--under", "schedule",

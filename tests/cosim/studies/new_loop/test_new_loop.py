@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -186,10 +187,17 @@ def test_the_double_integrators_gain_is_the_textbooks_whatever_plant_is_drawn() 
     assert "from the scenario's [model], which sensor and controller know" in repr(found)
 
 
-def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(folder: Path) -> None:
+def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """ẍ = u − k x + μ (1 − x²) ẋ: [[0, 1], [−1, 1]] at 0; at x = 1 it rests with u = 1."""
+    fmpy = pytest.importorskip("fmpy")
+    unpack = Mock(wraps=fmpy.extract)
+    monkeypatch.setattr(fmpy, "extract", unpack)
     fmu = build(folder, 2)
     found = noack.linearise(str(fmu))
+    assert unpack.call_count == 1  # for hundreds of instances
+    assert not Path(unpack.call_args.args[1]).exists()
     np.testing.assert_allclose(found.A, [[0, 1], [-1, 1]], atol=1e-4)
     np.testing.assert_allclose(found.B, [[0], [1]], atol=1e-4)
     moved = noack.linearise(str(fmu), at=[1.0, 0.0], input=[1.0])
