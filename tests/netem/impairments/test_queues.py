@@ -331,16 +331,6 @@ def test_each_packet_leaves_as_in_mahimahi(seed: int, mansd: int | None) -> None
     assert found == [-1 if at < 0 else at - offset_ms * MS for at in expected]
 
 
-def test_a_packet_that_must_pass_leaves_although_the_queue_is_full() -> None:
-    settings = Opportunities(times_ms=(100,), queue=1)
-    decisions = []
-    link = Link(LinkSettings(impairments=(settings,), mansd=1), 0, "test")
-    for _ in range(5):
-        decision = link.decide(0, 1472, 0)
-        decisions.append((decision.fate, decision.release_ns // MS))
-    assert decisions == [(0, 100), (4, -1), (2, 200), (4, -1), (2, 300)]
-
-
 def test_the_longest_delay_is_that_of_a_full_queue() -> None:
     for times_ms, queue in (((7,), 1), ((0, 3, 4, 20), 5), ((1, 1, 1, 9, 30), 11)):
         settings = Opportunities(times_ms=times_ms, queue=queue)

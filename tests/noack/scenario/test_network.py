@@ -34,15 +34,6 @@ from tests.netem.feature_examples import IMPAIRED, keeps_loss, names_file
 from tests.oracles.link import Datagram, Link
 
 
-def test_a_delay_that_depends_on_the_loss_state_needs_a_loss_with_states() -> None:
-    before = [{"kind": "loss", "loss": {"model": "worst_case"}}]
-    late = {"kind": "delay", "jitter_s": 0.1, "loss_correlation": 0.5}
-    with pytest.raises(ValidationError, match=r"impairments\.1\.loss_correlation: needs a loss"):
-        LinkSettings.model_validate_json(json.dumps({"impairments": [*before, late]}))
-    loss = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.1}}
-    LinkSettings.model_validate_json(json.dumps({"impairments": [*before, loss, late]}))
-
-
 @given(st.floats(0, 0.99), st.floats(1, 1000))
 def test_means_determine_the_chain(loss: float, burst: float) -> None:
     """Bursts last 1/r on average, the loss rate is p/(p + r); refused exactly if p exceeds 1."""
