@@ -87,10 +87,11 @@ def test_a_short_deadline_adds_decay_to_a_constant_threshold() -> None:
             assert bound[-1] < 1e-100 if decays else bound[-1] > 0.0
 
 
-@pytest.mark.parametrize("kind", sorted(POLICY_KINDS.keys() - {"lyapunov"}))
+@pytest.mark.parametrize("kind", sorted(POLICY_KINDS.keys() - {"lyapunov", "relative"}))
 @settings(SEARCH, max_examples=1)
 @given(systems(**INSTANT), seeds)
 def test_no_bound_of_a_policy_is_exceeded_in_continuous_time(kind: str, system: System, seed: int) -> None:
+    """Events of "relative" may accumulate, so that it has no certificate."""
     resolved, _, system = policy_case(kind, system, seed)
     certificate = certify(resolved, NetworkConditions(system.mansd))
     assume(certificate.constants is not None)
