@@ -18,8 +18,7 @@ from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.protocol.record_tables import Fate
 from tests.netem import any_settings
 from tests.oracles.link import Datagram, Link
-from tests.oracles.loss_language import is_allowed
-from tests.oracles.receiver import longest_burst
+from tests.oracles.loss_language import is_allowed, longest_burst
 
 MS = 1_000_000
 OUT_OF_ORDER = settings_of("delay 5ms 20ms reorder 50%").impairments
