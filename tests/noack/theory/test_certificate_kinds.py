@@ -13,7 +13,7 @@ from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, constant
 from tests.noack.theory.certificate_kinds.decaying import dominated_by_errors
 
 MOST = 60
-LOOPS = dict.fromkeys(KINDS, 1) | {"decaying": 4, "continuous time": 4}
+LOOPS = dict.fromkeys(KINDS, 1) | {"decaying": 4, "continuous time": 4, "self_triggered": 2}
 """Of each kind; `python -m tests.noack.theory.certificate_kinds` tries thousands."""
 BROKEN = [(name, next(iter(kind.broken))) for name, kind in KINDS.items() if kind.broken]
 """One of each kind; `python -m tests.noack.theory.certificate_kinds` tries all."""
