@@ -26,8 +26,12 @@ DECISIONS = 100_000_000
 _BATCH = 1_000_000
 REORDERING = "delay 5ms 5ms reorder 20% duplicate 5% corrupt 5%"
 COMBINATIONS = (
-    "mansd 4", "atmost 3 in 10", "atmost 20 in 100", "mansd 4 recover 3", "mansd 2 atmost 3 in 10 recover 2",
-)  # fmt: skip
+    "mansd 4",
+    "atmost 3 in 10",
+    "atmost 20 in 100",
+    "mansd 4 recover 3",
+    "mansd 2 atmost 3 in 10 recover 2",
+)
 CAP = 3
 _LOSS, _DELAY = "loss 30%", "delay 10ms 10ms distribution normal reorder 10% limit 1000000"
 _SPACING_NS = 2_000_000
