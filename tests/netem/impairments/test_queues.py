@@ -490,6 +490,7 @@ def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
     st.sampled_from([None, 0, 1, 3]),
 )
 @example(9_600, 6, (1,), [(0, flow, 72, level) for flow, level in WAITING], None)
+@example(9_600, 6, (2, 0), [(0, 1, 1472, 0), (0, 0, 72, 0), (100 * MS, 1, 72, 0)], None)
 @example(9_600, 2, (1,), [*((0, flow, 72, 0) for flow in (0, 1, 2, 2, 3, 3)), (100 * MS, 0, 72, 0)], 1)
 def test_the_first_of_what_waits_is_sent_when_the_link_is_free(
     kind: type[Scheduler], rate_bps: int, queue: int, numbers: Any, steps: Any, mansd: int | None
