@@ -104,6 +104,9 @@ def test_packets_lost_before_the_queue_and_dropped_copies_use_no_line_time(decid
     assert decisions["fate"].tolist() == [0, 0, 4, 0, 0]
     assert (decisions["release_ns"] // NS).tolist() == [1, 3, -1, 4, 11]
     assert (decisions["copy_ns"] // NS).tolist() == [2, -1, -1, -1, 12]
+    for queue in ("opportunities at 10 queue 1", "schedule 0 slot 10ms queue 1"):
+        (decision,) = decide(f"duplicate 100% {queue}", 1, sizes_bytes=1000, arrivals_ns=1).decisions
+        assert (decision["release_ns"], decision["copy_ns"]) == (10_000_000, -1)
 
 
 def test_departures_of_forced_packets_stay_within_the_largest_time(decide: Any) -> None:
