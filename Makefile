@@ -102,7 +102,7 @@ netem: setup ## The network: loses at most M - 1 consecutive packets
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
+.PHONY: setup setup-dev test test-builds pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
 setup: $(VENV)/.installed ## Create the environment in .venv (the other targets do this if needed)
 
 setup-dev: $(VENV)/.installed-dev
@@ -110,10 +110,14 @@ setup-dev: $(VENV)/.installed-dev
 ifneq (,$(filter test,$(MAKECMDGOALS)))
 MAKEFLAGS += --jobs=2 # what is checked does not wait for what is tested
 endif
-test: check pytest ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
+test: check pytest ## Lint, types, import rules, and tests (ARGS are pytest's, e.g. ARGS="-k mansd")
+
+test-builds: setup-dev ## Test other builds: with sanitizers, by another compiler, for qemu, the wheel
+	$(BIN)/python -m pytest -m builds --numprocesses=2 --dist=loadfile $(ARGS)
 
 pytest: setup-dev
-	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=3 --dist=loadfile --no-loadscope-reorder)
+	$(BIN)/python -m pytest \
+		$(or $(ARGS),-m "not builds" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
 
 fuzz: setup-dev ## Fuzz every parser for MINUTES=10 in total; exit status 1 if an input fails
 	$(BIN)/python -m tests.fuzz run --minutes $(MINUTES) $(ARGS)

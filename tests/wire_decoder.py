@@ -24,6 +24,7 @@ class Decoder:
         key: bytes,
         *,
         not_before_ns: int = 0,
+        not_after_ns: int = wire_format.TIMES_NS - 1,
         loop: int = 0,
         encrypted: bool = False,
     ) -> None:
@@ -33,7 +34,7 @@ class Decoder:
             "noack_reception *",
             {
                 "flow": flow, "entries": dimension, "newest": -1,
-                "not_before_ns": not_before_ns, "not_after_ns": wire_format.TIMES_NS - 1,
+                "not_before_ns": not_before_ns, "not_after_ns": not_after_ns,
             },
         )  # fmt: skip
         self._message = ffi.new("noack_message *")

@@ -20,6 +20,7 @@ from cosim.doctor.machine_measures import EXTRAS
 from native.build import HEADER, INTO, LIBRARY
 from tests.integration.conftest import EPHEMERAL, PATIENCE_S
 
+pytestmark = pytest.mark.builds
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {
     name: value

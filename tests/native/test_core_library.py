@@ -21,20 +21,6 @@ from tests.netem.feature_examples import IMPAIRED, names_file
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("name", [
-    "noack_decision", "noack_recorded", "noack_stage_memory", "noack_flow", "noack_queue",
-    "noack_counters", "noack_window",
-])  # fmt: skip
-def test_a_row_type_has_the_fields_of_its_structure(name: str) -> None:
-    rows = np.zeros(2, dtype_of(name))
-    assert rows.itemsize == ffi.sizeof(name)
-    first = pointer_to(rows, f"{name} *")
-    for number, field in enumerate(rows.dtype.names or ()):
-        setattr(first[1], field, number)
-        assert rows[1][field] == number
-    assert not rows[0].tobytes().strip(b"\0")
-
-
 def test_a_pointer_has_the_address_of_its_array() -> None:
     numbers = np.arange(6, dtype=np.int64)
     pointer = pointer_to(numbers, "int64_t *")

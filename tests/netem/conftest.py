@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.impairments.link_settings import Decisions, LinkSettings
-from noack.protocol.record_tables import Fate
 
 MOST = 1_000_000
 
@@ -89,9 +88,6 @@ def _assert_share(flags: ArrayLike, expected: float, batches: int = 200) -> None
 @pytest.fixture(scope="session")
 def share_is() -> Callable[..., None]:
     return _assert_share
-
-
-FORWARDED = (Fate.DELIVERED, Fate.FORCED, Fate.CORRUPTED)
 
 
 class Emulator:

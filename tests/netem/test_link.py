@@ -16,7 +16,7 @@ from netem.tc_words import settings_of
 from noack.core.core_library import address_of, core, ffi
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.record_tables import NETEM_PACKET, Fate, tables
+from noack.protocol.record_tables import NETEM_PACKET, PACKET_HEAD_BYTES, Fate, tables
 from noack.protocol.roles import Notice, Record
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
@@ -217,7 +217,10 @@ def test_it_does_what_the_plain_network_does(
         while leaves and (due_ns := expected.next_deadline_ns()) is not None and due_ns <= now_ns:
             assert channel.next_deadline_ns() == due_ns
             assert content_of(channel.on_timer(now_ns)) == content_of(expected.on_timer(now_ns))
-        datagram = Datagram(flow, rng.bytes(size))
+        data = rng.bytes(size)
+        if k % 2 and size >= PACKET_HEAD_BYTES:  # an update with an error level
+            data = b"NA\1\2\2" + data[5:]
+        datagram = Datagram(flow, data)
         assert content_of(channel.handle(datagram, now_ns)) == content_of(expected.handle(datagram, now_ns))
     while (due_ns := expected.next_deadline_ns()) is not None:
         assert channel.next_deadline_ns() == due_ns

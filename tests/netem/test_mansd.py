@@ -14,14 +14,11 @@ from hypothesis import strategies as st
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
-from noack.impairments.constraints import join_guarantee
 from noack.impairments.link_settings import LinkSettings, RecordedDecision
-from noack.impairments.loss_guarantee import LossAutomaton
 from noack.protocol.record_tables import Fate
 from tests.netem import any_settings
 from tests.oracles.link import Datagram, Link
-from tests.oracles.loss_language import is_allowed
-from tests.oracles.receiver import longest_burst
+from tests.oracles.loss_language import is_allowed, longest_burst
 
 MS = 1_000_000
 OUT_OF_ORDER = settings_of("delay 5ms 20ms reorder 50%").impairments
@@ -263,23 +260,6 @@ def test_a_datagram_is_held_back_no_longer_than_necessary(
             assert decision.hold_back_ns == least - wish
             releases.append(least)
         assert is_allowed(lost_of(releases), own)
-
-
-@given(st.lists(st.booleans(), max_size=60), st.integers(0, 4), any_settings.constraints)
-def test_the_link_and_the_rules_of_the_analysis_are_one_guarantee(
-    wishes: list[bool], mansd: int, constraints: Any
-) -> None:
-    """A packet must pass exactly where the automaton of the analysis has no path for a loss."""
-    own = settings_of(f"mansd {mansd}").model_copy(update={"constraints": constraints})
-    link = LinkState(own, 0, "a")
-    link.start_flow(0, 0)
-    automaton, place = LossAutomaton(join_guarantee(mansd, constraints)), np.zeros(1, np.int64)
-    for packet, wish in enumerate(wishes):
-        must_pass = core.noack_must_pass(link.core, 0)
-        assert must_pass == (automaton.after_loss(place)[0] < 0)
-        lost = wish and not must_pass
-        place = automaton.after_loss(place) if lost else automaton.after_delivery(place)
-        settle(link, packet, None if lost else 0)
 
 
 PAGE = (Path(__file__).parents[2] / "docs/mansd.md").read_text()

@@ -1,9 +1,10 @@
-"""The sequences of outcomes that a guarantee allows, from its definition; no rule of netem is used.
+"""What a receiver misses, and what a guarantee allows, by definition; no rule of netem is used.
 
 An outcome is 1 for a lost and 0 for a delivered datagram. Before the first one, all are delivered.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,31 @@ from numpy.typing import NDArray
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.constraints.recovery import Recovery
 from noack.impairments.link_settings import LinkSettings
+
+
+def outcomes_of(decisions: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return (k,) whether each datagram of a flow is lost, from its decisions in order.
+
+    A datagram is lost if no intact copy of it leaves, or if a later one leaves before it.
+    """
+    numbers = np.arange(len(decisions))
+    times, leaving = [], []
+    for departure, bit in (("release_ns", "bit"), ("copy_ns", "copy_bit")):
+        intact = (decisions[departure] >= 0) & (decisions[bit] < 0)
+        times.append(decisions[departure][intact])
+        leaving.append(numbers[intact])
+    # Datagrams with equal release times leave in the order of arrival.
+    in_order = np.concatenate(leaving)[np.lexsort((np.concatenate(leaving), np.concatenate(times)))]
+    newest = np.maximum.accumulate(np.concatenate([[-1], in_order]))
+    lost = np.ones(len(decisions), bool)
+    lost[in_order[in_order > newest[:-1]]] = False
+    return lost
+
+
+def longest_burst(lost: NDArray[np.bool_]) -> int:
+    """Return the largest number of consecutive losses."""
+    ends = np.flatnonzero(np.concatenate([[True], ~lost, [True]]))
+    return int(np.diff(ends).max()) - 1
 
 
 def allowed_rows(lost: NDArray[np.bool_], settings: LinkSettings) -> NDArray[np.bool_]:
@@ -33,6 +59,6 @@ def allowed_rows(lost: NDArray[np.bool_], settings: LinkSettings) -> NDArray[np.
     return allowed
 
 
-def is_allowed(lost: Sequence[bool], settings: LinkSettings) -> bool:
+def is_allowed(lost: Sequence[bool] | NDArray[np.bool_], settings: LinkSettings) -> bool:
     """The same for one sequence."""
     return bool(allowed_rows(np.array([lost], bool), settings)[0])

@@ -5,19 +5,25 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
+
+import pytest
 
 from tests.command_line import invoke
 
 ROOT = Path(__file__).parents[2]
-CERTIFIED = (["certify", "lane_following"], ["margin", "lane_periodic", "--most", "2", "--no-period"])
+CERTIFIED = (
+    ["certify", "lane_following", "--json"],
+    ["margin", "lane_periodic", "--most", "2", "--no-period", "--json"],
+)
 COMMANDS = (
-    ["simulate", "lane_following", "--set", "horizon_s=1"],
-    ["summary"],
-    ["replay"],
-    ["fidelity"],
+    ["simulate", "lane_following", "--set", "horizon_s=1", "--json"],
+    ["summary", "--json"],
+    ["replay", "--json"],
+    ["fidelity", "--json"],
     *CERTIFIED,
-    ["measure", "rural_n8_10kmh", "--deadline", "100ms", "--out", "measured.html"],
-    ["campaign", "mb_vs_zoh", "--draws", "1", "--workers", "1"],
+    ["measure", "rural_n8_10kmh", "--deadline", "100ms", "--out", "measured.html", "--json"],
+    ["campaign", "mb_vs_zoh", "--draws", "1", "--workers", "1", "--json"],
 )
 LIVE = (["demo"], ["run", "lane_following"], ["doctor"], ["netem", "loss", "5%"], ["plant"])
 PROGRAM = """
@@ -31,13 +37,22 @@ for words in json.loads(sys.argv[1]):
 """
 
 
-def answers(
-    folder: Path, *commands: list[str]
-) -> tuple[list[dict[str, object]], list[list[object]], list[str]]:
-    """Run commands one after another; return their documents, how they ended, and the errors."""
+class Answers(NamedTuple):
+    """What the commands left in a folder, printed as documents, how each ended, and the errors."""
+
+    folder: Path
+    documents: list[dict[str, object]]
+    ends: list[list[object]]
+    errors: list[str]
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory: pytest.TempPathFactory) -> Answers:
+    """Run all commands one after another, in one process."""
+    folder = tmp_path_factory.mktemp("other_system")
     paths = [str(ROOT), str(Path(__file__).parent)]
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, json.dumps(commands)],
+        [sys.executable, "-c", PROGRAM, json.dumps([*LIVE, *COMMANDS])],
         cwd=folder, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}, capture_output=True,
         text=True, check=False, timeout=500,
     )  # fmt: skip
@@ -47,25 +62,23 @@ def answers(
         found.append(document)
         text = text[end:].lstrip()
     documents = [one for one in found if isinstance(one, dict)]
-    return documents, [one for one in found if isinstance(one, list)], done.stderr.splitlines()
+    ends = [one for one in found if isinstance(one, list)]
+    return Answers(folder, documents, ends, done.stderr.splitlines())
 
 
-def test_simulation_theory_measurement_and_campaigns_work(tmp_path: Path) -> None:
-    commands = [[*command, "--json"] for command in COMMANDS]
-    documents, ends, errors = answers(tmp_path, *commands)
-    assert ends == [["end", command, "other", 0] for command in commands], errors
+def test_simulation_theory_measurement_and_campaigns_work(answers: Answers) -> None:
+    documents = answers.documents
+    assert answers.ends[len(LIVE) :] == [["end", command, "other", 0] for command in COMMANDS], answers.errors
     assert documents[0] == documents[1]  # the last run is found without a link
     assert documents[2]["bit_exact"] is True
-    assert documents[4:6] == [json.loads(invoke(*command, "--json").stdout) for command in CERTIFIED]
-    (run,) = (path for path in (tmp_path / "runs").iterdir() if path.name != "campaigns")
-    pages = run / "report.html", tmp_path / "measured.html"
+    assert documents[4:6] == [json.loads(invoke(*command).stdout) for command in CERTIFIED]
+    (run,) = (path for path in (answers.folder / "runs").iterdir() if path.name != "campaigns")
+    pages = run / "report.html", answers.folder / "measured.html"
     assert all("</svg>" in page.read_text("utf-8") for page in pages)
 
 
-def test_what_needs_linux_is_refused_in_one_line(tmp_path: Path) -> None:
-    _, ends, errors = answers(tmp_path, *LIVE)
-    assert [end[3] for end in ends] == [2] * len(LIVE), errors
-    assert {line.partition(";")[0] for line in errors} == {
-        "noack: live runs and the network emulator need Linux"
-    }
-    assert [*tmp_path.iterdir()] == []
+def test_what_needs_linux_is_refused_in_one_line(answers: Answers) -> None:
+    assert [end[3] for end in answers.ends[: len(LIVE)]] == [2] * len(LIVE)
+    lines = [line.partition(";")[0] for line in answers.errors[: len(LIVE)]]
+    assert lines == ["noack: live runs and the network emulator need Linux"] * len(LIVE)
+    assert {path.name for path in answers.folder.iterdir()} == {"runs", "measured.html"}  # of the others

@@ -1,10 +1,8 @@
 """The recorder of fates; its traces, damaged or not; and the replay, which repeats them."""
 
 import json
-import re
 import resource
 import threading
-from collections.abc import Callable
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -23,6 +21,7 @@ from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.protocol.record_tables import Fate
+from tests.approved import compare_lines, lines_of_error
 from tests.fuzz.parsers.fates import DOCUMENT, TABLE
 from tests.netem.any_settings import harsh
 from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record, spec_of
@@ -135,65 +134,49 @@ def write(path: Path, table: pa.Table, document: object = DOCUMENT) -> Path:
     return path
 
 
-def refused(path: Path) -> str:
-    with pytest.raises(CallerError) as caught:
-        read_fates(path)
-    line = str(caught.value)
-    assert line.startswith(f"{path}")
-    assert "\n" not in line
-    return line
-
-
-def with_values(column: str, values: Callable[[list[Any]], list[Any]]) -> pa.Table:
+def with_first(column: str, value: int | None) -> pa.Table:
+    """Return the trace with another value in the first row."""
     at = TABLE.column_names.index(column)
     field = TABLE.schema.field(at)
-    return TABLE.set_column(at, field, pa.array(values(TABLE[column].to_pylist()), field.type))
+    values = [value, *TABLE[column].to_pylist()[1:]]
+    return TABLE.set_column(at, field, pa.array(values, field.type))
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    assert len(read_fates(write(tmp_path / "a", TABLE)).decisions["up", "forward"]) == 2
-    assert re.search(r"cannot be read \(.*No such file", refused(tmp_path / "none"))
-    assert "cannot be read" in refused(tmp_path)
-    (tmp_path / "a").write_text("fates")
-    assert "not a fate trace, or incomplete" in refused(tmp_path / "a")
-    pq.write_table(pa.table({"a": [1]}), tmp_path / "a")
-    assert "not a fate trace of this program" in refused(tmp_path / "a")
-    other = write(tmp_path / "a", TABLE, {"format": 9, "version": "9.9"})
-    assert "has the format of noack 9.9; record it again" in refused(other)
+def test_a_wrong_trace_is_refused_with_the_approved_line(path: Path) -> None:
+    """A line has a key that is left out, other keys, the rows that are left, or another value."""
+
+    def refusal(line: str) -> list[str]:
+        table, given = TABLE, json.loads(line)
+        document: Any = DOCUMENT
+        if given is None:
+            document = None
+        elif given.keys() <= DOCUMENT.keys():
+            document = DOCUMENT | given
+        elif "without" in given:
+            document = {key: value for key, value in DOCUMENT.items() if key != given["without"]}
+        elif "reverse" in given:
+            document = DOCUMENT | {"links": [DOCUMENT["links"][0] | given]}
+        elif "rows" in given:
+            table = TABLE.take(given["rows"])
+        else:
+            table = with_first(*given["first"])
+        return lines_of_error(lambda: read_fates(write(path, table, document)), FILE=path)
+
+    assert len(read_fates(write(path, TABLE)).decisions["up", "forward"]) == 2
+    compare_lines(Path(__file__).with_name("mistakes.txt"), refusal)
 
 
-@pytest.mark.parametrize(
-    "document",
-    [
-        None, *({k: v for k, v in DOCUMENT.items() if k != key} for key in DOCUMENT),
-        DOCUMENT | {"missing_events": "0"}, DOCUMENT | {"missing_events": -1},
-        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"reverse": {}}]},
-        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"reverse": {"mansd": 1_000_001}}]},
-    ],
-)  # fmt: skip
-def test_a_trace_with_an_invalid_document_is_refused(document: object, tmp_path: Path) -> None:
-    assert "not a fate trace of this program" in refused(write(tmp_path / "a", TABLE, document))
-
-
-@pytest.mark.parametrize(
-    ("column", "value"),
-    [("fate", 9), ("delay_ns", -5), ("delay_ns", 2**62 + 1), ("copy_delay_ns", 2**62 + 1),
-     ("bit", -2), ("flow", -1), ("flow", 10**12), ("copy_bit", -3)],
-)  # fmt: skip
-def test_an_impossible_decision_is_refused(column: str, value: int, tmp_path: Path) -> None:
-    table = with_values(column, lambda values: [value, *values[1:]])
-    line = refused(write(tmp_path / "a", table))
-    assert "impossible decision: " in line
-    assert f"{column} {value}" in line
-
-
-def test_a_missing_or_repeated_packet_or_value_is_refused(tmp_path: Path) -> None:
-    for packets, message in (([0, 3], "expected packet 1, found 2"), ([0, 0], "found 0")):
-        line = refused(write(tmp_path / "a", TABLE.take(packets)))
-        assert "up forward: flow 0: expected packet 1" in line
-        assert f"{message}; an incomplete trace" in line
-    table = with_values("delay_ns", lambda values: [*values[:-1], None])
-    assert "an incomplete trace cannot be replayed" in refused(write(tmp_path / "a", table))
+def test_other_files_are_refused(path: Path, tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match=r"cannot be read \(.*No such file"):
+        read_fates(tmp_path / "none")
+    with pytest.raises(CallerError, match="cannot be read"):
+        read_fates(tmp_path)
+    path.write_text("fates")
+    with pytest.raises(CallerError, match="not a fate trace, or incomplete"):
+        read_fates(path)
+    pq.write_table(pa.table({"a": [1]}), path)
+    with pytest.raises(CallerError, match="not a fate trace of this program"):
+        read_fates(path)
 
 
 BAD = settings_of(

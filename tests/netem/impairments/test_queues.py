@@ -104,6 +104,9 @@ def test_packets_lost_before_the_queue_and_dropped_copies_use_no_line_time(decid
     assert decisions["fate"].tolist() == [0, 0, 4, 0, 0]
     assert (decisions["release_ns"] // NS).tolist() == [1, 3, -1, 4, 11]
     assert (decisions["copy_ns"] // NS).tolist() == [2, -1, -1, -1, 12]
+    for queue in ("opportunities at 10 queue 1", "schedule 0 slot 10ms queue 1"):
+        (decision,) = decide(f"duplicate 100% {queue}", 1, sizes_bytes=1000, arrivals_ns=1).decisions
+        assert (decision["release_ns"], decision["copy_ns"]) == (10_000_000, -1)
 
 
 def test_departures_of_forced_packets_stay_within_the_largest_time(decide: Any) -> None:
@@ -331,16 +334,6 @@ def test_each_packet_leaves_as_in_mahimahi(seed: int, mansd: int | None) -> None
     assert found == [-1 if at < 0 else at - offset_ms * MS for at in expected]
 
 
-def test_a_packet_that_must_pass_leaves_although_the_queue_is_full() -> None:
-    settings = Opportunities(times_ms=(100,), queue=1)
-    decisions = []
-    link = Link(LinkSettings(impairments=(settings,), mansd=1), 0, "test")
-    for _ in range(5):
-        decision = link.decide(0, 1472, 0)
-        decisions.append((decision.fate, decision.release_ns // MS))
-    assert decisions == [(0, 100), (4, -1), (2, 200), (4, -1), (2, 300)]
-
-
 def test_the_longest_delay_is_that_of_a_full_queue() -> None:
     for times_ms, queue in (((7,), 1), ((0, 3, 4, 20), 5), ((1, 1, 1, 9, 30), 11)):
         settings = Opportunities(times_ms=times_ms, queue=queue)
@@ -500,6 +493,7 @@ def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
     st.sampled_from([None, 0, 1, 3]),
 )
 @example(9_600, 6, (1,), [(0, flow, 72, level) for flow, level in WAITING], None)
+@example(9_600, 6, (2, 0), [(0, 1, 1472, 0), (0, 0, 72, 0), (100 * MS, 1, 72, 0)], None)
 @example(9_600, 2, (1,), [*((0, flow, 72, 0) for flow in (0, 1, 2, 2, 3, 3)), (100 * MS, 0, 72, 0)], 1)
 def test_the_first_of_what_waits_is_sent_when_the_link_is_free(
     kind: type[Scheduler], rate_bps: int, queue: int, numbers: Any, steps: Any, mansd: int | None

@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shlex
 import shutil
 import socket
 import subprocess
@@ -11,50 +10,16 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from itertools import groupby, islice
 
 import pytest
 
-from netem.emulator_options import LINK_NAME
-from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus, MachineError
 from noack.runtime.address import address_text
 from noack.runtime.udp_sockets import enlarge_buffer
 from tests.attacks.attacked import unread_bytes
 from tests.attacks.kinds import enter_namespace
-from tests.netem.conftest import FORWARDED, Emulate
-from tests.oracles.link import Link
+from tests.netem.conftest import Emulate
 from tests.two_hosts import TwoHosts, two_hosts
-
-CASES = [
-    ("loss worst mansd 2", "loss worst mansd 2", 3 * 3),
-    ("loss worst mansd 1", "loss worst mansd 3", 2 * 4),
-    ("loss 70% mansd 2", "loss 70% mansd 2", 3 * 3),
-    ("loss gemodel 30% 20% mansd 2", "loss gemodel 30% 20% mansd 1", 3 * 2),
-]
-"""Words of the two directions, and the sufficient number of tries."""
-
-
-def answered(forward: str, reverse: str) -> Iterator[bool]:
-    """Yield for each try whether it gets an answer, as the links decide without sockets."""
-    there, back = (
-        Link(settings_of(shlex.split(words)), 0, LINK_NAME, direction)
-        for words, direction in ((forward, "forward"), (reverse, "reverse"))
-    )
-    while True:
-        yield passes(there) and passes(back)
-
-
-def passes(link: Link) -> bool:
-    return link.decide(0, 30, 0).fate in FORWARDED
-
-
-@pytest.mark.parametrize(("forward", "reverse", "most"), CASES)
-def test_the_bound_on_tries_holds_from_any_question_on(forward: str, reverse: str, most: int) -> None:
-    expected = list(islice(answered(forward, reverse), 3000))
-    bursts = [len(list(burst)) for got, burst in groupby(expected) if not got]
-    assert max(bursts) == most - 1
-
 
 SLOW_LINE = ("tbf", "rate", "800kbit", "burst", "40kb", "limit", "40kb")
 """Its queue is smaller than the number of packets that arrive within milliseconds.

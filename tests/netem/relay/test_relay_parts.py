@@ -117,7 +117,7 @@ hosts = st.sampled_from(["127.0.0.1", "10.1.2.3", "::1", "2001:db8::7", "fe80::1
 addresses = st.tuples(hosts, st.integers(1, 12))
 
 
-@given(st.lists(st.tuples(st.booleans(), addresses, st.integers(0, 1)), max_size=200))
+@given(st.lists(st.tuples(st.booleans(), addresses, st.integers(0, 1)), min_size=50, max_size=200))
 def test_the_table_of_clients_is_a_dictionary(
     steps: list[tuple[bool, tuple[str, int], int]],
 ) -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from noack.core.core_library import CoreMemory, core, ffi, reals_at
+from noack.core.core_library import CoreMemory, reals_at
 from noack.core.number_format import at_least, at_most, duration_at_least, plus_minus
 from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
 
@@ -98,18 +98,6 @@ def test_arrays_are_copies_that_live_with_their_memory() -> None:
     shown[0, 1] = 7.0  # shares the memory
     assert pointer[1] == 7.0
     assert reals_at(memory.zeros(0), 0).tolist() == []
-
-
-def test_models_with_the_same_matrix_share_its_exponentials() -> None:
-    memory, H = CoreMemory(), np.array([[0.0, 1.0], [-2.0, -0.5]])
-    one, other = memory.transitions(H, (5, 0)), memory.transitions(H.copy(), (7,))
-    assert one is other
-    assert memory.transitions(-H) is not one
-    known = np.frombuffer(ffi.buffer(one.steps_ns, 8 * one.places), np.int64)
-    assert sorted(known[known != 0]) == [5, 7]
-    matrix = core.noack_transition(one, 5)
-    assert matrix - one.matrices in range(0, 4 * one.places, 4)  # kept, where it was
-    assert sorted(known[known != 0]) == [5, 7]
 
 
 @pytest.mark.parametrize(("value", "most", "least"), [

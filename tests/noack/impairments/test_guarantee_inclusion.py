@@ -3,7 +3,6 @@
 from itertools import product
 
 import numpy as np
-import pytest
 
 from noack.impairments.loss_guarantee import (
     DeliveriesBetweenBursts,
@@ -61,26 +60,3 @@ def test_windows_against_the_closed_form() -> None:
             one = guarantee(LossesInWindow(losses, window))
             implied = find_pattern_beyond(one, guarantee(LossesInWindow(limit, other))) is None
             assert implied == (limit >= min(most, other)) or losses >= window
-
-
-@pytest.mark.parametrize(
-    ("one", "other", "pattern"),
-    [
-        (guarantee(LongestBurst(4)), guarantee(LossesInWindow(80, 100)), None),
-        (guarantee(LongestBurst(4)), guarantee(LossesInWindow(79, 100)), 99),
-        (guarantee(LongestBurst(6)), guarantee(LossesInWindow(6, 7)), None),
-        (guarantee(LossesInWindow(6, 7)), guarantee(LongestBurst(6)), None),
-        (guarantee(LossesInWindow(1, 4)), guarantee(DeliveriesBetweenBursts(3)), None),
-        (guarantee(LossesInWindow(1, 4)), guarantee(DeliveriesBetweenBursts(4)), 5),
-        (
-            guarantee(LongestBurst(2), DeliveriesBetweenBursts(3)),
-            guarantee(LossesInWindow(2, 5)),
-            None,
-        ),
-        (guarantee(LongestBurst(3)), guarantee(), None),
-        (guarantee(LossesInWindow(3, 30)), guarantee(LossesInWindow(102, 999)), None),
-    ],
-)
-def test_known_implications(one: LossGuarantee, other: LossGuarantee, pattern: int | None) -> None:
-    found = find_pattern_beyond(one, other)
-    assert (found and len(found)) == pattern

@@ -10,8 +10,7 @@ from scipy.linalg import expm, logm
 
 from noack.core.errors import CallerError
 from noack.plants.gymnasium import GymnasiumSettings
-from noack.plants.linear import LinearSystem
-from noack.plants.plant_settings import OdeSystem, PlantEquations, PlantStart, PlantSystem, SystemFailedError
+from noack.plants.plant_settings import OdeSystem, PlantEquations, PlantStart, SystemFailedError
 from noack.plants.systems.linearisation import (
     NO_LOGARITHM,
     NOT_FINITE,
@@ -85,18 +84,6 @@ def test_the_remainder_is_of_the_second_order() -> None:
     assert sizes[1][0] == 0.0  # ẋ₁ = x₂ is linear
     assert sizes[1][1] == pytest.approx(expected, rel=0.02)
     assert sizes[0][1] == pytest.approx(10 * expected, rel=0.1)
-
-
-def test_a_linear_system_that_is_moved_has_no_error() -> None:
-    A, B = np.array([[0.0, 1.0], [9.81, -0.1]]), np.array([[0.0], [1.0]])
-
-    def at(x0: np.ndarray) -> PlantSystem:
-        return LinearSystem(A, B, x0)
-
-    found = linearise(at, 2, 1)
-    np.testing.assert_allclose(found.A, A, atol=1e-8)
-    errors = largest_errors(at, found, np.ones(3), x0=np.zeros(2), u0=np.zeros(1))
-    assert errors.max() < 1e-8
 
 
 DRAWN = itertools.count()  # as a plant that draws random numbers

@@ -34,15 +34,6 @@ from tests.netem.feature_examples import IMPAIRED, keeps_loss, names_file
 from tests.oracles.link import Datagram, Link
 
 
-def test_a_delay_that_depends_on_the_loss_state_needs_a_loss_with_states() -> None:
-    before = [{"kind": "loss", "loss": {"model": "worst_case"}}]
-    late = {"kind": "delay", "jitter_s": 0.1, "loss_correlation": 0.5}
-    with pytest.raises(ValidationError, match=r"impairments\.1\.loss_correlation: needs a loss"):
-        LinkSettings.model_validate_json(json.dumps({"impairments": [*before, late]}))
-    loss = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.1}}
-    LinkSettings.model_validate_json(json.dumps({"impairments": [*before, loss, late]}))
-
-
 @given(st.floats(0, 0.99), st.floats(1, 1000))
 def test_means_determine_the_chain(loss: float, burst: float) -> None:
     """Bursts last 1/r on average, the loss rate is p/(p + r); refused exactly if p exceeds 1."""
@@ -88,31 +79,16 @@ def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None
     assert delay.samples_s == pytest.approx((-0.002, -0.001, 0, 0.002, 0.004), rel=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        (None, "cannot be read: No such file or directory"),
-        (b"01x1", "has a 'x'; a trace is of 0 and 1, and white space"),
-        (b"01\xff", "has a 'ÿ'; a trace is of 0 and 1"),
-        (b" \n", "is empty; a trace has a 1 for each lost packet"),
-    ],
-)
-def test_a_mistake_in_a_trace_gets_one_line(content: bytes | None, says: str, tmp_path: Path) -> None:
-    if content is not None:
-        (tmp_path / "t").write_bytes(content)
-    settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="t")),))
-    with pytest.raises(CallerError) as caught:
-        read_files(settings, tmp_path, "l.toml: link.0.reverse")
-    assert str(caught.value).startswith(f'l.toml: link.0.reverse.impairments.0.loss.file = "t": {says}')
-
-
-def test_a_mistake_in_a_delay_file_gives_the_approved_line(tmp_path: Path) -> None:
+def test_a_mistake_in_a_file_of_delays_or_losses_gives_the_approved_line(tmp_path: Path) -> None:
     def mistake(line: str) -> list[str]:
         name, jitter_s, content = json.loads(line)
         (tmp_path / name).unlink(missing_ok=True)
         if content is not None:
-            (tmp_path / name).write_text(content)
-        return lines_of_error(lambda: read_delay(tmp_path, jitter_s=jitter_s, file=name))
+            (tmp_path / name).write_bytes(content.encode("latin-1"))
+        if jitter_s is not None:
+            return lines_of_error(lambda: read_delay(tmp_path, jitter_s=jitter_s, file=name))
+        losses = LinkSettings(impairments=(LossOf(loss=TraceLoss(file=name)),))
+        return lines_of_error(lambda: read_files(losses, tmp_path, "links.toml: link.0.reverse"))
 
     compare_lines(Path(__file__).with_name("delay_mistakes.txt"), mistake)
 

@@ -12,8 +12,9 @@ from tests.noack.theory.certificate_kinds.comparison import KINDS, examine
 from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, constants_of
 from tests.noack.theory.certificate_kinds.decaying import dominated_by_errors
 
-FEW, MOST = 2, 60
-LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 6, "continuous time": 5}
+MOST = 60
+LOOPS = dict.fromkeys(KINDS, 1) | {"decaying": 4, "continuous time": 4, "self_triggered": 2}
+"""Of each kind; `python -m tests.noack.theory.certificate_kinds` tries thousands."""
 BROKEN = [(name, next(iter(kind.broken))) for name, kind in KINDS.items() if kind.broken]
 """One of each kind; `python -m tests.noack.theory.certificate_kinds` tries all."""
 
@@ -27,7 +28,7 @@ def examined(name: str, seed: int) -> Tally:
 @pytest.mark.parametrize("name", KINDS)
 def test_no_bound_of_a_random_loop_is_exceeded(name: str) -> None:
     tally = reduce(Tally.plus, (examined(name, seed) for seed in range(LOOPS[name])))
-    assert tally.runs >= FEW
+    assert tally.runs > 1
     assert tally.violated[""] == 0
     assert max(tally.closest.values()) > 0
 

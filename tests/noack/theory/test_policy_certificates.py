@@ -27,18 +27,18 @@ SCENARIO = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
 
 
 @pytest.mark.parametrize("kind", POLICY_KINDS)
-@settings(SEARCH, max_examples=2)
+@settings(SEARCH, max_examples=1)
 @given(systems(step_share=0.002), st.sampled_from([0.02, 0.3]), seeds)
 def test_no_bound_of_a_policy_is_exceeded_under_disturbances(
     kind: str, system: System, push: float, seed: int
 ) -> None:
     resolved, rule, system = policy_case(kind, system, seed, push)
     certificate, n = certify(resolved, system.conditions), len(system.A)
-    if certificate.constants is not None:
-        loop = DisturbedLoop(system, push * np.eye(n), (STEPS,) * n, np.zeros(n), 0.0)
-        pushes, _ = signals(loop, np.random.default_rng(seed))
-        trace = simulate(system, *networks(seed, system), rule=rule, pushes=pushes)
-        assert exceeded_by(trace, certificate, system) == []
+    assume(certificate.constants is not None)
+    loop = DisturbedLoop(system, push * np.eye(n), (STEPS,) * n, np.zeros(n), 0.0)
+    pushes, _ = signals(loop, np.random.default_rng(seed))
+    trace = simulate(system, *networks(seed, system), rule=rule, pushes=pushes)
+    assert exceeded_by(trace, certificate, system) == []
 
 
 EPSILON = 0.3
@@ -87,14 +87,14 @@ def test_a_short_deadline_adds_decay_to_a_constant_threshold() -> None:
             assert bound[-1] < 1e-100 if decays else bound[-1] > 0.0
 
 
-@pytest.mark.parametrize("kind", sorted(POLICY_KINDS.keys() - {"lyapunov"}))
-@settings(SEARCH, max_examples=2)
+@pytest.mark.parametrize("kind", sorted(POLICY_KINDS.keys() - {"lyapunov", "relative"}))
+@settings(SEARCH, max_examples=1)
 @given(systems(**INSTANT), seeds)
 def test_no_bound_of_a_policy_is_exceeded_in_continuous_time(kind: str, system: System, seed: int) -> None:
+    """Events of "relative" may accumulate, so that it has no certificate."""
     resolved, _, system = policy_case(kind, system, seed)
     certificate = certify(resolved, NetworkConditions(system.mansd))
-    if certificate.constants is None:
-        return
+    assume(certificate.constants is not None)
     loop = ContinuousLoop(loop_of(resolved), policy_of(resolved))
     horizon_s = 6 / float(np.abs(np.linalg.eigvals(system.A + system.B @ system.K)).max())
     for delivered in networks(seed, system)[0][:3].tolist():  # most lost, none, at random
