@@ -252,7 +252,7 @@ class NetworkSearch:
         setting = self.ladder[rung]
         loop = self.quick_loop(candidate, setting.period_ns)
         graph = self.graph(setting, candidate.hold)
-        return graph.growth(loop.maps(graph.bursts)).logarithm
+        return graph.growth(loop.maps(graph.bursts))
 
     def cost(self, candidate: Candidate, rung: int) -> float:
         """Return the cost without losses."""

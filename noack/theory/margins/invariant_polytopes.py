@@ -136,24 +136,24 @@ class PolytopeNorm:
         combinations = self.combinations(points.middle, enough)
         basis = exactly(self.vertices[combinations.vertices])
         sums = exactly(combinations.coefficients[:, None, :]) @ basis
-        missed = (points - IntervalMatrix(sums.middle[:, 0], sums.radius[:, 0])).magnitude
+        missed = (points - IntervalMatrix(*(part[:, 0] for part in sums))).magnitude
         bounds = (combinations.norms + (missed / self._units).sum(axis=1)) * _ENLARGED
         return np.where(np.isnan(bounds), np.inf, bounds)
 
 
-def initial_vertices(system: SwitchedSystem, cycle: Cycle, growth: float) -> dict[int, Matrix]:
+def initial_vertices(system: SwitchedSystem, cycle: Cycle, growth: float) -> list[Matrix]:
     """Return small unit vectors, and the leading eigenvectors of a cycle, at each node."""
-    vertices = {node: [UNIT * np.eye(n)] for node, n in system.dimensions.items()}
+    vertices = [UNIT * np.eye(system.dimension) for _ in range(system.graph.nodes)]
     if cycle.path:
         values, vectors = np.linalg.eig(system.product(cycle.path).middle)
         leading = vectors[:, int(np.abs(values).argmax())]
         rows = np.array([leading.real, leading.imag])
         rows = rows[np.linalg.norm(rows, axis=1) > 1e-9]
         for number in cycle.path:
-            edge = system.edges[number]
-            vertices[edge.source].append(rows)
-            rows = rows @ edge.matrix.middle.T / growth**edge.duration
-    return {node: np.concatenate(parts) for node, parts in vertices.items()}
+            source = system.graph.sources[number]
+            vertices[source] = np.concatenate([vertices[source], rows])
+            rows = rows @ system.matrices.middle[number].T / growth ** system.graph.durations[number]
+    return vertices
 
 
 @dataclass
@@ -162,8 +162,8 @@ class InvariantPolytopes:
 
     system: SwitchedSystem
     growth: float
-    vertices: dict[int, Matrix]
-    """By node, (m, n)."""
+    vertices: list[Matrix]
+    """Of each node, (m, n)."""
     _examined: dict[int, int] = field(default_factory=dict)
     """Number of vertices after the last search for redundant ones, by node."""
     _work: int = 0
@@ -171,7 +171,7 @@ class InvariantPolytopes:
     @property
     def count(self) -> int:
         """Number of vertices."""
-        return sum(map(len, self.vertices.values()))
+        return sum(map(len, self.vertices))
 
     def grow(self, most_vertices: int) -> bool:
         """Add images until all are inside.
@@ -180,13 +180,14 @@ class InvariantPolytopes:
         should cost, or when the vertices show that a path grows faster than γ, or after 60 rounds.
         """
         most_work = (most_vertices + self.count) * _WORK_PER_VERTEX
-        pending, most_vertices = dict(self.vertices), self.count + most_vertices
+        pending, most_vertices = dict(enumerate(self.vertices)), self.count + most_vertices
+        graph = self.system.graph
+        steps = self.system.matrices.middle / (self.growth**graph.durations)[:, None, None]
         for _ in range(_ROUNDS):
             images: dict[int, list[Matrix]] = {}
-            for edge in self.system.edges:
-                if edge.source in pending:
-                    image = pending[edge.source] @ edge.matrix.middle.T
-                    images.setdefault(edge.target, []).append(image / self.growth**edge.duration)
+            for source, target, step in zip(graph.sources, graph.targets, steps, strict=True):
+                if source in pending:
+                    images.setdefault(target, []).append(pending[source] @ step.T)
             pending = {}
             for node, parts in images.items():
                 added = self._add(node, np.concatenate(parts))
@@ -225,11 +226,12 @@ class InvariantPolytopes:
 
     def bound(self) -> float:
         """Return a rigorous upper bound of the joint spectral radius, from the polytopes."""
-        growths = [0.0]
-        for edge in self.system.edges:
-            M = edge.matrix
-            images = exactly(self.vertices[edge.source]) @ IntervalMatrix(M.middle.T, M.radius.T)
-            norm, inside = PolytopeNorm(self.vertices[edge.target]), self.growth**edge.duration
+        graph, growths = self.system.graph, [0.0]
+        for source, target, duration, middle, radius in zip(
+            graph.sources, graph.targets, graph.durations, *self.system.matrices, strict=True
+        ):
+            images = exactly(self.vertices[source]) @ IntervalMatrix(middle, radius).transposed
+            norm, inside = PolytopeNorm(self.vertices[target]), self.growth**duration
             largest = float(norm.bounds(images, inside).max())
-            growths.append(largest ** (1 / edge.duration) * (1 + 1e-15))
+            growths.append(largest ** (1 / duration) * (1 + 1e-15))
         return max(growths)

@@ -155,7 +155,7 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         if not more or more == timeouts[0]:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
         stability = exact.coarse_bounds(search.ladder[4].guarantee)
-        lower = np.exp(PatternGraph(bursts).growth(quick).logarithm)
+        lower = np.exp(PatternGraph(bursts).growth(quick))
         assert lower <= stability.upper
         assert lower == pytest.approx(stability.lower, rel=2e-2)
 
