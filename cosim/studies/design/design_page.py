@@ -7,6 +7,7 @@ for a network (:class:`DesignOutcome`).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -164,17 +165,29 @@ def print_found(console: Console, result: DesignResult) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
+class LoopResult(NamedTuple):
+    """What is found of a loop."""
+
+    reach: str
+    """The most that it is certified for."""
+    cells: dict[str, str]
+    """By heading."""
+    document: dict[str, object]
+    """As JSON."""
+
+
 @dataclass(frozen=True)
 class DesignOutcome:
     """The given loop and the best one found, as results."""
 
     name: str
     """Name of the given scenario."""
-    verdict: str
+    claim: str
+    """What is certified of both loops."""
+    given: LoopResult
+    best: LoopResult
     notes: Sequence[str]
     """What the reader should know of the search."""
-    cells: tuple[dict[str, str], dict[str, str]]
-    """Of the given loop and the best one, by heading."""
     scenario: Scenario
     """The scenario of the best loop, with the guarantee that it is certified for."""
     is_certified: bool
@@ -183,13 +196,17 @@ class DesignOutcome:
     """Whether it is another loop than the given one."""
     document: dict[str, object]
     """The limits and the size of the search, as JSON."""
-    original: dict[str, object]
-    """The given loop as JSON."""
-    best: dict[str, object]
     figure: FigureDescription
     by_hold: tuple[tuple[str, str], ...] = ()
     """Hold strategies that were tried, each with the most for which no pattern destabilises its best
     loop, as far as was searched."""
+
+    @property
+    def verdict(self) -> str:
+        """The result as a sentence."""
+        if not self.is_better:
+            return f"{self.best.reach} for the given loop; no better one was found"
+        return f"{self.claim}: {self.given.reach} before, {self.best.reach} after"
 
     @property
     def lines(self) -> str:
@@ -211,8 +228,7 @@ class DesignOutcome:
     @property
     def rows(self) -> list[tuple[str, str, str]]:
         """The comparison of both loops."""
-        original, best = self.cells
-        return [(heading, original[heading], best[heading]) for heading in original]
+        return [(heading, cell, self.best.cells[heading]) for heading, cell in self.given.cells.items()]
 
     def to_json(self) -> dict[str, object]:
         """Return the result and the lines for the scenario."""
@@ -221,8 +237,8 @@ class DesignOutcome:
             "verdict": self.verdict,
             "lines": self.lines,
             **self.document,
-            "given": self.original,
-            "best": self.best,
+            "given": self.given.document,
+            "best": self.best.document,
         }
 
     def written(self) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 from cosim.analysis.margin_search import stability_document
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import Axis, FigureDescription, Item, Line, Marks, Panel, Rule
-from cosim.studies.design.design_page import DesignOutcome, figure_of, gain_text
+from cosim.studies.design.design_page import DesignOutcome, LoopResult, figure_of, gain_text
 from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.hold_strategies import HOLDS, Hold, given_hold
@@ -457,67 +457,53 @@ class _FoundError(Exception):
 
 def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) -> DesignOutcome:
     """Return what is shown of a search."""
-    ladder, wish = search.ladder, search.wish
-
-    def reach(reached: Reached) -> str:
-        if reached.rung < 0:
-            return "nothing proven"
-        return ladder[reached.rung].name + (", the most examined" * (reached.rung == len(ladder) - 1))
-
-    def sent(reached: Reached) -> float:
-        period_ns = ladder[max(reached.rung, 0)].period_ns
-        return search.scenario.timing.measurement_period_ns / period_ns
-
-    def cells(reached: Reached) -> dict[str, str]:
-        is_excluded = reached is original and not search.keeps_given_hold
-        return {
-            "proven stable for": reach(reached),
-            "growth per period there": _growth(reached.stability),
-            "the next one": _beyond(ladder, reached),
-            "cost without losses": f"{reached.cost:.4g}",
-            "share of measurements sent": f"{100 * sent(reached):.3g} %",
-            "between updates": reached.candidate.hold.text + " (not in --holds)" * is_excluded,
-            "K": gain_text(reached.candidate.K),
-        }
-
-    def entry(reached: Reached) -> dict[str, object]:
-        certified = None if reached.rung < 0 else ladder[reached.rung].number
-        figures = {"certified": certified, "cost": reached.cost, "transmitted": sent(reached)}
-        bounds = {"stability": _document(reached.stability), "beyond": _document(reached.beyond)}
-        hold, K = reached.candidate
-        return {**figures, "mode": hold.mode, "hold": hold.text, "K": K, **bounds}
-
-    verdict = f"proven stable for every loss pattern: {reach(original)} before, {reach(best)} after"
-    if best.candidate == original.candidate:
-        verdict = f"{reach(best)} for the given loop; no better one was found"
-    document: dict[str, object] = {
-        "goal": wish.goal,
-        "window": wish.window,
-        "cost_limit": search.limit,
-        "tried": search.tried,
-        "judged": search.judged,
-        "highest_by_hold": dict(search.by_hold()),
-    }
     return DesignOutcome(
         search.scenario.name,
-        verdict,
+        "proven stable for every loss pattern",
+        _loop_result(search, original, is_excluded=not search.keeps_given_hold),
+        _loop_result(search, best),
         list(_notes(search, original, best)),
-        (cells(original), cells(best)),
         search.scenario_of(best.candidate, best.rung),
         best.rung >= 0,
         best.candidate != original.candidate,
-        document,
-        entry(original),
-        entry(best),
+        {
+            "goal": search.wish.goal,
+            "window": search.wish.window,
+            "cost_limit": search.limit,
+            "tried": search.tried,
+            "judged": search.judged,
+            "highest_by_hold": dict(search.by_hold()),
+        },
         _figure(search, original, best),
         tuple(search.by_hold()),
     )
 
 
-def _growth(proven: Stability | None) -> str:
-    if proven is None:
-        return NONE
-    return f"{at_least(proven.lower, decimals=5)} to {at_most(proven.upper, decimals=5)}"
+def _loop_result(search: NetworkSearch, reached: Reached, *, is_excluded: bool = False) -> LoopResult:
+    ladder, (hold, K), proven = search.ladder, reached.candidate, reached.stability
+    rung = ladder[max(reached.rung, 0)]
+    sent = search.scenario.timing.measurement_period_ns / rung.period_ns
+    reach = rung.name + (", the most examined" * (reached.rung == len(ladder) - 1))
+    if reached.rung < 0:
+        reach = "nothing proven"
+    growth = (
+        f"{at_least(proven.lower, decimals=5)} to {at_most(proven.upper, decimals=5)}" if proven else NONE
+    )
+    cells = {
+        "proven stable for": reach,
+        "growth per period there": growth,
+        "the next one": _beyond(ladder, reached),
+        "cost without losses": f"{reached.cost:.4g}",
+        "share of measurements sent": f"{100 * sent:.3g} %",
+        "between updates": hold.text + " (not in --holds)" * is_excluded,
+        "K": gain_text(K),
+    }
+    certified = None if reached.rung < 0 else rung.number
+    document: dict[str, object] = {"certified": certified, "cost": reached.cost, "transmitted": sent}
+    document |= {"mode": hold.mode, "hold": hold.text, "K": K}
+    for name, stability in (("stability", proven), ("beyond", reached.beyond)):
+        document[name] = stability and stability_document(stability)
+    return LoopResult(reach, cells, document)
 
 
 def _notes(search: NetworkSearch, original: Reached, best: Reached) -> Iterator[str]:
@@ -543,10 +529,6 @@ def _beyond(ladder: Sequence[Rung], reached: Reached) -> str:
     destabilised = reached.beyond.verdict == "destabilised"
     result = f"{reached.beyond.text} destabilises" if destabilised else "undecided"
     return f"{ladder[reached.rung + 1].name}: {result}"
-
-
-def _document(stability: Stability | None) -> dict[str, object] | None:
-    return stability and stability_document(stability)
 
 
 def _figure(search: NetworkSearch, original: Reached, best: Reached) -> FigureDescription:

@@ -28,6 +28,8 @@ _ROUNDEST = 1e-6
 _TINY = float(np.finfo(np.float64).tiny)
 _SLOWEST = -50.0
 """Paths of different durations are compared with the best growth if its logarithm is above this."""
+_EQUAL = 1e-12
+"""Logarithms of growths that differ by less are those of one cycle."""
 _SQUARINGS = 44
 _SUBTRACTED = 1 - 1e-15
 
@@ -143,9 +145,10 @@ class Graph:
             if len(closed):
                 with np.errstate(divide="ignore"):
                     growths = np.log(spectral_radii(products[closed])) / durations[closed]
-                fastest = int(growths.argmax())
-                if growths[fastest] > best + 1e-12:
-                    best, cycle = float(growths[fastest]), tuple(paths[closed[fastest]].tolist())
+                fastest = float(growths.max())
+                if fastest > best + _EQUAL:  # of the rotations of a cycle, take always the same
+                    rotations = paths[closed[growths > fastest - _EQUAL]]
+                    best, cycle = fastest, tuple(min(rotations.tolist()))
             rank = durations * (norms - (best if best > _SLOWEST else 0.0))
             longest = np.argsort(-rank, kind="stable")[:beam]
             steps = [self.leaving[self.targets[paths[index, -1]]] for index in longest]
