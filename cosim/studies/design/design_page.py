@@ -30,7 +30,7 @@ from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
-from cosim.studies.design.design_search import WORDS, DesignResult, certified
+from cosim.studies.design.design_search import WORDS, DesignResult, certified, designed_name
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
 from noack.scenario.scenario import Scenario
@@ -45,7 +45,6 @@ _CAPTION = (
 _HEIGHT_IN = 3.8
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
-_DESIGNED = "_designed"
 _LOOP_HEADINGS = ("", "given", "designed")
 _HOLD_HEADINGS = ("between updates", "no destabilising pattern found for")
 _HOLD_CAPTION = "best loop tried with each hold strategy (proven is only what the designed loop tolerates)"
@@ -243,7 +242,7 @@ class DesignOutcome:
 
     def written(self) -> str:
         """Return the scenario of the best loop as TOML, under a new name."""
-        name = f"{self.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}"
+        name = designed_name(self.name)
         description = f"{self.name}{', designed' * self.is_better}: {self.verdict}."
         return dumps(self.scenario.model_copy(update={"name": name, "description": description}))
 
