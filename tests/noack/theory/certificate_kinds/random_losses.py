@@ -1,8 +1,8 @@
 """Losses without a limit: means and mean squares of many runs of each loop.
 
 Mean squares at every fixed time are compared for loops with a schedule; both moments of a run's
-largest values, and of e_c at events, under the paper's conditions. A mean over runs is random itself. So the value
-that is compared with a bound is the mean minus five standard errors.
+largest values, and of e_c at events, under the paper's conditions. A mean over runs is random
+itself. So the value that is compared with a bound is the mean minus five standard errors.
 """
 
 from collections.abc import Callable
