@@ -42,6 +42,7 @@ _CAPTION = (
     "same draws. Candidates that settle too rarely to have a quantile are left out. The star is "
     "the chosen candidate on new draws."
 )
+_FRONT_CAPTION = "The trade-off curve; intervals have 95 % confidence, not corrected for the selection"
 _HEIGHT_IN = 3.8
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
@@ -50,39 +51,39 @@ _HOLD_HEADINGS = ("between updates", "no destabilising pattern found for")
 _HOLD_CAPTION = "best loop tried with each hold strategy (proven is only what the designed loop tolerates)"
 
 
+def _write(
+    path: Path, figure: FigureDescription, figure_files: FigureFiles | None, **content: object
+) -> list[Path]:
+    template = templates(Path(__file__).parent).get_template("design.html.jinja")
+    html = template.render(figure=figure, **content)
+    return [write_whole(path, html), *save_figures([figure], path, figure_files)]
+
+
 def write_page(result: DesignResult, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
-    """Write page and figure; return the files.
+    """Write page and figure; return the files. All text except the figure is escaped.
 
     Raises:
         MachineError: they cannot be written.
     """
-    return [write_whole(path, page(result)), *save_figures([trade_off(result)], path, figure_files)]
-
-
-def page(result: DesignResult) -> str:
-    """Return the page as HTML; all text except the figure is escaped."""
     limits, bounds = result.limits, result.bounds or {}
-    lines = [
-        f"{100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
-        f"within {limits.settling_s:g} s",
-        *(f"{WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
-    ]
-    return (
-        templates(Path(__file__).parent)
-        .get_template("design.html.jinja")
-        .render(
-            title=result.name,
-            subtitle=f"{len(result.trials):,} candidates, {result.fresh.draws:,} draws, seed {result.seed}",
-            verdict=result.verdict(),
-            tone="good" if result.confirmed else "doubt" if result.feasible else "bad",
-            limits=lines,
-            certified=[certified(name, value) for name, value in bounds.items()],
-            conditions=result.conditions,
-            figure=trade_off(result),
-            headings=HEADINGS,
-            rows=rows(result),
-            scenario_toml=dumps(result.scenario),
-        )
+    return _write(
+        path,
+        trade_off(result),
+        figure_files,
+        title=result.name,
+        kind="design",
+        subtitle=f"{len(result.trials):,} candidates, {result.fresh.draws:,} draws, seed {result.seed}",
+        verdict=result.verdict(),
+        tone="good" if result.confirmed else "doubt" if result.feasible else "bad",
+        notes=[
+            f"required: {100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
+            f"within {limits.settling_s:g} s",
+            *(f"required: {WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
+            *(f"certified {result.conditions}: {certified(*bound)}" for bound in bounds.items()),
+        ],
+        heading="Trade-off",
+        tables=[(_FRONT_CAPTION, HEADINGS, rows(result), 0)],
+        scenario_toml=dumps(result.scenario),
     )
 
 
@@ -263,15 +264,20 @@ def write_outcome(outcome: DesignOutcome, path: Path, figure_files: FigureFiles 
     Raises:
         MachineError: they cannot be written.
     """
-    page = templates(Path(__file__).parent).get_template("network.html.jinja")
-    html = page.render(
-        outcome=outcome,
-        headings=_LOOP_HEADINGS,
-        hold_headings=_HOLD_HEADINGS,
-        hold_caption=_HOLD_CAPTION,
+    by_hold = (_HOLD_CAPTION, _HOLD_HEADINGS, outcome.by_hold, 1)
+    return _write(
+        path,
+        outcome.figure,
+        figure_files,
+        title=outcome.name,
+        kind="design for a network",
+        verdict=outcome.verdict,
+        tone="good" if outcome.is_better else "doubt",
+        notes=outcome.notes,
+        heading="Worst losses",
+        tables=[("Both loops", _LOOP_HEADINGS, outcome.rows, 1), *[by_hold] * (len(outcome.by_hold) > 1)],
         scenario_toml=outcome.written(),
     )
-    return [write_whole(path, html), *save_figures([outcome.figure], path, figure_files)]
 
 
 def print_design(console: Console, outcome: DesignOutcome) -> None:

@@ -29,6 +29,7 @@ from cosim.studies.design.network_search import (
     Progress,
     Wish,
     examined_m,
+    nelder_mead,
     periodic_outcome,
     scaled_steps,
 )
@@ -231,8 +232,6 @@ class EventSearch:
         return original, chosen
 
     def _improve(self, start: EventLoop, most: int, progress: Progress) -> tuple[EventLoop, float]:
-        from scipy.optimize import minimize  # slow to import
-
         centre = np.array([*np.ravel(start.K), start.alpha_per_s, start.beta])
         scale = np.append(scaled_steps(np.array(start.K)), centre[-2:])
         best, value, tries = start, math.inf, 0
@@ -250,13 +249,7 @@ class EventSearch:
             return excess
 
         if most > 0:
-            simplex = np.vstack([np.zeros(centre.size), 0.2 * np.eye(centre.size)])
-            minimize(
-                objective,
-                np.zeros(centre.size),
-                method="Nelder-Mead",
-                options={"maxfev": most, "adaptive": True, "initial_simplex": simplex},
-            )
+            nelder_mead(objective, centre.size, 0.2, most)
         return best, value
 
 

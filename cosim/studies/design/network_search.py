@@ -36,7 +36,14 @@ from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows, rows_of
-from noack.theory.margins.loss_margin import LossMargin, Stability, list_bursts, without_timeout
+from noack.theory.margins.loss_margin import (
+    LossMargin,
+    Stability,
+    capped,
+    list_bursts,
+    uncapped,
+    without_timeout,
+)
 from noack.theory.margins.time_triggered_loop import LoopTimes
 from noack.trigger.periodic_trigger import PeriodicSettings
 
@@ -135,18 +142,9 @@ def time_triggered(scenario: Scenario, period_s: float | None) -> Scenario:
     return scenario.model_copy(update={"trigger": trigger})
 
 
-def _further(guarantee: LossGuarantee) -> LossGuarantee:
-    """Return the rules besides the cap M − 1."""
-    return LossGuarantee(tuple(rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)))
-
-
-def _capped(further: LossGuarantee, limit: int) -> LossGuarantee:
-    return LossGuarantee((LongestBurst(limit), *further.rules))
-
-
 def examined_m(scenario: Scenario, most: int) -> int:
     """Return the largest M to examine; above the bursts that the constraints allow, M means nothing."""
-    burst = _further(scenario.network.guarantee).longest_burst
+    burst = uncapped(scenario.network.guarantee).longest_burst
     return most if burst is None else min(most, burst + 1)
 
 
@@ -166,9 +164,9 @@ def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
             name = f"m = {m} of {wish.window}"
             rungs.append(Rung(name, m, guarantee, period_ns, settings))
         return rungs
-    further, most = _further(network.guarantee), examined_m(scenario, wish.most or _MOST_M)
     return [
-        Rung(f"M = {m}", m, _capped(further, m - 1), period_ns, {"mansd": m - 1}) for m in range(1, most + 1)
+        Rung(f"M = {m}", m, capped(network.guarantee, m - 1), period_ns, {"mansd": m - 1})
+        for m in range(1, examined_m(scenario, wish.most or _MOST_M) + 1)
     ]
 
 
@@ -406,8 +404,6 @@ class NetworkSearch:
 
     def _improve(self, start: Candidate, rung: int, most: int) -> Candidate | None:
         """Return a loop near ``start`` whose lower bound is below 1 on a rung; None: none found."""
-        from scipy.optimize import minimize  # slow to import
-
         K = np.array(start.K)
         scale = scaled_steps(K)
 
@@ -418,23 +414,22 @@ class NetworkSearch:
                 raise _FoundError(candidate)
             return excess
 
-        simplex = np.vstack([np.zeros(K.size), 0.3 * np.eye(K.size)])
         try:
-            minimize(
-                objective,
-                np.zeros(K.size),
-                method="Nelder-Mead",
-                options={
-                    "maxfev": most,
-                    "adaptive": True,
-                    "initial_simplex": simplex,
-                    "xatol": 1e-4,
-                    "fatol": 1e-5,
-                },
-            )
+            nelder_mead(objective, K.size, 0.3, most, xatol=1e-4, fatol=1e-5)
         except _FoundError as success:
             return success.candidate
         return None
+
+
+def nelder_mead(
+    objective: Callable[[Vector], float], size: int, first_step: float, most: int, **tolerances: float
+) -> None:
+    """Minimise without gradients from 0 on, with a simplex of this size and so many evaluations."""
+    from scipy.optimize import minimize  # slow to import
+
+    simplex = np.vstack([np.zeros(size), first_step * np.eye(size)])
+    options = {"maxfev": most, "adaptive": True, "initial_simplex": simplex, **tolerances}
+    minimize(objective, simplex[0], method="Nelder-Mead", options=options)
 
 
 def scaled_steps(K: Matrix) -> Vector:
