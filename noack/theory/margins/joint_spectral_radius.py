@@ -47,17 +47,10 @@ _LEAST_GROWTH = 1e-3
 _SMALLEST_POWER = 1e-280
 """Growths whose power by a duration is smaller are not distinguished from 0."""
 _ROUNDED = 1 + 1e-8
+_SEARCH, _LONG_SEARCH = (20, 100), (40, 300)
+"""Length of the cycles that are tried, at least the number of nodes, and the width of the beam."""
 _WITHIN = 0.1
 """A growth below the threshold by this share of its distance from the lower bound is proven."""
-
-
-class _CycleSearch(NamedTuple):
-    edges: int
-    """Length of the cycles that are tried; at least the number of nodes."""
-    beam: int
-
-
-_SEARCH, _LONG_SEARCH = _CycleSearch(20, 100), _CycleSearch(40, 300)
 
 
 class JointSpectralRadius(NamedTuple):
@@ -217,9 +210,9 @@ class _Enclosure:
         return bound.needed_products / products
 
 
-def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _CycleSearch) -> Cycle:
-    longest = min(max(search.edges, system.graph.nodes), _MOST_CYCLE_EDGES)
-    cycle = find_cycle(balanced, longest, search.beam)
+def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: tuple[int, int]) -> Cycle:
+    most_edges, beam = search
+    cycle = find_cycle(balanced, min(max(most_edges, system.graph.nodes), _MOST_CYCLE_EDGES), beam)
     if not cycle.path:
         return cycle
     # The original matrices have smaller radii.

@@ -164,8 +164,11 @@ class _Inequalities:
             values = np.append(solution.bound, 1.0)
             if not np.isfinite(values).all():
                 return bounds, min(loop_gain, float(solution.loop_gain))
-            by_rows = ({C: float(row @ values) for C, row in signals.items()} for signals in (states, errors))
-            found = _Bounds(*by_rows, *solution.bound.tolist())
+            found = _Bounds(
+                {C: float(row @ values) for C, row in states.items()},
+                {C: float(row @ values) for C, row in errors.items()},
+                *solution.bound.tolist(),
+            )
             if bounds and found.states[Output.STATE] > _SETTLED * bounds.states[Output.STATE]:
                 break
             bounds, loop_gain = found, float(solution.loop_gain)

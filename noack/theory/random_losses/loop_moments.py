@@ -267,26 +267,25 @@ class LoopMoments:
 
 def require_predictable(resolved: Scenario) -> None:
     """Raise CallerError unless the loop's second moments follow linear equations."""
-    scenario = resolved
     resolved.coverage.require_direct_inputs()
     resolved.coverage.require_unchanging()
     if (why := resolved.coverage.beyond_theory) is not None:
         raise CallerError(f"{why}; the mean cost needs a linear plant with u = K x_c")
-    if scenario.observer is not None:
-        raise CallerError(f'observer.kind = "{scenario.observer.kind}": the mean cost needs none')
-    for number, disturbance in enumerate(scenario.plant.disturbances):
+    if resolved.observer is not None:
+        raise CallerError(f'observer.kind = "{resolved.observer.kind}": the mean cost needs none')
+    for number, disturbance in enumerate(resolved.plant.disturbances):
         if any(disturbance.entries) and not disturbance.variance.any():
             raise CallerError(
                 f"plant.disturbances.{number}: {disturbance.kind} is not random; the mean cost needs "
                 "disturbances of kind gaussian or uniform"
             )
-    if any(scenario.controller.safe_input or ()):
+    if any(resolved.controller.safe_input or ()):
         raise CallerError("controller.safe_input: the mean cost needs the input 0 at the start")
     require_idle_watchdog(resolved)
     shortest_ns, longest_ns = intervals_ns(resolved)
     if shortest_ns != longest_ns:
         raise CallerError(
-            f'trigger.policy = "{scenario.trigger.policy}": the mean cost needs a time-triggered '
+            f'trigger.policy = "{resolved.trigger.policy}": the mean cost needs a time-triggered '
             "sensor: --set 'trigger={policy=\"periodic\", period_s=0.5}'"
         )
 

@@ -216,7 +216,7 @@ def from_triangles(entries: Vector, size: int) -> Stack:
 def triangles(stack: Stack) -> Vector:
     """Return the upper triangles of symmetric matrices, one after the other."""
     i, j = np.triu_indices(stack.shape[-1])
-    return stack[:, i, j].ravel()
+    return stack[..., i, j].ravel()
 
 
 def resolved_by(operator: "csc_array[np.float64]", value: float, entries: Vector) -> Vector:

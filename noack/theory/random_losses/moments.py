@@ -230,18 +230,18 @@ def _at_fixed_times(
     alpha = trigger.alpha_per_s if below(trigger.alpha_per_s, decay) else _SLOWER * decay
     if trigger.floor > 0:
         alpha = 0.0
-    known = conditions, max(trigger.beta, trigger.floor), losses.largest_probability
+    beta, p = max(trigger.beta, trigger.floor), losses.largest_probability
     found, reason = None, None
     for share in _RATES:
         try:
-            found = mean_squares(*_gains(loop, share * alpha), *known)
+            found = mean_squares(*_gains(loop, share * alpha), conditions, beta, p)
         except (NoCertificateError, NotDecayingError) as error:
             reason = str(error)
         if found and (share == 1 or found.loop_gain < _CLEARLY):
             break
     if found is None:
         return None, reason
-    return mean_squares(*_gains(loop, found.rate_per_s), *known, refined=True), None
+    return mean_squares(*_gains(loop, found.rate_per_s), conditions, beta, p, refined=True), None
 
 
 def _gains(loop: LoopMatrices, rate_per_s: float) -> tuple[ErrorGains, PlantGains]:
