@@ -415,21 +415,33 @@ class NetworkSearch:
             return excess
 
         try:
-            nelder_mead(objective, K.size, 0.3, most, xatol=1e-4, fatol=1e-5)
+            nelder_mead(objective, K.size, 0.3, most, tolerance=1e-5)
         except _FoundError as success:
             return success.candidate
         return None
 
 
 def nelder_mead(
-    objective: Callable[[Vector], float], size: int, first_step: float, most: int, **tolerances: float
+    objective: Callable[[Vector], float], size: int, first_step: float, most: int, tolerance: float = 1e-4
 ) -> None:
-    """Minimise without gradients from 0 on, with a simplex of this size and so many evaluations."""
+    """Minimise without gradients from 0 on.
+
+    Args:
+        objective: to be minimised.
+        size: number of unknowns.
+        first_step: size of the first simplex.
+        most: largest number of evaluations.
+        tolerance: difference of values at which the search ends.
+    """
     from scipy.optimize import minimize  # slow to import
 
     simplex = np.vstack([np.zeros(size), first_step * np.eye(size)])
-    options = {"maxfev": most, "adaptive": True, "initial_simplex": simplex, **tolerances}
-    minimize(objective, simplex[0], method="Nelder-Mead", options=options)
+    minimize(
+        objective,
+        np.zeros(size),
+        method="Nelder-Mead",
+        options={"maxfev": most, "adaptive": True, "initial_simplex": simplex, "fatol": tolerance},
+    )
 
 
 def scaled_steps(K: Matrix) -> Vector:

@@ -11,7 +11,7 @@ vertices. It is computed for many points at once by the simplex method. Each bas
 gives an upper bound of ‖y‖, and an exchange of one vertex improves it. Every basis is thus a proof.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,11 +26,9 @@ _IMPROVEMENT = 1e-11
 _PIVOT = 1e-9
 _PRODUCTS = 250_000
 """Of a product of matrices: the BLAS uses several threads for larger ones, which is slower here."""
-_NONE = -1
 _ENLARGED = 1 + 2.0**-40
 UNIT = 0.1
 _INSIDE = 1 - 1e-9
-_MUCH_LARGER = 1.3
 _ROUNDS = 60
 _WORK_PER_VERTEX = 1_000_000
 _FARTHEST = 1e3
@@ -70,29 +68,11 @@ class PolytopeNorm:
 
     def combinations(self, points: Matrix, enough: float = 0.0) -> Combinations:
         """Return combinations for points, (k, n), of the smallest norm, or at most ``enough``."""
-        excluded = np.full(len(points), _NONE)
-        return self._in_chunks(points, enough, excluded)
-
-    def redundant(self, first: int, enough: float) -> NDArray[np.bool_]:
-        """Return which vertices from number ``first`` on have a norm up to ``enough`` without them.
-
-        Each is compared with all others; the unit vectors are never redundant.
-        """
-        numbers = np.arange(first, len(self.vertices))
-        norms = self._in_chunks(self.vertices[first:], enough, numbers).norms
-        redundant = np.zeros(len(self.vertices), dtype=bool)
-        redundant[first:] = (norms <= enough) & (numbers >= self.vertices.shape[1])
-        return redundant
-
-    def _in_chunks(self, points: Matrix, enough: float, excluded: NDArray[np.int64]) -> Combinations:
         chunk = max(_PRODUCTS // self.vertices.size, 16)
-        parts = [
-            self._combinations(points[i : i + chunk], enough, excluded[i : i + chunk])
-            for i in range(0, len(points), chunk)
-        ]
+        parts = [self._combinations(points[i : i + chunk], enough) for i in range(0, len(points), chunk)]
         return Combinations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
-    def _combinations(self, points: Matrix, enough: float, excluded: NDArray[np.int64]) -> Combinations:
+    def _combinations(self, points: Matrix, enough: float) -> Combinations:
         (k, n), V = points.shape, self.vertices
         chosen = np.tile(np.arange(n), (k, 1))
         signs = np.where(points >= 0, 1.0, -1.0) * np.sign(np.diag(V[:n]))
@@ -109,7 +89,6 @@ class PolytopeNorm:
             # The vertex that violates the dual's inequalities most enters the basis.
             scores = undone.sum(axis=2) @ V.T
             self.work += scores.size * n
-            scores[excluded[active] != _NONE, excluded[active][excluded[active] != _NONE]] = 0.0
             entering = np.abs(scores).argmax(axis=1)
             value = scores[np.arange(len(active)), entering]
             sign = np.sign(value)
@@ -164,8 +143,6 @@ class InvariantPolytopes:
     growth: float
     vertices: list[Matrix]
     """Of each node, (m, n)."""
-    _examined: dict[int, int] = field(default_factory=dict)
-    """Number of vertices after the last search for redundant ones, by node."""
     _work: int = 0
 
     @property
@@ -201,7 +178,7 @@ class InvariantPolytopes:
         return False
 
     def _add(self, node: int, points: Matrix) -> Matrix:
-        """Add the points that are outside, the farthest first; return those that are vertices."""
+        """Add the points that are outside, the farthest first; return them."""
         before = len(self.vertices[node])
         while len(points):
             norm = PolytopeNorm(self.vertices[node])
@@ -211,18 +188,7 @@ class InvariantPolytopes:
             order = order[norms[order] > _INSIDE]
             largest, points = np.split(points[order], [max(4, len(order) // 4)])
             self.vertices[node] = np.concatenate([self.vertices[node], largest])
-        if len(self.vertices[node]) == before:
-            return points
-        # Without points in its interior it is the same polytope.
-        everywhere = len(self.vertices[node]) > _MUCH_LARGER * self._examined.get(node, 0)
-        norm = PolytopeNorm(self.vertices[node])
-        is_new = ~norm.redundant(0 if everywhere else before, _INSIDE)
-        self._work += norm.work
-        added = self.vertices[node][before:][is_new[before:]]
-        self.vertices[node] = self.vertices[node][is_new]
-        if everywhere:
-            self._examined[node] = len(self.vertices[node])
-        return added
+        return self.vertices[node][before:]
 
     def bound(self) -> float:
         """Return a rigorous upper bound of the joint spectral radius, from the polytopes."""
