@@ -271,6 +271,7 @@ def write_outcome(outcome: DesignOutcome, path: Path, figure_files: FigureFiles 
         figure_files,
         title=outcome.name,
         kind="design for a network",
+        subtitle="",
         verdict=outcome.verdict,
         tone="good" if outcome.is_better else "doubt",
         notes=outcome.notes,

@@ -42,7 +42,7 @@ def test_rows_are_as_published_and_as_documented(name: str) -> None:
 
 def test_a_value_that_differs_fails_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     plants = demirel.drawn_loops()
-    monkeypatch.setattr(demirel, "loops", lambda: [*plants[:2], plants[0]])
+    monkeypatch.setattr(demirel, "drawn_loops", lambda: [*plants[:2], plants[0]])
     result = invoke("paper", "demirel", "--json")
     assert result.exit_code == ExitStatus.FAILED
     assert {row["verdict"] for row in json.loads(result.stdout)["rows"]} == {"differs"}
