@@ -176,8 +176,10 @@ class _Inequalities:
 
     def refine(self, bounds: _Bounds) -> _Bounds:
         """Make bounds smaller; each one that is used holds already."""
-        loop = LossyFlow(self._error, self._plant, self._conditions, self._probability)
-        functions = quadratic_functions(loop, self._known(bounds))
+        known, loop = self._known(bounds), (self._error, self._plant, self._conditions, self._probability)
+        functions = quadratic_functions(LossyFlow(*loop), known)
+        if not functions and self._conditions.hold_s > 0:
+            functions = quadratic_functions(LossyFlow(*loop, counts_age=False), known)
         for _ in range(_ROUNDS):
             before, bounds = bounds, self._improved(bounds, functions)
             if bounds.states[Output.STATE] > _SETTLED * before.states[Output.STATE]:
@@ -185,15 +187,19 @@ class _Inequalities:
         return bounds
 
     def _known(self, bounds: _Bounds) -> Known:
-        """What is known of the parts of v."""
-        errors, in_flight = bounds.errors, 0.0
-        if self._conditions.delay_s > 0:
+        """What is known of the parts of v; errors[C] bounds both ‖C e_c‖ and ‖C(e_c − ê_c)‖ with a delay."""
+        states, errors, conditions = bounds.states, bounds.errors, self._conditions
+        gains = dict(self._ages)
+        in_flight, by_rate = 0.0, gains.pop(Output.GAIN_RATE)
+        if conditions.delay_s > 0:
             missing = self._missing_events(Output.GAIN, self._driving(bounds))
             in_flight = float(missing.recent @ bounds.values)
-        other = self._with_age(in_flight, bounds.states, errors)
-        starts_late = self._conditions.start_s > 0
-        at_start = float(self._start_error) + errors[Output.GAIN] + in_flight if starts_late else 0.0
-        return Known(bounds.sensor_error, other, at_start)
+        other = in_flight + sum(gain * (states[C] + errors[C]) for C, gain in gains.items())
+        if conditions.delay_s > 0:
+            other += by_rate * errors[Output.GAIN_RATE]
+        aged = by_rate * (states[Output.GAIN_RATE] + errors[Output.GAIN_RATE])
+        at_start = float(self._start_error) + errors[Output.GAIN] + in_flight if conditions.start_s else 0.0
+        return Known(bounds.sensor_error, other, aged, at_start)
 
     def _driving(self, bounds: _Bounds) -> _Signals:
         """Return rows that bound R_E x, and p at all times: before and after the first input, at t_a.

@@ -7,21 +7,21 @@ v = p − K ê_c, between events
     x' = (A+BK+αI) x + B (K ê_c + v),   q' = (H+αI) q,   e_s' = (H+αI) e_s − E x − B (K ê_c + v)
 
 At an event e_s becomes 0, and q becomes q + e_s if it is lost, with a probability of at most p̄
-whatever happened before, and 0 else. v has two parts: v_f of the oldest update in flight, and w.
-Let y = (q, e_s) and V = xᵀX x + yᵀP y. If
+whatever happened before, and 0 else. v has three parts: v_f of the oldest update in flight, v_h of
+the input's age σ, ‖v_h‖ ≤ σ‖K H (x + ê_c)‖, and w. Let y = (q, e_s) and V = xᵀX x + yᵀP y. If
 
     P ⪰ p̄ (I I)ᵀ P_qq (I I) + ζ_f (I I)ᵀ D (I I)         no event increases the mean of V
-    V' + 2λV ≤ μ‖e_s‖_W² + ζ‖w‖² + ζ_f‖v_f‖²
+    V' + 2λV ≤ μ‖e_s‖_W² + ζ‖w‖² + ζ_f‖v_f‖² + ζ_h (‖v_h‖² − σ²‖K H (x + q + e_s)‖²)
 
-for all x, y, w and v_f, then the mean of V is at most max(V(0), (μ a² + ζ ω²)/2λ) at every fixed
-time, where a² and ω² bound the mean squares of ‖e_s‖_W and of w. An update is in flight for d
+for all x, y, w, v_f and v_h, then the mean of V is at most max(V(0), (μ a² + ζ ω²)/2λ) at every
+fixed time, where a² and ω² bound the mean squares of ‖e_s‖_W and of w. An update is in flight for d
 at most. D = ∫₀ᵈ e^{2λτ}‖K e^{(H+αI)τ}·‖² dτ bounds what it adds to V meanwhile, and is counted when it
 is sent. (V has no product of x and y: an event changes y and leaves x, so the first inequality would
 not hold with one.)
 
 These are linear matrix inequalities. :func:`quadratic_functions` looks for those with the smallest
 bounds by a barrier method, which stays inside of them; that the result is inside is checked with a
-margin for rounding. They can be met for all p̄ < 1 (derivations.md, "Without a
+margin for rounding. Without delay and age they can be met for all p̄ < 1 (derivations.md, "Without a
 limit on the losses").
 """
 
@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
-from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.random_losses.mean_square_growth import from_triangles, triangles
 
@@ -45,6 +45,8 @@ _ROUNDING = 1e-13
 _INFLATED = 1 + 1e-9
 _MOST_STATES = 8
 """With 7 the four searches took up to 12 s of CPU on a busy machine, with 12 about a minute."""
+_LEFT = 0.01
+"""Share of the decay of x that the input's age leaves where the search begins."""
 Blocks = tuple[Vector, *tuple[Matrix, ...]]
 """Numbers that are to be positive, and symmetric matrices that are to be positive definite."""
 
@@ -56,6 +58,8 @@ class Known(NamedTuple):
     """a, of ‖e_s‖_W at every fixed time."""
     other: float
     """ω, of w from the first applied input on."""
+    aged: float
+    """Of v_h, if it is counted as a part of w."""
     start: float
     """Of w before the first applied input."""
 
@@ -74,13 +78,13 @@ class QuadraticFunction(NamedTuple):
     of_sensor_error: float
     """μ."""
     of_inputs: Vector
-    """ζ and ζ_f; 0 for what there is not, (2,)."""
+    """ζ, ζ_f and ζ_h; 0 for what there is not, (3,)."""
     loop: "LossyFlow"
 
     def level(self, known: Known) -> float:
         """Bound of the mean of xᵀXx + yᵀPy, at every fixed time."""
         loop, of_other = self.loop, self.of_inputs[0]
-        entering = self.of_sensor_error * known.sensor_error**2 + of_other * known.other**2
+        entering = self.of_sensor_error * known.sensor_error**2 + of_other * loop.other(known) ** 2
         first = loop.start @ self.state @ loop.start
         begun = of_other * known.start**2 * loop.start_s
         added = self.added * known.sensor_error**2
@@ -110,10 +114,16 @@ class LossyFlow:
         plant: the gains of the plant; α of both is the same.
         conditions: of the schedule; ``dropouts`` has no effect.
         probability: p̄.
+        counts_age: whether the input's age is followed by itself, as v_h.
     """
 
     def __init__(
-        self, error: ErrorGains, plant: PlantGains, conditions: NetworkConditions, probability: float
+        self,
+        error: ErrorGains,
+        plant: PlantGains,
+        conditions: NetworkConditions,
+        probability: float,
+        counts_age: bool = True,
     ) -> None:
         generators = plant.closed_loop, error.scaled_H
         self.decay_per_s = -max(spectral_abscissa(M) for M in generators)
@@ -121,9 +131,11 @@ class LossyFlow:
         self.closed_loop, self.model = (W @ M @ self.inverse_weight for M in generators)
         self.probability, self.delay_s = probability, conditions.delay_s
         self.start_s, self.start = conditions.start_s, W @ plant.start[:, 0]
-        is_delayed = conditions.delay_s > 0
-        self.inputs = np.array([is_delayed or conditions.hold_s > 0 or conditions.start_s > 0, is_delayed])
-        """Whether there are w and v_f."""
+        delayed, aged = conditions.delay_s > 0, conditions.hold_s > 0
+        self.counts_age = aged and counts_age
+        self.inputs = np.array([delayed or aged or conditions.start_s > 0, delayed, self.counts_age])
+        """Whether there is w, v_f and v_h."""
+        self.age = conditions.hold_s * error.outputs[Output.GAIN_RATE] @ self.inverse_weight
         self.input, self.gain = W @ plant.input_matrix, error.split_K[1] @ self.inverse_weight
         BK, E = self.input @ self.gain, self.closed_loop - self.model
         zero = np.zeros_like(E)
@@ -133,6 +145,10 @@ class LossyFlow:
             [-E, -BK, self.model - BK],
         ])  # fmt: skip
         self.entering = np.vstack([self.input, 0 * self.input, -self.input])
+
+    def other(self, known: Known) -> float:
+        """Bound ω of w."""
+        return known.other + (0.0 if self.counts_age else known.aged)
 
     def flight(self, rate_per_s: float) -> Matrix:
         """D, (n, n), enlarged by the rounding of an exponential.
@@ -174,7 +190,7 @@ class _Unknowns(NamedTuple):
     mu: float
     nu: float
     zetas: Vector
-    """ζ and ζ_f; 0 for what there is not, (2,)."""
+    """ζ, ζ_f and ζ_h; 0 for what there is not, (3,)."""
     gain: float
     """The bound of the output is its root's inverse."""
 
@@ -191,7 +207,7 @@ class _Search:
         self._sum, self._sensor = np.hstack([np.eye(n)] * 2), np.diag(np.repeat([0.0, 1.0], n))
         self._of_state, self._of_error = of_state, of_error @ self._sum
         unit = known.sensor_error
-        self._other, self._begun = (known.other / unit) ** 2, (known.start / unit) ** 2 * loop.start_s
+        self._other, self._begun = (loop.other(known) / unit) ** 2, (known.start / unit) ** 2 * loop.start_s
         self._start = loop.start / unit
         self._flight = loop.flight(self._rate) if loop.delay_s > 0 else None
 
@@ -209,9 +225,8 @@ class _Search:
 
     def _unknowns(self, values: Vector) -> _Unknowns:
         n = self._n
-        of_state, of_errors, (mu, nu, *others, gain) = np.split(
-            values, np.cumsum([n * (n + 1) // 2, n * (2 * n + 1)])
-        )
+        sizes = np.cumsum([n * (n + 1) // 2, n * (2 * n + 1)])
+        of_state, of_errors, (mu, nu, *others, gain) = np.split(values, sizes)
         zetas = np.zeros(len(self._loop.inputs))
         zetas[self._loop.inputs] = others
         (X,), (P,) = from_triangles(of_state, n), from_triangles(of_errors, 2 * n)
@@ -240,12 +255,15 @@ class _Search:
         )
 
     def _between_events(self, unknowns: _Unknowns) -> Matrix:
-        """What V' + 2λV is below it, as a form of (x, q, e_s) and of w and v_f."""
+        """What V' + 2λV is below it, as a form of (x, q, e_s) and of w, v_f and v_h."""
         X, P, mu, _, zetas, _ = unknowns
         loop, n = self._loop, self._n
         V, entering = np.zeros((3 * n, 3 * n)), np.zeros((3 * n, 3 * n))
         V[:n, :n], V[n:, n:], entering[n:, n:] = X, P, mu * self._sensor
         form = entering - loop.flow.T @ V - V @ loop.flow - 2 * self._rate * V
+        if loop.counts_age:
+            aged = np.hstack([loop.age] * 3)
+            form = form - zetas[2] * aged.T @ aged
         squares = zetas[loop.inputs]
         if not len(squares):
             return np.asarray(form)
@@ -257,23 +275,26 @@ class _Search:
         """Values inside of all inequalities; None if rounding leaves none.
 
         q decays by itself, so a large P_qq covers what q does to x. A larger P_ss covers the events,
-        ζ_f what v_f does to x, and large μ and ζ what e_s and w do. Then all is made small.
+        ζ_f and ζ_h what v_f and v_h do to x, and large μ and ζ what e_s and w do. Then all is made small.
         """
-        loop, p, rate_per_s = self._loop, self._loop.probability, (self._rate + self._loop.decay_per_s) / 2
-        X, Q = (_decaying_form(M, rate_per_s) for M in (loop.closed_loop, loop.model))
-        root = np.linalg.cholesky(self._decay(loop.closed_loop, X))
+        loop, p = self._loop, self._loop.probability
+        X, root = self._state_form()
+        Q = _decaying_form(loop.model, (self._rate + loop.decay_per_s) / 2)
+        if root is None:
+            return None
         pushed = np.linalg.solve(root, X @ loop.input)
         of_flight = 8 * float(np.linalg.norm(pushed, 2)) ** 2
         left = np.linalg.cholesky(self._decay(loop.model, Q))
-        coupling = np.linalg.solve(left, (pushed @ loop.gain).T)
-        size = float(np.trace(X) / np.trace(Q)) + 8 * float(np.linalg.norm(coupling, 2)) ** 2
+        couplings = (pushed @ loop.gain).T, np.linalg.solve(root, loop.age.T @ loop.age).T, loop.age.T
+        size = float(np.trace(X) / np.trace(Q))
+        size += 8 * sum(float(np.linalg.norm(np.linalg.solve(left, C), 2)) ** 2 for C in couplings)
         P = np.asarray(np.kron(np.diag([1.0, 2 * p / (1 - p) + 1.0]), Q), np.float64)
         if self._flight is not None:
             lost, taken = (self._sum.T @ form @ self._sum for form in (p * Q, self._flight))
             size += 2 * of_flight * float(np.linalg.norm(np.linalg.solve(P - lost, taken), 2))
         P, large = P * size, size
         while True:
-            zetas = np.where(loop.inputs, [large, of_flight], 0.0)
+            zetas = np.where(loop.inputs, [large, of_flight, 1.0], 0.0)
             begin = _Unknowns(X, P, large, large, zetas, 0.0)
             if _is_positive(self._between_events(begin)):
                 break
@@ -286,6 +307,28 @@ class _Search:
         level += float(self._start @ X @ self._start + np.trace(X) + np.trace(P))
         first = self._values(begin._replace(gain=gain)) / (4 * level)
         return first if all(map(_is_positive, self._blocks(first))) else None
+
+    def _state_form(self) -> tuple[Matrix, Matrix | None]:
+        """X that decays, and a root of what is left of its decay; ζ_h = 1 covers the input's age.
+
+        It is that of the bounded real lemma, which exists if age and input amplify by less than 1.
+        """
+        loop = self._loop
+        X = _decaying_form(loop.closed_loop, (self._rate + loop.decay_per_s) / 2)
+        left = self._decay(loop.closed_loop, X)
+        if loop.counts_age:
+            from scipy.linalg import solve_continuous_are  # slow to import
+
+            flow = loop.closed_loop + self._rate * np.eye(self._n)
+            aged, identity = loop.age.T @ loop.age, np.eye(loop.input.shape[1])
+            remaining = aged + _LEFT * (np.linalg.norm(aged, 2) + 1e-9) * np.eye(self._n)
+            try:
+                X = np.asarray(solve_continuous_are(flow, loop.input, remaining, -identity / (1 + _LEFT)))
+            except (np.linalg.LinAlgError, ValueError):
+                return X, None
+            left = self._decay(loop.closed_loop, X) - aged - X @ loop.input @ loop.input.T @ X
+        has_root = _is_positive(left) and _is_positive(X)
+        return X, np.asarray(np.linalg.cholesky(left)) if has_root else None
 
     def _decay(self, M: Matrix, form: Matrix) -> Matrix:
         """What is left of a form's decay along z' = M z beside the rate λ."""

@@ -104,23 +104,25 @@ def test_no_event_and_no_flow_raises_the_mean_of_a_quadratic_function(late: bool
         gains, H, K, W = loop.system.gains(), loop.system.H, loop.system.K, loop.system.weight
         n, flow = len(H), LossyFlow(gains.error, gains, conditions, p)
         one, zero = np.eye(n), np.zeros((n, n))
-        x, q, e_s, w, v_f = np.split(np.eye(5 * n), 5)  # v is B (w + v_f) of the derivation
+        x, q, e_s, w, v_f, v_h = np.split(np.eye(6 * n), 6)  # v is B (w + v_f + v_h) of the derivation
         B = loop.system.B @ gains.error.split_K[0]
         R, pushed = gains.error.split_K[1], np.pad(B, ((0, 0), (0, n - B.shape[1])))
         G, shift = loop.system.A + loop.system.B @ K, gains.alpha_per_s * one
-        entering = loop.system.B @ K @ (q + e_s) + late * pushed @ (w + v_f)
+        entering = loop.system.B @ K @ (q + e_s) + late * pushed @ (w + v_f + v_h)
         rates = (
             (G + shift) @ x + entering, (H + shift) @ q, (H + shift) @ e_s - (G - H) @ x - entering,
         )  # fmt: skip
-        for V in quadratic_functions(flow, Known(loop.system.beta, loop.system.beta * late, 0.0)):
+        aged = conditions.hold_s * R @ H @ (x + q + e_s)
+        for V in quadratic_functions(flow, Known(loop.system.beta, loop.system.beta * late, 0.0, 0.0)):
             checked += 1
             P = np.kron(np.eye(2), W).T @ V.errors @ np.kron(np.eye(2), W)
             P[n:, n:] -= V.added * W.T @ W
             form = np.block([[W.T @ V.state @ W, zero, zero], [np.zeros((2 * n, n)), P]])
             z, moved = np.vstack([x, q, e_s]), np.vstack(rates)
             grown = z.T @ form @ moved + moved.T @ form @ z + 2 * V.rate_per_s * z.T @ form @ z
-            zeta, zeta_f = V.of_inputs
+            zeta, zeta_f, zeta_h = V.of_inputs
             allowed = V.of_sensor_error * e_s.T @ W.T @ W @ e_s + zeta * w.T @ w + zeta_f * v_f.T @ v_f
+            allowed += zeta_h * (v_h.T @ v_h - aged.T @ aged)
             used = np.flatnonzero(np.abs(grown).sum(axis=0) + np.abs(allowed).sum(axis=0))
             difference = (allowed - grown)[np.ix_(used, used)]
             assert np.linalg.eigvalsh(difference)[0] > -1e-9 * np.linalg.norm(difference)
