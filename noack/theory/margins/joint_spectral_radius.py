@@ -22,7 +22,15 @@ from numpy.typing import NDArray
 from noack.core.linear_systems import Vector
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.margins.invariant_polytopes import InvariantPolytopes, initial_vertices
-from noack.theory.margins.quadratic_norms import NormSearch, norms_above, representatives
+from noack.theory.margins.quadratic_norms import (
+    FEW_ENTRIES,
+    MOST_ENTRIES,
+    NormSearch,
+    norms_above,
+    number_of_entries,
+    remembering,
+    representatives,
+)
 from noack.theory.margins.switched_system import (
     Cycle,
     Edge,
@@ -42,6 +50,8 @@ _FEW_VERTICES, _MORE_VERTICES = 300, 4000
 _PRODUCTS, _MORE_PRODUCTS = 30_000, 300_000
 MOST_LEAVING = 60
 """Largest number of edges that leave a node for which polytopes are tried."""
+_REMEMBERED = 3
+"""Classes of edges that a node remembers in the second search for quadratic norms."""
 _LEAST_GROWTH = 1e-3
 """Growth of the polytopes if no cycle grows, relative to the largest norm of a matrix."""
 _SMALLEST_POWER = 1e-280
@@ -110,13 +120,14 @@ class _Enclosure:
         self._system, self._most_vertices = system, most_vertices
         self.upper, self.vertices = math.inf, 0
         self._is_large = not most_vertices or max(map(len, system.graph.leaving)) > MOST_LEAVING
+        self._searches: dict[bool, NormSearch] = {}
         only = system.graph.only_cycle()
         if only is not None:
             bounds = [growth_bounds(part, only) for part in (system, self._balanced)]
             lowers, uppers = zip(*bounds, strict=True)
             self.cycle, self.upper = Cycle(only if max(lowers) else (), max(lowers)), min(uppers)
         elif self._is_large:
-            norms = self._search.improve(0.0)
+            norms = self._search().improve(0.0)
             self._improve(norms.upper)
             numbers = representatives(system.graph, norms.growths)
             cycle = _best_cycle(system.at(numbers), (norms.system or system).at(numbers), _SEARCH)
@@ -133,8 +144,22 @@ class _Enclosure:
         return _best_cycle(self._system, self._balanced, _LONG_SEARCH)
 
     @cached_property
-    def _search(self) -> NormSearch:
-        return NormSearch(self._system)
+    def _remembering(self) -> SwitchedSystem:
+        """The same system with more nodes, if they are not too many for the search for norms."""
+        reaching = int(np.bincount(self._system.graph.targets).max())
+        for classes in (_REMEMBERED,) if self._is_large else (reaching, _REMEMBERED):
+            system = remembering(self._system, classes)
+            if number_of_entries(system) <= FEW_ENTRIES:
+                return system
+        return self._system
+
+    def _search(self, remembers: bool = False) -> NormSearch:
+        if remembers not in self._searches:
+            system, entries = self._system, FEW_ENTRIES
+            if remembers:
+                system, entries = self._remembering, MOST_ENTRIES
+            self._searches[remembers] = NormSearch(system, entries)
+        return self._searches[remembers]
 
     def _improve(self, upper: float, vertices: int = 0) -> None:
         self.upper, self.vertices = min((self.upper, self.vertices), (upper, vertices))
@@ -151,7 +176,7 @@ class _Enclosure:
             self._search_longer,
             lambda growth: self._prove_by_norms(growth, int(_PRODUCTS * effort)),
             lambda growth: self._prove_by_polytopes(growth, int(_MORE_VERTICES * effort)),
-            lambda growth: self._prove_by_norms(growth, int(_MORE_PRODUCTS * effort)),
+            lambda growth: self._prove_by_norms(growth, int(_MORE_PRODUCTS * effort), True),
         )
         for attempt in attempts:
             needed_effort = attempt(threshold - _WITHIN * (threshold - self.cycle.growth))
@@ -175,7 +200,7 @@ class _Enclosure:
                 self._search_longer(growth)
                 if self.cycle.growth > before * (1 + accuracy / 2):
                     continue
-                self._prove_by_norms(growth, _PRODUCTS)
+                self._prove_by_norms(growth, _PRODUCTS, remembers=self._is_large)
             if self._is_large:
                 break
             accuracy *= _COARSER
@@ -194,20 +219,20 @@ class _Enclosure:
                 self._improve(polytopes.bound(), polytopes.count)
         return math.inf
 
-    def _prove_by_norms(self, growth: float, products: int) -> float:
+    def _prove_by_norms(self, growth: float, entries: int, remembers: bool = False) -> float:
         """Try to prove a growth; return the effort that this is estimated to need, 1: the limit."""
-        norms = self._search.improve(growth)
+        norms = self._search(remembers).improve(growth)
         self._improve(norms.upper)
         if self.upper <= growth * _ROUNDED:
             return math.inf  # if the threshold is not above the bound, by rounding only
         if norms.system is None:
             return math.inf
         try:
-            bound = bound_by_products(norms.system, growth, products, slowest=self.cycle.growth)
+            bound = bound_by_products(norms.system, growth, entries, slowest=self.cycle.growth)
         except FloatingPointError:  # an overflow, where the caller has asked for it
             return math.inf
         self._improve(bound.upper)
-        return bound.needed_products / products
+        return bound.needed_products / entries
 
 
 def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: tuple[int, int]) -> Cycle:

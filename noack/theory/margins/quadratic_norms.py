@@ -6,7 +6,8 @@ N = M γ^−d. The smallest γ is approached from inside, as interior-point meth
 c log γ + Σ tr P_v − Σ log det F is made small by Newton's method, for larger and larger c.
 
 The bound is computed from the norms with all rounding, so it does not depend on the search. It may
-stay above the joint spectral radius. Then products of several steps are shorter than γ^duration
+stay above the joint spectral radius. Then there are more norms if the nodes also remember the last
+edges (:func:`remembering`), or products of several steps are shorter than γ^duration
 (:func:`~noack.theory.margins.joint_spectral_radius.bound_by_products`).
 """
 
@@ -22,8 +23,8 @@ from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.margins.switched_system import Graph, Numbers, SwitchedSystem
 
 _FASTEST, _STEADY = 8, 17
-_MOST_ENTRIES = 1200
-"""Number of entries of all P_v with which the search takes some seconds; for more, all P_v are equal."""
+FEW_ENTRIES, MOST_ENTRIES = 1200, 2500
+"""Numbers of entries of all P_v with which the search takes some seconds, and up to a minute."""
 _STAGES, _NEWTON_STEPS = 40, 40
 _HEAVIER = 4.0
 """Factor of the weight of log γ from stage to stage."""
@@ -54,20 +55,28 @@ class QuadraticNorms(NamedTuple):
 
 
 class NormSearch:
-    """Looks for norms with the smallest γ, beginning with the balanced coordinates."""
+    """Looks for norms with the smallest γ, beginning with the balanced coordinates.
 
-    def __init__(self, system: SwitchedSystem) -> None:
-        self._system, self._searched, n = system, system.graph, system.dimension
-        if system.graph.nodes * n * (n + 1) // 2 > _MOST_ENTRIES:
+    Args:
+        system: the system.
+        most_entries: largest number of entries of all P_v; for more, all P_v are equal.
+    """
+
+    def __init__(self, system: SwitchedSystem, most_entries: int = MOST_ENTRIES) -> None:
+        self._system, self._searched = system, system.graph
+        if number_of_entries(system) > most_entries:
             everywhere = np.zeros_like(system.graph.sources)
             self._searched = replace(system.graph, sources=everywhere, targets=everywhere)
-        identity = np.tile(np.eye(n), (self._searched.nodes, 1, 1))
         self._coordinates = self._searched.balancing(system.matrices.middle)
         balanced = replace(system, graph=self._searched).in_coordinates(self._coordinates)
         if balanced is None:
-            balanced, self._coordinates = system, identity
+            balanced, self._coordinates = (
+                system,
+                np.tile(np.eye(system.dimension), (self._searched.nodes, 1, 1)),
+            )
         self._matrices = balanced.matrices.middle
-        self._squares: Stack = identity * len(self._matrices) / self._searched.nodes
+        share = len(self._matrices) / self._searched.nodes
+        self._squares: Stack = np.tile(np.eye(system.dimension) * share, (self._searched.nodes, 1, 1))
         """P_v in balanced coordinates."""
 
     def improve(self, target: float) -> QuadraticNorms:
@@ -90,6 +99,12 @@ class NormSearch:
         if (turned := self._system.in_coordinates(forms)) is None:
             return QuadraticNorms(None, np.full(len(durations), np.inf))
         return QuadraticNorms(turned, norms_above(turned.matrices) ** (1 / durations) * (1 + 1e-15))
+
+
+def number_of_entries(system: SwitchedSystem) -> int:
+    """Return the number of entries of one norm for each node."""
+    n = system.dimension
+    return system.graph.nodes * n * (n + 1) // 2
 
 
 class _Centers(NamedTuple):
@@ -227,6 +242,23 @@ def _symmetric_basis(n: int) -> Matrix:
     for position in (rows * n + columns, columns * n + rows):
         basis[position, np.arange(len(rows))] = 1.0
     return basis
+
+
+def remembering(system: SwitchedSystem, classes: int) -> SwitchedSystem:
+    """Return the same system with nodes that also remember the class of the last edge.
+
+    The classes have equal numbers of edges, in the order of the edges. More norms give a smaller
+    bound (Ahmadi, Jungers, Parrilo and Roozbehani, *SIAM J. Control Optim.* 52, 2014). Each edge
+    becomes ``classes`` successive ones.
+    """
+    graph, kinds = system.graph, np.zeros_like(system.graph.sources)
+    for node in range(graph.nodes):
+        reaching = np.flatnonzero(graph.targets == node)
+        kinds[reaching] = np.arange(len(reaching)) * classes // len(reaching)
+    sources = (graph.sources[:, None] * classes + np.arange(classes)).ravel()
+    targets = np.repeat(graph.targets * classes + kinds, classes)
+    numbers = np.repeat(np.arange(len(kinds)), classes)
+    return SwitchedSystem(Graph(sources, targets, graph.durations[numbers]), system.matrices.at(numbers))
 
 
 def representatives(graph: Graph, growths: Vector) -> Numbers:
