@@ -23,7 +23,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.margins.loss_margin import LossMargin
-from noack.theory.margins.switched_system import find_cycle, strongly_connected
+from noack.theory.margins.switched_system import SwitchedSystem, find_cycle
 
 GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
 MEDIAN_S = 2.0
@@ -96,8 +96,8 @@ def random_loop(seed: int) -> RandomLoop:
 
 
 def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:
-    edges = margin.edges(margin.bursts(guarantee))
-    parts = [part.balanced() for part in strongly_connected(edges)]
+    system = SwitchedSystem.of(margin.edges(margin.bursts(guarantee)))
+    parts = [system.at(numbers).balanced() for numbers in system.graph.strongly_connected()]
     return max(find_cycle(part, 30, 200).growth for part in parts)
 
 

@@ -16,18 +16,12 @@ from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_guarantee import (
-    LongestBurst,
-    LossGuarantee,
-    Pattern,
-    find_pattern_beyond,
-    outcome_letters,
-)
+from noack.impairments.loss_guarantee import LossGuarantee, Pattern, find_pattern_beyond, outcome_letters
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import ACCURACY
-from noack.theory.margins.loss_margin import LossMargin, Stability, capped
+from noack.theory.margins.loss_margin import LossMargin, Stability, capped, uncapped
 from noack.theory.random_losses.random_growth import RandomGrowth, random_growth
 
 MOST_M = 16
@@ -335,9 +329,7 @@ def find_margin(
         raise CallerError(f"effort {effort:g}: expected a factor of the work up to 1e6, e.g. 10")
     margin, network = LossMargin(resolved), resolved.network
     others_read = [read_guarantee(words) for words in guarantees]
-    other_rules = LossGuarantee(
-        tuple(rule for rule in network.guarantee.rules if not isinstance(rule, LongestBurst))
-    )
+    other_rules = uncapped(network.guarantee)
     caps: list[LossCap] = []
     every_m = False
     for m in range(1, most_m + 1):

@@ -6,7 +6,7 @@ time-triggered loop, :func:`print_mean_cost` its mean cost under random losses.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from rich.console import Console
 from rich.markup import escape
@@ -224,28 +224,6 @@ def _limit(value_s: float) -> str:
 _MARGIN_STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}
 
 
-_COMPARED_HEADINGS = ("guarantee", "at least", "at most", "worst pattern", "verdict")
-MARGIN_HEADINGS = ("M", "maximum consecutive losses (M − 1)", "at least", "at most", "verdict")
-
-
-def margin_title(margin: MarginResult) -> str:
-    """Return the title of the table of the bounds."""
-    delay = f", updates delayed by {margin.delay_s:g} s" if margin.delay_s else ""
-    times = f"with an update every {margin.period_s:g} s"
-    if not margin.is_periodic:
-        times = f"with updates {margin.shortest_s:g} to {margin.period_s:g} s apart"
-    return (
-        f"{margin.scenario}: growth of the worst loss pattern per {margin.period_s:g} s, "
-        f"{times}, {margin.between_updates}{delay}"
-    )
-
-
-def margin_rows(margin: MarginResult) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of the table of the bounds."""
-    for m, growth in margin.caps:
-        yield str(m), str(m - 1), *_growth(growth), growth.verdict
-
-
 def _growth(growth: Stability) -> tuple[str, str]:
     return at_least(growth.lower, decimals=9), at_most(growth.upper, decimals=9)
 
@@ -269,15 +247,25 @@ def print_margin(console: Console, margin: MarginResult) -> None:
 
 def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
     """Yield the bounds of the growth for each M, and for guarantees that are compared."""
-    rows = [*margin_rows(margin)]
-    yield ResultTable("margin", margin_title(margin), MARGIN_HEADINGS, rows)
+    delay = f", updates delayed by {margin.delay_s:g} s" if margin.delay_s else ""
+    times = f"with an update every {margin.period_s:g} s"
+    if not margin.is_periodic:
+        times = f"with updates {margin.shortest_s:g} to {margin.period_s:g} s apart"
+    yield ResultTable(
+        "margin",
+        f"{margin.scenario}: growth of the worst loss pattern per {margin.period_s:g} s, "
+        f"{times}, {margin.between_updates}{delay}",
+        ("M", "maximum consecutive losses (M − 1)", "at least", "at most", "verdict"),
+        [(str(m), str(m - 1), *_growth(growth), growth.verdict) for m, growth in margin.caps],
+    )
     if margin.compared.guarantees:
         rows = [
             (meaning, *_growth(growth), growth.text, growth.verdict)
             for meaning, growth in margin.compared.guarantees
         ]
         title = f"{margin.scenario}: the scenario's guarantee, and others"
-        yield ResultTable("guarantees", title, _COMPARED_HEADINGS, rows)
+        headings = ("guarantee", "at least", "at most", "worst pattern", "verdict")
+        yield ResultTable("guarantees", title, headings, rows)
 
 
 def print_mean_cost(console: Console, cost: MeanCost) -> None:
@@ -302,24 +290,22 @@ def mean_cost_tables(costs: MeanCost) -> Iterator[ResultTable]:
     title = f"{costs.scenario}: moments and cost, with an update every {costs.period_s:g} s, {mode}"
     headings = ["", *(cost.guarantee for cost in known)]
     rows = [("growth of √E‖z‖² per period", *(f"{cost.growth:.6g}" for cost in known))]
+
+    def add(label: str, values: Iterable[float | None], unit: str = "") -> None:
+        rows.append((label, *("∞" if value is None else number(value, 6) + unit for value in values)))
+
     for rms, names, where in (
         ("state_rms", costs.state_names, ""),
         ("state_rms_at_transmissions", costs.state_names, " at transmissions"),
         ("input_rms", costs.input_names, ""),
-        ("cost_per_s", None, ""),
     ):
-        values = [cost.stationary and getattr(cost.stationary, rms) for cost in known]
-        if names is None:
-            cells = ("∞" if v is None else f"{number(v, 6)} /s" for v in values)
-            rows.append(("mean cost, stationary", *cells))
-            continue
         for i, name in enumerate(names):
-            cells = ("∞" if v is None else number(v[i], 6) for v in values)
-            rows.append((f"rms of {name}{where}", *cells))
-    until = (number(cost.horizon_cost, 6) for cost in known)
-    rows.append((f"mean cost from x(0) until {costs.horizon_s:g} s", *until))
-    transient = ("∞" if (v := cost.transient_cost) is None else number(v, 6) for cost in known)
-    rows.append(("mean cost from x(0), without disturbances and noise", *transient))
+            found = (cost.stationary and getattr(cost.stationary, rms)[i] for cost in known)
+            add(f"rms of {name}{where}", found)
+    add("mean cost, stationary", (cost.stationary and cost.stationary.cost_per_s for cost in known), " /s")
+    add(f"mean cost from x(0) until {costs.horizon_s:g} s", (cost.horizon_cost for cost in known))
+    transients = (cost.transient_cost for cost in known)
+    add("mean cost from x(0), without disturbances and noise", transients)
     yield ResultTable("cost", title, headings, rows)
 
 
@@ -372,8 +358,11 @@ def moments_table(unlimited: UnlimitedLosses, error: str, beta: float) -> Result
         error: how the norm of e_c is written, in the trigger's norm.
         beta: β of the trigger, by which the bounds at events are multiplied.
     """
-    bounds = [
-        *(("at every time", m.rate_per_s, m.order, m.state, m.controller_error) for m in unlimited.moments),
+    bounds: list[tuple[str, float, int, float | None, float]] = []
+    if (found := unlimited.mean_squares) is not None:  # a mean is at most the root mean square
+        values = found.state, found.controller_error
+        bounds += [("at every time", found.rate_per_s, order, *values) for order in _MOMENT]
+    bounds += [
         *(("largest of a run", m.rate_per_s, m.order, m.state, m.controller_error) for m in unlimited.runs),
         *(
             ("before an event", unlimited.paper_rate_per_s or 0.0, order, None, beta * value)
@@ -386,15 +375,15 @@ def moments_table(unlimited: UnlimitedLosses, error: str, beta: float) -> Result
         row[f"{_MOMENT[order]}\n{error}"] = at_most(controller_error)
         if state is not None:
             row[f"{_MOMENT[order]}\n‖x‖"] = at_most(state)
-    values = [f"{moment}\n{norm}" for norm in ("‖x‖", error) for moment in _MOMENT.values()]
+    columns = [f"{moment}\n{norm}" for norm in ("‖x‖", error) for moment in _MOMENT.values()]
     losses = f"independent losses with probability {unlimited.largest_probability:.4g}"
     if not unlimited.is_independent:
         losses = f"losses with probability at most {at_most(unlimited.largest_probability)} given any past"
     return ResultTable(
         "moments",
         f"without the guarantee, {losses}: bounds of means over runs, multiplied by e^(−rate·t)",
-        ("", "rate,\n1/s", *values),
-        [(*key, *(row.get(value, NONE) for value in values)) for key, row in cells.items()],
+        ("", "rate,\n1/s", *columns),
+        [(*key, *(row.get(column, NONE) for column in columns)) for key, row in cells.items()],
     )
 
 
@@ -410,13 +399,12 @@ def sentences(unlimited: UnlimitedLosses) -> Iterator[str]:
     if unlimited.at_events:
         yield "Before an event: under the paper's conditions (no sampling, no delay, no hold)."
     if unlimited.void is not None:
-        order = _MOMENT[len(unlimited.moments) + 1]
-        yield f"At every time no {order} is certified: {unlimited.void}."
+        yield f"At every time no mean is certified: {unlimited.void}."
     rates = {"": unlimited.sure_rate_per_s, " under the paper's conditions": unlimited.paper_rate_per_s}
     for conditions, rate_per_s in rates.items():
         if rate_per_s is not None:
             yield f"x decays almost surely{conditions}, at every rate below {at_least(rate_per_s, 3)} /s."
-    if unlimited.moments or unlimited.bursts:
+    if unlimited.mean_squares or unlimited.bursts:
         yield (
             "These are statements about many runs: one run cannot violate a mean. The "
             "probabilities are bounds; a campaign shows the frequencies, and with the metrics "

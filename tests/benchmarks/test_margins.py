@@ -6,24 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.cases.margins import random_loop
-from noack.core.clock import NEVER_NS
-from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import LossHistory
-from noack.theory.margins.exact_matrices import exponential, fixed, stacked
-from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
-
-
-def period(loop: TimeTriggeredLoop, slot: int, delivered: bool) -> Matrix:
-    """Return the map of (x, x_c, u, w) from a transmission to the next one, rounded."""
-    from_ns, times = slot * loop.times.period_ns, loop.times
-    until_ns, arrival_ns = from_ns + times.period_ns, from_ns + times.delay_ns
-    if not delivered:
-        return loop._between(from_ns, until_ns, NEVER_NS).interval().middle
-    start = fixed(np.eye(len(loop._latch.entries)))
-    state = loop._between(from_ns, arrival_ns, NEVER_NS) @ start
-    updated = exponential(loop._H, times.delay_ns) @ start.rows(loop._x)
-    state = stacked(state.rows(loop._x), updated, state.rows(loop._inputs))
-    return (loop._between(arrival_ns, until_ns, NEVER_NS) @ state).interval().middle
 
 
 @pytest.mark.parametrize("seed", [3, 5, 7, 9, 10, 13, 14, 15])  # others take up to a minute
@@ -32,7 +15,7 @@ def test_patterns_of_random_loops_grow_as_proven(seed: int) -> None:
     random = random_loop(seed)
     found = random.margin.stability(random.guarantee)
     loop, slots = random.margin.loop, random.margin.loop.times.slots
-    steps = [[period(loop, slot, fate) for fate in (False, True)] for slot in range(slots)]
+    steps = [[loop.period(slot, fate).middle for fate in (False, True)] for slot in range(slots)]
     fastest, longest = 0.0, 9
     for length in range(1, longest + 1):
         for pattern in product((True, False), repeat=length):

@@ -113,7 +113,7 @@ def paper(
     """
     if list_names:
         names = paper_results.NAMES if name is None else [name]
-        known = {result_name: paper_results.named(result_name).about for result_name in names}
+        known = {result_name: paper_results.find_result(result_name).about for result_name in names}
         cli.print_lines(json, known, *(f"{result_name:<18} {about}" for result_name, about in known.items()))
         return ExitStatus.OK
     if name is not None:

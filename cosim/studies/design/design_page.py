@@ -7,6 +7,7 @@ for a network (:class:`DesignOutcome`).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -29,7 +30,7 @@ from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
-from cosim.studies.design.design_search import WORDS, DesignResult, certified
+from cosim.studies.design.design_search import WORDS, DesignResult, certified, designed_name
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
 from noack.scenario.scenario import Scenario
@@ -41,48 +42,48 @@ _CAPTION = (
     "same draws. Candidates that settle too rarely to have a quantile are left out. The star is "
     "the chosen candidate on new draws."
 )
+_FRONT_CAPTION = "The trade-off curve; intervals have 95 % confidence, not corrected for the selection"
 _HEIGHT_IN = 3.8
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
-_DESIGNED = "_designed"
 _LOOP_HEADINGS = ("", "given", "designed")
 _HOLD_HEADINGS = ("between updates", "no destabilising pattern found for")
 _HOLD_CAPTION = "best loop tried with each hold strategy (proven is only what the designed loop tolerates)"
 
 
+def _write(
+    path: Path, figure: FigureDescription, figure_files: FigureFiles | None, **content: object
+) -> list[Path]:
+    template = templates(Path(__file__).parent).get_template("design.html.jinja")
+    html = template.render(figure=figure, **content)
+    return [write_whole(path, html), *save_figures([figure], path, figure_files)]
+
+
 def write_page(result: DesignResult, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
-    """Write page and figure; return the files.
+    """Write page and figure; return the files. All text except the figure is escaped.
 
     Raises:
         MachineError: they cannot be written.
     """
-    return [write_whole(path, page(result)), *save_figures([trade_off(result)], path, figure_files)]
-
-
-def page(result: DesignResult) -> str:
-    """Return the page as HTML; all text except the figure is escaped."""
     limits, bounds = result.limits, result.bounds or {}
-    lines = [
-        f"{100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
-        f"within {limits.settling_s:g} s",
-        *(f"{WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
-    ]
-    return (
-        templates(Path(__file__).parent)
-        .get_template("design.html.jinja")
-        .render(
-            title=result.name,
-            subtitle=f"{len(result.trials):,} candidates, {result.fresh.draws:,} draws, seed {result.seed}",
-            verdict=result.verdict(),
-            tone="good" if result.confirmed else "doubt" if result.feasible else "bad",
-            limits=lines,
-            certified=[certified(name, value) for name, value in bounds.items()],
-            conditions=result.conditions,
-            figure=trade_off(result),
-            headings=HEADINGS,
-            rows=rows(result),
-            scenario_toml=dumps(result.scenario),
-        )
+    return _write(
+        path,
+        trade_off(result),
+        figure_files,
+        title=result.name,
+        kind="design",
+        subtitle=f"{len(result.trials):,} candidates, {result.fresh.draws:,} draws, seed {result.seed}",
+        verdict=result.verdict(),
+        tone="good" if result.confirmed else "doubt" if result.feasible else "bad",
+        notes=[
+            f"required: {100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
+            f"within {limits.settling_s:g} s",
+            *(f"required: {WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
+            *(f"certified {result.conditions}: {certified(*bound)}" for bound in bounds.items()),
+        ],
+        heading="Trade-off",
+        tables=[(_FRONT_CAPTION, HEADINGS, rows(result), 0)],
+        scenario_toml=dumps(result.scenario),
     )
 
 
@@ -164,17 +165,29 @@ def print_found(console: Console, result: DesignResult) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
+class LoopResult(NamedTuple):
+    """What is found of a loop."""
+
+    reach: str
+    """The most that it is certified for."""
+    cells: dict[str, str]
+    """By heading."""
+    document: dict[str, object]
+    """As JSON."""
+
+
 @dataclass(frozen=True)
 class DesignOutcome:
     """The given loop and the best one found, as results."""
 
     name: str
     """Name of the given scenario."""
-    verdict: str
+    claim: str
+    """What is certified of both loops."""
+    given: LoopResult
+    best: LoopResult
     notes: Sequence[str]
     """What the reader should know of the search."""
-    cells: tuple[dict[str, str], dict[str, str]]
-    """Of the given loop and the best one, by heading."""
     scenario: Scenario
     """The scenario of the best loop, with the guarantee that it is certified for."""
     is_certified: bool
@@ -183,13 +196,17 @@ class DesignOutcome:
     """Whether it is another loop than the given one."""
     document: dict[str, object]
     """The limits and the size of the search, as JSON."""
-    original: dict[str, object]
-    """The given loop as JSON."""
-    best: dict[str, object]
     figure: FigureDescription
     by_hold: tuple[tuple[str, str], ...] = ()
     """Hold strategies that were tried, each with the most for which no pattern destabilises its best
     loop, as far as was searched."""
+
+    @property
+    def verdict(self) -> str:
+        """The result as a sentence."""
+        if not self.is_better:
+            return f"{self.best.reach} for the given loop; no better one was found"
+        return f"{self.claim}: {self.given.reach} before, {self.best.reach} after"
 
     @property
     def lines(self) -> str:
@@ -211,8 +228,7 @@ class DesignOutcome:
     @property
     def rows(self) -> list[tuple[str, str, str]]:
         """The comparison of both loops."""
-        original, best = self.cells
-        return [(heading, original[heading], best[heading]) for heading in original]
+        return [(heading, cell, self.best.cells[heading]) for heading, cell in self.given.cells.items()]
 
     def to_json(self) -> dict[str, object]:
         """Return the result and the lines for the scenario."""
@@ -221,13 +237,13 @@ class DesignOutcome:
             "verdict": self.verdict,
             "lines": self.lines,
             **self.document,
-            "given": self.original,
-            "best": self.best,
+            "given": self.given.document,
+            "best": self.best.document,
         }
 
     def written(self) -> str:
         """Return the scenario of the best loop as TOML, under a new name."""
-        name = f"{self.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}"
+        name = designed_name(self.name)
         description = f"{self.name}{', designed' * self.is_better}: {self.verdict}."
         return dumps(self.scenario.model_copy(update={"name": name, "description": description}))
 
@@ -248,15 +264,21 @@ def write_outcome(outcome: DesignOutcome, path: Path, figure_files: FigureFiles 
     Raises:
         MachineError: they cannot be written.
     """
-    page = templates(Path(__file__).parent).get_template("network.html.jinja")
-    html = page.render(
-        outcome=outcome,
-        headings=_LOOP_HEADINGS,
-        hold_headings=_HOLD_HEADINGS,
-        hold_caption=_HOLD_CAPTION,
+    by_hold = (_HOLD_CAPTION, _HOLD_HEADINGS, outcome.by_hold, 1)
+    return _write(
+        path,
+        outcome.figure,
+        figure_files,
+        title=outcome.name,
+        kind="design for a network",
+        subtitle="",
+        verdict=outcome.verdict,
+        tone="good" if outcome.is_better else "doubt",
+        notes=outcome.notes,
+        heading="Worst losses",
+        tables=[("Both loops", _LOOP_HEADINGS, outcome.rows, 1), *[by_hold] * (len(outcome.by_hold) > 1)],
         scenario_toml=outcome.written(),
     )
-    return [write_whole(path, html), *save_figures([outcome.figure], path, figure_files)]
 
 
 def print_design(console: Console, outcome: DesignOutcome) -> None:

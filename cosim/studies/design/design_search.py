@@ -147,17 +147,12 @@ def _require_certifiable(scenario: Scenario) -> None:
         raise CallerError(f"--bound: {outside}")
 
 
-def certificate_of(scenario: Scenario, limits: DesignLimits) -> ScenarioCertificate:
-    """Return the certificate of all plants in the box, or of the plant if there is no box."""
+def certified_bounds(scenario: Scenario, limits: DesignLimits) -> Bounds:
+    """Return the bounds for all plants in the box, or for the plant if there is no box."""
     resolved = resolve(scenario)
     late = resolved.certificate.late_periods
     conditions = nominal_conditions(resolved, late) if limits.schedule else ideal_conditions(resolved)
-    return certify_box(resolved, conditions) or certify(resolved, conditions)
-
-
-def _bounds_of(scenario: Scenario, limits: DesignLimits) -> Bounds:
-    """Return the certified bounds of a scenario."""
-    return bounds_of(certificate_of(scenario, limits), scenario)
+    return bounds_of(certify_box(resolved, conditions) or certify(resolved, conditions), scenario)
 
 
 def bounds_of(certificate: ScenarioCertificate, scenario: Scenario) -> Bounds:
@@ -272,7 +267,7 @@ class Search:
             trial.measured = measure(self.scenario(trial), self.limits, self._all)
             trial.full = True
         elif not trial.bounds:
-            trial.bounds = _bounds_of(self.scenario(trial), self.limits)
+            trial.bounds = certified_bounds(self.scenario(trial), self.limits)
 
 
 @dataclass(frozen=True)
@@ -314,7 +309,7 @@ class DesignResult:
         chosen = self.space.families[self.best.candidate.family].with_trigger(self.best.candidate)
         return chosen.model_copy(
             update={
-                "name": f"{chosen.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}",
+                "name": designed_name(chosen.name),
                 "description": f"{chosen.name} with the trigger that transmits least while "
                 f"{100 * self.limits.quantile:g} % of draws settle within "
                 f"{self.limits.settling_s:g} s.",
@@ -379,6 +374,11 @@ class DesignResult:
         return chosen | {"alpha_per_s": alpha_per_s, "beta": beta} | trial.measured._asdict()
 
 
+def designed_name(name: str) -> str:
+    """Return the name of a scenario that is designed from one of another name."""
+    return f"{name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}"
+
+
 def certified(name: Bounded, value: float) -> str:
     """Return a certified bound as text."""
     if not math.isfinite(value):
@@ -415,7 +415,7 @@ def design(
     scenario = search.scenario(best)
     try:
         _require_certifiable(scenario)
-        bounds = best.bounds or _bounds_of(scenario, limits)
+        bounds = best.bounds or certified_bounds(scenario, limits)
     except CallerError:  # a bound is not required here
         bounds = None
     return DesignResult(

@@ -10,6 +10,7 @@ searched together without gradients (Nelder and Mead). The result is measured on
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from cosim.output.figures.figure_description import Axis, FigureDescription, Lin
 from cosim.output.figures.palette import LOST, NETWORK
 from cosim.simulation.exact_simulation import Population, run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.design_page import DesignOutcome, figure_of, gain_text
+from cosim.studies.design.design_page import DesignOutcome, LoopResult, figure_of, gain_text
 from cosim.studies.design.design_search import WORDS, bounds_of
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.network_search import (
@@ -28,6 +29,7 @@ from cosim.studies.design.network_search import (
     Progress,
     Wish,
     examined_m,
+    nelder_mead,
     periodic_outcome,
     scaled_steps,
 )
@@ -230,8 +232,6 @@ class EventSearch:
         return original, chosen
 
     def _improve(self, start: EventLoop, most: int, progress: Progress) -> tuple[EventLoop, float]:
-        from scipy.optimize import minimize  # slow to import
-
         centre = np.array([*np.ravel(start.K), start.alpha_per_s, start.beta])
         scale = np.append(scaled_steps(np.array(start.K)), centre[-2:])
         best, value, tries = start, math.inf, 0
@@ -249,13 +249,7 @@ class EventSearch:
             return excess
 
         if most > 0:
-            simplex = np.vstack([np.zeros(centre.size), 0.2 * np.eye(centre.size)])
-            minimize(
-                objective,
-                np.zeros(centre.size),
-                method="Nelder-Mead",
-                options={"maxfev": most, "adaptive": True, "initial_simplex": simplex},
-            )
+            nelder_mead(objective, centre.size, 0.2, most)
         return best, value
 
 
@@ -274,75 +268,62 @@ def _rounded(entries: Vector, template: EventLoop, alpha_per_s: float, beta: flo
 
 def event_outcome(search: EventSearch, original: Certified, best: Certified) -> DesignOutcome:
     """Return what is shown of a search."""
-    limits = search.limits
-    is_network = search.wish.goal == "network"
-
-    def entry(certified: Certified) -> dict[str, object]:
-        return {"certified": certified.m or None, **certified.loop._asdict(), **certified.measured._asdict()}
-
-    plants = "for the whole box" if search.of_box else "for the scenario's own plant"
-    sent = f"{original.measured.transmissions:.4g} to {best.measured.transmissions:.4g}"
-    reach_before, reach_after = (_reach(search, certified) for certified in (original, best))
-    verdict = f"certified {plants}: {reach_before} before, {reach_after} after; transmissions {sent}"
-    if best.loop == original.loop:
-        verdict = f"{reach_after} for the given loop; no better one was found"
-    limit = f"a mean cost of at most {limits.cost:.4g}"
-    limit += f", at most {limits.transmissions:.4g} transmissions" if is_network else ""
-    for name, most in search.wish.bounds.items():
-        limit += f", {WORDS[name]} ≤ {most:g} certified"
-    document: dict[str, object] = {
-        "goal": search.wish.goal,
-        "of_box": search.of_box,
-        "limits": limits._asdict(),
-        "tried": search.tried,
-        "judged": search.judged,
-    }
-    proven = "its certificate is proven, that it is the best is not" if best.m else "it has no certificate"
-    notes = [
-        f"the best of {search.tried:,} loops tried with {limit}; {proven}",
-        "costs and transmissions are means over fresh draws with the scenario's own network",
-    ]
-    before, after = original.loop.alpha_per_s, best.loop.alpha_per_s
-    if after < before:
-        notes.append(
-            f"the threshold and the certified bounds decay at {after:.4g} /s instead of {before:.4g} /s"
-        )
+    of_network = search.wish.goal == "network"
     return DesignOutcome(
         search.scenario.name,
-        verdict,
-        notes,
-        (_cells(search, original), _cells(search, best)),
-        search.scenario_of(best.loop, best.m if is_network and best.m else None),
+        "certified " + ("for the whole box" if search.of_box else "for the scenario's own plant"),
+        _loop_result(search, original),
+        _loop_result(search, best),
+        list(_notes(search, original, best)),
+        search.scenario_of(best.loop, best.m if of_network and best.m else None),
         best.m > 0,
         best.loop != original.loop,
-        document,
-        entry(original),
-        entry(best),
+        {
+            "goal": search.wish.goal,
+            "of_box": search.of_box,
+            "limits": search.limits._asdict(),
+            "tried": search.tried,
+            "judged": search.judged,
+        },
         _figure(search, original, best),
     )
 
 
-def _reach(search: EventSearch, certified: Certified) -> str:
-    top = ", the most examined" if certified.m == search.most else ""
-    return f"M = {certified.m}{top}" if certified.m else "nothing certified"
+def _notes(search: EventSearch, original: Certified, best: Certified) -> Iterator[str]:
+    """Yield what the reader should know of a search."""
+    limits, before, after = search.limits, original.loop.alpha_per_s, best.loop.alpha_per_s
+    limit = f"a mean cost of at most {limits.cost:.4g}"
+    if search.wish.goal == "network":
+        limit += f", at most {limits.transmissions:.4g} transmissions"
+    for name, most in search.wish.bounds.items():
+        limit += f", {WORDS[name]} ≤ {most:g} certified"
+    proven = "its certificate is proven, that it is the best is not" if best.m else "it has no certificate"
+    yield f"the best of {search.tried:,} loops tried with {limit}; {proven}"
+    yield "costs and transmissions are means over fresh draws with the scenario's own network"
+    if after < before:
+        yield f"the threshold and the certified bounds decay at {after:.4g} /s instead of {before:.4g} /s"
 
 
-def _cells(search: EventSearch, certified: Certified) -> dict[str, str]:
+def _loop_result(search: EventSearch, certified: Certified) -> LoopResult:
+    loop, m, measured = certified
+
     def bound(m: int) -> str:
-        value = search.state_bound(certified.loop, m) if m else math.inf
+        value = search.state_bound(loop, m) if m else math.inf
         return at_most(value) if value < math.inf else NONE
 
+    reach = f"M = {m}{', the most examined' * (m == search.most)}" if m else "nothing certified"
     own_m = search.scenario.network.mansd + 1
-    return {
-        "certified for": _reach(search, certified),
-        "sup‖x‖ for that M at most": bound(certified.m),
+    cells = {
+        "certified for": reach,
+        "sup‖x‖ for that M at most": bound(m),
         f"sup‖x‖ with M = {own_m} at most": bound(own_m),
-        "cost, mean": f"{certified.measured.cost:.4g}",
-        "transmissions, mean": f"{certified.measured.transmissions:.4g}",
-        "α [1/s]": f"{certified.loop.alpha_per_s:.4g}",
-        "β": f"{certified.loop.beta:.4g}",
-        "K": gain_text(certified.loop.K),
+        "cost, mean": f"{measured.cost:.4g}",
+        "transmissions, mean": f"{measured.transmissions:.4g}",
+        "α [1/s]": f"{loop.alpha_per_s:.4g}",
+        "β": f"{loop.beta:.4g}",
+        "K": gain_text(loop.K),
     }
+    return LoopResult(reach, cells, {"certified": m or None, **loop._asdict(), **measured._asdict()})
 
 
 def _figure(search: EventSearch, original: Certified, best: Certified) -> FigureDescription:

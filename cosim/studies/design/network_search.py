@@ -22,7 +22,7 @@ import numpy as np
 from cosim.analysis.margin_search import stability_document
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import Axis, FigureDescription, Item, Line, Marks, Panel, Rule
-from cosim.studies.design.design_page import DesignOutcome, figure_of, gain_text
+from cosim.studies.design.design_page import DesignOutcome, LoopResult, figure_of, gain_text
 from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.hold_strategies import HOLDS, Hold, given_hold
@@ -36,7 +36,14 @@ from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows, rows_of
-from noack.theory.margins.loss_margin import LossMargin, Stability, list_bursts, without_timeout
+from noack.theory.margins.loss_margin import (
+    LossMargin,
+    Stability,
+    capped,
+    list_bursts,
+    uncapped,
+    without_timeout,
+)
 from noack.theory.margins.time_triggered_loop import LoopTimes
 from noack.trigger.periodic_trigger import PeriodicSettings
 
@@ -135,18 +142,9 @@ def time_triggered(scenario: Scenario, period_s: float | None) -> Scenario:
     return scenario.model_copy(update={"trigger": trigger})
 
 
-def _further(guarantee: LossGuarantee) -> LossGuarantee:
-    """Return the rules besides the cap M − 1."""
-    return LossGuarantee(tuple(rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)))
-
-
-def _capped(further: LossGuarantee, limit: int) -> LossGuarantee:
-    return LossGuarantee((LongestBurst(limit), *further.rules))
-
-
 def examined_m(scenario: Scenario, most: int) -> int:
     """Return the largest M to examine; above the bursts that the constraints allow, M means nothing."""
-    burst = _further(scenario.network.guarantee).longest_burst
+    burst = uncapped(scenario.network.guarantee).longest_burst
     return most if burst is None else min(most, burst + 1)
 
 
@@ -166,9 +164,9 @@ def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
             name = f"m = {m} of {wish.window}"
             rungs.append(Rung(name, m, guarantee, period_ns, settings))
         return rungs
-    further, most = _further(network.guarantee), examined_m(scenario, wish.most or _MOST_M)
     return [
-        Rung(f"M = {m}", m, _capped(further, m - 1), period_ns, {"mansd": m - 1}) for m in range(1, most + 1)
+        Rung(f"M = {m}", m, capped(network.guarantee, m - 1), period_ns, {"mansd": m - 1})
+        for m in range(1, examined_m(scenario, wish.most or _MOST_M) + 1)
     ]
 
 
@@ -252,7 +250,7 @@ class NetworkSearch:
         setting = self.ladder[rung]
         loop = self.quick_loop(candidate, setting.period_ns)
         graph = self.graph(setting, candidate.hold)
-        return graph.growth(loop.maps(graph.bursts)).logarithm
+        return graph.growth(loop.maps(graph.bursts))
 
     def cost(self, candidate: Candidate, rung: int) -> float:
         """Return the cost without losses."""
@@ -406,8 +404,6 @@ class NetworkSearch:
 
     def _improve(self, start: Candidate, rung: int, most: int) -> Candidate | None:
         """Return a loop near ``start`` whose lower bound is below 1 on a rung; None: none found."""
-        from scipy.optimize import minimize  # slow to import
-
         K = np.array(start.K)
         scale = scaled_steps(K)
 
@@ -418,23 +414,34 @@ class NetworkSearch:
                 raise _FoundError(candidate)
             return excess
 
-        simplex = np.vstack([np.zeros(K.size), 0.3 * np.eye(K.size)])
         try:
-            minimize(
-                objective,
-                np.zeros(K.size),
-                method="Nelder-Mead",
-                options={
-                    "maxfev": most,
-                    "adaptive": True,
-                    "initial_simplex": simplex,
-                    "xatol": 1e-4,
-                    "fatol": 1e-5,
-                },
-            )
+            nelder_mead(objective, K.size, 0.3, most, tolerance=1e-5)
         except _FoundError as success:
             return success.candidate
         return None
+
+
+def nelder_mead(
+    objective: Callable[[Vector], float], size: int, first_step: float, most: int, tolerance: float = 1e-4
+) -> None:
+    """Minimise without gradients from 0 on.
+
+    Args:
+        objective: to be minimised.
+        size: number of unknowns.
+        first_step: size of the first simplex.
+        most: largest number of evaluations.
+        tolerance: difference of values at which the search ends.
+    """
+    from scipy.optimize import minimize  # slow to import
+
+    simplex = np.vstack([np.zeros(size), first_step * np.eye(size)])
+    minimize(
+        objective,
+        np.zeros(size),
+        method="Nelder-Mead",
+        options={"maxfev": most, "adaptive": True, "initial_simplex": simplex, "fatol": tolerance},
+    )
 
 
 def scaled_steps(K: Matrix) -> Vector:
@@ -457,67 +464,53 @@ class _FoundError(Exception):
 
 def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) -> DesignOutcome:
     """Return what is shown of a search."""
-    ladder, wish = search.ladder, search.wish
-
-    def reach(reached: Reached) -> str:
-        if reached.rung < 0:
-            return "nothing proven"
-        return ladder[reached.rung].name + (", the most examined" * (reached.rung == len(ladder) - 1))
-
-    def sent(reached: Reached) -> float:
-        period_ns = ladder[max(reached.rung, 0)].period_ns
-        return search.scenario.timing.measurement_period_ns / period_ns
-
-    def cells(reached: Reached) -> dict[str, str]:
-        is_excluded = reached is original and not search.keeps_given_hold
-        return {
-            "proven stable for": reach(reached),
-            "growth per period there": _growth(reached.stability),
-            "the next one": _beyond(ladder, reached),
-            "cost without losses": f"{reached.cost:.4g}",
-            "share of measurements sent": f"{100 * sent(reached):.3g} %",
-            "between updates": reached.candidate.hold.text + " (not in --holds)" * is_excluded,
-            "K": gain_text(reached.candidate.K),
-        }
-
-    def entry(reached: Reached) -> dict[str, object]:
-        certified = None if reached.rung < 0 else ladder[reached.rung].number
-        figures = {"certified": certified, "cost": reached.cost, "transmitted": sent(reached)}
-        bounds = {"stability": _document(reached.stability), "beyond": _document(reached.beyond)}
-        hold, K = reached.candidate
-        return {**figures, "mode": hold.mode, "hold": hold.text, "K": K, **bounds}
-
-    verdict = f"proven stable for every loss pattern: {reach(original)} before, {reach(best)} after"
-    if best.candidate == original.candidate:
-        verdict = f"{reach(best)} for the given loop; no better one was found"
-    document: dict[str, object] = {
-        "goal": wish.goal,
-        "window": wish.window,
-        "cost_limit": search.limit,
-        "tried": search.tried,
-        "judged": search.judged,
-        "highest_by_hold": dict(search.by_hold()),
-    }
     return DesignOutcome(
         search.scenario.name,
-        verdict,
+        "proven stable for every loss pattern",
+        _loop_result(search, original, is_excluded=not search.keeps_given_hold),
+        _loop_result(search, best),
         list(_notes(search, original, best)),
-        (cells(original), cells(best)),
         search.scenario_of(best.candidate, best.rung),
         best.rung >= 0,
         best.candidate != original.candidate,
-        document,
-        entry(original),
-        entry(best),
+        {
+            "goal": search.wish.goal,
+            "window": search.wish.window,
+            "cost_limit": search.limit,
+            "tried": search.tried,
+            "judged": search.judged,
+            "highest_by_hold": dict(search.by_hold()),
+        },
         _figure(search, original, best),
         tuple(search.by_hold()),
     )
 
 
-def _growth(proven: Stability | None) -> str:
-    if proven is None:
-        return NONE
-    return f"{at_least(proven.lower, decimals=5)} to {at_most(proven.upper, decimals=5)}"
+def _loop_result(search: NetworkSearch, reached: Reached, *, is_excluded: bool = False) -> LoopResult:
+    ladder, (hold, K), proven = search.ladder, reached.candidate, reached.stability
+    rung = ladder[max(reached.rung, 0)]
+    sent = search.scenario.timing.measurement_period_ns / rung.period_ns
+    reach = rung.name + (", the most examined" * (reached.rung == len(ladder) - 1))
+    if reached.rung < 0:
+        reach = "nothing proven"
+    growth = (
+        f"{at_least(proven.lower, decimals=5)} to {at_most(proven.upper, decimals=5)}" if proven else NONE
+    )
+    cells = {
+        "proven stable for": reach,
+        "growth per period there": growth,
+        "the next one": _beyond(ladder, reached),
+        "cost without losses": f"{reached.cost:.4g}",
+        "share of measurements sent": f"{100 * sent:.3g} %",
+        "between updates": hold.text + " (not in --holds)" * is_excluded,
+        "K": gain_text(K),
+    }
+    certified = None if reached.rung < 0 else rung.number
+    document: dict[str, object] = {"certified": certified, "cost": reached.cost, "transmitted": sent}
+    document |= {"mode": hold.mode, "hold": hold.text, "K": K}
+    for name, stability in (("stability", proven), ("beyond", reached.beyond)):
+        document[name] = stability and stability_document(stability)
+    return LoopResult(reach, cells, document)
 
 
 def _notes(search: NetworkSearch, original: Reached, best: Reached) -> Iterator[str]:
@@ -543,10 +536,6 @@ def _beyond(ladder: Sequence[Rung], reached: Reached) -> str:
     destabilised = reached.beyond.verdict == "destabilised"
     result = f"{reached.beyond.text} destabilises" if destabilised else "undecided"
     return f"{ladder[reached.rung + 1].name}: {result}"
-
-
-def _document(stability: Stability | None) -> dict[str, object] | None:
-    return stability and stability_document(stability)
 
 
 def _figure(search: NetworkSearch, original: Reached, best: Reached) -> FigureDescription:

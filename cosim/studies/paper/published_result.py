@@ -107,14 +107,16 @@ def print_rows(console: "Console", reproduction: Reproduction) -> None:
     console.print(verdict, style="bold" if reproduction.as_expected else "bold red", highlight=False)
 
 
-def number(quantity: str, place: str, published: float, computed: float, method: str, *, digits: int) -> Row:
+def value_row(
+    quantity: str, place: str, published: float, computed: float, method: str, *, digits: int
+) -> Row:
     """Return the row of a number that is published with so many digits after the point."""
     agrees = abs(computed - published) <= 0.5000001 * 10.0**-digits
     texts = f"{published:.{digits}f}", f"{computed:.{digits + 1}f}"
     return Row(quantity, place, "=", *texts, method, agrees)
 
 
-def stored(name: str) -> dict[str, dict[str, Matrix]]:
+def stored_matrices(name: str) -> dict[str, dict[str, Matrix]]:
     """Return the tables of numbers, published or found, beside the result in NAME.toml."""
     path = Path(__file__).parent / "results" / f"{name}.toml"
     tables = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -126,7 +128,7 @@ def shipped_loop(name: str, settings: Iterable[str] = ()) -> ContinuousLoop:
     return continuous_loop_of(resolve(load(find_shipped(name, "scenarios"), list(settings))))
 
 
-def directions(draws: int, n: int) -> Matrix:
+def unit_states(draws: int, n: int) -> Matrix:
     """Return initial states of length 1: evenly spaced for two states, else random, (draws, n)."""
     if n == 2:
         angles = np.linspace(0.0, math.pi, draws, endpoint=False)
@@ -135,7 +137,7 @@ def directions(draws: int, n: int) -> Matrix:
     return np.asarray(states / np.linalg.norm(states, axis=1, keepdims=True), np.float64)
 
 
-def run_all(loop: ContinuousLoop, x0: Matrix, horizon_s: float, places: int = 2000) -> EventLog:
+def run_from_each(loop: ContinuousLoop, x0: Matrix, horizon_s: float, places: int = 2000) -> EventLog:
     """Return the events of a run from each initial state; every update arrives.
 
     Raise MachineError if a run has more events than there are places.

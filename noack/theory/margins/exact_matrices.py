@@ -59,28 +59,38 @@ class IntervalMatrix(NamedTuple):
         bound: NDArray[np.float64] = (np.abs(self.middle) + self.radius) * _ENLARGED
         return bound
 
+    @property
+    def transposed(self) -> "IntervalMatrix":
+        """The transposed matrices."""
+        return IntervalMatrix(self.middle.swapaxes(-1, -2), self.radius.swapaxes(-1, -2))
+
+    def at(self, numbers: NDArray[np.int64] | NDArray[np.bool_]) -> "IntervalMatrix":
+        """Return some matrices of a stack."""
+        return IntervalMatrix(self.middle[numbers], self.radius[numbers])
+
 
 def exactly(matrix: Matrix) -> IntervalMatrix:
     """Return a matrix that is known exactly."""
     return IntervalMatrix(matrix, np.zeros_like(matrix))
 
 
-def inverse(matrix: Matrix) -> IntervalMatrix | None:
-    """Enclose the inverse of an invertible matrix, (n, n); None if that fails.
+def inverse(matrices: Matrix) -> IntervalMatrix | None:
+    """Enclose the inverses of invertible matrices, (…, n, n); None if that fails for one of them.
 
     With an approximate inverse R and E = I − R M: M⁻¹ − R = E M⁻¹, so M⁻¹ differs from R by at most
     ‖E‖∞/(1 − ‖E‖∞) times the largest entry of each column of R.
     """
     try:
-        approximate: Matrix = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+        approximate: Matrix = np.asarray(np.linalg.inv(matrices), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
-    product = exactly(approximate) @ exactly(matrix)
-    defect = float((exactly(np.eye(len(matrix))) - product).magnitude.sum(axis=1).max())
-    if not defect * _ENLARGED < 0.5:
+    errors = exactly(np.eye(matrices.shape[-1])) - exactly(approximate) @ exactly(matrices)
+    defects = errors.magnitude.sum(axis=-1).max(axis=-1)
+    if not (defects * _ENLARGED < 0.5).all():
         return None
-    columns = np.abs(approximate).max(axis=0) * (defect / (1 - defect)) * _ENLARGED**4
-    return IntervalMatrix(approximate, np.broadcast_to(columns, matrix.shape).copy())
+    shares = (defects / (1 - defects))[..., None, None]
+    columns = np.abs(approximate).max(axis=-2, keepdims=True) * shares * _ENLARGED**4
+    return IntervalMatrix(approximate, np.broadcast_to(columns, matrices.shape).copy())
 
 
 @dataclass(frozen=True)
@@ -99,6 +109,10 @@ class FixedPointMatrix:
         crossed = self.error * other.error * len(other.entries)
         error = ((rows * other.error + self.error * columns + crossed) >> _DIGITS) + 2
         return FixedPointMatrix((self.entries @ other.entries) >> _DIGITS, error)
+
+    def then(self, later: "FixedPointMatrix") -> "FixedPointMatrix":
+        """Return the product for x that becomes M x, and then is multiplied by another matrix."""
+        return later @ self
 
     def __add__(self, other: "FixedPointMatrix") -> "FixedPointMatrix":
         """Return the sum."""
@@ -132,18 +146,6 @@ def stacked(*parts: FixedPointMatrix) -> FixedPointMatrix:
     return FixedPointMatrix(entries, max(part.error for part in parts))
 
 
-def power(matrix: FixedPointMatrix, exponent: int) -> FixedPointMatrix:
-    """Return a power by repeated squaring; the exponent is not negative."""
-    result = fixed(np.eye(len(matrix.entries)))
-    while exponent:
-        if exponent & 1:
-            result = matrix @ result
-        exponent >>= 1
-        if exponent:
-            matrix = matrix @ matrix
-    return result
-
-
 def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
     """Return e^{G dt}, with G per second, by Taylor's series and repeated squaring."""
     whole = fixed(generator)
@@ -159,4 +161,6 @@ def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
         term = FixedPointMatrix(term.entries // order, term.error // order + 2)
         total = total + term
     total = FixedPointMatrix(total.entries, total.error + 1)
-    return power(total, 1 << halvings)
+    for _ in range(halvings):
+        total = total @ total
+    return total

@@ -11,7 +11,7 @@ vertices. It is computed for many points at once by the simplex method. Each bas
 gives an upper bound of ‖y‖, and an exchange of one vertex improves it. Every basis is thus a proof.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,11 +26,9 @@ _IMPROVEMENT = 1e-11
 _PIVOT = 1e-9
 _PRODUCTS = 250_000
 """Of a product of matrices: the BLAS uses several threads for larger ones, which is slower here."""
-_NONE = -1
 _ENLARGED = 1 + 2.0**-40
 UNIT = 0.1
 _INSIDE = 1 - 1e-9
-_MUCH_LARGER = 1.3
 _ROUNDS = 60
 _WORK_PER_VERTEX = 1_000_000
 _FARTHEST = 1e3
@@ -70,29 +68,11 @@ class PolytopeNorm:
 
     def combinations(self, points: Matrix, enough: float = 0.0) -> Combinations:
         """Return combinations for points, (k, n), of the smallest norm, or at most ``enough``."""
-        excluded = np.full(len(points), _NONE)
-        return self._in_chunks(points, enough, excluded)
-
-    def redundant(self, first: int, enough: float) -> NDArray[np.bool_]:
-        """Return which vertices from number ``first`` on have a norm up to ``enough`` without them.
-
-        Each is compared with all others; the unit vectors are never redundant.
-        """
-        numbers = np.arange(first, len(self.vertices))
-        norms = self._in_chunks(self.vertices[first:], enough, numbers).norms
-        redundant = np.zeros(len(self.vertices), dtype=bool)
-        redundant[first:] = (norms <= enough) & (numbers >= self.vertices.shape[1])
-        return redundant
-
-    def _in_chunks(self, points: Matrix, enough: float, excluded: NDArray[np.int64]) -> Combinations:
         chunk = max(_PRODUCTS // self.vertices.size, 16)
-        parts = [
-            self._combinations(points[i : i + chunk], enough, excluded[i : i + chunk])
-            for i in range(0, len(points), chunk)
-        ]
+        parts = [self._combinations(points[i : i + chunk], enough) for i in range(0, len(points), chunk)]
         return Combinations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
-    def _combinations(self, points: Matrix, enough: float, excluded: NDArray[np.int64]) -> Combinations:
+    def _combinations(self, points: Matrix, enough: float) -> Combinations:
         (k, n), V = points.shape, self.vertices
         chosen = np.tile(np.arange(n), (k, 1))
         signs = np.where(points >= 0, 1.0, -1.0) * np.sign(np.diag(V[:n]))
@@ -109,7 +89,6 @@ class PolytopeNorm:
             # The vertex that violates the dual's inequalities most enters the basis.
             scores = undone.sum(axis=2) @ V.T
             self.work += scores.size * n
-            scores[excluded[active] != _NONE, excluded[active][excluded[active] != _NONE]] = 0.0
             entering = np.abs(scores).argmax(axis=1)
             value = scores[np.arange(len(active)), entering]
             sign = np.sign(value)
@@ -136,24 +115,24 @@ class PolytopeNorm:
         combinations = self.combinations(points.middle, enough)
         basis = exactly(self.vertices[combinations.vertices])
         sums = exactly(combinations.coefficients[:, None, :]) @ basis
-        missed = (points - IntervalMatrix(sums.middle[:, 0], sums.radius[:, 0])).magnitude
+        missed = (points - IntervalMatrix(*(part[:, 0] for part in sums))).magnitude
         bounds = (combinations.norms + (missed / self._units).sum(axis=1)) * _ENLARGED
         return np.where(np.isnan(bounds), np.inf, bounds)
 
 
-def initial_vertices(system: SwitchedSystem, cycle: Cycle, growth: float) -> dict[int, Matrix]:
+def initial_vertices(system: SwitchedSystem, cycle: Cycle, growth: float) -> list[Matrix]:
     """Return small unit vectors, and the leading eigenvectors of a cycle, at each node."""
-    vertices = {node: [UNIT * np.eye(n)] for node, n in system.dimensions.items()}
+    vertices = [UNIT * np.eye(system.dimension) for _ in range(system.graph.nodes)]
     if cycle.path:
         values, vectors = np.linalg.eig(system.product(cycle.path).middle)
         leading = vectors[:, int(np.abs(values).argmax())]
         rows = np.array([leading.real, leading.imag])
         rows = rows[np.linalg.norm(rows, axis=1) > 1e-9]
         for number in cycle.path:
-            edge = system.edges[number]
-            vertices[edge.source].append(rows)
-            rows = rows @ edge.matrix.middle.T / growth**edge.duration
-    return {node: np.concatenate(parts) for node, parts in vertices.items()}
+            source = system.graph.sources[number]
+            vertices[source] = np.concatenate([vertices[source], rows])
+            rows = rows @ system.matrices.middle[number].T / growth ** system.graph.durations[number]
+    return vertices
 
 
 @dataclass
@@ -162,16 +141,14 @@ class InvariantPolytopes:
 
     system: SwitchedSystem
     growth: float
-    vertices: dict[int, Matrix]
-    """By node, (m, n)."""
-    _examined: dict[int, int] = field(default_factory=dict)
-    """Number of vertices after the last search for redundant ones, by node."""
+    vertices: list[Matrix]
+    """Of each node, (m, n)."""
     _work: int = 0
 
     @property
     def count(self) -> int:
         """Number of vertices."""
-        return sum(map(len, self.vertices.values()))
+        return sum(map(len, self.vertices))
 
     def grow(self, most_vertices: int) -> bool:
         """Add images until all are inside.
@@ -180,13 +157,14 @@ class InvariantPolytopes:
         should cost, or when the vertices show that a path grows faster than γ, or after 60 rounds.
         """
         most_work = (most_vertices + self.count) * _WORK_PER_VERTEX
-        pending, most_vertices = dict(self.vertices), self.count + most_vertices
+        pending, most_vertices = dict(enumerate(self.vertices)), self.count + most_vertices
+        graph = self.system.graph
+        steps = self.system.matrices.middle / (self.growth**graph.durations)[:, None, None]
         for _ in range(_ROUNDS):
             images: dict[int, list[Matrix]] = {}
-            for edge in self.system.edges:
-                if edge.source in pending:
-                    image = pending[edge.source] @ edge.matrix.middle.T
-                    images.setdefault(edge.target, []).append(image / self.growth**edge.duration)
+            for source, target, step in zip(graph.sources, graph.targets, steps, strict=True):
+                if source in pending:
+                    images.setdefault(target, []).append(pending[source] @ step.T)
             pending = {}
             for node, parts in images.items():
                 added = self._add(node, np.concatenate(parts))
@@ -200,7 +178,7 @@ class InvariantPolytopes:
         return False
 
     def _add(self, node: int, points: Matrix) -> Matrix:
-        """Add the points that are outside, the farthest first; return those that are vertices."""
+        """Add the points that are outside, the farthest first; return them."""
         before = len(self.vertices[node])
         while len(points):
             norm = PolytopeNorm(self.vertices[node])
@@ -210,26 +188,16 @@ class InvariantPolytopes:
             order = order[norms[order] > _INSIDE]
             largest, points = np.split(points[order], [max(4, len(order) // 4)])
             self.vertices[node] = np.concatenate([self.vertices[node], largest])
-        if len(self.vertices[node]) == before:
-            return points
-        # Without points in its interior it is the same polytope.
-        everywhere = len(self.vertices[node]) > _MUCH_LARGER * self._examined.get(node, 0)
-        norm = PolytopeNorm(self.vertices[node])
-        is_new = ~norm.redundant(0 if everywhere else before, _INSIDE)
-        self._work += norm.work
-        added = self.vertices[node][before:][is_new[before:]]
-        self.vertices[node] = self.vertices[node][is_new]
-        if everywhere:
-            self._examined[node] = len(self.vertices[node])
-        return added
+        return self.vertices[node][before:]
 
     def bound(self) -> float:
         """Return a rigorous upper bound of the joint spectral radius, from the polytopes."""
-        growths = [0.0]
-        for edge in self.system.edges:
-            M = edge.matrix
-            images = exactly(self.vertices[edge.source]) @ IntervalMatrix(M.middle.T, M.radius.T)
-            norm, inside = PolytopeNorm(self.vertices[edge.target]), self.growth**edge.duration
+        graph, growths = self.system.graph, [0.0]
+        for source, target, duration, middle, radius in zip(
+            graph.sources, graph.targets, graph.durations, *self.system.matrices, strict=True
+        ):
+            images = exactly(self.vertices[source]) @ IntervalMatrix(middle, radius).transposed
+            norm, inside = PolytopeNorm(self.vertices[target]), self.growth**duration
             largest = float(norm.bounds(images, inside).max())
-            growths.append(largest ** (1 / edge.duration) * (1 + 1e-15))
+            growths.append(largest ** (1 / duration) * (1 + 1e-15))
         return max(growths)

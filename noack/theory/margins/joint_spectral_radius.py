@@ -12,7 +12,6 @@ threshold is much shorter than one for a growth just above the radius.
 """
 
 import math
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -21,25 +20,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Vector
-from noack.theory.margins.exact_matrices import IntervalMatrix
+from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.margins.invariant_polytopes import InvariantPolytopes, initial_vertices
 from noack.theory.margins.quadratic_norms import (
     FEW_ENTRIES,
     MOST_ENTRIES,
     NormSearch,
-    entries_of,
     norms_above,
+    number_of_entries,
     remembering,
     representatives,
 )
 from noack.theory.margins.switched_system import (
     Cycle,
     Edge,
+    Numbers,
     SwitchedSystem,
     find_cycle,
     growth_bounds,
-    only_cycle,
-    strongly_connected,
 )
 
 ACCURACY = 2e-4
@@ -59,17 +57,10 @@ _LEAST_GROWTH = 1e-3
 _SMALLEST_POWER = 1e-280
 """Growths whose power by a duration is smaller are not distinguished from 0."""
 _ROUNDED = 1 + 1e-8
+_SEARCH, _LONG_SEARCH = (20, 100), (40, 300)
+"""Length of the cycles that are tried, at least the number of nodes, and the width of the beam."""
 _WITHIN = 0.1
 """A growth below the threshold by this share of its distance from the lower bound is proven."""
-
-
-class _CycleSearch(NamedTuple):
-    edges: int
-    """Length of the cycles that are tried; at least the number of nodes."""
-    beam: int
-
-
-_SEARCH, _LONG_SEARCH = _CycleSearch(20, 100), _CycleSearch(40, 300)
 
 
 class JointSpectralRadius(NamedTuple):
@@ -104,17 +95,17 @@ def joint_spectral_radius(
         threshold: a number with which the radius is compared, with more work than its enclosure.
         effort: factor of the limits of the work for this comparison.
     """
-    numbers = {id(edge): number for number, edge in enumerate(edges)}
+    system = SwitchedSystem.of(edges)
     lower, upper, vertices, needed_effort = 0.0, 0.0, 0, 0.0
     path: tuple[int, ...] = ()
-    for part in strongly_connected(edges):
-        enclosure = _Enclosure(part, most_vertices)
+    for numbers in system.graph.strongly_connected():
+        enclosure = _Enclosure(system.at(numbers), most_vertices)
         if threshold is not None and not enclosure.is_decided(threshold):
             needed_effort = max(needed_effort, enclosure.compare(threshold, effort))
         enclosure.sharpen(accuracy)
         if enclosure.cycle.growth > lower:
             lower = enclosure.cycle.growth
-            path = tuple(numbers[id(part.edges[i])] for i in enclosure.cycle.path)
+            path = tuple(numbers[list(enclosure.cycle.path)].tolist())
         upper, vertices = max(upper, enclosure.upper), vertices + enclosure.vertices
     if threshold is not None and not lower <= threshold <= upper:
         needed_effort = 0.0
@@ -128,10 +119,9 @@ class _Enclosure:
         system = system.in_similar_units()
         self._system, self._most_vertices = system, most_vertices
         self.upper, self.vertices = math.inf, 0
-        leaving = Counter(edge.source for edge in system.edges)
-        self._is_large = not most_vertices or max(leaving.values()) > MOST_LEAVING
+        self._is_large = not most_vertices or max(map(len, system.graph.leaving)) > MOST_LEAVING
         self._searches: dict[bool, NormSearch] = {}
-        only = only_cycle(system)
+        only = system.graph.only_cycle()
         if only is not None:
             bounds = [growth_bounds(part, only) for part in (system, self._balanced)]
             lowers, uppers = zip(*bounds, strict=True)
@@ -139,12 +129,9 @@ class _Enclosure:
         elif self._is_large:
             norms = self._search().improve(0.0)
             self._improve(norms.upper)
-            numbers = representatives(system, norms.growths)
-            fastest = SwitchedSystem(tuple(system.edges[number] for number in numbers))
-            turned = fastest.in_coordinates(norms.forms) or fastest
-            cycle = _best_cycle(fastest, turned, _SEARCH)
-            path = tuple(numbers[number] for number in cycle.path)
-            self.cycle = cycle._replace(path=path)
+            numbers = representatives(system.graph, norms.growths)
+            cycle = _best_cycle(system.at(numbers), (norms.system or system).at(numbers), _SEARCH)
+            self.cycle = cycle._replace(path=tuple(numbers[list(cycle.path)].tolist()))
         else:
             self.cycle = _best_cycle(system, self._balanced, _SEARCH)
 
@@ -159,10 +146,10 @@ class _Enclosure:
     @cached_property
     def _remembering(self) -> SwitchedSystem:
         """The same system with more nodes, if they are not too many for the search for norms."""
-        reaching = Counter(edge.target for edge in self._system.edges)
-        for classes in (_REMEMBERED,) if self._is_large else (max(reaching.values()), _REMEMBERED):
+        reaching = int(np.bincount(self._system.graph.targets).max())
+        for classes in (_REMEMBERED,) if self._is_large else (reaching, _REMEMBERED):
             system = remembering(self._system, classes)
-            if entries_of(system) <= FEW_ENTRIES:
+            if number_of_entries(system) <= FEW_ENTRIES:
                 return system
         return self._system
 
@@ -201,8 +188,9 @@ class _Enclosure:
         """Bring the bounds together as far as the limits of the work allow."""
         is_first = True
         while self.cycle.growth * (1 + accuracy) < self.upper and accuracy < _COARSEST:
-            longest = max(edge.duration for edge in self._system.edges)
-            least = max(_LEAST_GROWTH * _largest(self._balanced), _SMALLEST_POWER ** (1 / longest))
+            longest = int(self._system.graph.durations.max())
+            largest = float(np.abs(self._balanced.matrices.middle).max())
+            least = max(_LEAST_GROWTH * largest, _SMALLEST_POWER ** (1 / longest))
             growth = max(self.cycle.growth, least) * (1 + accuracy)
             self._prove_by_polytopes(growth, self._most_vertices)
             if self.upper <= growth * _ROUNDED:
@@ -237,29 +225,23 @@ class _Enclosure:
         self._improve(norms.upper)
         if self.upper <= growth * _ROUNDED:
             return math.inf  # if the threshold is not above the bound, by rounding only
-        system = self._remembering if remembers else self._system
-        turned = system.in_coordinates(norms.forms)
-        if turned is None:
+        if norms.system is None:
             return math.inf
         try:
-            bound = bound_by_products(turned, growth, entries, slowest=self.cycle.growth)
+            bound = bound_by_products(norms.system, growth, entries, slowest=self.cycle.growth)
         except FloatingPointError:  # an overflow, where the caller has asked for it
             return math.inf
         self._improve(bound.upper)
         return bound.needed_products / entries
 
 
-def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _CycleSearch) -> Cycle:
-    longest = min(max(search.edges, len(system.dimensions)), _MOST_CYCLE_EDGES)
-    cycle = find_cycle(balanced, longest, search.beam)
+def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: tuple[int, int]) -> Cycle:
+    most_edges, beam = search
+    cycle = find_cycle(balanced, min(max(most_edges, system.graph.nodes), _MOST_CYCLE_EDGES), beam)
     if not cycle.path:
         return cycle
     # The original matrices have smaller radii.
     return cycle._replace(growth=max(cycle.growth, growth_bounds(system, cycle.path)[0]))
-
-
-def _largest(system: SwitchedSystem) -> float:
-    return max(float(np.abs(edge.matrix.middle).max()) for edge in system.edges)
 
 
 _LARGEST_EXPONENT, _NEAR_1 = 600.0, 1e-6
@@ -277,23 +259,29 @@ class ProductBound(NamedTuple):
 
 
 class _Paths(NamedTuple):
-    """Products of paths between two nodes, which are to be continued."""
+    """Products of k paths."""
 
+    ends: Numbers
+    """The nodes that they lead to, (k,)."""
     matrices: IntervalMatrix
-    """(k, n_w, n_v)."""
-    durations: Vector
+    """(k, n, n)."""
+    durations: Numbers
     """(k,)."""
     growths: Vector
     """Upper bounds of ‖Π‖^(1/duration), (k,)."""
 
-    def where(self, kept: NDArray[np.bool_]) -> "_Paths":
+    def at(self, numbers: NDArray[np.bool_]) -> "_Paths":
         """Return some of the paths."""
-        matrices = IntervalMatrix(self.matrices.middle[kept], self.matrices.radius[kept])
-        return _Paths(matrices, self.durations[kept], self.growths[kept])
+        matrices = self.matrices.at(numbers)
+        return _Paths(self.ends[numbers], matrices, self.durations[numbers], self.growths[numbers])
 
-
-_Ends = tuple[int, int]
-"""Source and target of paths."""
+    def then(self, system: SwitchedSystem, edge: int) -> "_Paths":
+        """Return the paths, of which all lead to the source of an edge, continued by it."""
+        graph = system.graph
+        matrices = system.matrices.at(np.array([edge])) @ self.matrices
+        durations = self.durations + graph.durations[edge]
+        growths = norms_above(matrices) ** (1 / durations) * (1 + 1e-15)
+        return _Paths(np.full_like(self.ends, graph.targets[edge]), matrices, durations, growths)
 
 
 def bound_by_products(
@@ -312,65 +300,46 @@ def bound_by_products(
         most_products: limit of the work.
         slowest: a lower bound of the joint spectral radius, for the estimate.
     """
-    leaving: dict[int, list[Edge]] = {}
-    for edge in system.edges:
-        leaving.setdefault(edge.source, []).append(edge)
+    graph, n = system.graph, system.dimension
     upper, products, before, steps = 0.0, 0, 0, 0
-    paths: dict[_Ends, _Paths] = {
-        (node, node): _Paths(IntervalMatrix(np.eye(n)[None], np.zeros((1, n, n))), np.zeros(1), np.zeros(1))
-        for node, n in system.dimensions.items()
-    }
-    while paths:
-        longer: dict[_Ends, list[_Paths]] = {}
-        for (source, target), group in paths.items():
-            for edge in leaving[target]:
-                following = _continued(group, edge)
-                products += len(following.durations)
-                ended = following.growths <= growth
-                upper = max(upper, float(following.growths[ended].max(initial=0.0)))
-                if not ended.all():
-                    longer.setdefault((source, edge.target), []).append(following.where(~ended))
-        paths = {ends: _joined(parts) for ends, parts in longer.items()}
+    identity, starts = np.tile(np.eye(n), (graph.nodes, 1, 1)), np.arange(graph.nodes)
+    paths = _Paths(starts, exactly(identity), np.zeros_like(starts), np.zeros(graph.nodes))
+    while len(paths.ends):
+        longer: list[_Paths] = []
+        for edge, source in enumerate(graph.sources):
+            following = paths.at(paths.ends == source).then(system, edge)
+            products += len(following.ends)
+            ended = following.growths <= growth
+            upper = max(upper, float(following.growths[ended].max(initial=0.0)))
+            longer.append(following.at(~ended))
+        paths = _joined(longer)
         steps += 1
-        count = sum(len(group.durations) for group in paths.values())
-        if paths and products > most_products:
-            remaining = list(paths.values())
-            upper = max(upper, *(float(group.growths.max()) for group in remaining))
-            durations = np.concatenate([group.durations for group in remaining])
-            growths = np.concatenate([group.growths for group in remaining])
-            further = _further_steps(durations, growths, growth, slowest) * steps
-            ratio = count / before if before else float(count)
-            return ProductBound(upper, products, products + count * _sum_of_powers(ratio, further))
-        before = count
+        if len(paths.ends) and products > most_products:
+            upper = max(upper, float(paths.growths.max()))
+            further = _further_steps(paths, growth, slowest) * steps
+            ratio = len(paths.ends) / (before or 1)
+            needed = products + len(paths.ends) * _sum_of_powers(ratio, further)
+            return ProductBound(upper, products, needed)
+        before = len(paths.ends)
     return ProductBound(upper, products, products)
 
 
-def _continued(paths: _Paths, edge: Edge) -> _Paths:
-    matrices, durations = edge.matrix @ paths.matrices, paths.durations + edge.duration
-    growths = norms_above(matrices) ** (1 / durations) * (1 + 1e-15)
-    return _Paths(matrices, durations, growths)
-
-
 def _joined(parts: Sequence[_Paths]) -> _Paths:
-    matrices, durations, growths = zip(*parts, strict=True)
-    middles, radii = zip(*matrices, strict=True)
-    return _Paths(
-        IntervalMatrix(np.concatenate(middles), np.concatenate(radii)),
-        np.concatenate(durations),
-        np.concatenate(growths),
-    )
+    ends, matrices, durations, growths = zip(*parts, strict=True)
+    stack = IntervalMatrix(*map(np.concatenate, zip(*matrices, strict=True)))
+    return _Paths(np.concatenate(ends), stack, np.concatenate(durations), np.concatenate(growths))
 
 
-def _further_steps(durations: Vector, growths: Vector, growth: float, slowest: float) -> float:
+def _further_steps(paths: _Paths, growth: float, slowest: float) -> float:
     """Estimate how many steps follow until all paths have ended, relative to those until now.
 
     ‖Π‖ is assumed to stay at its present multiple of ρ^duration, with the lower bound ρ.
     """
     if not 0 < slowest < growth:
         return math.inf
-    excess = durations * np.log(growths / slowest)
-    missing = float((excess / math.log(growth / slowest) - durations).max())
-    return max(missing, 0.0) / float(durations.mean())
+    excess = paths.durations * np.log(paths.growths / slowest)
+    missing = float((excess / math.log(growth / slowest) - paths.durations).max())
+    return max(missing, 0.0) / float(paths.durations.mean())
 
 
 def _sum_of_powers(ratio: float, steps: float) -> float:

@@ -192,10 +192,14 @@ class Stability(NamedTuple):
         )
 
 
+def uncapped(guarantee: LossGuarantee) -> LossGuarantee:
+    """Return the rules besides the maximum number of consecutive losses."""
+    return LossGuarantee(tuple(rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)))
+
+
 def capped(guarantee: LossGuarantee, losses: int) -> LossGuarantee:
     """Return a guarantee with another maximum number of consecutive losses."""
-    others = [rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)]
-    return LossGuarantee((LongestBurst(losses), *others))
+    return LossGuarantee((LongestBurst(losses), *uncapped(guarantee).rules))
 
 
 class LossMargin:

@@ -10,19 +10,26 @@ is nearly a normal matrix, whose eigenvalues move by no more than the difference
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, balancing_exponents
+from noack.core.linear_systems import Vector, balancing_exponents
+from noack.theory.bounds.contraction import Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 
+Numbers = NDArray[np.int64]
 _ITERATIONS = 60
 _ROUNDEST = 1e-6
 """Smallest eigenvalue of a quadratic form, relative to the largest one."""
 _TINY = float(np.finfo(np.float64).tiny)
+_SLOWEST = -50.0
+"""Paths of different durations are compared with the best growth if its logarithm is above this."""
+_EQUAL = 1e-12
+"""Logarithms of growths that differ by less are those of one cycle."""
 _SQUARINGS = 44
 _SUBTRACTED = 1 - 1e-15
 
@@ -33,112 +40,186 @@ class Edge(NamedTuple):
     source: int
     target: int
     matrix: IntervalMatrix
-    """M; its shape is given by the dimensions of the nodes."""
+    """M, (n, n)."""
     duration: int = 1
     """Length of the step in units of time, at least 1; growth is counted per unit."""
+
+
+@dataclass(frozen=True)
+class Graph:
+    """The steps of a system without their matrices: k edges between nodes, numbered from 0."""
+
+    sources: Numbers
+    """(k,). Each node is left by an edge."""
+    targets: Numbers
+    durations: Numbers
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        return int(self.sources.max()) + 1
+
+    @cached_property
+    def leaving(self) -> list[Numbers]:
+        """The edges that leave each node."""
+        return [np.flatnonzero(self.sources == node) for node in range(self.nodes)]
+
+    def at(self, numbers: Numbers) -> "Graph":
+        """Return the graph of some edges, by which each node is still left."""
+        return Graph(self.sources[numbers], self.targets[numbers], self.durations[numbers])
+
+    def renumbered(self) -> "Graph":
+        """Return the graph with the nodes that occur numbered anew."""
+        ends = np.unique([self.sources, self.targets], return_inverse=True)[1]
+        sources, targets = ends.reshape(2, -1)
+        return Graph(sources, targets, self.durations)
+
+    def strongly_connected(self) -> list[Numbers]:
+        """Return the edges of the parts in which every node can be reached from any other.
+
+        The growth of all infinite paths is that of those within one part.
+        """
+        from scipy.sparse import coo_array  # slow to import
+        from scipy.sparse.csgraph import connected_components
+
+        size = 1 + int(max(self.sources.max(), self.targets.max()))
+        graph = coo_array((np.ones(len(self.sources)), (self.sources, self.targets)), shape=(size, size))
+        labels = connected_components(graph, connection="strong")[1]
+        within, label = labels[self.sources] == labels[self.targets], labels[self.sources]
+        return [np.flatnonzero(within & (label == part)) for part in np.unique(label[within])]
+
+    def only_cycle(self) -> tuple[int, ...] | None:
+        """Return the edges of the only cycle, in their order of time; None if there are more.
+
+        Every node is left by an edge; if by one only, there is no choice.
+        """
+        if self.nodes < len(self.sources):
+            return None
+        path = [0]
+        while self.targets[path[-1]] != self.sources[0]:
+            path.append(int(self.leaving[self.targets[path[-1]]][0]))
+        return tuple(path)
+
+    def balancing(self, matrices: Stack, iterations: int = _ITERATIONS) -> Stack:
+        """Return T for each node, (nodes, n, n); in T x no direction grows much more than others.
+
+        The squared length in these coordinates is the fixed point of P ← Σ Mᵀ P M / c over the
+        edges that leave a node, found by iteration. If that fails, T is the identity.
+        """
+        identity = np.tile(np.eye(matrices.shape[1]), (self.nodes, 1, 1))
+        forms = identity
+        for _ in range(iterations):
+            following = np.zeros_like(forms)
+            np.add.at(following, self.sources, matrices.swapaxes(1, 2) @ forms[self.targets] @ matrices)
+            traces = np.trace(following, axis1=1, axis2=2)[:, None, None]
+            size = float(traces.max())
+            if not 0 < size < np.inf:
+                return identity
+            forms = (following + _ROUNDEST * traces * identity) / size
+        try:
+            return np.asarray(np.linalg.cholesky(forms).swapaxes(1, 2), np.float64)
+        except np.linalg.LinAlgError:
+            return identity
+
+    def fastest_cycle(
+        self, matrices: Stack, most_edges: int, beam: int, at_least: float = -math.inf
+    ) -> tuple[float, tuple[int, ...]]:
+        """Search for the cycle with the largest growth; return log growth and the edges.
+
+        Of all paths of each length, those with the largest products are continued.
+
+        Args:
+            matrices: of the edges, (k, n, n), best in balanced coordinates.
+            most_edges: largest length.
+            beam: number of paths that are continued.
+            at_least: logarithm of a known growth; without a faster cycle there are no edges.
+        """
+        best, cycle = at_least, tuple[int, ...]()
+        paths, products = np.arange(len(matrices))[:, None], matrices
+        durations = self.durations.astype(np.float64)
+        for _ in range(most_edges):
+            norms = np.log(np.linalg.norm(products, axis=(1, 2)) + _TINY) / durations
+            # A product cannot grow faster than its norm.
+            is_closed = self.sources[paths[:, 0]] == self.targets[paths[:, -1]]
+            closed = np.flatnonzero(is_closed & (norms > best))
+            if len(closed):
+                with np.errstate(divide="ignore"):
+                    growths = np.log(spectral_radii(products[closed])) / durations[closed]
+                fastest = float(growths.max())
+                if fastest > best + _EQUAL:  # of the rotations of a cycle, take always the same
+                    rotations = paths[closed[growths > fastest - _EQUAL]]
+                    best, cycle = fastest, tuple(min(rotations.tolist()))
+            rank = durations * (norms - (best if best > _SLOWEST else 0.0))
+            longest = np.argsort(-rank, kind="stable")[:beam]
+            steps = [self.leaving[self.targets[paths[index, -1]]] for index in longest]
+            continued, step = np.repeat(longest, list(map(len, steps))), np.concatenate(steps)
+            paths = np.concatenate([paths[continued], step[:, None]], axis=1)
+            products = matrices[step] @ products[continued]
+            durations = durations[continued] + self.durations[step]
+        return best, cycle
+
+
+def spectral_radii(matrices: Stack) -> Vector:
+    """Return the spectral radii of matrices, (k,)."""
+    return np.asarray(np.abs(np.linalg.eigvals(matrices)).max(axis=-1))
 
 
 @dataclass(frozen=True)
 class SwitchedSystem:
     """Every path in a graph is a sequence of steps that may happen."""
 
-    edges: tuple[Edge, ...]
-    """Each node is left and reached by an edge, and every node can be reached from any other."""
+    graph: Graph
+    matrices: IntervalMatrix
+    """Of its edges, (k, n, n)."""
+
+    @classmethod
+    def of(cls, edges: Sequence[Edge]) -> "SwitchedSystem":
+        """Return the system of some edges, which keep their order; nodes are numbered anew."""
+        sources, targets, matrices, durations = zip(*edges, strict=True)
+        graph = Graph(*map(np.array, (sources, targets, durations)))
+        stack = IntervalMatrix(*(np.array(part) for part in zip(*matrices, strict=True)))
+        return cls(graph.renumbered(), stack)
 
     @property
-    def dimensions(self) -> dict[int, int]:
-        """Number of states, by node."""
-        return {edge.source: edge.matrix.middle.shape[1] for edge in self.edges}
+    def dimension(self) -> int:
+        """Number of states."""
+        return int(self.matrices.middle.shape[1])
+
+    def at(self, numbers: Numbers) -> "SwitchedSystem":
+        """Return the system of some edges, with the nodes that occur numbered anew."""
+        return SwitchedSystem(self.graph.at(numbers).renumbered(), self.matrices.at(numbers))
 
     def product(self, path: Sequence[int]) -> IntervalMatrix:
         """Enclose the product of the matrices of edges, given by number in their order of time."""
-        product, *matrices = (self.edges[number].matrix for number in path)
+        product, *matrices = map(IntervalMatrix, *(part[list(path)] for part in self.matrices))
         for matrix in matrices:
             product = matrix @ product
         return product
 
-    def duration(self, path: Sequence[int]) -> int:
-        """Return the length of a path in units of time."""
-        return sum(self.edges[number].duration for number in path)
-
-    def in_coordinates(self, forms: dict[int, Matrix]) -> "SwitchedSystem | None":
+    def in_coordinates(self, forms: Stack) -> "SwitchedSystem | None":
         """Return the system in the coordinates T x, with an invertible T for each node.
 
         None: an inverse could not be enclosed.
         """
-        inverses = {node: inverse(form) for node, form in forms.items()}
-        edges = []
-        for edge in self.edges:
-            undone = inverses[edge.source]
-            if undone is None:
-                return None
-            matrix = exactly(forms[edge.target]) @ edge.matrix @ undone
-            edges.append(edge._replace(matrix=matrix))
-        return SwitchedSystem(tuple(edges))
+        if (undone := inverse(forms)) is None:
+            return None
+        sources, targets = self.graph.sources, self.graph.targets
+        return replace(self, matrices=exactly(forms[targets]) @ self.matrices @ undone.at(sources))
 
     def in_similar_units(self) -> "SwitchedSystem":
         """Return the system with its states times powers of two, the same at every node.
 
         Otherwise inputs in other units than the states' could leave it undecided.
         """
-        if len(set(self.dimensions.values())) > 1:
-            return self
-        sizes = np.max([np.abs(edge.matrix.middle) for edge in self.edges], axis=0)
+        sizes = np.abs(self.matrices.middle).max(axis=0)
         if not np.isfinite(sizes).all():
             return self
         exponents = balancing_exponents(sizes)
-        shifts = exponents[:, None] - exponents
-        return SwitchedSystem(tuple(edge._replace(matrix=edge.matrix.scaled(shifts)) for edge in self.edges))
+        return replace(self, matrices=self.matrices.scaled(exponents[:, None] - exponents))
 
     def balanced(self) -> "SwitchedSystem":
-        """Return the system in the coordinates of :meth:`balancing`, or else itself."""
-        return self.in_coordinates(self.balancing()) or self
-
-    def balancing(self) -> dict[int, Matrix]:
-        """Return T for each node; in T x no direction grows much more than others.
-
-        The squared length in these coordinates is the fixed point of P ← Σ Mᵀ P M / c over the
-        edges that leave a node, found by iteration. If that fails, T is the identity.
-        """
-        identity = {node: np.eye(n) for node, n in self.dimensions.items()}
-        forms = identity
-        for _ in range(_ITERATIONS):
-            following = {node: np.zeros_like(form) for node, form in forms.items()}
-            for edge in self.edges:
-                M = edge.matrix.middle
-                following[edge.source] += M.T @ forms[edge.target] @ M
-            size = max(float(np.trace(form)) for form in following.values())
-            if not 0 < size < np.inf:
-                return identity
-            forms = {
-                node: form / size + _ROUNDEST * float(np.trace(form)) / size * np.eye(len(form))
-                for node, form in following.items()
-            }
-        try:
-            return {
-                node: np.asarray(np.linalg.cholesky(form).T, dtype=np.float64) for node, form in forms.items()
-            }
-        except np.linalg.LinAlgError:
-            return identity
-
-
-def strongly_connected(edges: Sequence[Edge]) -> list[SwitchedSystem]:
-    """Return the parts of a graph in which every node can be reached from any other.
-
-    The growth of all infinite paths is that of those within one part.
-    """
-    from scipy.sparse import coo_array  # slow to import
-    from scipy.sparse.csgraph import connected_components
-
-    sources, targets = [edge.source for edge in edges], [edge.target for edge in edges]
-    size = 1 + max(*sources, *targets)
-    graph = coo_array((np.ones(len(edges)), (sources, targets)), shape=(size, size))
-    _, labels = connected_components(graph, connection="strong")
-    parts: dict[int, list[Edge]] = {}
-    for edge in edges:
-        if labels[edge.source] == labels[edge.target]:
-            parts.setdefault(int(labels[edge.source]), []).append(edge)
-    return [SwitchedSystem(tuple(part)) for part in parts.values()]
+        """Return the system in the coordinates of :meth:`Graph.balancing`, or else itself."""
+        return self.in_coordinates(self.graph.balancing(self.matrices.middle)) or self
 
 
 class Cycle(NamedTuple):
@@ -219,86 +300,14 @@ def _root(value: float, exponent: float, j: int, sign: int) -> float:
     return float(2.0 ** (logarithm + sign * slack) * (1 + sign * 4e-16))
 
 
-class _Path(NamedTuple):
-    edges: tuple[int, ...]
-    source: int
-    target: int
-    duration: int
-    product: Matrix
-    norm: float
-
-
 def find_cycle(system: SwitchedSystem, most_edges: int, beam: int) -> Cycle:
-    """Search for the cycle with the largest growth among those of up to ``most_edges`` edges.
-
-    Args:
-        system: the system, best in balanced coordinates.
-        most_edges: largest length.
-        beam: number of paths that are kept at each length.
-    """
-    best: tuple[int, ...] = ()
-    growth = 0.0
-    leaving: dict[int, list[_Path]] = {}
-    for number, edge in enumerate(system.edges):
-        M = edge.matrix.middle
-        step = _Path((number,), edge.source, edge.target, edge.duration, M, _size(M))
-        leaving.setdefault(edge.source, []).append(step)
-    paths = [step for steps in leaving.values() for step in steps]
-    for _ in range(most_edges):
-        closed = [
-            path
-            for path in paths
-            # A product cannot grow faster than its norm.
-            if path.source == path.target and path.norm > (growth * (1 + 1e-12)) ** path.duration
-        ]
-        for path, radius in zip(closed, _radii([path.product for path in closed]), strict=True):
-            path_growth = radius ** (1 / path.duration)
-            if path_growth > growth * (1 + 1e-12):
-                best, growth = path.edges, path_growth
-        scale = growth or 1.0
-        paths.sort(key=lambda path: path.norm / max(scale**path.duration, _TINY), reverse=True)
-        paths = [_joined(path, step) for path in paths[:beam] for step in leaving[path.target]]
-    if not best:
-        return NO_CYCLE
-    return Cycle(best, growth_bounds(system, best)[0])
-
-
-def _radii(matrices: Sequence[Matrix]) -> list[float]:
-    """Return the spectral radii of matrices; those of one size are computed together."""
-    radii = np.zeros(len(matrices))
-    for size in {len(matrix) for matrix in matrices}:
-        which = [k for k, matrix in enumerate(matrices) if len(matrix) == size]
-        values = np.linalg.eigvals(np.array([matrices[k] for k in which]))
-        radii[which] = np.abs(values).max(axis=1)
-    return radii.tolist()
+    """Search for the cycle with the largest growth, as :meth:`Graph.fastest_cycle`, and bound it."""
+    _, path = system.graph.fastest_cycle(system.matrices.middle, most_edges, beam)
+    return Cycle(path, growth_bounds(system, path)[0]) if path else NO_CYCLE
 
 
 def growth_bounds(system: SwitchedSystem, path: Sequence[int]) -> tuple[float, float]:
     """Return a lower and an upper bound of the growth of a cycle per unit of time."""
     lower, upper = spectral_radius_bounds(system.product(path))
-    share = 1 / system.duration(path)
+    share = 1 / int(system.graph.durations[list(path)].sum())
     return lower**share * (1 - 1e-15), upper**share * (1 + 1e-15)
-
-
-def only_cycle(system: SwitchedSystem) -> tuple[int, ...] | None:
-    """Return the edges of the only cycle of a graph, in their order of time; None if it has more.
-
-    Every node is left by an edge; if by one only, there is no choice.
-    """
-    leaving = {edge.source: number for number, edge in enumerate(system.edges)}
-    if len(leaving) < len(system.edges):
-        return None
-    path = [0]
-    while system.edges[path[-1]].target != system.edges[0].source:
-        path.append(leaving[system.edges[path[-1]].target])
-    return tuple(path)
-
-
-def _joined(path: _Path, step: _Path) -> _Path:
-    product = step.product @ path.product
-    duration = path.duration + step.duration
-    return _Path(path.edges + step.edges, path.source, step.target, duration, product, _size(product))
-
-
-def _size(matrix: Matrix) -> float:
-    return math.sqrt(float(np.vdot(matrix, matrix)))

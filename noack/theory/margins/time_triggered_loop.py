@@ -17,21 +17,15 @@ how much longer x_c may be used.
 """
 
 import math
-from functools import cache
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import cache, reduce
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
 from noack.core.clock import NEVER_NS
 from noack.core.linear_systems import Matrix, balancing_exponents
-from noack.theory.margins.exact_matrices import (
-    FixedPointMatrix,
-    IntervalMatrix,
-    exponential,
-    fixed,
-    power,
-    stacked,
-)
+from noack.theory.margins.exact_matrices import FixedPointMatrix, IntervalMatrix, exponential, fixed, stacked
 
 
 class LoopTimes(NamedTuple):
@@ -77,6 +71,71 @@ class LoopTimes(NamedTuple):
         return sorted([(t_ns, False) for t_ns in steps] + [(t_ns, True) for t_ns in ticks])
 
 
+class Step(Protocol):
+    """What becomes of a state over some time."""
+
+    def then(self, later: Self) -> Self:
+        """Return this step and the one after it."""
+
+
+_Step = TypeVar("_Step", bound=Step)
+
+
+def repeated(step: _Step, times: int) -> _Step:
+    """Return a step once or more often in sequence, by repeated squaring."""
+    whole = step
+    for digit in f"{times:b}"[1:]:
+        whole = whole.then(whole)
+        if digit == "1":
+            whole = whole.then(step)
+    return whole
+
+
+class Timeline(Generic[_Step]):
+    """What happens to (x, x_c, u, w) while no update arrives, in any arithmetic.
+
+    Args:
+        times: of the loop.
+        flow: what happens in some nanoseconds between steps and ticks.
+        latch: a step of the plant.
+        tick: of the controller.
+        late_tick: a tick when no update is new enough.
+    """
+
+    def __init__(
+        self, times: LoopTimes, flow: Callable[[int], _Step], latch: _Step, tick: _Step, late_tick: _Step
+    ) -> None:
+        self._times, self._flow, self._latch = times, cache(flow), latch
+        self._ticks = tick, late_tick
+        self._cycle_ns = math.lcm(times.step_ns, times.tick_ns)
+        self._advance = cache(self._advance_from_cycle)
+
+    def between(self, from_ns: int, until_ns: int, timeout_ns: int = NEVER_NS) -> _Step:
+        """Return what happens between two times; a tick at the end is excluded, a step at the start.
+
+        From ``timeout_ns`` on the ticks are late.
+        """
+        split_ns = min(max(timeout_ns, from_ns), until_ns)
+        in_time = self._advance(from_ns % self._cycle_ns, split_ns - from_ns, False)
+        if split_ns == until_ns:
+            return in_time
+        return in_time.then(self._advance(split_ns % self._cycle_ns, until_ns - split_ns, True))
+
+    def _advance_from_cycle(self, from_ns: int, duration_ns: int, is_late: bool) -> _Step:
+        cycles, rest_ns = divmod(duration_ns, self._cycle_ns)
+        last_part = self._occurrences(from_ns, from_ns + rest_ns, is_late)
+        if not cycles:
+            return last_part
+        return repeated(self._occurrences(from_ns, from_ns + self._cycle_ns, is_late), cycles).then(last_part)
+
+    def _occurrences(self, from_ns: int, until_ns: int, is_late: bool) -> _Step:
+        parts, now_ns = list[_Step](), from_ns
+        for t_ns, is_tick in self._times.occurrences(from_ns, until_ns):
+            parts += [self._flow(t_ns - now_ns), self._ticks[is_late] if is_tick else self._latch]
+            now_ns = t_ns
+        return reduce(lambda first, later: first.then(later), [*parts, self._flow(until_ns - now_ns)])
+
+
 class TimeTriggeredLoop:
     """The maps of a loop with the matrices A, (n, n), B, (n, m), K, (m, n), and H, (n, n)."""
 
@@ -89,7 +148,6 @@ class TimeTriggeredLoop:
         A, H = np.ldexp(A, of_x - of_x.T), np.ldexp(H, of_x - of_x.T)
         B, K = np.ldexp(B, of_x - of_u.T), np.ldexp(K, of_u - of_x.T)
         self.times, self._H = times, H
-        self._cycle_ns = math.lcm(times.step_ns, times.tick_ns)
         # The state of the loop is (x, x_c, u, w).
         size = 2 * (n + m)
         generator = np.zeros((size, size))
@@ -98,11 +156,12 @@ class TimeTriggeredLoop:
         x, x_c, u, w = np.split(np.eye(size), [n, 2 * n, 2 * n + m])
         self._x, self._x_c, self._K = slice(n), slice(n, 2 * n), fixed(K)
         self._inputs = slice(2 * n, size)
-        self._latch = fixed(np.vstack([x, x_c, w, w]))
         without_update = w if times.holds_input else 0 * w
-        self._ticks = [fixed(np.vstack([x, x_c, u, sent])) for sent in (K @ x_c, without_update)]
-        self._flow = cache(lambda dt_ns: exponential(generator, dt_ns))
-        self._advance = cache(self._advance_from_cycle)
+        occurrences = [(x, x_c, w, w), (x, x_c, u, K @ x_c), (x, x_c, u, without_update)]
+        self._start = fixed(np.eye(size))
+        self._between = Timeline(
+            times, lambda dt_ns: exponential(generator, dt_ns), *(fixed(np.vstack(o)) for o in occurrences)
+        ).between
         self._states: dict[tuple[int, int], list[FixedPointMatrix]] = {}
         """By slot and use of x_c: (x, x_c, u, w) after 1, 2, … periods, as functions of z."""
         since_ns = [times.since_tick_ns(k * times.period_ns) for k in range(times.slots)]
@@ -137,10 +196,10 @@ class TimeTriggeredLoop:
         Raises:
             OverflowError: an entry is beyond double precision.
         """
-        from_ns, start = slot * self.times.period_ns, fixed(np.eye(len(self._latch.entries)))
+        from_ns = slot * self.times.period_ns
         if is_delivered:
-            return self._updated(start, from_ns, NEVER_NS, NEVER_NS).interval()
-        return self._between(from_ns, from_ns + self.times.period_ns, NEVER_NS).interval()
+            return self._updated(self._start, from_ns, NEVER_NS, NEVER_NS).interval()
+        return self._between(from_ns, from_ns + self.times.period_ns).interval()
 
     def _after(self, slot: int, usable_ns: int, losses: int) -> FixedPointMatrix:
         period_ns = self.times.period_ns
@@ -177,26 +236,3 @@ class TimeTriggeredLoop:
             return stacked(z, z.rows(slice(2 * n, None)))
         u = self._K @ exponential(-self._H, self.times.since_tick_ns(t_ns)) @ z.rows(self._x_c)
         return stacked(z, u, u)
-
-    def _between(self, from_ns: int, until_ns: int, timeout_ns: int) -> FixedPointMatrix:
-        """Return the map of (x, x_c, u, w); a tick at its end is excluded, a step at its start."""
-        split_ns = min(max(timeout_ns, from_ns), until_ns)
-        in_time = self._advance(from_ns % self._cycle_ns, split_ns - from_ns, False)
-        if split_ns == until_ns:
-            return in_time
-        return self._advance(split_ns % self._cycle_ns, until_ns - split_ns, True) @ in_time
-
-    def _advance_from_cycle(self, from_ns: int, duration_ns: int, is_late: bool) -> FixedPointMatrix:
-        cycles, rest_ns = divmod(duration_ns, self._cycle_ns)
-        last_part = self._occurrences(from_ns, from_ns + rest_ns, is_late)
-        if not cycles:
-            return last_part
-        return last_part @ power(self._occurrences(from_ns, from_ns + self._cycle_ns, is_late), cycles)
-
-    def _occurrences(self, from_ns: int, until_ns: int, is_late: bool) -> FixedPointMatrix:
-        result, now_ns = fixed(np.eye(len(self._latch.entries))), from_ns
-        for t_ns, is_tick in self.times.occurrences(from_ns, until_ns):
-            occurrence = self._ticks[is_late] if is_tick else self._latch
-            result = occurrence @ self._flow(t_ns - now_ns) @ result
-            now_ns = t_ns
-        return self._flow(until_ns - now_ns) @ result

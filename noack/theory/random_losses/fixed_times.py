@@ -1,8 +1,7 @@
-"""Moments at every fixed time, without a limit on consecutive losses.
+"""Mean squares at every fixed time, without a limit on consecutive losses.
 
-Each update is lost with a probability of at most p̄, whatever happened before. |v| is the r-th
-moment norm, (E‖v‖ʳ)^{1/r}, r = 1 or 2, and ρ = p̄^{1/r}. With all signals scaled by e^{αt}, at
-every fixed time
+Each update is lost with a probability of at most p̄, whatever happened before. |v| is the root mean
+square, √(E‖v‖²), and ρ = √p̄. With all signals scaled by e^{αt}, at every fixed time
 
     |C e_c| ≤ ‖C W⁻¹‖ a + f_C(a, m, π) + ℓ_C(m, π)            (I1): in flight, and lost
     |C x|   ≤ free_C + gain_C π
@@ -16,13 +15,13 @@ test, if there have been i − 1 more since; and all i are lost with a probabili
 their sum is at most S_J = c_1 + … + c_J, where J is like a random number with P(J ≥ i) ≤ min(1,
 p̄ⁱ D_C/c_i):
 
-    ℓ_C ≤ (Σ_i (S_iʳ − S_{i−1}ʳ) min(1, p̄ⁱ D_C/c_i))^{1/r} + ρ/(1 − ρ) √(h d_C D_C)
+    ℓ_C ≤ √(Σ_i (S_i² − S_{i−1}²) min(1, p̄ⁱ D_C/c_i)) + ρ/(1 − ρ) √(h d_C D_C)
 
-d_C the rate at which C e_c can grow; the last term is for r = 2, and 0 without a period h of tests.
-This is concave: any tangent bounds it, and then the inequalities are linear. Without h and delay
-there is a bound for every p̄ < 1.
+d_C the rate at which C e_c can grow; the last term is 0 without a period h of tests. This is
+concave: any tangent bounds it, and then the inequalities are linear. Without h and delay there is a
+bound for every p̄ < 1.
 
-Mean squares are made smaller afterwards, by quadratic functions of the loop's state
+The bounds are made smaller afterwards, by quadratic functions of the loop's state
 (:mod:`~noack.theory.random_losses.quadratic_moments`), which need bounds of ‖e_s‖ and of what the
 input's age does to p: a first bound is that of the inequalities, and each one makes others smaller.
 """
@@ -32,7 +31,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector, exponential
+from noack.core.linear_systems import Vector, exponential
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
@@ -45,9 +44,6 @@ from noack.theory.random_losses.quadratic_moments import (
     quadratic_functions,
 )
 
-ORDERS = (1, 2)
-BOUNDED = ("sensor_error", "controller_error", "input_error", "state")
-"""The bounds of :class:`Moments`."""
 _CELLS = 64
 _MOST_LOST, _ROUNDS, _SETTLED, _FIRST = 256, 30, 0.999, 1e6
 _A, _PI, _ONE = np.eye(3)
@@ -59,11 +55,9 @@ _Signals = tuple[Vector, Vector]
 _Term = TypeVar("_Term", float, Vector)
 
 
-class Moments(NamedTuple):
-    """Bounds of (E‖·‖ʳ)^{1/r}, each multiplied by e^{−rate·t}, at every fixed time t."""
+class MeanSquares(NamedTuple):
+    """Bounds of √(E‖·‖²), each multiplied by e^{−rate·t}, at every fixed time t."""
 
-    order: int
-    """r."""
     rate_per_s: float
     sensor_error: float
     """Of ‖e_s‖_W."""
@@ -77,15 +71,16 @@ class Moments(NamedTuple):
     """Spectral radius of the inequalities; below 1."""
 
 
-def moments(
+def mean_squares(
     error: ErrorGains,
     plant: PlantGains,
     conditions: NetworkConditions,
     beta: float,
     largest_probability: float,
-    order: int,
-) -> Moments:
-    """Bound the moments of all signals at every fixed time; ``conditions.dropouts`` has no effect.
+    *,
+    refined: bool = False,
+) -> MeanSquares:
+    """Bound all signals at every fixed time; ``conditions.dropouts`` has no effect.
 
     Args:
         error: the gains of the models.
@@ -93,41 +88,23 @@ def moments(
         conditions: of the schedule.
         beta: β: after a test, ‖e_s‖_W ≤ βe^{−αt}.
         largest_probability: p̄, the largest probability of a loss, given the past.
-        order: r.
+        refined: whether to make the bounds smaller by quadratic functions, which takes longer.
 
     Raises:
         NoCertificateError: the spectral radius of the inequalities is not below 1.
         NotDecayingError: α is not below the decay rate of the models, or of A + BK.
     """
     try:
-        candidates = [
-            _Inequalities(error, plant, conditions, beta, largest_probability, higher_order).solve()
-            for higher_order in ORDERS[order - 1 :]  # a mean is at most the root mean square
-        ]
+        inequalities = _Inequalities(error, plant, conditions, beta, largest_probability)
+        bounds, loop_gain = inequalities.solve()
     except (np.linalg.LinAlgError, OverflowError):
         raise NoCertificateError("numbers overflow: an input is too old for the fastest mode") from None
-    if not any(np.isfinite(candidate.state) for candidate in candidates):
-        loop_gain = min(candidate.loop_gain for candidate in candidates)
-        raise NoCertificateError(f"the loop gain of the moments is {loop_gain:.3g}, not below 1")
-    return Moments(order, *map(min, zip(*(candidate[1:] for candidate in candidates), strict=True)))
-
-
-def refined_mean_squares(
-    error: ErrorGains,
-    plant: PlantGains,
-    conditions: NetworkConditions,
-    beta: float,
-    largest_probability: float,
-) -> Moments:
-    """Bound root mean squares at every fixed time, also by quadratic functions, which takes longer.
-
-    Arguments and errors are those of :func:`moments`.
-    """
-    inequalities = _Inequalities(error, plant, conditions, beta, largest_probability, 2)
-    first = inequalities.solve()
-    if not np.isfinite(first.state):
-        raise NoCertificateError(f"the loop gain of the moments is {first.loop_gain:.3g}, not below 1")
-    return inequalities.refine(first)
+    if bounds is None:
+        raise NoCertificateError(f"the loop gain of the mean squares is {loop_gain:.3g}, not below 1")
+    if refined:
+        bounds = inequalities.refine(bounds)
+    e_c, x = bounds.errors[Output.WEIGHTED], bounds.states[Output.STATE]
+    return MeanSquares(error.alpha_per_s, bounds.sensor_error, e_c, bounds.input_error, x, loop_gain)
 
 
 class _Bounds(NamedTuple):
@@ -141,6 +118,11 @@ class _Bounds(NamedTuple):
     input_error: float
     """From the first applied input on."""
 
+    @property
+    def values(self) -> Vector:
+        """Those of a, π and 1."""
+        return np.array([self.sensor_error, self.input_error, 1.0])
+
 
 class _Inequalities:
     """The inequalities; every signal is bounded by a row: multiples of a and π, and a constant."""
@@ -152,12 +134,11 @@ class _Inequalities:
         conditions: NetworkConditions,
         beta: float,
         probability: float,
-        order: int,
     ) -> None:
         if not error.scaled_H.any():
             raise NotDecayingError("a hold does not decay")
         self._error, self._plant, self._conditions = error, plant, conditions
-        self._beta, self._probability, self._order = beta, probability, order
+        self._beta, self._probability = beta, probability
         self._start_error, self._start = plant.start_up(conditions.start_s)
         columns, delay_s = (plant.split_mismatch[0], plant.input_matrix), conditions.delay_s
         self._drive = [response(error.scaled_H, D) for D in columns]
@@ -166,40 +147,35 @@ class _Inequalities:
         self._signals = self._state(Output.MISMATCH), _PI + self._start_error * _ONE
         self._missing = {str(output): self._missing_events(output, self._signals) for output in error.outputs}
 
-    def solve(self) -> Moments:
-        """Return the bounds, infinite ones with a loop gain if there are none.
+    def solve(self) -> tuple[_Bounds | None, float]:
+        """Return bounds, if there are any, and the loop gain.
 
         Each round bounds the concave terms by their tangents at the bounds that hold already.
         """
-        rate_per_s, state = self._error.alpha_per_s, self._state(Output.STATE)
-        best = Moments(self._order, rate_per_s, *(np.inf,) * 5)
-        values = np.array([*(_FIRST * self._beta,) * 2, 1.0])
+        bounds: _Bounds | None = None
+        values, loop_gain = np.array([*(_FIRST * self._beta,) * 2, 1.0]), np.inf
         for _ in range(_ROUNDS):
-            controller = {C: self._controller_error(values, missing) for C, missing in self._missing.items()}
-            rows = self._rows(controller)
+            errors = {C: self._controller_error(values, missing) for C, missing in self._missing.items()}
+            states = {C: self._state(C) for C in self._plant.outputs}
+            rows = np.array(
+                [self._tested(self._signals), self._with_age(errors[Output.GAIN], states, errors)]
+            )
             solution = solve_inequalities(rows[:, :2], rows[:, 2])
             values = np.append(solution.bound, 1.0)
-            loop_gain = float(solution.loop_gain)
             if not np.isfinite(values).all():
-                return best._replace(loop_gain=min(best.loop_gain, loop_gain))
-            signals = (_A, controller[Output.WEIGHTED], _PI, state)
-            a, e_c, pi, x = (float(row @ values) for row in signals)
-            refined = Moments(self._order, rate_per_s, a, e_c, pi, x, loop_gain)
-            if refined.state > _SETTLED * best.state:
+                return bounds, min(loop_gain, float(solution.loop_gain))
+            found = _Bounds(
+                {C: float(row @ values) for C, row in states.items()},
+                {C: float(row @ values) for C, row in errors.items()},
+                *solution.bound.tolist(),
+            )
+            if bounds and found.states[Output.STATE] > _SETTLED * bounds.states[Output.STATE]:
                 break
-            best = refined
-        return best
+            bounds, loop_gain = found, float(solution.loop_gain)
+        return bounds, loop_gain
 
-    def refine(self, first: Moments) -> Moments:
-        """Make bounds of mean squares smaller; each one that is used holds already."""
-        values = np.array([first.sensor_error, first.input_error, 1.0])
-        controller = {C: self._controller_error(values, missing) for C, missing in self._missing.items()}
-        bounds = _Bounds(
-            {C: float(self._state(C) @ values) for C in self._plant.outputs},
-            {C: float(row @ values) for C, row in controller.items()},
-            first.sensor_error,
-            first.input_error,
-        )
+    def refine(self, bounds: _Bounds) -> _Bounds:
+        """Make bounds smaller; each one that is used holds already."""
         known, loop = self._known(bounds), (self._error, self._plant, self._conditions, self._probability)
         functions = quadratic_functions(LossyFlow(*loop), known)
         if not functions and self._conditions.hold_s > 0:
@@ -208,12 +184,7 @@ class _Inequalities:
             before, bounds = bounds, self._improved(bounds, functions)
             if bounds.states[Output.STATE] > _SETTLED * before.states[Output.STATE]:
                 break
-        return first._replace(
-            sensor_error=bounds.sensor_error,
-            controller_error=bounds.errors[Output.WEIGHTED],
-            input_error=bounds.input_error,
-            state=bounds.states[Output.STATE],
-        )
+        return bounds
 
     def _known(self, bounds: _Bounds) -> Known:
         """What is known of the parts of v; errors[C] bounds both ‖C e_c‖ and ‖C(e_c − ê_c)‖ with a delay."""
@@ -222,7 +193,7 @@ class _Inequalities:
         in_flight, by_rate = 0.0, gains.pop(Output.GAIN_RATE)
         if conditions.delay_s > 0:
             missing = self._missing_events(Output.GAIN, self._driving(bounds))
-            in_flight = float(missing.recent @ self._values(bounds))
+            in_flight = float(missing.recent @ bounds.values)
         other = in_flight + sum(gain * (states[C] + errors[C]) for C, gain in gains.items())
         if conditions.delay_s > 0:
             other += by_rate * errors[Output.GAIN_RATE]
@@ -238,13 +209,10 @@ class _Inequalities:
         input_error = float(np.hypot(bounds.input_error, self._start_error))
         return bounds.states[Output.MISMATCH] * _ONE, input_error * _ONE
 
-    def _values(self, bounds: _Bounds) -> Vector:
-        return np.array([bounds.sensor_error, bounds.input_error, 1.0])
-
     def _improved(self, bounds: _Bounds, functions: Sequence[QuadraticFunction]) -> _Bounds:
         """Bound every signal by what is known of the others."""
         known, delay_s = self._known(bounds), self._conditions.delay_s
-        signals, values = self._driving(bounds), self._values(bounds)
+        signals, values = self._driving(bounds), bounds.values
         propagated = exponential(self._error.scaled_H * delay_s)
         errors: dict[str, float] = {}
         for output, C in self._error.outputs.items():
@@ -270,12 +238,6 @@ class _Inequalities:
         for C, gain in self._ages.items():
             total = total + gain * (states[C] + errors[C])
         return total
-
-    def _rows(self, controller: Mapping[str, Vector]) -> Matrix:
-        """Return the rows that bound a and π, (2, 3)."""
-        states = {str(C): self._state(C) for C in self._ages}
-        pi = self._with_age(controller[Output.GAIN], states, controller)
-        return np.array([self._tested(self._signals), pi])
 
     def _tested(self, signals: _Signals) -> Vector:
         """Return the row that bounds a: β, grown until the next test, and what enters before it."""
@@ -306,11 +268,11 @@ class _Inequalities:
 
     def _controller_error(self, values: Vector, missing: "_Missing") -> Vector:
         """The bound of |C e_c|, as tight as can be where the signals have these values."""
-        share = self._probability ** (1 / self._order)
+        share = np.sqrt(self._probability)
         lost = [share * (missing.whole - missing.recent)]
         whole, overshoot = missing.whole @ values, missing.overshoot @ values
-        if share < 1 and whole > 0 and (self._order > 1 or overshoot == 0):
-            row = missing.burst(self._probability, self._order, float(whole))
+        if share < 1 and whole > 0:
+            row = missing.burst(self._probability, float(whole))
             if overshoot > 0:
                 ratio = np.sqrt(whole / overshoot)
                 row = row + share / (1 - share) / 2 * (ratio * missing.overshoot + missing.whole / ratio)
@@ -338,16 +300,15 @@ class _Missing(NamedTuple):
     ceilings: Vector
     """What the i-th last event since the last delivery has at most, without the overshoot."""
 
-    def burst(self, probability: float, order: int, whole: float) -> Vector:
-        """Bound (Σ_i (S_iʳ − S_{i−1}ʳ) min(1, p^i D/c_i))^{1/r} by its tangent at a value of D."""
+    def burst(self, probability: float, whole: float) -> Vector:
+        """Bound √(Σ_i (S_i² − S_{i−1}²) min(1, p^i D/c_i)) by its tangent at a value of D."""
         c, powers = self.ceilings, probability ** np.arange(1.0, len(self.ceilings) + 1)
         sums = np.cumsum(np.append(0.0, c))
-        weights = np.ones_like(c) if order == 1 else sums[1:] + sums[:-1]
+        weights = sums[1:] + sums[:-1]
         few = powers * whole < c
-        # Beyond the last one c_i is not larger, and (S_iʳ − S_{i−1}ʳ)/c_i at most r S_iʳ⁻¹.
-        ratio = probability / (1 - probability)
-        beyond = ratio if order == 1 else 2 * ratio * (sums[-1] + c[-1] / (1 - probability))
+        # Beyond the last one c_i is not larger, and (S_i² − S_{i−1}²)/c_i at most 2 S_i.
+        beyond = 2 * probability / (1 - probability) * (sums[-1] + c[-1] / (1 - probability))
         slope = float((weights * powers)[few].sum() + powers[-1] * beyond)
-        value = float(((weights * c)[~few].sum() + slope * whole) ** (1 / order))
-        tangent = slope / (order * value ** (order - 1)) if slope else 0.0
+        value = float(np.sqrt((weights * c)[~few].sum() + slope * whole))
+        tangent = slope / (2 * value) if slope else 0.0
         return np.asarray(tangent * self.whole + (value - tangent * whole) * _ONE)

@@ -39,7 +39,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.contraction import Stack
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.loss_margin import intervals_ns, loop_times, require_idle_watchdog
-from noack.theory.margins.time_triggered_loop import LoopTimes
+from noack.theory.margins.time_triggered_loop import LoopTimes, Timeline, repeated
 from noack.theory.random_losses.mean_square_growth import (
     from_triangles,
     mean_square_growth,
@@ -75,14 +75,6 @@ class MomentStep(NamedTuple):
             self.constants + later.constants + np.einsum("kij,ij->k", later.costs, self.noise),
         )
 
-    def repeated(self, times: int) -> "MomentStep":
-        """Return this interval ``times`` times in sequence."""
-        if times == 0:
-            return jump(np.eye(len(self.matrix)), len(self.costs))
-        half = self.repeated(times // 2)
-        whole = half.then(half)
-        return whole.then(self) if times % 2 else whole
-
     def of_first(self, states: int) -> "MomentStep":
         """Leave out all but the first states, of which nothing after the interval depends."""
         rows = slice(states)
@@ -114,7 +106,7 @@ def flow(generator: Matrix, intensity: Matrix, forms: Stack, duration_s: float) 
         costs.sum(axis=0) * squares,
         np.einsum("t,tkij,ij->k", t_s - times_s, costs, intensity),
     )
-    return short.repeated(2**halvings)
+    return repeated(short, 2**halvings)
 
 
 def jump(matrix: Matrix, costs: int, noise: Matrix | None = None) -> MomentStep:
@@ -150,17 +142,21 @@ class LoopPeriods:
         sizes = np.cumsum([n, n, m, m, n])
         x, x_c, u, w, d, s = np.split(np.eye(4 * n + 2 * m), sizes)
         self.times, self.size = times, 2 * (n + m)
-        self._generator = x.T @ (loop.A @ x + loop.B @ u + d) + x_c.T @ (loop.H @ x_c)
+        generator = x.T @ (loop.A @ x + loop.B @ u + d) + x_c.T @ (loop.H @ x_c)
         xu = np.vstack([x, u])
-        self._forms = np.einsum("ia,kij,jb->kab", xu, forms, xu, optimize=True)
+        forms = np.einsum("ia,kij,jb->kab", xu, forms, xu, optimize=True)
         count, fresh, nothing = len(forms), d.T @ disturbance @ d, 0 * d
         self._fresh = jump(np.vstack([x, x_c, u, w, nothing, s]), count, fresh)
-        self._latch = jump(np.vstack([x, x_c, w, w, nothing, s]), count, fresh)
-        self._tick = jump(np.vstack([x, x_c, u, loop.K @ x_c, d, s]), count)
+        latch = jump(np.vstack([x, x_c, w, w, nothing, s]), count, fresh)
+        tick = jump(np.vstack([x, x_c, u, loop.K @ x_c, d, s]), count)
+
+        def flow_of(dt_ns: int) -> MomentStep:
+            return flow(generator, 0 * generator, forms, dt_ns / NS_PER_S)
+
+        self._between = Timeline(times, flow_of, latch, tick, tick).between
         self._send = jump(np.vstack([x, x_c, u, w, d, x]), count, s.T @ noise @ s)
         during_delay = flow(loop.H, 0 * loop.H, np.zeros((0, n, n)), times.delay_ns / NS_PER_S).matrix
         self._receive = jump(np.vstack([x, during_delay @ s, u, w, d, s]), count)
-        self._flows: dict[int, MomentStep] = {}
 
     def step(self, slot: int, delivered: bool, duration_ns: int | None = None) -> MomentStep:
         """Return a period, or what of it is before a time, from just before its transmission.
@@ -177,29 +173,6 @@ class LoopPeriods:
         sent = self._fresh.then(self._send).then(self._between(from_ns, arrival_ns))
         received = sent.then(self._receive).then(self._between(arrival_ns, until_ns))
         return received.of_first(self.size)
-
-    def _between(self, from_ns: int, until_ns: int) -> MomentStep:
-        """Return an interval; a tick at its end is excluded, a step at its start."""
-        cycle_ns = np.lcm(self.times.step_ns, self.times.tick_ns)
-        cycles, rest_ns = divmod(until_ns - from_ns, int(cycle_ns))
-        last_part = self._interval(from_ns, from_ns + rest_ns)
-        if not cycles:
-            return last_part
-        cycle = self._interval(from_ns + rest_ns, from_ns + rest_ns + int(cycle_ns))
-        return last_part.then(cycle.repeated(cycles))
-
-    def _interval(self, from_ns: int, until_ns: int) -> MomentStep:
-        parts, now_ns = [], from_ns
-        for t_ns, is_tick in self.times.occurrences(from_ns, until_ns):
-            parts += [self._flow(t_ns - now_ns), self._tick if is_tick else self._latch]
-            now_ns = t_ns
-        return reduce(MomentStep.then, [*parts, self._flow(until_ns - now_ns)])
-
-    def _flow(self, dt_ns: int) -> MomentStep:
-        if dt_ns not in self._flows:
-            G = self._generator
-            self._flows[dt_ns] = flow(G, 0 * G, self._forms, dt_ns / NS_PER_S)
-        return self._flows[dt_ns]
 
 
 class LoopMoments:
@@ -294,26 +267,25 @@ class LoopMoments:
 
 def require_predictable(resolved: Scenario) -> None:
     """Raise CallerError unless the loop's second moments follow linear equations."""
-    scenario = resolved
     resolved.coverage.require_direct_inputs()
     resolved.coverage.require_unchanging()
     if (why := resolved.coverage.beyond_theory) is not None:
         raise CallerError(f"{why}; the mean cost needs a linear plant with u = K x_c")
-    if scenario.observer is not None:
-        raise CallerError(f'observer.kind = "{scenario.observer.kind}": the mean cost needs none')
-    for number, disturbance in enumerate(scenario.plant.disturbances):
+    if resolved.observer is not None:
+        raise CallerError(f'observer.kind = "{resolved.observer.kind}": the mean cost needs none')
+    for number, disturbance in enumerate(resolved.plant.disturbances):
         if any(disturbance.entries) and not disturbance.variance.any():
             raise CallerError(
                 f"plant.disturbances.{number}: {disturbance.kind} is not random; the mean cost needs "
                 "disturbances of kind gaussian or uniform"
             )
-    if any(scenario.controller.safe_input or ()):
+    if any(resolved.controller.safe_input or ()):
         raise CallerError("controller.safe_input: the mean cost needs the input 0 at the start")
     require_idle_watchdog(resolved)
     shortest_ns, longest_ns = intervals_ns(resolved)
     if shortest_ns != longest_ns:
         raise CallerError(
-            f'trigger.policy = "{scenario.trigger.policy}": the mean cost needs a time-triggered '
+            f'trigger.policy = "{resolved.trigger.policy}": the mean cost needs a time-triggered '
             "sensor: --set 'trigger={policy=\"periodic\", period_s=0.5}'"
         )
 

@@ -27,7 +27,7 @@ from noack.impairments.loss_prediction import OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.contraction import EPSILON, Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
-from noack.theory.margins.switched_system import Edge, SwitchedSystem
+from noack.theory.margins.switched_system import Graph
 from noack.theory.margins.time_triggered_loop import LoopTimes
 
 if TYPE_CHECKING:
@@ -93,8 +93,9 @@ class PeriodMaps(NamedTuple):
         U, singular, _ = np.linalg.svd(stack.transpose(2, 0, 1, 3).reshape(size, -1))
         rank = max(int((singular > 10 * size * EPSILON * singular[0]).sum()), 1)
         range_maps = U[:, :rank].T @ stack @ U[:, :rank]
-        edges = tuple(Edge(0, 0, exactly(matrix)) for slot in range_maps for matrix in slot)
-        T = SwitchedSystem(edges).balancing()[0]
+        every = range_maps.reshape(-1, rank, rank)
+        nodes = np.zeros(len(every), np.int64)
+        (T,) = Graph(nodes, nodes, nodes + 1).balancing(every)
         range_maps = T @ range_maps @ np.linalg.inv(T)
         turned = U.T.copy()
         turned[:rank] = T @ turned[:rank]
@@ -158,7 +159,7 @@ class PeriodMaps(NamedTuple):
         moves = exactly(np.vstack([outcomes.delivered, outcomes.lost]).T)
         image = exactly(X)
         for slot in self.enclosed:
-            parts = [M @ image @ IntervalMatrix(M.middle.T, M.radius.T) for M in slot]
+            parts = [M @ image @ M.transposed for M in slot]
             flat = [np.concatenate(part).reshape(2 * modes, -1) for part in zip(*parts, strict=True)]
             mixed = moves @ IntervalMatrix(*flat)
             image = IntervalMatrix(*(part.reshape(X.shape) for part in mixed))
@@ -215,7 +216,7 @@ def from_triangles(entries: Vector, size: int) -> Stack:
 def triangles(stack: Stack) -> Vector:
     """Return the upper triangles of symmetric matrices, one after the other."""
     i, j = np.triu_indices(stack.shape[-1])
-    return stack[:, i, j].ravel()
+    return stack[..., i, j].ravel()
 
 
 def resolved_by(operator: "csc_array[np.float64]", value: float, entries: Vector) -> Vector:

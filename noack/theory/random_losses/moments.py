@@ -1,6 +1,6 @@
 """Bounds of a loop without a limit on consecutive losses: bursts, and moments.
 
-At every fixed time: :mod:`~noack.theory.random_losses.fixed_times`.
+Mean squares at every fixed time: :mod:`~noack.theory.random_losses.fixed_times`.
 
 At an event of the continuous trigger, where ‖e_s‖_W = β, the distribution of the number of missing
 events is known exactly, and (I1) gives a bound by itself: :func:`moment_at_events`.
@@ -8,7 +8,7 @@ events is known exactly, and (I1) gives a bound by itself: :func:`moment_at_even
 A run ends. Up to its horizon the certificates for at most m consecutive losses bound each run by its
 own longest burst: :func:`moments_of_runs` bounds the mean of the largest ‖e_c‖ and ‖x‖ of a run.
 
-Almost surely, x decays at every rate below that of the moments. Under the paper's conditions it does
+Almost surely, x decays at every rate below that of the mean squares. Under the paper's conditions it does
 so for every loss probability below 1. :func:`unlimited_losses` says all of this of a scenario.
 """
 
@@ -31,8 +31,10 @@ from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.certificates.assumptions import below
 from noack.theory.certificates.conditions import most_events
 from noack.theory.certificates.scenario_certificates import CertificateScope
-from noack.theory.random_losses.fixed_times import BOUNDED, ORDERS, Moments, moments, refined_mean_squares
+from noack.theory.random_losses.fixed_times import MeanSquares, mean_squares
 
+ORDERS = (1, 2)
+"""r of the moments at events, and of a run's largest values."""
 _TERMS = 1024
 _MOST_BURST = 64
 _CERTAIN = 1 - 1e-9
@@ -40,8 +42,8 @@ _ROUNDING = 1e-9
 """Above the relative error of a probability, which is a sum of products of numbers that are not negative."""
 _SLOWER = 0.9
 _RATES = (1.0, 0.5, 0.25, 1e-3)
-"""Shares of the trigger's rate at which moments are tried, until one of the smaller ones has a loop
-gain that is clearly below 1: near 1 the bounds are large."""
+"""Shares of the trigger's rate at which mean squares are tried, until one of the smaller ones has a
+loop gain that is clearly below 1: near 1 the bounds are large."""
 _CLEARLY = 0.9
 
 
@@ -143,8 +145,8 @@ class UnlimitedLosses:
     """For increasing m, as long as there are certificates."""
     runs: tuple[RunMoments, ...]
     """For r = 1 and 2; none if there is no certificate."""
-    moments: tuple[Moments, ...]
-    """For r = 1 and 2, under the schedule's conditions; those that exist."""
+    mean_squares: MeanSquares | None
+    """At every fixed time, under the schedule's conditions."""
     at_events: tuple[float, ...]
     """Bounds of (E(‖e_c‖_W e^{αt}/β)ʳ)^{1/r} at events, r = 1 and 2, the paper's conditions."""
     sure_rate_per_s: float | None
@@ -152,7 +154,7 @@ class UnlimitedLosses:
     paper_rate_per_s: float | None
     """The same under the paper's conditions."""
     void: str | None
-    """Why there are no moments; None if there are."""
+    """Why there are no mean squares; None if there are."""
 
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
@@ -160,7 +162,7 @@ class UnlimitedLosses:
             **{name: getattr(self, name) for name in self.__dataclass_fields__},
             "bursts": [burst._asdict() for burst in self.bursts],
             "runs": [moment._asdict() for moment in self.runs],
-            "moments": [moment._asdict() for moment in self.moments],
+            "mean_squares": self.mean_squares and self.mean_squares._asdict(),
         }
 
 
@@ -173,7 +175,7 @@ def unlimited_losses(
         NotPredictableError: the losses are no Markov chain over the packets.
     """
     losses = loss_process(resolved.network.link)
-    bounds, void = _moments(resolved, losses, conditions)
+    found, void = _at_fixed_times(resolved, losses, conditions)
     bursts = _bursts(resolved, scope, losses, conditions)
     paper_rate, at_events = _paper(resolved, losses)
     return UnlimitedLosses(
@@ -182,9 +184,9 @@ def unlimited_losses(
         resolved.timing.horizon_ns / NS_PER_S,
         tuple(bursts),
         tuple(moments_of_runs(bursts)),
-        tuple(bounds),
+        found,
         at_events,
-        bounds[0].rate_per_s if bounds and bounds[0].rate_per_s > 0 else None,
+        found.rate_per_s if found and found.rate_per_s > 0 else None,
         paper_rate,
         void,
     )
@@ -215,50 +217,31 @@ def _bursts(
     return certificates
 
 
-def _moments(
+def _at_fixed_times(
     resolved: Scenario, losses: LossProcess, conditions: NetworkConditions
-) -> tuple[list[Moments], str | None]:
+) -> tuple[MeanSquares | None, str | None]:
+    """Return mean squares at the first rate with a small loop gain, or else at the lowest; or why not."""
     if not _is_covered(resolved):
-        return [], "moments need the paper's trigger, and no disturbance, noise or observer"
+        return None, "this needs the paper's trigger, and no disturbance, noise or observer"
     loop, trigger = loop_of(resolved), resolved.decaying
     decay = -max(spectral_abscissa(loop.H), spectral_abscissa(loop.A + loop.B @ loop.K))
+    if decay <= 0:
+        return None, "the models or A + BK do not decay"
     alpha = trigger.alpha_per_s if below(trigger.alpha_per_s, decay) else _SLOWER * decay
     if trigger.floor > 0:
         alpha = 0.0
-    if decay <= 0:
-        return [], "the models or A + BK do not decay"
-    level, p = max(trigger.beta, trigger.floor), losses.largest_probability
-    bounds: list[Moments] = []
-    for order in ORDERS:
-        try:
-            bounds.append(_at_a_rate(loop, alpha, conditions, level, p, order))
-        except (NoCertificateError, NotDecayingError) as error:
-            return bounds, str(error)
-    mean, first = bounds
-    refined = refined_mean_squares(*_gains(loop, first.rate_per_s), conditions, level, p)
-    if refined.rate_per_s >= mean.rate_per_s:  # a mean is at most the root mean square
-        smaller = {name: min(getattr(mean, name), getattr(refined, name)) for name in BOUNDED}
-        mean = mean._replace(**smaller)
-    return [mean, refined], None
-
-
-def _at_a_rate(
-    loop: LoopMatrices, alpha_per_s: float, conditions: NetworkConditions, beta: float, p: float, order: int
-) -> Moments:
-    """Return the moments at the first rate with a small loop gain, or else at the lowest one."""
-    found: Moments | None = None
-    reason: Exception | None = None
+    beta, p = max(trigger.beta, trigger.floor), losses.largest_probability
+    found, reason = None, None
     for share in _RATES:
         try:
-            found = moments(*_gains(loop, share * alpha_per_s), conditions, beta, p, order)
+            found = mean_squares(*_gains(loop, share * alpha), conditions, beta, p)
         except (NoCertificateError, NotDecayingError) as error:
-            reason = error
+            reason = str(error)
         if found and (share == 1 or found.loop_gain < _CLEARLY):
-            return found
+            break
     if found is None:
-        assert reason is not None
-        raise reason
-    return found
+        return None, reason
+    return mean_squares(*_gains(loop, found.rate_per_s), conditions, beta, p, refined=True), None
 
 
 def _gains(loop: LoopMatrices, rate_per_s: float) -> tuple[ErrorGains, PlantGains]:

@@ -25,15 +25,15 @@ margin for rounding. Without delay and age they can be met for all p̄ < 1 (deri
 limit on the losses").
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.random_losses.mean_square_growth import from_triangles, triangles
 
 _OF_STATE, _OF_ERROR = (0.1, 0.35), (0.35, 0.75)
 """λ for small bounds of ‖x‖ and of ‖ê_c‖, as shares of the decay rate that is left at α."""
@@ -179,7 +179,7 @@ def quadratic_functions(loop: LossyFlow, known: Known) -> list[QuadraticFunction
     zero = np.zeros_like(loop.model)
     searches = [_Search(loop, known, share, loop.inverse_weight, zero) for share in _OF_STATE]
     searches += [_Search(loop, known, share, zero, np.eye(len(zero))) for share in _OF_ERROR]
-    return [function for search in searches for function in search.functions()]
+    return [function for search in searches if (function := search.function()) is not None]
 
 
 class _Unknowns(NamedTuple):
@@ -203,7 +203,7 @@ class _Search:
     ) -> None:
         self._loop, self._rate = loop, share * loop.decay_per_s
         n = len(loop.model)
-        self._n, self._triangle, self._larger = n, np.triu_indices(n), np.triu_indices(2 * n)
+        self._n = n
         self._sum, self._sensor = np.hstack([np.eye(n)] * 2), np.diag(np.repeat([0.0, 1.0], n))
         self._of_state, self._of_error = of_state, of_error @ self._sum
         unit = known.sensor_error
@@ -211,30 +211,30 @@ class _Search:
         self._start = loop.start / unit
         self._flight = loop.flight(self._rate) if loop.delay_s > 0 else None
 
-    def functions(self) -> Iterator[QuadraticFunction]:
-        """The function for the smallest bound that was found; none if it cannot be confirmed."""
+    def function(self) -> QuadraticFunction | None:
+        """The function for the smallest bound that was found; None if it cannot be confirmed."""
         try:
             first = self._first()
             found = None if first is None else _Inequalities(self._blocks, len(first)).maximise_last(first)
         except np.linalg.LinAlgError:  # a matrix is singular to rounding
-            return
-        if found is not None:
-            X, P, mu, nu, zetas, _ = self._unknowns(found)
-            yield QuadraticFunction(X, P + nu * self._sensor, nu, self._rate, mu, zetas, self._loop)
+            return None
+        if found is None:
+            return None
+        X, P, mu, nu, zetas, _ = self._unknowns(found)
+        return QuadraticFunction(X, P + nu * self._sensor, nu, self._rate, mu, zetas, self._loop)
 
     def _unknowns(self, values: Vector) -> _Unknowns:
-        n, first = self._n, len(self._triangle[0])
-        last = first + len(self._larger[0])
-        mu, nu, *others, gain = values[last:]
+        n = self._n
+        sizes = np.cumsum([n * (n + 1) // 2, n * (2 * n + 1)])
+        of_state, of_errors, (mu, nu, *others, gain) = np.split(values, sizes)
         zetas = np.zeros(len(self._loop.inputs))
         zetas[self._loop.inputs] = others
-        X = _symmetric(values[:first], self._triangle, n)
-        P = _symmetric(values[first:last], self._larger, 2 * n)
+        (X,), (P,) = from_triangles(of_state, n), from_triangles(of_errors, 2 * n)
         return _Unknowns(X, P, mu, nu, zetas, gain)
 
     def _values(self, unknowns: _Unknowns) -> Vector:
         X, P, mu, nu, zetas, gain = unknowns
-        return np.array([*X[self._triangle], *P[self._larger], mu, nu, *zetas[self._loop.inputs], gain])
+        return np.array([*triangles(X), *triangles(P), mu, nu, *zetas[self._loop.inputs], gain])
 
     def _blocks(self, values: Vector) -> Blocks:
         """What is to be positive definite; affine in the values."""
@@ -431,12 +431,6 @@ def _decaying_form(M: Matrix, rate_per_s: float) -> Matrix:
     both_sides = np.kron(flow, identity) + np.kron(identity, flow)
     form = np.linalg.solve(both_sides, -identity.ravel()).reshape(M.shape)
     return np.asarray((form + form.T) / 2)
-
-
-def _symmetric(entries: Vector, triangle: tuple[NDArray[np.intp], NDArray[np.intp]], n: int) -> Matrix:
-    matrix = np.zeros((n, n))
-    matrix[triangle] = matrix.T[triangle] = entries
-    return matrix
 
 
 def _rounding(sizes: Matrix) -> Matrix:

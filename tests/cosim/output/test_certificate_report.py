@@ -212,8 +212,8 @@ def test_without_a_cap_the_mean_at_events_in_the_chosen_norm_is_beta_over_1_minu
     for shorter, longer in pairwise(found.bursts):
         assert shorter.probability < longer.probability
         assert shorter.state < longer.state
-    gain = "the loop gain of the moments is 1.32, not below 1"
-    texts = list(sentences(replace(found, moments=(), void=gain, sure_rate_per_s=None)))
+    gain = "the loop gain of the mean squares is 1.32, not below 1"
+    texts = list(sentences(replace(found, mean_squares=None, void=gain, sure_rate_per_s=None)))
     assert f"At every time no mean is certified: {gain}." in texts
 
 
@@ -221,18 +221,16 @@ def test_the_bounds_of_means_are_one_table_with_rounding_up(without_a_cap: Certi
     found = without_a_cap.unlimited
     assert found is not None
     runs = tuple(run._replace(controller_error=1.00001 + run.order) for run in found.runs)
-    rare = found.moments[0]._replace(order=2, rate_per_s=0.125, state=7.00001)
-    found = replace(found, runs=runs, moments=(found.moments[0], rare), at_events=(1.5, 2.00001))
+    assert found.mean_squares is not None
+    fixed = found.mean_squares._replace(rate_per_s=0.125, state=7.00001)
+    found = replace(found, runs=runs, mean_squares=fixed, at_events=(1.5, 2.00001))
     table = moments_table(found, "‖W e_c‖", beta=0.5)
     assert table.headings == (
         "", "rate,\n1/s", "mean\n‖x‖", "rms\n‖x‖", "mean\n‖W e_c‖", "rms\n‖W e_c‖",
     )  # fmt: skip
-    at_mean_rate, at_rms_rate, of_run, at_event = (tuple(row) for row in table.rows)
-    mean = found.moments[0]
-    assert at_mean_rate == (
-        "at every time", "0.25", at_most(mean.state), "-", at_most(mean.controller_error), "-",
-    )  # fmt: skip
-    assert at_rms_rate[:4] == ("at every time", "0.125", "-", "7.001")
+    at_fixed_times, of_run, at_event = (tuple(row) for row in table.rows)
+    error = at_most(fixed.controller_error)
+    assert at_fixed_times == ("at every time", "0.125", "7.001", "7.001", error, error)
     assert (of_run[0], *of_run[4:]) == ("largest of a run", "2.001", "3.001")
     assert at_event == ("before an event", "0.25", "-", "-", "0.75", "1.001")
 

@@ -16,12 +16,7 @@ from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, exponen
 from noack.theory.margins.invariant_polytopes import InvariantPolytopes, PolytopeNorm
 from noack.theory.margins.joint_spectral_radius import bound_by_products, joint_spectral_radius
 from noack.theory.margins.quadratic_norms import NormSearch, remembering
-from noack.theory.margins.switched_system import (
-    Edge,
-    SwitchedSystem,
-    spectral_radius_bounds,
-    strongly_connected,
-)
+from noack.theory.margins.switched_system import Edge, SwitchedSystem, spectral_radius_bounds
 
 GOLDEN_RATIO = (1 + 5**0.5) / 2
 
@@ -60,12 +55,13 @@ def random_graph(rng: np.random.Generator) -> list[Edge]:
 def test_no_polytopes_prove_too_much(seed: int) -> None:
     """The bound is valid for any vertices, also if they were not grown to the end."""
     rng = np.random.default_rng(seed)
-    (system,) = strongly_connected(random_graph(rng))
-    value = joint_spectral_radius(system.edges, accuracy=1e-3).lower
-    vertices = {
-        node: np.concatenate([np.diag(rng.uniform(0.01, 2, n)), rng.normal(size=(5, n))])
-        for node, n in system.dimensions.items()
-    }
+    edges = random_graph(rng)
+    system, value = SwitchedSystem.of(edges), joint_spectral_radius(edges, accuracy=1e-3).lower
+    n = system.dimension
+    vertices = [
+        np.concatenate([np.diag(rng.uniform(0.01, 2, n)), rng.normal(size=(5, n))])
+        for _ in range(system.graph.nodes)
+    ]
     polytopes = InvariantPolytopes(system, value * rng.uniform(0.5, 2), vertices)
     assert polytopes.bound() >= value
     polytopes.grow(30)
@@ -98,9 +94,9 @@ def test_a_growth_near_the_threshold_is_decided(seed: int) -> None:
 def test_the_estimate_of_the_work_is_mostly_that_of_a_complete_search() -> None:
     ratios = []
     for seed in range(12):
-        (system,) = strongly_connected(random_graph(np.random.default_rng(seed)))
-        slowest = joint_spectral_radius(system.edges, accuracy=1e-3).lower
-        balanced, growth = system.balanced(), 1.05 * slowest
+        edges = random_graph(np.random.default_rng(seed))
+        slowest = joint_spectral_radius(edges, accuracy=1e-3).lower
+        balanced, growth = SwitchedSystem.of(edges).balanced(), 1.05 * slowest
         complete = bound_by_products(balanced, growth, 60_000, slowest=slowest)
         assert complete.upper <= growth
         assert complete.needed_products == complete.products
@@ -121,20 +117,20 @@ def test_a_growth_that_is_the_threshold_is_undecided() -> None:
 def test_no_norms_and_no_products_prove_too_much(seed: int) -> None:
     """Their bounds hold in any coordinates; a broken copy without the best cycle is caught."""
     rng = np.random.default_rng(seed)
-    (system,) = strongly_connected(random_graph(rng))
-    found = joint_spectral_radius(system.edges, accuracy=1e-3)
+    edges = random_graph(rng)
+    system, found = SwitchedSystem.of(edges), joint_spectral_radius(edges, accuracy=1e-3)
     norms = NormSearch(system).improve(0.0)
     assert found.lower <= norms.upper
     assert found.lower <= NormSearch(remembering(system, 3)).improve(0.0).upper
-    forms = {v: np.eye(n) + 0.5 * rng.normal(size=(n, n)) for v, n in system.dimensions.items()}
-    for coordinates in (norms.forms, forms):
-        turned = system.in_coordinates(coordinates)
+    n = system.dimension
+    forms = np.eye(n) + 0.5 * rng.normal(size=(system.graph.nodes, n, n))
+    for turned in (norms.system, system.in_coordinates(forms)):
         assert turned is not None
         for growth in (0.5 * found.lower, 1.01 * found.lower):
             assert bound_by_products(turned, growth, 300).upper >= found.lower
     zero = [one._replace(matrix=exactly(0 * one.matrix.middle)) if number in found.cycle else one
-            for number, one in enumerate(system.edges)]  # fmt: skip
-    assert NormSearch(SwitchedSystem(tuple(zero))).improve(0.0).upper < found.lower
+            for number, one in enumerate(edges)]  # fmt: skip
+    assert NormSearch(SwitchedSystem.of(zero)).improve(0.0).upper < found.lower
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -232,7 +228,7 @@ def test_nilpotent_systems_do_not_grow() -> None:
 
 
 def test_maps_that_are_zero_have_norms() -> None:
-    zeros = SwitchedSystem((edge(0, 0, np.zeros((2, 2))), edge(0, 0, np.zeros((2, 2)), 2)))
+    zeros = SwitchedSystem.of([edge(0, 0, np.zeros((2, 2))), edge(0, 0, np.zeros((2, 2)), 2)])
     assert NormSearch(zeros).improve(1.0).growths.max() < 1e-70
 
 

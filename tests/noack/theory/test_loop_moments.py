@@ -17,7 +17,7 @@ from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.loss_margin import loop_times
-from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
+from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop, repeated
 from noack.theory.random_losses.loop_moments import (
     LoopMoments,
     LoopPeriods,
@@ -59,8 +59,8 @@ def integrator() -> tuple[MomentStep, MomentStep]:
 def test_first_example_of_jitter_time() -> None:
     """The figures are those of X-N-C/JitterTime.jl, test/example_1_test.jl and test_periodic.jl."""
     tenth, sample = integrator()
-    period = tenth.repeated(10).then(sample)
-    run = tenth.repeated(20).then(period.repeated(4))
+    period = repeated(tenth, 10).then(sample)
+    run = repeated(tenth, 20).then(repeated(period, 4))
     assert run.constants[0] == pytest.approx(7.420841162336913, rel=1e-13)
     variance = [1.078061834694495, 1.078061834694495, -1.366927632691700]
     assert run.noise[0] == pytest.approx(np.array(variance), rel=1e-13)

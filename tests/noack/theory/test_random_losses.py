@@ -16,7 +16,7 @@ from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.random_losses import mean_square_growth as mean_square_module
 from noack.theory.random_losses import moments as moments_module
 from noack.theory.random_losses import random_growth as random_growth_module
-from noack.theory.random_losses.fixed_times import moments, refined_mean_squares
+from noack.theory.random_losses.fixed_times import mean_squares
 from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
 from noack.theory.random_losses.quadratic_moments import Known, LossyFlow, quadratic_functions
 from tests.noack.theory.certificate_kinds.random_losses import certify, draw, simulate_runs
@@ -76,25 +76,19 @@ def test_the_mean_of_the_largest_values_of_runs_by_hand() -> None:
     assert moments_of_runs([]) == []
 
 
-@pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("p", [0.0, 0.01, 0.3, 0.9])
-def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand(
-    p: float, order: int
-) -> None:
+def test_mean_squares_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand(p: float) -> None:
     """π = g|e_c|, |x| = 1 + π/(r + e), |e_c| = β + lost errors, of which all add (e|x| + π)/r."""
     rate, gain, mismatch, beta = 2.0, 1.5, 0.2, 0.1
     plant = scalar(rate, gain, mismatch)
-    found = moments(plant.error, plant, NetworkConditions(0), beta, p, order)
+    found = mean_squares(plant.error, plant, NetworkConditions(0), beta, p)
     e_c, powers = beta, p ** np.arange(1.0, 2000)
     for _ in range(2000):
         x = 1.0 + gain * e_c / (rate + mismatch)
         whole = (mismatch * x + gain * e_c) / rate
         tails = np.minimum(1, powers * whole / beta)
-        numbers = np.arange(len(tails))
-        burst = [
-            beta * (tails @ (numbers**0 if r == 1 else 2 * numbers + 1)) ** (1 / r) for r in range(order, 3)
-        ]
-        e_c = beta + min(p ** (1 / order) * whole, *burst)
+        burst = beta * np.sqrt(tails @ (2 * np.arange(len(tails)) + 1))
+        e_c = beta + min(np.sqrt(p) * whole, burst)
     assert found.controller_error == pytest.approx(e_c, rel=0.02)
     assert found.state == pytest.approx(x, rel=0.02)
     assert found.input_error == pytest.approx(gain * e_c, rel=0.02)
@@ -173,7 +167,7 @@ def test_mean_squares_without_a_quadratic_function_are_those_of_the_inequalities
     error = ErrorGains(-np.eye(1), np.array([[gain / unit]]), np.eye(1), 0.2)
     plant = PlantGains(error, np.array([[-1.2 - gain]]), np.array([[unit]]), np.array([[unit]]), 0.2)
     args = error, plant, conditions, 0.1 * unit, p
-    found, first = refined_mean_squares(*args), moments(*args, 2)
+    found, first = mean_squares(*args, refined=True), mean_squares(*args)
     assert found.state <= first.state
     assert found.controller_error <= first.controller_error
 
@@ -183,7 +177,7 @@ def test_inputs_that_are_too_old_for_the_fastest_mode_have_no_moments() -> None:
     error = ErrorGains(-np.diag([1.0, 1e6]), np.array([[-0.1, -0.1]]), np.eye(2), 0.2)
     plant = PlantGains(error, -np.diag([1.0, 1e6]), np.zeros((2, 1)), np.ones((2, 1)), 0.2)
     with np.errstate(all="ignore"), pytest.raises(NoCertificateError, match="overflow"):
-        moments(error, plant, NetworkConditions(0, hold_s=0.007), 0.1, 0.3, 2)
+        mean_squares(error, plant, NetworkConditions(0, hold_s=0.007), 0.1, 0.3)
 
 
 def test_moments_at_a_lower_rate_than_the_triggers() -> None:

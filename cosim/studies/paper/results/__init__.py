@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 NAMES = tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
 
 
-def named(name: str) -> "PublishedResult":
+def find_result(name: str) -> "PublishedResult":
     """Return a result; raise CallerError if there is none of this name."""
     if name not in NAMES:
         hint = did_you_mean(name, NAMES) or f"there are {', '.join(NAMES)}"
@@ -30,5 +30,5 @@ def named(name: str) -> "PublishedResult":
 
 def reproduce(name: str) -> "Reproduction":
     """Compute a result; raise CallerError if there is none of this name."""
-    result = named(name)
+    result = find_result(name)
     return published_result.Reproduction(name, result, result.rows())

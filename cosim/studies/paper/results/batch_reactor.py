@@ -8,10 +8,10 @@ from cosim.simulation.continuous import ContinuousLoop
 from cosim.studies.paper.published_result import (
     PublishedResult,
     Row,
-    directions,
-    run_all,
+    run_from_each,
     shipped_loop,
-    stored,
+    stored_matrices,
+    unit_states,
 )
 from noack.core.linear_systems import Matrix
 
@@ -24,36 +24,36 @@ _AFTER_ONE = {1, 2, 3}
 
 def _periods(loop: ContinuousLoop, states: Matrix) -> NDArray[np.int64]:
     """Return the periods until the first event from each state, (k,)."""
-    log = run_all(loop, states, 0.2, places=30)
+    log = run_from_each(loop, states, 0.2, places=30)
     return np.asarray(np.rint(log.event_s[:, 0] / _PERIOD_S), np.int64)
 
 
-def _held(loop: ContinuousLoop, periods: int) -> Matrix:
+def _held_map(loop: ContinuousLoop, periods: int) -> Matrix:
     """Return M of x(t) = M x(0), t so many periods after an event."""
     A, BK = loop.loop.A, loop.loop.B @ loop.loop.K
     transition = expm(np.block([[A, BK], [np.zeros((4, 8))]]) * _PERIOD_S * periods)
     return np.asarray(transition[:4, :4] + transition[:4, 4:])
 
 
-def _latest(loop: ContinuousLoop, periods: int) -> tuple[float, Matrix]:
+def _slowest_state(loop: ContinuousLoop, periods: int) -> tuple[float, Matrix]:
     """Return the smallest eigenvalue of the compared form after so many periods, and its state.
 
     If it is positive, every state has transmitted by then.
     """
     P, N = loop.trigger.form
-    z = np.vstack([M := _held(loop, periods), np.eye(4) - M])
+    z = np.vstack([M := _held_map(loop, periods), np.eye(4) - M])
     values, vectors = np.linalg.eigh(z.T @ (P.T @ P - N.T @ N) @ z)
     return float(values[0]), vectors[:, 0]
 
 
 def _rows() -> list[Row]:
     loop = shipped_loop("reactor_petc")
-    states = np.vstack([directions(2000, 4), *(_latest(loop, k)[1] for k in range(1, 5))])
+    states = np.vstack([unit_states(2000, 4), *(_slowest_state(loop, k)[1] for k in range(1, 5))])
     periods = _periods(loop, states)
     proven = set(periods.tolist())
-    complete = proven == _REGIONS and _latest(loop, 5)[0] > 0
-    following = set(_periods(loop, states[periods == 1] @ _held(loop, 1).T).tolist())
-    forms = stored("batch_reactor")["region_2"].values()
+    complete = proven == _REGIONS and _slowest_state(loop, 5)[0] > 0
+    following = set(_periods(loop, states[periods == 1] @ _held_map(loop, 1).T).tolist())
+    forms = stored_matrices("batch_reactor")["region_2"].values()
     stays, leaves = (np.einsum("ki,ij,kj->k", states, form, states) for form in forms)
     inside, has_two = (stays <= 0) & (leaves > 0), periods == 2
     counts, agree = (f"{inside.sum()}", f"{has_two.sum()}"), bool((inside == has_two).all())

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from cosim.studies.paper.published_result import PublishedResult, Row, number, stored
+from cosim.studies.paper.published_result import PublishedResult, Row, stored_matrices, value_row
 from noack.core.linear_systems import Matrix
 
 _WHERE = "authors' README.md"
@@ -17,7 +17,7 @@ _HOW = (
 _DEVIATION = "the authors' formula gives 380.4944, too; the table's last digits differ"
 
 
-class Loop(NamedTuple):
+class ScheduledLoop(NamedTuple):
     """x⁺ = Ax + Bu + w, y = Cx + v, and the cost xᵀQx + uᵀRu; W and V are covariances."""
 
     A: Matrix
@@ -41,7 +41,7 @@ class Loop(NamedTuple):
         P = solve_discrete_are(self.A.T, self.C.T, self.W, self.V)
         return np.asarray(np.linalg.solve(self.C @ P @ self.C.T + self.V, self.C @ P).T)
 
-    def loss(self, sent: Sequence[bool]) -> float:
+    def mean_cost(self, sent: Sequence[bool]) -> float:
         """Return the mean cost per step if the estimate is sent at these steps of a period.
 
         The state is (x, x_f, x_c): plant, filtered estimate, the controller's estimate. After a
@@ -66,7 +66,7 @@ class Loop(NamedTuple):
         return total / len(steps)
 
 
-def loops(seed: int = 20, n: int = 2, count: int = 3) -> list[Loop]:
+def drawn_loops(seed: int = 20, n: int = 2, count: int = 3) -> list[ScheduledLoop]:
     """Return the plants that the authors' program draws, each with an unstable A, and n states."""
     random = np.random.RandomState(seed)  # as the authors' program
 
@@ -74,22 +74,22 @@ def loops(seed: int = 20, n: int = 2, count: int = 3) -> list[Loop]:
         drawn = random.rand(size, size)
         return np.asarray((drawn + drawn.T) / 2 + size * np.eye(size))
 
-    loops: list[Loop] = []
+    loops: list[ScheduledLoop] = []
     while len(loops) < count:
         A = random.rand(n, n)
         while np.linalg.eigvals(A).real.max() < 1:
             A = random.rand(n, n)
         B, C = random.rand(n, 1), random.rand(1, n)
-        loops.append(Loop(A, B, C, positive(n), positive(1), positive(n), positive(1)))
+        loops.append(ScheduledLoop(A, B, C, positive(n), positive(1), positive(n), positive(1)))
     return loops
 
 
 def _rows() -> list[Row]:
-    drawn, rows = list(zip("123", loops(), strict=True)), []
-    for schedule, published in stored("demirel")["losses"].items():
+    drawn, rows = list(zip("123", drawn_loops(), strict=True)), []
+    for schedule, published in stored_matrices("demirel")["losses"].items():
         turns = schedule.split(",")
-        total = sum(loop.loss([turn == name for turn in turns]) for name, loop in drawn)
-        row = number(f"loss of {', '.join(turns)}", _WHERE, float(published), total, _HOW, digits=4)
+        total = sum(loop.mean_cost([turn == name for turn in turns]) for name, loop in drawn)
+        row = value_row(f"loss of {', '.join(turns)}", _WHERE, float(published), total, _HOW, digits=4)
         rows.append(row._replace(deviation=_DEVIATION if len(turns) == 7 else ""))
     return rows
 

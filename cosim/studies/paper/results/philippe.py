@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cosim.studies.paper.published_result import PublishedResult, Row, number
+from cosim.studies.paper.published_result import PublishedResult, Row, value_row
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.joint_spectral_radius import joint_spectral_radius
 from noack.theory.margins.switched_system import Edge
@@ -34,8 +34,8 @@ def _rows() -> list[Row]:
     computed_cycle = _CYCLE if _CYCLE in rotated else rotated[0]
     published, computed = (",".join(map(str, cycle)) for cycle in (_CYCLE, computed_cycle))
     return [
-        number("growth, lower bound", _WHERE, _RADIUS, radius.lower, _HOW, digits=12),
-        number("growth, upper bound", _WHERE, _RADIUS, radius.upper, _HOW, digits=10),
+        value_row("growth, lower bound", _WHERE, _RADIUS, radius.lower, _HOW, digits=12),
+        value_row("growth, upper bound", _WHERE, _RADIUS, radius.upper, _HOW, digits=10),
         Row("its modes", _WHERE, "=", published, computed, _HOW, _CYCLE in rotated),
     ]
 

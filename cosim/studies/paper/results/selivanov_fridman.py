@@ -14,10 +14,10 @@ from cosim.simulation.continuous import ContinuousLoop
 from cosim.studies.paper.published_result import (
     PublishedResult,
     Row,
-    directions,
-    run_all,
+    run_from_each,
     shipped_loop,
-    stored,
+    stored_matrices,
+    unit_states,
 )
 from noack.core.linear_systems import Matrix
 
@@ -123,7 +123,7 @@ INEQUALITIES = {
 
 
 def _rows() -> list[Row]:
-    rows, solved = [], stored("selivanov_fridman")
+    rows, solved = [], stored_matrices("selivanov_fridman")
     for statement, (inequalities, h, epsilon, waits) in INEQUALITIES.items():
         parts = inequalities(solved[statement], h, epsilon, waits=waits)
         margin = min(map(smallest_eigenvalue, parts))
@@ -132,7 +132,7 @@ def _rows() -> list[Row]:
     loops = (("switching", "Theorem 1", _switching()), ("periodic", "Remark 1", _periodic()))
     means = []
     for name, statement, loop in loops:
-        grown, mean = _run(loop, solved[statement]["P"], directions(100, 2))
+        grown, mean = _run(loop, solved[statement]["P"], unit_states(100, 2))
         means.append(mean)
         quantity, place = f"growth of V, {name}", f"follows from {statement}"
         rows.append(Row(quantity, place, "≤", "1", f"{grown:.3f}", _RUN, grown <= 1))
@@ -160,7 +160,7 @@ def _run(loop: ContinuousLoop, P: Matrix, x0: Matrix) -> tuple[float, float]:
 
     At a transmission the paper's functional V is xᵀPx. The one at t = 0 counts.
     """
-    log = run_all(loop, x0, 20.0, places=100)
+    log = run_from_each(loop, x0, 20.0, places=100)
     assert log.states is not None
     happened = ~np.isnan(log.event_s)
     x, t_s = log.states[:, :, 0][happened], log.event_s[happened]

@@ -154,7 +154,7 @@ class Message(NamedTuple):
     inputs: Vector
     end: float
     """The input after these is end − Kz."""
-    heard: int
+    acknowledged: int
     """The newest period of which the controller knows the nominal state."""
 
     def input(self, age: int, K: Vector, z: Vector) -> float:
@@ -162,7 +162,7 @@ class Message(NamedTuple):
         return float(self.inputs[age]) if age < N else self.end - float(K @ z)
 
 
-class Outcome(NamedTuple):
+class RunOutcome(NamedTuple):
     """How a run went: the largest shares of tube and limits, and what there was at its end."""
 
     tube: float
@@ -176,10 +176,10 @@ class Outcome(NamedTuple):
     """Of the plant's position from the target, after 5 s."""
 
 
-def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vector) -> Outcome:
+def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vector) -> RunOutcome:
     """Run the loop from rest; ``own`` is the gain of the plant's side.
 
-    The plant's side uses a message if it has received all since the period ``heard`` in it: then
+    The plant's side uses a message if it has received all since the period ``acknowledged`` in it: then
     the controller knew the nominal state. Its answer says which message it uses. Without an answer
     the controller assumes that it uses the newest one. The first packets arrive.
     """
@@ -189,7 +189,7 @@ def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vect
     arriving = np.random.default_rng(round(100 * lost)).random((STEPS, 2)) >= lost
     arriving[0] = True
     sent, x, z, assumed = list[Message](), np.zeros(n), np.zeros(n), np.zeros(n)
-    heard = used = unbroken = unsolved = 0
+    acknowledged = used = unbroken = unsolved = 0
     shares = np.zeros(3)
     for k, ((arrives, answered), w) in enumerate(zip(arriving, disturbances, strict=True)):
         if (solution := optimisation.inputs(assumed)) is None:
@@ -197,9 +197,9 @@ def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vect
             sent.append(sent[-1])
         else:
             inputs, position_m = solution
-            sent.append(Message(inputs, K[0] * position_m, heard))
+            sent.append(Message(inputs, K[0] * position_m, acknowledged))
         unbroken = unbroken + 1 if arrives else 0
-        if arrives and unbroken >= k - heard:
+        if arrives and unbroken >= k - acknowledged:
             used = k
         v = sent[used].input(k - used, K, z)
         u = v - float(own @ (x - z))
@@ -208,13 +208,13 @@ def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vect
         assumed = A @ assumed + b * sent[k].inputs[0]
         z, x = A @ z + b * v, A @ x + b * u + w
         if answered:
-            assumed, heard = z, k
+            assumed, acknowledged = z, k
     tube, state, most_input = shares.tolist()
     distance_m, plant_distance_m = abs(float(z[0]) - TARGET_M), abs(float(x[0]) - TARGET_M)
-    return Outcome(tube, state, most_input, unsolved, distance_m, plant_distance_m)
+    return RunOutcome(tube, state, most_input, unsolved, distance_m, plant_distance_m)
 
 
-def disturbances_of(optimisation: Optimisation) -> tuple[Matrix, Matrix]:
+def make_disturbances(optimisation: Optimisation) -> tuple[Matrix, Matrix]:
     """Return disturbances w_k within their limits, (k, n): random ones, and those that turn most.
 
     The latter make the angle's difference x − z reach the tube's end in the last period.
@@ -232,7 +232,7 @@ def _rows() -> list[Row]:
     outcomes = [
         run(optimisation, lost, disturbances, optimisation.K[0])
         for lost in LOSSES
-        for disturbances in disturbances_of(optimisation)
+        for disturbances in make_disturbances(optimisation)
     ]
     tube, state, most_input, unsolved, distance_m, _ = map(max, zip(*outcomes, strict=True))
     largest = (

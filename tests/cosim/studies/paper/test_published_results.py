@@ -10,8 +10,15 @@ from rich.console import Console
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
 
-from cosim.studies.paper.published_result import print_rows, stored
-from cosim.studies.paper.results import NAMES, demirel, named, reproduce, selivanov_fridman, umsonst_barbosa
+from cosim.studies.paper.published_result import print_rows, stored_matrices
+from cosim.studies.paper.results import (
+    NAMES,
+    demirel,
+    find_result,
+    reproduce,
+    selivanov_fridman,
+    umsonst_barbosa,
+)
 from noack.core.errors import ExitStatus
 from tests.command_line import invoke
 from tests.pages import ROOT
@@ -34,8 +41,8 @@ def test_rows_are_as_published_and_as_documented(name: str) -> None:
 
 
 def test_a_value_that_differs_fails_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    plants = demirel.loops()
-    monkeypatch.setattr(demirel, "loops", lambda: [*plants[:2], plants[0]])
+    plants = demirel.drawn_loops()
+    monkeypatch.setattr(demirel, "drawn_loops", lambda: [*plants[:2], plants[0]])
     result = invoke("paper", "demirel", "--json")
     assert result.exit_code == ExitStatus.FAILED
     assert {row["verdict"] for row in json.loads(result.stdout)["rows"]} == {"differs"}
@@ -44,10 +51,10 @@ def test_a_value_that_differs_fails_the_command(monkeypatch: pytest.MonkeyPatch)
 def test_the_list_has_every_result() -> None:
     result = invoke("paper", "--list", "--json")
     assert result.exit_code == ExitStatus.OK
-    assert json.loads(result.stdout) == {name: named(name).about for name in NAMES}
+    assert json.loads(result.stdout) == {name: find_result(name).about for name in NAMES}
 
 
-def formula(loop: demirel.Loop, sent: Sequence[bool]) -> float:
+def formula(loop: demirel.ScheduledLoop, sent: Sequence[bool]) -> float:
     """The authors' formula of the loss, by the steps since the last transmission."""
     A, L, C = loop.A, loop.gain, loop.C
     S = solve_discrete_are(A, loop.B, loop.Q, loop.R)
@@ -64,14 +71,14 @@ def formula(loop: demirel.Loop, sent: Sequence[bool]) -> float:
 @pytest.mark.parametrize("seed", range(5))
 def test_losses_agree_with_the_authors_formula(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    for loop in demirel.loops(seed + 20):
+    for loop in demirel.drawn_loops(seed + 20):
         sent = [True, *(rng.random(6) < 0.4)]
-        assert loop.loss(sent) == pytest.approx(formula(loop, sent), rel=1e-8)
+        assert loop.mean_cost(sent) == pytest.approx(formula(loop, sent), rel=1e-8)
 
 
 def test_the_row_that_differs_is_not_what_the_authors_formula_gives_either() -> None:
     turns = list("2131211")
-    loops = zip("123", demirel.loops(), strict=True)
+    loops = zip("123", demirel.drawn_loops(), strict=True)
     total = sum(formula(loop, [turn == own for turn in turns]) for own, loop in loops)
     assert total == pytest.approx(380.4944, abs=5e-5)
 
@@ -85,7 +92,7 @@ def margin(statement: str, solution: selivanov_fridman.Solution, h: float, epsil
 def test_a_broken_solution_is_no_solution() -> None:
     """Beyond the published h and ε the stored solutions fail, and so do changed ones."""
     for statement, (_, h, epsilon, _) in selivanov_fridman.INEQUALITIES.items():
-        solution = stored("selivanov_fridman")[statement]
+        solution = stored_matrices("selivanov_fridman")[statement]
         assert margin(statement, solution, h, epsilon) > 1e-9
         assert margin(statement, solution, 1.02 * h, epsilon) < 0
         assert margin(statement, solution, h, 1.05 * epsilon) < 0
@@ -143,7 +150,7 @@ def test_predicted_inputs_are_the_best_within_the_limits(optimisation: umsonst_b
 def test_without_the_gain_at_the_plants_side_the_tube_is_left(
     optimisation: umsonst_barbosa.Optimisation,
 ) -> None:
-    drawn, worst = umsonst_barbosa.disturbances_of(optimisation)
+    drawn, worst = umsonst_barbosa.make_disturbances(optimisation)
     own = optimisation.K[0]
     assert umsonst_barbosa.run(optimisation, 0.5, drawn, own).tube < 1
     assert umsonst_barbosa.run(optimisation, 0.5, drawn, 0 * own).tube > 1
@@ -156,7 +163,7 @@ def test_the_plant_is_farther_from_the_target_than_the_nominal_position(
     farthest_m = max(
         umsonst_barbosa.run(optimisation, lost, disturbances, optimisation.K[0]).plant_distance_m
         for lost in umsonst_barbosa.LOSSES
-        for disturbances in umsonst_barbosa.disturbances_of(optimisation)
+        for disturbances in umsonst_barbosa.make_disturbances(optimisation)
     )
     reach_m = optimisation.plant.tube(optimisation.K, np.eye(4)[0])
     for metres in (farthest_m, reach_m):

@@ -119,7 +119,7 @@ def _each_burst_alone(loop: LoopMaps) -> Stability:
     true = loss_margin.joint_spectral_radius
 
     def wrong(edges: Sequence[Edge], **options: Any) -> JointSpectralRadius:
-        fastest = find_cycle(SwitchedSystem(tuple(edges)), 1, len(edges)).growth
+        fastest = find_cycle(SwitchedSystem.of(edges), 1, len(edges)).growth
         return true(edges, **options)._replace(upper=fastest)
 
     with patch.object(loss_margin, "joint_spectral_radius", wrong):

@@ -1,8 +1,8 @@
 """Losses without a limit: means and mean squares of many runs of each loop.
 
-Those at every fixed time are compared for loops with a schedule; those of a run's largest values,
-and of e_c at events, under the paper's conditions. A mean over runs is random itself. So the value
-that is compared with a bound is the mean minus five standard errors.
+Mean squares at every fixed time are compared for loops with a schedule; both moments of a run's
+largest values, and of e_c at events, under the paper's conditions. A mean over runs is random
+itself. So the value that is compared with a bound is the mean minus five standard errors.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
-from noack.theory.random_losses.fixed_times import moments, refined_mean_squares
+from noack.theory.random_losses.fixed_times import mean_squares
 from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.oracles.continuous_loops import simulate_continuous_time
@@ -35,21 +35,18 @@ _SIGNALS = {
 
 @dataclass(frozen=True)
 class RandomLoop:
-    """A loop, the probability of a loss, and what its moments are."""
+    """A loop, the probability of a loss, and which runs count."""
 
     system: System
     probability: float
-    order: int
-    """r, of the moments at every fixed time."""
     most_lost: int
     """Only runs with so few consecutive losses count in the moments of a run's largest values."""
 
 
 def draw(rng: np.random.Generator, **fixed: Any) -> RandomLoop:
-    """Draw a loop; half of the moments at every fixed time are mean squares."""
+    """Draw a loop."""
     probability = fixed.pop("probability", 10 ** rng.uniform(-2.5, -0.1))
-    system, order = random_system(rng, **fixed), int(rng.integers(1, 3))
-    return RandomLoop(system, probability, order, int(rng.choice(_LOST)))
+    return RandomLoop(random_system(rng, **fixed), probability, int(rng.choice(_LOST)))
 
 
 def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds | None:
@@ -58,10 +55,7 @@ def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds
     gains, conditions = system.gains(), system.conditions._replace(**changes)
     network = conditions, system.beta, share * loop.probability
     try:
-        if loop.order == 2:
-            found = refined_mean_squares(gains.error, gains, *network)
-        else:
-            found = moments(gains.error, gains, *network, loop.order)
+        found = mean_squares(gains.error, gains, *network, refined=True)
     except (NoCertificateError, NotDecayingError):
         return None
     return {
@@ -71,7 +65,7 @@ def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds
 
 
 def simulate_runs(loop: RandomLoop, rng: np.random.Generator, rate_share: float = 1.0) -> Observed:
-    """The largest moments over time, scaled at a share of α, each minus five standard errors."""
+    """The largest mean squares over time, scaled at a share of α, each minus five standard errors."""
     system = loop.system
     lost = rng.uniform(size=(_RUNS, system.events)) < loop.probability
     if not system.known_start:
@@ -83,7 +77,7 @@ def simulate_runs(loop: RandomLoop, rng: np.random.Generator, rate_share: float 
     growth = np.exp(rate_share * system.alpha * times_s(system))
     signals = {name: growth * getattr(trace, field) for name, field in _SIGNALS.items()}
     assert all(values.shape == (_RUNS, STEPS) for values in signals.values())
-    return Observed(_RUNS, {name: _least_moment(values, loop.order) for name, values in signals.items()})
+    return Observed(_RUNS, {name: _least_moment(values, 2) for name, values in signals.items()})
 
 
 def _least_moment(values: Reals, order: int) -> float:
