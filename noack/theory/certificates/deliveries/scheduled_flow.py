@@ -92,7 +92,9 @@ class _ScheduledFlow:
     @cached_property
     def _ellipsoids(self) -> InvariantEllipsoids:
         largest = self.known.errors[Output.WEIGHTED]
-        level = self._part.bound.reached or 0.0 if self._is_ideal else 0.0
+        bound = self._part.bound
+        # An event that is due to an integral does not need this ‖e_s‖_W.
+        level = bound.reached or 0.0 if self._is_ideal and not bound.ago_s else 0.0
         return InvariantEllipsoids(self._part.plant, largest, self._step.age_gains, level)
 
     @property
