@@ -93,8 +93,9 @@ class _ScheduledFlow:
     def _ellipsoids(self) -> InvariantEllipsoids:
         largest = self.known.errors[Output.WEIGHTED]
         bound = self._part.bound
-        # An event that is due to an integral does not need this ‖e_s‖_W.
-        level = bound.reached or 0.0 if self._is_ideal and not bound.ago_s else 0.0
+        # An event that is due to an integral, or to a deadline, does not need this ‖e_s‖_W.
+        needs_level = bound.ago_s == 0 and math.isinf(bound.forced_s)
+        level = bound.reached or 0.0 if self._is_ideal and needs_level else 0.0
         return InvariantEllipsoids(self._part.plant, largest, self._step.age_gains, level)
 
     @property
