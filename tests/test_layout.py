@@ -19,7 +19,7 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 428
+MOST_MODULES = 427
 LINES = {
     "noack/scenario": 4090,
     "noack/controllers": 270,
@@ -32,7 +32,7 @@ LINES = {
     "noack/protocol": 1235,
     "noack/runtime": 5665,
     "noack/settings": 600,
-    "noack/theory": 12190,
+    "noack/theory": 11990,
     "noack/traces": 1320,
     "noack/trigger": 1055,
     "netem": 6500,
@@ -53,7 +53,7 @@ LINES = {
     "controller_node": 420,
     "benchmarks": 3685,
     "native": 11120,
-    "tests": 47530,
+    "tests": 47500,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

@@ -480,20 +480,6 @@ class PlantGains:
         return response(self.closed_loop, self.input_matrix)
 
     @cached_method
-    def on_grid(self, until_s: Vector, cells: int) -> tuple[Vector, Mapping[str, Vector]]:
-        """Return the gains of a missing event's error, and of the input error, on equal cells.
-
-        Returns:
-            sup‖R e^{(H+αI)τ} W^{−1}‖ over each cell, (…, cells), and ∫‖C e^{(A+BK+αI)τ} B U‖ over
-            each cell for every output.
-        """
-        error = self.error
-        lost = response_until(error.scaled_H, error.inverse_weight, until_s, cells)
-        forced = response_until(self.closed_loop, self.input_matrix, until_s, cells)
-        areas = {output: kernel.area for output, kernel in forced.through_each(self.stacked).items()}
-        return lost.through(error.outputs[Output.GAIN]).highest, areas
-
-    @cached_method
     def start_up(self, start_s: float) -> tuple[Vector, Mapping[str, Vector]]:
         """Return the effect of zero input before ``start_s``, where p = −K x.
 

@@ -8,8 +8,7 @@ loop"):
    The plant bounds ‖C x‖ by free + gain · sup‖p‖; between two tests β̃ grows from β; a held
    input is of age ≤ σ. All these inequalities are linear in non-negative numbers. If the loop gain
    is below 1, their solution bounds the run at all times, by induction over time: Δ (of the size of
-   eq:Normec, but without Proposition 1), X (eq:normXt) and β̃. ``loss_accumulation.py`` bounds the
-   effect of all losses together, if windows limit them.
+   eq:Normec, but without Proposition 1), X (eq:normXt) and β̃.
 2. ``solution.py``. The minimum inter-event time δ is the time that e_s needs from 0 to the
    threshold under these bounds (eq:miet_errdyn; the paper's is eq:tau). N and D_C depend on δ, so
    the largest consistent δ is used. For one known plant ``deliveries/`` sharpens the bounds by what

@@ -18,9 +18,8 @@ B U. Both parts are followed on their own, each with its direction:
 
 and I_C the same with L_E. A policy's threshold may contain more than β
 (:mod:`noack.theory.bounds.trigger_bounds`); where e_s may have grown in several ways, β̃ is used in
-place of β, without I_C and J_C. The part of x from lost events is smaller if few updates may be
-lost in a window (:mod:`noack.theory.certificates.loss_accumulation`). These inequalities are linear
-and hold on every [0, T]. So their solution bounds the run if the loop gain is below 1.
+place of β, without I_C and J_C. These inequalities are linear and hold on every [0, T]. So their
+solution bounds the run if the loop gain is below 1.
 
 **Solution.** For v ≤ F v + g with F, g ≥ 0: if some w > 0 has F w < w, the spectral radius of F is
 below 1, and v ≤ x for every x with x − F x ≥ g. Both are checked with a bound of all rounding, so
@@ -40,7 +39,6 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
 from noack.theory.bounds.terms import Constants, NetworkConditions, Part
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
-from noack.theory.certificates.loss_accumulation import LossAccumulation
 
 _SIGNALS = 6
 _HELD, _INPUT, _ONE = (np.eye(_SIGNALS)[index] for index in (0, 3, 5))
@@ -158,7 +156,6 @@ class ErrorInequalities:
     def __init__(self, part: Part, conditions: NetworkConditions, earlier_error: float) -> None:
         self._error, self._plant, self._bound, self._estimation = error, plant, bound, _ = part
         self._conditions = conditions
-        self._lost: LossAccumulation | None = None
         self.age_gains = error.age_gains(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
         self._beyond = np.maximum(self._start_error, earlier_error)
@@ -167,11 +164,6 @@ class ErrorInequalities:
         }
         self._growths = [list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every]
         self._begin_s = math.inf if earlier_error else conditions.start_s
-
-    def use_windows(self) -> None:
-        """Use how many updates may be lost in a window, too."""
-        if self._error.decays:
-            self._lost = LossAccumulation(self._plant, self._conditions.delay_s)
 
     @property
     def methods(self) -> Sequence[BoundMethod]:
@@ -223,13 +215,13 @@ class ErrorInequalities:
         is_counted: NDArray[np.bool_],
     ) -> LoopConstants:
         """Return what follows from bounds of the signals, (loops, 6)."""
-        states = signals.free + _applied(signals.states, solved)
-        state = dict(zip(self._states, np.moveaxis(states, -1, 0), strict=True))
         age_input, estimation = solved[..., 0], solved[..., 2]
+        input_error = _product(signals.input_error, solved)
+        state = {C: free + gain * input_error for C, (free, gain) in self._states.items()}
         fields = (
             (_product(signals.errors[Output.WEIGHTED], solved) + estimation) / self.unit,
             (_product(signals.sensor, solved) + estimation) / self.unit,
-            _product(signals.errors[Output.GAIN], solved) + age_input,
+            input_error,
             self._start_error,
             state[Output.STATE],
             state[Output.WEIGHTED],
@@ -240,7 +232,7 @@ class ErrorInequalities:
             _product(signals.earlier, solved) + age_input,
             np.isfinite(solved).all(axis=-1) & is_counted,
         )
-        return LoopConstants(events, *(np.broadcast_to(values, events.shape) for values in fields))
+        return LoopConstants._make([events, *(np.broadcast_to(values, events.shape) for values in fields)])
 
     @property
     def unit(self) -> float:
@@ -255,17 +247,16 @@ class ErrorInequalities:
         Every ‖e_s‖_W has grown by ``own_growth`` from at most b at the last test; without it b is β̃. An
         event's x_s − x̂ is at most this plus η, the present x_s − x is at most this.
         """
-        held_unit, test_unit, estimate_unit, *_ = np.eye(_SIGNALS)
-        sensor = test_unit
+        sensor = np.eye(_SIGNALS)[1]
         if own_growth is not None:
             sensor = self._begun(
                 _columns(0.0, own_growth.stretch, 0.0, *own_growth.driven), own_growth.highest
             )
-        counted, flying = events, events - self._conditions.dropouts
+        counted = events
         at_present = present = {output: self._present(output, own_growth) for output in self._error.outputs}
         if drifts := method is BoundMethod.DRIFTING:
             # d ago, e_c consisted of e_s and of the errors of events that are lost.
-            counted, flying = events - flying, 0 * events
+            counted = np.full_like(events, self._conditions.dropouts)
             present = {
                 output: self._present(output, own_growth, self._conditions.delay_s) for output in at_present
             }
@@ -280,21 +271,15 @@ class ErrorInequalities:
         input_error = errors[Output.GAIN]
         earlier = input_error if drifts else with_missing(Output.GAIN, 0 * _ONE, counted, stages)
         received = with_missing(Output.GAIN, at_present[Output.GAIN], 0 * events)
-        in_flight = with_missing(Output.GAIN, present[Output.GAIN], flying)
-        lost = self._missing_gain(Output.GAIN, counted, spacing_s)
-        lost = lost - self._missing_gain(Output.GAIN, flying, spacing_s)
-        alone = self._alone(lost, spacing_s)
-        states = []
-        for name, (_, gain) in self._states.items():
-            gain = np.asarray(gain)[..., None]
-            row = gain * (held_unit + input_error)
-            if name in alone:
-                in_windows = gain * (held_unit + in_flight) + alone[name][:, None] * (sensor + estimate_unit)
-                row = np.where((alone[name] < gain[..., 0] * lost)[:, None], in_windows, row)
-            states.append(row)
-        free = _columns(*(state.free for state in self._states.values()))
-        rows = _rows(*states)
-        return _Signals([*self._states], free, rows, errors, sensor, received, earlier)
+        return _Signals(errors, sensor, received, earlier)
+
+    def _through(self, signals: "_Signals", gains: Mapping[str, Vector | float]) -> tuple[Matrix, Vector]:
+        """Return Σ_C gain_C sup‖C x‖ by its linear, (…, 6), and its constant part, (…)."""
+        free, gain = np.zeros(()), np.zeros(())
+        for C, share in gains.items():
+            free = free + share * self._states[C].free
+            gain = gain + share * self._states[C].gain
+        return gain[..., None] * signals.input_error, free
 
     def _present(self, output: Output, own_growth: ErrorGrowth | None, later_s: float = 0.0) -> Matrix:
         """Return the bound of sup‖C e_s‖ as a row of the signals.
@@ -394,20 +379,19 @@ class ErrorInequalities:
     def _solved(self, signals: "_Signals", growing: ErrorGrowth, own_growth: ErrorGrowth | None) -> Solution:
         """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
         errors, beyond, held = signals.errors, self._beyond, self.age_gains
-        held_input, _, estimated, *_ = np.eye(_SIGNALS)
-        input_error = errors[Output.GAIN] + held_input
+        estimated, input_error = np.eye(_SIGNALS)[2], signals.input_error
 
-        through, free = signals.through({str(C): gain for C, gain in held.items()})
+        through, free = self._through(signals, {str(C): gain for C, gain in held.items()})
         from_errors = sum(gain * errors[output] for output, gain in held.items())
         of_age = (through + from_errors, free)
         estimation = self._estimation
-        through, free = signals.through(estimation.shares)
+        through, free = self._through(signals, estimation.shares)
         of_estimate = (
             through + estimation.from_input * input_error,
             estimation.fixed + free + estimation.from_input * beyond,
         )
-        of_mismatch = signals.through({Output.MISMATCH: 1.0})
-        through, free = signals.through(growing.shares)
+        of_mismatch = self._through(signals, {Output.MISMATCH: 1.0})
+        through, free = self._through(signals, growing.shares)
         of_test = (through + growing.estimation * estimated, growing.fixed + free)
         if own_growth is None:
             driven = self._begun(_columns(0.0, 0.0, 0.0, *growing.driven), growing.highest)
@@ -422,26 +406,6 @@ class ErrorInequalities:
         if self._error.decays or math.isinf(self._bound.due_s):
             return self._error.missing(output, events, spacing_s)
         return self._error.missing_until(output, events, self._bound.due_s)
-
-    def _alone(self, lost: Vector, spacing_s: Vector) -> Mapping[str, Vector]:
-        """Return S_C for every output, from the losses in windows; infinite where it is not needed.
-
-        It is computed only where it can be smaller: where all lost updates together have less
-        effect than the longest burst at its largest, ``lost``.
-        """
-        if self._lost is None:
-            return {}
-        windows = self._conditions.guarantee.windows
-        density = min(window.losses / window.packets for window in windows)
-        lasting = density * self._error.kernels[Output.GAIN].integral()
-        loops = np.flatnonzero(lasting < lost * spacing_s).tolist()
-        bounds: dict[str, Vector] = {}
-        for output in self._states if loops else ():
-            bounds[output] = np.full(len(spacing_s), np.inf)
-            for loop in loops:
-                total = self._lost.total(output, float(spacing_s[loop]), windows, loop)
-                bounds[output][loop] = total
-        return bounds
 
     def inter_event_s(
         self, constants: LoopConstants, drifts: NDArray[np.bool_], searched: NDArray[np.bool_]
@@ -504,16 +468,11 @@ class _Stages(NamedTuple):
 
 
 class _Signals(NamedTuple):
-    """The outputs of x and e_c as linear functions of (q, b, η, π, sup‖R_E x‖, 1).
+    """The errors as linear functions of (q, b, η, π, sup‖R_E x‖, 1).
 
     η = sup‖x̂ − x‖_W, and b bounds ‖e_s‖_W after each test, or is β̃.
     """
 
-    names: list[str]
-    free: Vector
-    """(…, k) the constant part of sup‖C x‖."""
-    states: Matrix
-    """(…, k, 6)"""
     errors: Mapping[Output, Vector]
     """(…, 6) of sup‖C e_c‖."""
     sensor: Vector
@@ -523,10 +482,10 @@ class _Signals(NamedTuple):
     earlier: Vector
     """(…, 6) of the part of sup‖K e_c‖ that does not come from the present e_s."""
 
-    def through(self, gains: Mapping[str, Vector | float]) -> tuple[Vector, Vector]:
-        """Return Σ_C gain_C sup‖C x‖ by its linear, (…, 6), and its constant part, (…)."""
-        row = _columns(*(gains.get(name, 0.0) for name in self.names))
-        return np.asarray((row[..., None, :] @ self.states)[..., 0, :]), _product(row, self.free)
+    @property
+    def input_error(self) -> Vector:
+        """(…, 6) of π."""
+        return np.asarray(self.errors[Output.GAIN] + _HELD)
 
 
 def _product(row: Vector, column: Vector) -> Vector:

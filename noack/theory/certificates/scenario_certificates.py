@@ -26,7 +26,7 @@ from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
-from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate, tenth_s
+from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 MOST_S = 10.0
@@ -40,7 +40,8 @@ Points = Sequence[tuple[float, float]]
 """Logarithms of loop gains, and of their times."""
 _SLOWER = 0.9
 _TIMED_RATES = (0.7, 0.4, 0.1)
-"""Rates that are tried where events are due, as shares of the decay rate of A + BK."""
+"""Rates that are tried where events are due, as shares of the decay rate of A + BK: the first that
+has a certificate is used."""
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
 Phases = tuple[Constants, Constants | None, Constants | None]
@@ -255,17 +256,11 @@ class CertificateScope:
 
         ``apart_s``: events are known to be that far apart.
         """
-        soonest, soonest_s = None, math.inf
-        for deliveries in self._deliveries(conditions, apart_s=apart_s):
-            if math.log(10) / deliveries.rate_per_s >= soonest_s:
-                break  # a slower rate needs longer, since no bound of ‖x‖ is below ‖x(0)‖
-            constants = deliveries.constants(self._trigger.beta or 1.0)
-            if (later_s := tenth_s(constants, self._start)) < soonest_s:
-                soonest, soonest_s = constants, later_s
-        return soonest
+        deliveries = next(self._deliveries(conditions, _TIMED_RATES, apart_s), None)
+        return None if deliveries is None else deliveries.constants(self._trigger.beta or 1.0)
 
     def _deliveries(
-        self, conditions: NetworkConditions, shares: Sequence[float] = _TIMED_RATES, apart_s: float = 0.0
+        self, conditions: NetworkConditions, shares: Sequence[float], apart_s: float = 0.0
     ) -> Iterator[Deliveries]:
         """Yield what is known of the deliveries where events are due, for each rate that is tried."""
         trigger, loop = self._trigger, self._loop

@@ -198,8 +198,6 @@ def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
         together = part._replace(plant=part.plant.together(plants))
         earlier = example.earlier_error if index == 0 else 0.0
         steps.append(ErrorInequalities(together, conditions, earlier))
-        if example.structured and example.parts[0].plant.is_one_plant:
-            steps[-1].use_windows()
     apart_s = max(part.bound.apart_s for part in example.parts)
     least_s = max(conditions.spacing_s, apart_s)
     is_separated = all(any(bound.reached is not None for bound in part.bound.every) for part in example.parts)

@@ -47,6 +47,11 @@ def test_a_broken_copy_of_each_kind_is_detected(name: str, mistake: str) -> None
     pytest.fail("no run exceeds it")
 
 
+def test_the_first_event_of_an_integral_needs_no_large_error() -> None:
+    """In this loop the integral reaches δ long before e_s reaches δ divided by the sampling period."""
+    assert examine(KINDS["send_on_area"], range(6000, 6001)).violated[""] == 0
+
+
 def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() -> None:
     system, conditions = dominated_by_errors(None, far=True), NetworkConditions(3)
     sharp = system.certify(conditions)

@@ -6,13 +6,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from noack.impairments.loss_guarantee import LongestBurst, LossesInWindow, LossWindow
-from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, TriggerBound
+from noack.theory.bounds.gains import PlantGains
+from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.bounds.trigger_bounds import first_passage_s
 from noack.theory.certificates.inequalities import solve_inequalities
-from noack.theory.certificates.loss_accumulation import LossAccumulation
-from noack.theory.certificates.solution import solve
 from tests.oracles.lossy_loops import System
 
 
@@ -62,27 +59,6 @@ def test_a_spectral_radius_of_1_or_more_has_no_bound() -> None:
     assert np.isinf(solve_inequalities(np.full((2, 2), np.nan), np.ones(2)).bound).all()
 
 
-@pytest.mark.parametrize(
-    ("rule", "burst_only", "with_windows"),
-    [
-        (LongestBurst(4), 5.33, 5.33),
-        (LossesInWindow(4, 20), 5.33, 4.50),
-        (LossesInWindow(2, 20), 3.60, 3.35),
-        (LossesInWindow(1, 10), 2.70, 2.70),
-    ],
-    ids=str,
-)
-def test_the_table_of_the_documents(
-    rule: LongestBurst | LossesInWindow, burst_only: float, with_windows: float
-) -> None:
-    one = np.ones((1, 1))
-    plant = PlantGains(ErrorGains(-5 * one, -6 * one, one, 0.5), 1.05 * one, one, one, 0.5)
-    for constraints, expected in (((), burst_only), ((rule,), with_windows)):
-        conditions = NetworkConditions(rule.limit, constraints=constraints)
-        found = solve(plant.error, plant, conditions, TriggerBound(1.0, 1.0))
-        assert found.state == pytest.approx(expected, abs=0.006)
-
-
 def passage_s(plant: PlantGains, *values: float) -> float:
     """The first passage of one loop from 0."""
     return float(first_passage_s(plant, *np.array([*values, 0.0])[:, None])[0])
@@ -103,11 +79,3 @@ def test_without_mismatch_or_push_the_threshold_is_never_reached() -> None:
     assert passage_s(plant, 0.5, 0.0, 1.0, 0.0) == pytest.approx(math.log(2), rel=0.01)
     assert passage_s(plant, 0.5, 0.0, 1.0, 0.0) <= math.log(2)
     assert passage_s(plant, 1.01, 0.0, 1.0, 0.0) > 4
-
-
-def test_events_may_be_too_close_for_a_bound_of_the_losses() -> None:
-    one = np.ones((1, 1))
-    plant = PlantGains(ErrorGains(-5 * one, -6 * one, one, 0.5), 1.05 * one, one, one, 0.5)
-    found = LossAccumulation(plant, 0.0)
-    assert found.total(Output.STATE, 1e-12, [LossWindow(1, 2)]) == math.inf
-    assert found.total(Output.STATE, 0.1, [LossWindow(1, 2), LossWindow(0, 1)]) == 0

@@ -23,12 +23,12 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
-from noack.theory.bounds.contraction import Stack, logarithmic_norm, spectral_norms
+from noack.theory.bounds.contraction import Stack, logarithmic_norm, product, spectral_norms
 from noack.theory.bounds.gains import Output, PlantGains
 
 _CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
 _MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000
-TAYLOR_TERMS = 4
+_TAYLOR_TERMS = 4
 """Terms by which a second derivative over a cell is bounded."""
 ROUNDING = 1 + 1e-5
 """Exceeds the error of e^{Fτ}: measured below 1e-12 of its norm, which is up to 1e6; no proof."""
@@ -102,14 +102,10 @@ class DeliveryFlow:
     @cached_property
     def start_response(self) -> tuple[Matrix, Vector]:
         """e^{Fτ} (x(0), 0) at the nodes, (k + 1, 2n), and bounds of its second derivative, (k,)."""
-        z, steps_s, F = self.states @ self.start[:, 0], np.diff(self.edges_s), self.generator
-        term, bends = z[:-1] @ (F @ F).T, np.zeros(len(steps_s))
-        for order in range(1, TAYLOR_TERMS + 1):
-            bends += np.linalg.norm(term, axis=1)
-            term = term @ F.T * (steps_s / order)[:, None]
-        with np.errstate(over="ignore"):
-            growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s)
-        return z, bends + growth * np.linalg.norm(term, axis=1)
+        z = self.states @ self.start[:, 0]
+        terms, remainder = bend_terms(self.generator, z[:-1, :, None], np.diff(self.edges_s))
+        bends = sum(np.linalg.norm(term[..., 0], axis=1) for term in terms)
+        return z, np.asarray(bends + np.linalg.norm(remainder[..., 0], axis=1))
 
     def from_start(self, C: Matrix, limit: float, first_cell: int = 0) -> float:
         """Bound ‖C z‖ from a cell after the start on, until the first delivery, if ‖e_c‖_W ≤ D.
@@ -160,6 +156,21 @@ class DeliveryFlow:
     def transformed(self, matrix: Matrix) -> Matrix:
         """Return a matrix of the system in the coordinates W x."""
         return np.asarray(self.weight @ matrix @ self.inverse)
+
+
+def bend_terms(
+    F: Matrix, states: Stack, steps_s: Vector, count: int = _TAYLOR_TERMS
+) -> tuple[list[Stack], Stack]:
+    """Return Taylor's terms of F² e^{Fτ} Y over cells, and one that bounds the remainder, (k, n, r) each.
+
+    ``states``: Y, e^{Fτ} at the left nodes of the cells.
+    """
+    terms = [product(F @ F, states)]
+    for order in range(1, count + 1):
+        terms.append(product(F, terms[-1]) * (steps_s / order)[:, None, None])
+    with np.errstate(over="ignore"):
+        growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s)
+    return terms[:-1], growth[:, None, None] * terms[-1]
 
 
 def bend_rows(flow: DeliveryFlow) -> Matrix:

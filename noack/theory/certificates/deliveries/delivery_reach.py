@@ -29,7 +29,6 @@ from noack.theory.bounds.contraction import (
     Stack,
     largest_eigenvalues,
     logarithmic_norm,
-    product,
     spectral_norm,
     spectral_norms,
 )
@@ -38,9 +37,9 @@ from noack.theory.bounds.gains import Output
 from noack.theory.certificates.deliveries.delivery_flow import (
     NO_EFFECTS,
     ROUNDING,
-    TAYLOR_TERMS,
     DeliveryFlow,
     InputEffects,
+    bend_terms,
 )
 
 _LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), 40.0)
@@ -101,15 +100,9 @@ class Starts:
         of the terms' remainder.
         """
         flow, axes = self.flow, self.axes[1]
-        F, steps_s = flow.generator, np.diff(flow.edges_s)
         ends = [flow.states[:-1] @ axes, flow.states[1:] @ axes]
-        terms = [product(F @ F, ends[0])]
-        for order in range(1, TAYLOR_TERMS + 1):
-            terms.append(product(F, terms[-1]) * (steps_s / order)[:, None, None])
-        with np.errstate(over="ignore"):
-            growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s)
-        remainder = growth[:, None] * np.linalg.norm(terms[-1], axis=1)
-        return _columns(ends), _columns(terms[:-1]), remainder
+        terms, remainder = bend_terms(flow.generator, ends[0], np.diff(flow.edges_s))
+        return _columns(ends), _columns(terms), np.linalg.norm(remainder, axis=1)
 
     @cached_property
     def state_bounds(self) -> "_CellBounds":
@@ -191,17 +184,12 @@ class Reach:
 
     def _changes(self, bounds: "_CellBounds") -> Vector:
         """Bound what delay and hold change of C z over the cells, (k,)."""
-        return self.effects.sizes(bounds.unit_effects) if not self.effects.is_none else np.zeros(bounds.cells)
+        return self.effects.sizes(bounds.unit_effects)
 
     @cached_property
     def _errors(self) -> Vector:
         """The same of e_c."""
-        flow = self.starts.flow
-        return (
-            self.effects.sizes(flow.error_effects)
-            if not self.effects.is_none
-            else np.zeros(len(flow.edges_s) - 1)
-        )
+        return self.effects.sizes(self.starts.flow.error_effects)
 
     @cached_property
     def _levels(self) -> Vector:
@@ -223,10 +211,7 @@ class Reach:
 
     def _afterwards(self, bounds: "_CellBounds") -> float:
         """Bound ‖C z‖ after the last node that is followed, for c = 1."""
-        changes = np.zeros(bounds.cells)
-        if not self.effects.is_none:
-            held = self.effects._replace(late=0.0)
-            changes = held.sizes(bounds.unit_effects)
+        changes = self.effects.held * bounds.unit_effects[1]
         cells, moved, forms, roots = self._windows
         Y = bounds.C @ moved
         images = Y[:, None] @ roots
@@ -247,12 +232,9 @@ class Reach:
         flow, n, shape, windows = self.starts.flow, self.starts.flow.n, self.starts.shape, []
         last_s, limit, identity = float(flow.edges_s[self._cells]), self.limit / self.size, np.eye(n)
         # By how much held inputs change ‖e_c‖, and the bound of ‖Λx‖, over each cell.
-        errors = np.zeros(len(flow.edges_s) - 1)
-        levels = np.ones(len(errors))
-        if not self.effects.is_none:
-            held = self.effects._replace(late=0.0)
-            errors = held.sizes(flow.error_effects) / self.size
-            levels = levels + held.sizes(self.starts.state_bounds.unit_effects) / self.size
+        held = self.effects.held / self.size
+        errors = held * flow.error_effects[1]
+        levels = held * self.starts.state_bounds.unit_effects[1]
         for share in _WINDOWS:
             # h bounds x_c = x + e_c, which follows the model, at the node T' ago.
             node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
@@ -269,7 +251,7 @@ class Reach:
             step = exponential(flow.generator * (since_s / _EARLIER))
             for number in range(_EARLIER + 1):
                 cell = flow.cell_at(number * since_s / _EARLIER) if number else 0
-                added = (errors[cell], levels[cell] - 1) if number else (0.0, 0.0)
+                added = (errors[cell], levels[cell]) if number else (0.0, 0.0)
                 rows.append(moved[n:] / (limit + added[0]))
                 if number < _EARLIER:
                     rows.append(shape @ moved[:n] / (level + added[1]))
@@ -295,11 +277,11 @@ class _CellBounds:
         cells = self.cells
         ends, terms, remainder = starts.cell_terms
         self._ends = (C @ ends).reshape(len(C), 2, cells, n)
-        bend_terms = (C @ terms).reshape(len(C), TAYLOR_TERMS, cells, n)
+        bends = (C @ terms).reshape(len(C), -1, cells, n)
         self._squares = np.concatenate(
             [
                 np.einsum("qokj->kjo", self._ends**2),
-                np.einsum("qokj->kjo", bend_terms**2),
+                np.einsum("qokj->kjo", bends**2),
                 (np.linalg.norm(C, 2) * remainder)[..., None] ** 2,
             ],
             axis=2,

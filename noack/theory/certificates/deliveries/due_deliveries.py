@@ -74,11 +74,6 @@ class Deliveries:
         self._ages_seen[[*C].index(INPUT)] = 1.0
 
     @property
-    def rate_per_s(self) -> float:
-        """The rate at which all bounds decay."""
-        return self._loop.plant.alpha_per_s
-
-    @property
     def gain(self) -> float:
         """By what the norm of x grows from one delivery to the next, at most; below 1."""
         return self._norm.gain

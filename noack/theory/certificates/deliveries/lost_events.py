@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential
-from noack.theory.bounds.contraction import Stack, logarithmic_norm
+from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import KernelBounds, response_until
-from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, bend_rows
+from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, bend_rows, bend_terms
 from noack.theory.certificates.deliveries.delivery_reach import Reach, largest_outputs
 
 _NEAR, _RATIO, _MOST_NODES = np.linspace(0.0, 1.0, 20).tolist(), 1.03, 300
@@ -187,17 +187,14 @@ class _Stage:
 
     def _sags(self, forms: Stack, weights: Stack) -> Vector:
         """Bound how much e_c differs from its chord in each cell of r."""
-        F, steps_s = self._flow.generator, np.diff(self._r_s)[:, None, None]
+        steps_s = np.diff(self._r_s)
         inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
-        terms, bends = F @ F @ self._z[:-1], np.zeros(len(steps_s))
-        for order in range(1, _LATE_TERMS + 1):
-            error_terms = terms[:, self._flow.n :]
-            bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", error_terms, inverse, error_terms)))
-            terms = F @ terms * (steps_s / order)
-        with np.errstate(over="ignore"):
-            growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s[:, 0, 0])
-        bends += growth * np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", terms, inverse, terms)))
-        return np.asarray(steps_s[:, 0, 0] ** 2 / 8 * bends * ROUNDING)
+        terms, remainder = bend_terms(self._flow.generator, self._z[:-1], steps_s, _LATE_TERMS)
+        bends = np.zeros(len(steps_s))
+        # e_c of Taylor's terms, and the whole remainder.
+        for rows in (*(term[:, self._flow.n :] for term in terms), remainder):
+            bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", rows, inverse, rows)))
+        return np.asarray(steps_s**2 / 8 * bends * ROUNDING)
 
     def next_event_s(self, sensor: SensorErrors, late_part: float, bend: float, most_s: float) -> float:
         """Return a time before which there is no event; e_s may be larger than C_r z by ``late_part``."""

@@ -92,7 +92,10 @@ class _ScheduledFlow:
     @cached_property
     def _ellipsoids(self) -> InvariantEllipsoids:
         largest = self.known.errors[Output.WEIGHTED]
-        level = self._part.bound.reached or 0.0 if self._is_ideal else 0.0
+        bound = self._part.bound
+        # An event that is due to an integral, or to a deadline, does not need this ‖e_s‖_W.
+        needs_level = bound.ago_s == 0 and math.isinf(bound.forced_s)
+        level = bound.reached or 0.0 if self._is_ideal and needs_level else 0.0
         return InvariantEllipsoids(self._part.plant, largest, self._step.age_gains, level)
 
     @property
