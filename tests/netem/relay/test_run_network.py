@@ -172,7 +172,8 @@ def test_arrival_is_when_the_datagram_reached_the_socket() -> None:
             time.sleep(0.05)
             rows = _Rows()
             read_ns = clock.now_ns()
-            one.drive(read_ns + 10**6, rows)
+            while not rows:  # a machine that stalls may end it before it reads
+                one.drive(clock.now_ns() + 10**6, rows)
     ((_, _, t_ns, now_ns, *_),) = rows
     assert before_ns - 10**6 <= t_ns <= after_ns + 10**6
     assert now_ns >= read_ns
