@@ -112,7 +112,7 @@ MAKEFLAGS += --jobs=2 # what is checked does not wait for what is tested
 endif
 test: check pytest ## Lint, types, import rules, and tests (ARGS are pytest's, e.g. ARGS="-k mansd")
 
-test-builds: setup-dev ## Test other builds: with sanitizers, by another compiler, for qemu, the wheel
+test-builds: setup-dev ## Test sanitizers, another compiler, qemu, another system, wheel, site
 	$(BIN)/python -m pytest -m builds --numprocesses=2 --dist=loadfile $(ARGS)
 
 pytest: setup-dev

@@ -11,6 +11,7 @@ import pytest
 
 from tests.command_line import invoke
 
+pytestmark = pytest.mark.builds
 ROOT = Path(__file__).parents[2]
 CERTIFIED = (
     ["certify", "lane_following", "--json"],
