@@ -455,6 +455,8 @@ def chosen(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[list[int], lis
 
 WAITING = (0, 9), (1, 1), (0, 200), (2, 8), (1, 127), (2, 3), (1, 128), (0, 255)
 """Flows and error levels; some of what waits counts as what comes after it."""
+ON_THE_RIGHT = (3, 0), (0, 200), (1, 1), (1, 100), (2, 50)
+"""The same; what counts as what comes after it is a right child in the core's heap."""
 
 
 def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
@@ -493,6 +495,7 @@ def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
     st.sampled_from([None, 0, 1, 3]),
 )
 @example(9_600, 6, (1,), [(0, flow, 72, level) for flow, level in WAITING], None)
+@example(9_600, 6, (1,), [(0, flow, 72, level) for flow, level in ON_THE_RIGHT], None)
 @example(9_600, 6, (2, 0), [(0, 1, 1472, 0), (0, 0, 72, 0), (100 * MS, 1, 72, 0)], None)
 @example(9_600, 2, (1,), [*((0, flow, 72, 0) for flow in (0, 1, 2, 2, 3, 3)), (100 * MS, 0, 72, 0)], 1)
 def test_the_first_of_what_waits_is_sent_when_the_link_is_free(
