@@ -53,7 +53,7 @@ LINES = {
     "controller_node": 420,
     "benchmarks": 3685,
     "native": 11120,
-    "tests": 47500,
+    "tests": 47510,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
