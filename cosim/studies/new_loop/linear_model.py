@@ -188,8 +188,8 @@ class LoopGain:
 def linearise(
     plant: str,
     *,
-    at: Sequence[float] | None = None,
-    input: Sequence[float] | None = None,  # noqa: A002 # the option of the command
+    at: Sequence[float] | float | None = None,
+    input: Sequence[float] | float | None = None,  # noqa: A002 # the option of the command
     settings: ReadTable | None = None,
     within: float = 0.1,
 ) -> LinearModel:
@@ -202,8 +202,8 @@ def linearise(
     Args:
         plant: ``"file.py:Class"``, ``"file.fmu"``, ``"gymnasium:ID"``, a kind of plant, a scenario,
             or a file that ``noack linearise`` or ``noack gain`` wrote.
-        at: x at the point, n entries; by default 0.
-        input: u there, m entries; by default 0.
+        at: x at the point, n entries, or a number if n is 1; by default 0.
+        input: u there, m entries, or a number if m is 1; by default 0.
         settings: values by the keys of a scenario, e.g. ``{"plant.system.cart_kg": 1.0}``.
         within: half-width of the neighbourhood in which the error is sampled, in each coordinate's
             units; a tenth of it is sampled, too.
@@ -222,6 +222,7 @@ def linearise(
         )
     if not (np.isfinite(within) and within > 0):
         raise CallerError(f"within: {within:g}; give a positive number")
+    at, input = ([given] if isinstance(given, float | int) else given for given in (at, input))  # noqa: A001
     sizes = (None if at is None else len(at), None if input is None else len(input))
     reference = plant_reference(plant, settings or {}, sizes)
     x, u = vector("at", at, reference.n, "states"), vector("input", input, reference.m, "inputs")

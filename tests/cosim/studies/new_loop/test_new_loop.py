@@ -230,6 +230,7 @@ def test_uncontrollable_states_are_found_in_any_coordinates() -> None:
     moved[4:6] = [[199.77, -0.0805], [-0.0805, 199.964]]
     assert controllable_states(arms, moved).shape == (8, 4)
     stiff = noack.linearise("dc_motor")  # 1e6 between its eigenvalues
+    assert np.array_equal(noack.linearise("dc_motor", input=0.0).A, stiff.A)  # a number is enough
     assert stiff.rank == 3
     chain = np.diag(np.ones(5), 1)
     assert controllable_states(chain, np.eye(6)[:, -1:]).shape == (6, 6)
