@@ -201,7 +201,7 @@ def _growths(H: MatrixKey, weight: MatrixKey, period_ns: int) -> _Growths:
 
 
 _SHARE, _NEAREST = 1e-2, 0.98
-_FIRST_STEP, _STEPS_OF_A_LENGTH = 1 / 64, 64
+_FIRST_STEP, _STEPS_UNTIL_DOUBLED = 1 / 64, 64
 """Times at which ‖e^{Gt}‖ is sampled: the first step, times ‖G‖; steps until it is doubled."""
 _LAST_TIME = 50.0
 """The last of them, times the difference between the decay rates of loop and threshold."""
@@ -299,7 +299,7 @@ def _sampled_norms(generator: Matrix, until_s: float) -> tuple[Vector, Vector]:
     step, reached, t_s = exponential(step_s * generator), np.eye(len(generator)), 0.0
     times_s, matrices = [t_s], [reached]
     while t_s < until_s:
-        for _ in range(_STEPS_OF_A_LENGTH):
+        for _ in range(_STEPS_UNTIL_DOUBLED):
             reached, t_s = step @ reached, t_s + step_s
             times_s.append(t_s)
             matrices.append(reached)
