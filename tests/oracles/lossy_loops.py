@@ -169,7 +169,10 @@ def times_s(system: System) -> Reals:
 
 
 EventRule = Callable[[int, Steps, Reals, Reals], Flags]
-"""Which runs have an event at a test, from the step, the steps since each last event, x and e_s."""
+"""Which runs have an event at a test, from the step, the steps since each last event, x and e_s.
+
+With an observer both are those to the estimate.
+"""
 
 
 class Plants(NamedTuple):
@@ -238,7 +241,7 @@ def simulate(
             sensor_error[step] = np.maximum(sensor_error[step], tested)
             event = tested > threshold[step]
             if rule is not None:
-                event = rule(step, step - last_event, x, x_s - x)
+                event = rule(step, step - last_event, known, x_s - known)
             event = event | (step == 0 and not system.known_start)
             again = event & (events > 0)
             shortest = min(shortest, int((step - last_event)[again].min(initial=10**9)))

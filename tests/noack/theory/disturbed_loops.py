@@ -1,6 +1,7 @@
 """Random loops with bounded disturbances and noise, and with an observer; their worst signals."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import Any
@@ -22,6 +23,7 @@ from tests.oracles.lossy_loops import (
     DRIFTING,
     RUNS,
     STEPS,
+    EventRule,
     Matrix,
     Reals,
     System,
@@ -181,6 +183,9 @@ class ObservedLoop:
     push: float
     noise: float
     floor: float
+    settings: dict[str, Any] | None = None
+    """Of another trigger than the decaying threshold, which has ``floor``."""
+    rule: EventRule | None = None
 
     @property
     def scenario(self) -> Scenario:
@@ -194,6 +199,10 @@ class ObservedLoop:
         else:
             observer["gain"] = self.gain.tolist()
         rate_hz = 1 / system.step_s
+        threshold = {
+            "beta": system.beta, "alpha_per_s": system.alpha, "floor": self.floor,
+            "weight": system.weight.tolist(),
+        }  # fmt: skip
         return validate(
             {
                 "name": "observed", "horizon_s": STEPS * system.step_s,
@@ -211,10 +220,7 @@ class ObservedLoop:
                     ],
                 },
                 "observer": observer,
-                "trigger": {
-                    "beta": system.beta, "alpha_per_s": system.alpha, "floor": self.floor,
-                    "weight": system.weight.tolist(),
-                },
+                "trigger": self.settings or threshold,
                 "network": {
                     "mansd": 5, "loss": {"model": "lossless"},
                     "initial_sync": "known_state" if system.known_start else "first_packet",
@@ -301,7 +307,7 @@ def worst_shares(
     estimate = Filter(loop, np.concatenate([noise, noise], axis=2)[:, :, :p])
     trace: Trace = simulate(
         system, *networks(int(rng.integers(2**32)), system), floor=loop.floor, pushes=pushes,
-        estimate=estimate,
+        estimate=estimate, rule=deepcopy(loop.rule),
     )  # fmt: skip
     t_s = times_s(system)
     shares = {
