@@ -30,8 +30,8 @@ from noack.runtime.live_driver import LoopChannel
 from noack.runtime.node_driver import NodeDriver
 from noack.runtime.udp_sockets import bind
 from noack.settings.user_files import located
-from tests.approved import lines_of_error
 from tests.command_line import invoke
+from tests.helpers.approved import lines_of_error
 from tests.integration import conftest as live
 from tests.integration.test_restarts import goes_on, spooled
 from tests.noack.runtime.live_loops import KEY, RUN_ID, Rows, scenario

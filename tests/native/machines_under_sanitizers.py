@@ -16,10 +16,10 @@ from noack.core.errors import CallerError
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.exact_populations import random_population, random_setting
-from tests.example_rules import TABLES, area_rule, decaying_rule, random_rule
-from tests.machine_parts import SteppedMachines
+from tests.helpers.example_rules import TABLES, area_rule, decaying_rule, random_rule
+from tests.helpers.machine_parts import SteppedMachines
+from tests.helpers.wire_decoder import NO_VECTOR
 from tests.noack.machines.any_machines import MS, Sizes, controller, plant, sensor, set_number, sizes, text_of
-from tests.wire_decoder import NO_VECTOR
 
 TIMES_NS, NUMBERS = 2**62, 2**63
 """Times and numbers of messages are less."""

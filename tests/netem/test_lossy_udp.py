@@ -14,8 +14,8 @@ import pytest
 import noack
 from netem import pytest_plugin
 from noack.core.errors import NoackError
+from tests.helpers.pages import blocks
 from tests.netem.conftest import Decide
-from tests.pages import blocks
 
 PATIENCE_S = 120.0
 

@@ -19,7 +19,7 @@ from noack.impairments.loss_prediction import (
     with_kept_loss,
 )
 from noack.protocol.record_tables import Fate
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 from tests.oracles.link import Link
 
 DECISIONS = 400_000

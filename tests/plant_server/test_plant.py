@@ -12,7 +12,7 @@ from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from plant_server.plant import BLOCK, MeasurementModel, disturbance_of
-from tests.machine_parts import OneLoop, plant_of
+from tests.helpers.machine_parts import OneLoop, plant_of
 
 STEPS = 4000
 

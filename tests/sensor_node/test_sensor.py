@@ -17,8 +17,8 @@ from noack.scenario.resolution import assumed_model, resolve, steady_state, true
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from sensor_node.sensor import Sensor
-from tests.example_rules import decaying_rule
-from tests.machine_parts import machine, sensor_of
+from tests.helpers.example_rules import decaying_rule
+from tests.helpers.machine_parts import machine, sensor_of
 
 GRID_NS = 10_000_000
 ZOH = np.zeros((1, 1))

@@ -32,7 +32,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from tests.cosim.live.outage import Reborn, simulate_with
 from tests.cosim.record.changed_records import changed, flipped
-from tests.machine_parts import controller_of
+from tests.helpers.machine_parts import controller_of
 
 ROOT = Path(__file__).parents[3]
 SHORT = (

@@ -15,7 +15,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.cosim.simulation.shuttle import shuttled
-from tests.machine_parts import Machine
+from tests.helpers.machine_parts import Machine
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NO_OUTAGE = "none"

@@ -15,9 +15,9 @@ from noack.core.errors import CallerError
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import load
-from tests.approved import compare_lines, lines_of_error
 from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
+from tests.helpers.approved import compare_lines, lines_of_error
 
 JUNK: list[bytes | None] = [
     None, b"", b"{", b"\xff", b"[]", b"{}", b"null", b'{"rows": 1}', b"[" * 100_000,

@@ -23,7 +23,7 @@ from noack.runtime.spool import SPOOL, SpoolWriter, writer_of
 from noack.runtime.telemetry import OwnSpool
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario_file import validate
-from tests.cosim.summaries import alone
+from tests.helpers.summaries import alone
 
 RUN = "0123456789abcdef"
 SECRETS = {"controller": "known to the controller", "plant": "known to the plant"}

@@ -35,7 +35,7 @@ from noack.scenario.resolution import LoopMatrices, policy_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
 from noack.trigger.trigger_rule import TriggerRule
-from tests.example_rules import decaying_rule
+from tests.helpers.example_rules import decaying_rule
 from tests.oracles.random_scenarios import POLICIES, random_scenario
 
 

@@ -11,8 +11,8 @@ from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import loops_of
 from noack.scenario.scenario_file import validate
 from tests.cosim.simulation.shuttle import Shuttle, shuttled
+from tests.helpers.shipped import resolved, shipped
 from tests.oracles.random_scenarios import POLICIES, random_scenario
-from tests.shipped import resolved, shipped
 
 IMPAIRMENTS = [
     {"kind": "duplicate", "probability": 0.3},

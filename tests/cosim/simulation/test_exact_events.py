@@ -25,8 +25,8 @@ from tests.cosim.simulation.exact_populations import (
     random_setting,
     reference,
 )
-from tests.example_rules import TABLES, decaying_rule, mixed_rule, quadratic_rule, random_rule
-from tests.shipped import resolved
+from tests.helpers.example_rules import TABLES, decaying_rule, mixed_rule, quadratic_rule, random_rule
+from tests.helpers.shipped import resolved
 
 MS = 10**6
 SIZES = ((4, 2), (2, 1))

@@ -25,7 +25,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with
 from tests.cosim.record.changed_records import changed
-from tests.machine_parts import sensor_of
+from tests.helpers.machine_parts import sensor_of
 
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
 KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}

@@ -23,10 +23,10 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
-from tests.approved import compare_lines, lines_of_error
 from tests.command_line import invoke
+from tests.helpers.approved import compare_lines, lines_of_error
+from tests.helpers.shipped import resolved
 from tests.plant_server.fmus.build import build
-from tests.shipped import resolved
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 EXAMPLES = ("saturated_lqr", "model_predictive")

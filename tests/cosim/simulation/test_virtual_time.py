@@ -33,8 +33,8 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from tests.cosim.live.outage import CASES, POLICIES, at_the_end, with_outage
+from tests.helpers.shipped import resolved
 from tests.oracles.link import Link
-from tests.shipped import resolved
 
 
 @pytest.fixture

@@ -18,12 +18,12 @@ from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.scenario.sections import POLICIES as POLICY_KINDS
+from tests.helpers.wire_decoder import Decoder
 from tests.oracles.comparison import Comparison
 from tests.oracles.random_scenarios import POLICIES, random_scenario
 from tests.oracles.reference_run import settings_of, why_not
 from tests.oracles.trigger_rules import Array
 from tests.oracles.whole_loop import NONE
-from tests.wire_decoder import Decoder
 
 SCENARIOS = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
 RANDOM = 96

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from netem.capture import CaptureWriter, PcapngSection
 from netem.relay_links import DIRECTIONS, EVENT, Bytes, Events
 from noack.core.errors import CallerError
-from tests.approved import compare_lines
+from tests.helpers.approved import compare_lines
 from tests.netem.capture.reader import (
     INTERFACES,
     SPECS,

@@ -23,7 +23,7 @@ from netem.fates import FateRecorder
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.control_plane import open_session
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.conftest import Emulate
 from tests.netem.control import relays
 from tests.netem.control.relays import FakeRelay, press_q, read_until, terminal

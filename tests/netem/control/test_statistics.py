@@ -29,7 +29,7 @@ from netem.relay_links import FlowReport
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
-from tests.approved import compare_text
+from tests.helpers.approved import compare_text
 from tests.netem.control.relays import FakeRelay, running, times
 from tests.netem.fates.links import spec_of
 

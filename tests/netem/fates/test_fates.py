@@ -21,8 +21,8 @@ from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.protocol.record_tables import Fate
-from tests.approved import compare_lines, lines_of_error
 from tests.fuzz.parsers.fates import DOCUMENT, TABLE
+from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.any_settings import harsh
 from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record, spec_of
 from tests.oracles.link import Link

@@ -18,8 +18,8 @@ from noack.runtime.address import address_text
 from noack.runtime.udp_sockets import enlarge_buffer
 from tests.attacks.attacked import unread_bytes
 from tests.attacks.kinds import enter_namespace
+from tests.helpers.two_hosts import TwoHosts, two_hosts
 from tests.netem.conftest import Emulate
-from tests.two_hosts import TwoHosts, two_hosts
 
 SLOW_LINE = ("tbf", "rate", "800kbit", "burst", "40kb", "limit", "40kb")
 """Its queue is smaller than the number of packets that arrive within milliseconds.

@@ -29,7 +29,7 @@ from noack.runtime.udp_sockets import bind
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from tests.machine_parts import Machine
+from tests.helpers.machine_parts import Machine
 from tests.netem import any_settings
 from tests.netem.relay.relays import PATIENCE_S, KeepAll, Received, drain, endpoints, name_of, relayed
 from tests.oracles.link import Datagram, Link, network_of

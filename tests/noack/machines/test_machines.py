@@ -22,9 +22,9 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from plant_server.plant import Plant
 from sensor_node.sensor import Sensor, sensors_of
-from tests.approved import compare_lines
-from tests.example_rules import TABLES
-from tests.machine_parts import OneLoop, SteppedMachines, machine
+from tests.helpers.approved import compare_lines
+from tests.helpers.example_rules import TABLES
+from tests.helpers.machine_parts import OneLoop, SteppedMachines, machine
 from tests.noack.machines.any_machines import (
     MS,
     Inputs,

@@ -26,8 +26,8 @@ from noack.runtime.command_line import LogFormat, failed, log_event, log_format,
 from noack.runtime.connections import connection_gate
 from noack.runtime.connections import metrics_server as servers
 from noack.runtime.connections.metrics_server import metrics_server
-from tests.approved import lines_of_error
 from tests.command_line import invoke
+from tests.helpers.approved import lines_of_error
 
 Object = dict[str, Any]
 

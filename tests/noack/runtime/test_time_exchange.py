@@ -46,7 +46,7 @@ from noack.runtime.host_clocks.time_exchange import (
 from noack.runtime.join_ticket import new_ticket
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import validate
-from tests.two_hosts import DrivenClocks
+from tests.helpers.two_hosts import DrivenClocks
 
 KEY = bytes(range(32))
 

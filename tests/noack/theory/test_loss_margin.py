@@ -15,7 +15,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.theory.margins.loss_margin import LossMargin
 from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 
 ROOT = Path(__file__).parents[3]
 PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'

@@ -29,7 +29,7 @@ from noack.traces.packet_trace import (
     read_trace,
     relative_delays,
 )
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 from tests.oracles.capture_files import LINKS, Sent, pcap_of, pcapng_of
 
 

@@ -27,8 +27,8 @@ from noack.scenario.sections import POLICIES
 from noack.trigger.deadline import DeadlineSettings
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import ModelMatrices
-from tests.approved import compare_lines, lines_of_error
-from tests.example_rules import TABLES
+from tests.helpers.approved import compare_lines, lines_of_error
+from tests.helpers.example_rules import TABLES
 
 
 def test_every_rule_is_in_the_table() -> None:

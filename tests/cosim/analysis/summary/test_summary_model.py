@@ -27,7 +27,7 @@ from noack.protocol.roles import GENERATION, RESTART
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed as altered
-from tests.cosim.summaries import summary_of, with_values
+from tests.helpers.summaries import summary_of, with_values
 
 HUGE = 10**400
 DELETED = object()

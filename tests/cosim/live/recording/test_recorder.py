@@ -35,7 +35,7 @@ from noack.scenario.scenario_file import dumps, validate
 from tests.cosim.live.outage import with_outage
 from tests.cosim.live.test_coordinator import JUNK
 from tests.fuzz.plane import FakePlane, Query, Sample
-from tests.shipped import resolved
+from tests.helpers.shipped import resolved
 
 
 class RecordingPlane(FakePlane):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.command_line import invoke
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/network.md", "docs/many-loops.md",
     "docs/paper.md", "docs/netem.md", "docs/netem-programs.md", "docs/campaigns.md",
