@@ -25,7 +25,7 @@ from noack.theory.paper import (
 from noack.trigger.trigger_rule import TriggerRule
 from tests.helpers.example_rules import decaying_rule
 from tests.helpers.shipped import resolved
-from tests.noack.theory.certificate_kinds.policies import INSTANT
+from tests.noack.theory.certificates.certificate_kinds.policies import INSTANT
 from tests.oracles.continuous_loops import simulate_continuous_time
 from tests.oracles.lossy_loops import (
     ROUNDING,

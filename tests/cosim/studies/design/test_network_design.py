@@ -1,6 +1,6 @@
 """``noack design --for network``: what is found is proven, and no worse than what was given.
 
-``tests/noack/theory/certificate_kinds/designs.py`` attacks what is said of random loops.
+``tests/noack/theory/certificates/certificate_kinds/designs.py`` attacks what is said of random loops.
 """
 
 import json

@@ -31,10 +31,10 @@ from noack.theory.certificates.scenario_certificates import (
     own_plant,
 )
 from noack.theory.certificates.solution import completed
-from tests.noack.theory.certificate_kinds.policies import exceeded_by, scenario_with
+from tests.noack.theory.certificates.certificate_kinds.policies import exceeded_by, scenario_with
 from tests.oracles.lossy_loops import SEARCH, STEPS, System, Trace, networks, seeds, simulate, systems
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 def shipped(name: str = "lane_following", *overrides: str) -> Scenario:

@@ -20,11 +20,11 @@ from cosim.studies.design.network_search import NetworkSearch, Reached, Wish
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificate_kinds.decaying import search as search_losses
-from tests.noack.theory.certificate_kinds.margins import growth_shares, random_scenario
-from tests.noack.theory.certificate_kinds.policies import FAR, policy_shares, scenario_of
-from tests.noack.theory.certificate_kinds.shares import Case
+from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certificate_kinds.decaying import search as search_losses
+from tests.noack.theory.certificates.certificate_kinds.margins import growth_shares, random_scenario
+from tests.noack.theory.certificates.certificate_kinds.policies import FAR, policy_shares, scenario_of
+from tests.noack.theory.certificates.certificate_kinds.shares import Case
 from tests.oracles.lossy_loops import System, Trace, random_system
 from tests.oracles.time_triggered_loops import LoopMaps
 

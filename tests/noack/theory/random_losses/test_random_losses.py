@@ -19,7 +19,7 @@ from noack.theory.random_losses import random_growth as random_growth_module
 from noack.theory.random_losses.fixed_times import mean_squares
 from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
 from noack.theory.random_losses.quadratic_moments import Known, LossyFlow, quadratic_functions
-from tests.noack.theory.certificate_kinds.random_losses import certify, draw, simulate_runs
+from tests.noack.theory.certificates.certificate_kinds.random_losses import certify, draw, simulate_runs
 
 
 def mean_square_growth(maps: list[tuple[Array, Array]], chain: OutcomeChain) -> float:

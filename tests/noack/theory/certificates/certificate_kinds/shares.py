@@ -17,10 +17,10 @@ from scipy.linalg import expm
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.terms import NoCertificateError
 from noack.theory.certificates.certified_bounds import KnownStateBounds, KnownStatePart, ScenarioCertificate
-from tests.noack.theory import disturbed_loops
-from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificate_kinds.decaying import search
-from tests.noack.theory.disturbed_loops import (
+from tests.noack.theory.certificates import disturbed_loops
+from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certificate_kinds.decaying import search
+from tests.noack.theory.certificates.disturbed_loops import (
     DisturbedLoop,
     ObservedLoop,
     Sum,

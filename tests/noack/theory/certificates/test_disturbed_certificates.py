@@ -17,10 +17,10 @@ from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.disturbed import solve_two_parts
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.certificates.solution import completed_alone, solve
-from tests.noack.theory.disturbed_loops import Sum, random_disturbed_loop, signals
+from tests.noack.theory.certificates.disturbed_loops import Sum, random_disturbed_loop, signals
 from tests.oracles.lossy_loops import RUNS, STEPS, Plants, System, networks, random_system, simulate
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 def box_certificate(system: System, columns: np.ndarray, half: float, floor: float) -> Sum:

@@ -2,7 +2,7 @@
 
 import sys
 
-from tests.noack.theory.certificate_kinds.comparison import main
+from tests.noack.theory.certificates.certificate_kinds.comparison import main
 
 if __name__ == "__main__":
     sys.exit(main())

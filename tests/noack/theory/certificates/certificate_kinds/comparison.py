@@ -1,6 +1,6 @@
 """Every kind of certificate against random loops: no bound is exceeded, and broken copies are.
 
-``python -m tests.noack.theory.certificate_kinds --loops 10000`` prints a line for each kind and for
+``python -m tests.noack.theory.certificates.certificate_kinds --loops 10000`` prints a line for each kind and for
 each broken copy. The loops are simulated without any code of noack, in two processes.
 """
 
@@ -12,15 +12,15 @@ from functools import reduce
 import numpy as np
 
 from cosim.live.processes.process_pool import process_starts, processes
-from tests.noack.theory.certificate_kinds import Broken, Kind, Tally
-from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, SCHEDULED
-from tests.noack.theory.certificate_kinds.decaying import DECAYING
-from tests.noack.theory.certificate_kinds.designs import DESIGNS
-from tests.noack.theory.certificate_kinds.margins import MARGINS
-from tests.noack.theory.certificate_kinds.policies import POLICIES
-from tests.noack.theory.certificate_kinds.random_losses import MOMENT, RANDOM_LOSSES
-from tests.noack.theory.certificate_kinds.regions import REGIONS
-from tests.noack.theory.certificate_kinds.shares import DISTURBED, KNOWN_STATE, OBSERVED
+from tests.noack.theory.certificates.certificate_kinds import Broken, Kind, Tally
+from tests.noack.theory.certificates.certificate_kinds.continuous import CONTINUOUS, SCHEDULED
+from tests.noack.theory.certificates.certificate_kinds.decaying import DECAYING
+from tests.noack.theory.certificates.certificate_kinds.designs import DESIGNS
+from tests.noack.theory.certificates.certificate_kinds.margins import MARGINS
+from tests.noack.theory.certificates.certificate_kinds.policies import POLICIES
+from tests.noack.theory.certificates.certificate_kinds.random_losses import MOMENT, RANDOM_LOSSES
+from tests.noack.theory.certificates.certificate_kinds.regions import REGIONS
+from tests.noack.theory.certificates.certificate_kinds.shares import DISTURBED, KNOWN_STATE, OBSERVED
 
 KINDS: Mapping[str, Kind] = {
     kind.name: kind

@@ -17,7 +17,7 @@ from noack.theory.margins.loss_margin import LossMargin
 from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
 from tests.helpers.approved import compare_lines, lines_of_error
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'
 DWELL = '{policy="dwell", interval_s=0.11, rule={policy="absolute", delta=1}}'
 DEADLINE = f'{{policy="deadline", interval_s=0.3, rule={DWELL}}}'

@@ -24,9 +24,9 @@ from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
-from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificate_kinds.decaying import search
-from tests.noack.theory.certificate_kinds.shares import Case, shares_of
+from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certificate_kinds.decaying import search
+from tests.noack.theory.certificates.certificate_kinds.shares import Case, shares_of
 from tests.oracles.lossy_loops import (
     DRIFTING,
     EventRule,

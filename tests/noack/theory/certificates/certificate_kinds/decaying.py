@@ -18,7 +18,7 @@ from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, consta
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.bounds.terms import Constants, NoCertificateError
 from noack.theory.certificates.inequalities import ErrorInequalities
-from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.oracles.lossy_loops import (
     DRIFTING,
     Flags,

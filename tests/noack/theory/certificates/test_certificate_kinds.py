@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from noack.theory.bounds.terms import NetworkConditions
-from tests.noack.theory.certificate_kinds import Tally
-from tests.noack.theory.certificate_kinds.comparison import KINDS, examine
-from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS, constants_of
-from tests.noack.theory.certificate_kinds.decaying import dominated_by_errors
+from tests.noack.theory.certificates.certificate_kinds import Tally
+from tests.noack.theory.certificates.certificate_kinds.comparison import KINDS, examine
+from tests.noack.theory.certificates.certificate_kinds.continuous import CONTINUOUS, constants_of
+from tests.noack.theory.certificates.certificate_kinds.decaying import dominated_by_errors
 
 MOST = 60
 LOOPS = dict.fromkeys(KINDS, 1) | {"decaying": 4, "continuous time": 4, "self_triggered": 2}
-"""Of each kind; `python -m tests.noack.theory.certificate_kinds` tries thousands."""
+"""Of each kind; `python -m tests.noack.theory.certificates.certificate_kinds` tries thousands."""
 BROKEN = [(name, next(iter(kind.broken))) for name, kind in KINDS.items() if kind.broken]
-"""One of each kind; `python -m tests.noack.theory.certificate_kinds` tries all."""
+"""One of each kind; `python -m tests.noack.theory.certificates.certificate_kinds` tries all."""
 
 
 @cache

@@ -19,9 +19,9 @@ from noack.theory.margins import loss_margin
 from noack.theory.margins.joint_spectral_radius import JointSpectralRadius
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped, intervals_ns, without_timeout
 from noack.theory.margins.switched_system import Edge, SwitchedSystem, find_cycle
-from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificate_kinds.policies import scenario_of
-from tests.noack.theory.certificate_kinds.shares import Case, drawn, shares_of
+from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certificate_kinds.policies import scenario_of
+from tests.noack.theory.certificates.certificate_kinds.shares import Case, drawn, shares_of
 from tests.oracles.lossy_loops import random_system
 from tests.oracles.time_triggered_loops import LoopMaps
 

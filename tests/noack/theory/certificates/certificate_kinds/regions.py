@@ -19,9 +19,9 @@ from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.region import _Box
 from noack.theory.certificates.solution import Search
-from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificate_kinds.policies import scenario_of
-from tests.noack.theory.certificate_kinds.shares import Case, drawn, shares_of
+from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certificate_kinds.policies import scenario_of
+from tests.noack.theory.certificates.certificate_kinds.shares import Case, drawn, shares_of
 from tests.oracles import attacked_regions
 from tests.oracles.attacked_regions import attacked, inclusion_share
 from tests.oracles.lossy_loops import System, random_system

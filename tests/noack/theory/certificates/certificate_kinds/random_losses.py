@@ -18,7 +18,7 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.random_losses.fixed_times import mean_squares
 from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
-from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.oracles.continuous_loops import simulate_continuous_time
 from tests.oracles.lossy_loops import DRIFTING, STEPS, Reals, System, random_system, simulate, times_s
 

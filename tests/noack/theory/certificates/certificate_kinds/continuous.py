@@ -1,6 +1,6 @@
 """The paper's conditions: continuous time, an instant network, and the bounds from its flow.
 
-The search for bad losses is that of :mod:`tests.noack.theory.certificate_kinds.decaying`. The
+The search for bad losses is that of :mod:`tests.noack.theory.certificates.certificate_kinds.decaying`. The
 broken copies are mistakes in the bounds from the flow between two deliveries, each as a context.
 """
 
@@ -23,8 +23,8 @@ from noack.theory.certificates.deliveries.delivery_reach import Reach
 from noack.theory.certificates.deliveries.inserted_bounds import _OpenLoopErrors
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
 from noack.theory.certificates.deliveries.scheduled_flow import _ScheduledFlow
-from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificate_kinds.decaying import bounds_of, certified_by, dominated_by_errors, search
+from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certificate_kinds.decaying import bounds_of, certified_by, dominated_by_errors, search
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time
 from tests.oracles.lossy_loops import DRIFTING, System, random_system
 
