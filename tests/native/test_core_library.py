@@ -16,7 +16,7 @@ from noack.core.errors import CallerError
 from noack.impairments.feature import StageTables
 from noack.impairments.link_settings import Counters, RecordedDecision
 from noack.protocol.record_tables import Fate
-from tests.netem.feature_examples import IMPAIRED, names_file
+from tests.noack.impairments.feature_examples import IMPAIRED, names_file
 
 ROOT = Path(__file__).parents[2]
 

@@ -24,7 +24,7 @@ from netem.tc_words import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.runtime.address import address_text
 from noack.runtime.connections import metrics_server as servers
-from tests.netem.control.relays import FakeRelay, options, press_q, read_until, terminal
+from tests.netem.control.fake_relay import FakeRelay, options, press_q, read_until, terminal
 from tests.noack.runtime.test_log_and_metrics import read, slow_reader
 
 Values = dict[str, float]

@@ -30,7 +30,7 @@ from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
 from tests.helpers.approved import compare_text
-from tests.netem.control.relays import FakeRelay, running, times
+from tests.netem.control.fake_relay import FakeRelay, running, times
 from tests.netem.fates.links import spec_of
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000

@@ -23,8 +23,8 @@ from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.protocol.record_tables import Fate
 from tests.fuzz.parsers.fates import DOCUMENT, TABLE
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.netem.any_settings import harsh
 from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record, spec_of
+from tests.noack.impairments.any_link_settings import harsh
 from tests.oracles.link import Link
 
 NOTHING = np.zeros(0, np.uint8)
@@ -219,7 +219,7 @@ def test_the_same_arrivals_have_the_same_fates(
 def test_at_other_times_the_delays_are_the_same(
     folder: Path, link: LinkSettings, came: list[Arrival], data: st.DataObject
 ) -> None:
-    """tests/netem/test_mansd.py checks that the replay keeps the cap."""
+    """tests/noack/impairments/test_mansd.py checks that the replay keeps the cap."""
     before = record(folder / "fates.parquet", link, came)
     gaps = st.lists(st.integers(0, MAX_GAP_NS), min_size=len(came), max_size=len(came))
     mansd = data.draw(st.sampled_from([link.mansd, 0, 1, 2]))

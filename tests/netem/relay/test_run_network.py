@@ -30,8 +30,8 @@ from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.helpers.machine_parts import Machine
-from tests.netem import any_settings
 from tests.netem.relay.relays import PATIENCE_S, KeepAll, Received, drain, endpoints, name_of, relayed
+from tests.noack.impairments import any_link_settings as any_settings
 from tests.oracles.link import Datagram, Link, network_of
 
 NEVER_NS = 2**61

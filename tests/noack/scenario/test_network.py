@@ -30,7 +30,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import certified_delay_s
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.netem.feature_examples import IMPAIRED, keeps_loss, names_file
+from tests.noack.impairments.feature_examples import IMPAIRED, keeps_loss, names_file
 from tests.oracles.link import Datagram, Link
 
 

@@ -19,7 +19,12 @@ from noack.theory.certificates.certified_bounds import known_state_bounds
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from tests.helpers.example_rules import quadratic_rule
-from tests.noack.theory.certificates.certificate_kinds.policies import INSTANT, POLICY_KINDS, exceeded_by, policy_case
+from tests.noack.theory.certificates.certificate_kinds.policies import (
+    INSTANT,
+    POLICY_KINDS,
+    exceeded_by,
+    policy_case,
+)
 from tests.noack.theory.certificates.disturbed_loops import DisturbedLoop, signals
 from tests.oracles.lossy_loops import ROUNDING, SEARCH, STEPS, System, networks, seeds, simulate, systems
 

@@ -1,7 +1,7 @@
 """Every kind of certificate against random loops: no bound is exceeded, and broken copies are.
 
-``python -m tests.noack.theory.certificates.certificate_kinds --loops 10000`` prints a line for each kind and for
-each broken copy. The loops are simulated without any code of noack, in two processes.
+``python -m tests.noack.theory.certificates.certificate_kinds --loops 10000`` prints a line for each
+kind and for each broken copy. The loops are simulated without any code of noack, in two processes.
 """
 
 import argparse

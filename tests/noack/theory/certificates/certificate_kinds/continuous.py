@@ -24,7 +24,12 @@ from noack.theory.certificates.deliveries.inserted_bounds import _OpenLoopErrors
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
 from noack.theory.certificates.deliveries.scheduled_flow import _ScheduledFlow
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.certificates.certificate_kinds.decaying import bounds_of, certified_by, dominated_by_errors, search
+from tests.noack.theory.certificates.certificate_kinds.decaying import (
+    bounds_of,
+    certified_by,
+    dominated_by_errors,
+    search,
+)
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time
 from tests.oracles.lossy_loops import DRIFTING, System, random_system
 

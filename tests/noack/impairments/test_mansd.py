@@ -16,7 +16,7 @@ from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
 from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.protocol.record_tables import Fate
-from tests.netem import any_settings
+from tests.noack.impairments import any_link_settings as any_settings
 from tests.oracles.link import Datagram, Link
 from tests.oracles.loss_language import is_allowed, longest_burst
 
@@ -262,7 +262,7 @@ def test_a_datagram_is_held_back_no_longer_than_necessary(
         assert is_allowed(lost_of(releases), own)
 
 
-PAGE = (Path(__file__).parents[2] / "docs/mansd.md").read_text()
+PAGE = (Path(__file__).parents[3] / "docs/mansd.md").read_text()
 NEVER = "–"
 
 

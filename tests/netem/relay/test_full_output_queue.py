@@ -1,4 +1,4 @@
-"""The number of tries through two lossy directions; and a slow line between two hosts."""
+"""A relay before a line between two hosts that is slower than the packets arrive."""
 
 import errno
 import json

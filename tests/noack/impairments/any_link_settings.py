@@ -14,7 +14,7 @@ from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.kinds.delay import SHAPES, Delay
 from noack.impairments.kinds.reorder import Reorder
 from noack.impairments.link_settings import LinkSettings, require_order, require_scores
-from tests.netem.feature_examples import EXAMPLES, IMPAIRED, keeps_loss, names_file
+from tests.noack.impairments.feature_examples import EXAMPLES, IMPAIRED, keeps_loss, names_file
 
 _TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).filter(
     lambda name: name not in SHAPES
