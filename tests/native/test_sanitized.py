@@ -27,7 +27,7 @@ FILES = (
     "tests/native/machines_under_sanitizers.py", "tests/fuzz/test_parsers.py",
     "tests/netem/capture/test_pcapng.py", "tests/noack/protocol/test_wire_format.py",
     "tests/netem/test_link_state.py", "tests/netem/test_channel.py", "tests/noack/impairments/test_mansd.py",
-    "tests/cosim/simulation/test_event_order.py",
+    "tests/cosim/simulation/test_virtual_time.py",
     "tests/cosim/simulation/test_several_loops.py", "tests/cosim/analysis/test_replay.py",
     "tests/cosim/analysis/adversary/test_worst_patterns.py", "tests/noack/runtime/test_live_driver.py",
     "tests/noack/runtime/test_peer_sockets.py", "tests/cosim/output/export/test_fmu_export.py",

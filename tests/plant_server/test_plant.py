@@ -1,4 +1,4 @@
-"""The plant: its disturbances, its measurement noise, and the watchdog of the last actuation."""
+"""The plant: its disturbances and its measurement noise."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from noack.protocol.roles import Notice, Record
+from noack.protocol.roles import Record
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
@@ -97,25 +97,3 @@ def test_a_seed_changes_only_its_own_disturbance(disturbed: dict[str, Any]) -> N
         for messages, some in ((sent, rows), (sent_2, rows_2))
     )
     np.testing.assert_allclose(v, v_2, atol=1e-12)
-
-
-MS = 1_000_000
-
-
-@pytest.mark.parametrize(("policy", "then"), [("hold", 2.0), ("zero", 0.0)])
-@pytest.mark.parametrize(("sent_ns", "trips"), [(10 * MS, False), (10 * MS - 1, True)])
-def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout(
-    content: dict[str, Any], policy: str, then: float, sent_ns: int, *, trips: bool
-) -> None:
-    watchdog = {"policy": policy, "timeout_s": 0.05}
-    content["plant"] |= {"rate_hz": 100.0, "watchdog": watchdog}
-    scenario = resolved(content)
-    plant, outputs = plant_of(scenario), []
-    plant.handle(Message(Flow.ACTUATION, 0, sent_ns, np.array([2.0])), sent_ns)
-    for t_ns in range(0, 70 * MS, 10 * MS):
-        outputs += plant.on_timer(t_ns)
-    rows = [one.row for one in outputs if isinstance(one, Record)]
-    u = np.array(rows, tables_of(scenario)["plant_step"])["u"][:, 0]
-    assert (u[5], u[6]) == (2.0, then if trips else 2.0)
-    notices = [(one.t_ns, one.level) for one in outputs if isinstance(one, Notice)]
-    assert notices == [(60 * MS, "watchdog")] * trips

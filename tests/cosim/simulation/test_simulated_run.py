@@ -5,13 +5,11 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 import rerun.chunk
 from typer.testing import Result
 
 from cosim.analysis.summary import network_summary
-from cosim.analysis.summary.network_summary import in_flight
 from cosim.analysis.summary.summary_model import ReplayPart, read_summary
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint
@@ -20,8 +18,8 @@ from cosim.record.run_record import RecordedRun, RunRecord, load_record
 from cosim.simulation.virtual_time import Progress, simulate, simulate_run
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.number_format import number as written
-from noack.protocol.record_tables import NETEM_PACKET, tables
-from noack.scenario.resolution import network_tables, resolve
+from noack.protocol.record_tables import tables
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.command_line import invoke
@@ -164,20 +162,6 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     assert re.match(r"guarantee not checkable in \d of 3 loops: ", shown[1])
     sent = sum(one["actuations"]["sent"] for one in summary["loops"])
     assert any(f" {sent} (" in line for line in shown)
-
-
-def test_the_number_in_flight_over_time() -> None:
-    """Two datagrams overlap from 10 to 20 s; a third did not wait, a fourth was lost."""
-    packets = np.zeros(4, network_tables()[NETEM_PACKET])
-    packets["copy_ns"] = -1
-    packets["now_ns"] = np.array([0, 10, 50, 60]) * 10**9
-    packets["release_ns"] = np.array([20 * 10**9, 30 * 10**9, 50 * 10**9, -1])
-    found = in_flight(packets, 100 * 10**9, 100 * 10**9)
-    assert (found.mean, found.max, found.width_s) == (pytest.approx(0.4), 2, 0.5)
-    assert found.max_by_interval[:60] == [1] * 20 + [2] * 20 + [1] * 20
-    assert not any(found.max_by_interval[61:])
-    assert found.mean_by_interval[20:40] == [2.0] * 20
-    assert in_flight(packets, 100 * 10**9, 40 * 10**9).mean == pytest.approx(1.0)  # stopped
 
 
 # --- one loop -------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """A run in virtual time with a controller that stands still for a while, as under SIGSTOP.
 
-``python -m tests.cosim.live.outage`` prints the table of docs/network.md.
+``python -m tests.cosim.simulation.outage`` prints the table of docs/network.md.
 """
 
 import math

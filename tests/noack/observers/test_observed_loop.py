@@ -23,8 +23,8 @@ from noack.protocol.roles import GENERATION, RESTART, Start
 from noack.scenario.resolution import resolve, steady_state
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from tests.cosim.live.outage import Deaf, Reborn, simulate_with
 from tests.cosim.record.changed_records import changed
+from tests.cosim.simulation.outage import Deaf, Reborn, simulate_with
 from tests.helpers.machine_parts import sensor_of
 
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
