@@ -78,27 +78,34 @@ def test_the_summary_adds_up(run_dir: Path) -> None:
     assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.02)
 
 
-@pytest.mark.usefixtures("no_drawing")
-def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
-    loop = (run_dir, "--loop", "periodic")
-    for words in ((run_dir,), loop):
-        shown = invoke("summary", *words)
+def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> None:
+    for options in ((), ("--loop", "periodic")):
+        shown = invoke("summary", run_dir, *options)
         assert shown.exit_code == 0, shown.output
-        assert shown.stdout.count("--loop periodic --verbose") == (words == loop)
-        replayed = invoke("replay", *words, "--json")
+        assert ("--loop periodic --verbose" in shown.stdout) == bool(options)
+        replayed = invoke("replay", run_dir, *options, "--json")
         assert replayed.exit_code == 0, replayed.output
         assert json.loads(replayed.stdout)["gaps"] == []
-    refused = invoke("summary", run_dir, "--loop", "x")
-    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
-    assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
     shown = invoke("summary", run_dir).stdout
     assert "bottleneck" in shown
     assert "guarantee not checkable in 11 of 11 loops: pendulum-01: no certificate: " in shown
-    assert invoke("report", *loop).exit_code == 0
+    refused = invoke("summary", run_dir, "--loop", "x")
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_the_summary_and_the_page_of_a_run_name_the_pages_of_its_loops(run_dir: Path) -> None:
+    assert invoke("report", run_dir, "--loop", "periodic").exit_code == 0
+    shown = "".join(invoke("summary", run_dir, "--loop", "periodic").stdout.split())
+    assert f"more:{run_dir}/report-periodic.htmland" in shown
     assert invoke("report", run_dir).exit_code == 0
     page = (run_dir / "report.html").read_text()
     assert '<a href="report-periodic.html">periodic</a>' in page
     assert "report-pendulum-01.html" not in page  # no report of that loop was written
+
+
+def test_a_report_is_refused_if_the_scenario_has_other_loops_than_the_record(run_dir: Path) -> None:
     scenario = run_dir / "scenario.toml"
     given = scenario.read_text()
     scenario.write_text(given.replace("count = 10", "count = 9"))

@@ -20,6 +20,7 @@ from netem.capture import CaptureWriter, PcapngSection
 from netem.relay_links import DIRECTIONS, EVENT, Bytes, Events
 from noack.core.errors import CallerError
 from tests.helpers.approved import compare_lines
+from tests.helpers.waiting import wait_for
 from tests.netem.capture.reader import (
     INTERFACES,
     SPECS,
@@ -197,8 +198,7 @@ def test_events_that_overflow_the_queue_are_reported_missing(
         capture.take(*batch({"interface": 1}))
         assert capture.missing_events == 3
         free.set()
-        while capture.written < 3:
-            pass
+        wait_for(lambda: capture.written == 3)
         capture.take(*batch({"interface": 1}, {"interface": 1}, {}))
     assert (capture.missing_events, capture.written, capture.error) == (3, 6, None)
     drop_counts = [packet.options.get(4, [b""])[0] for packet in read(path.read_bytes()).packets]

@@ -6,7 +6,6 @@ import os
 import shutil
 import socket
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -19,6 +18,7 @@ from noack.runtime.udp_sockets import enlarge_buffer
 from tests.attacks.attacked import unread_bytes
 from tests.attacks.kinds import enter_namespace
 from tests.helpers.two_hosts import TwoHosts, two_hosts
+from tests.helpers.waiting import wait_for
 from tests.netem.conftest import Emulate
 
 SLOW_LINE = ("tbf", "rate", "800kbit", "burst", "40kb", "limit", "40kb")
@@ -48,6 +48,11 @@ def run(hosts: TwoHosts, *command: str) -> str:
     return done.stdout.decode()
 
 
+def queue_length(hosts: TwoHosts) -> int:
+    """Return the number of packets that wait for the line."""
+    return int(json.loads(run(hosts, "tc", "-s", "-j", "qdisc", "show", "dev", "line"))[0]["qlen"])
+
+
 def bound_in(namespace: str, address: str) -> socket.socket:
     """Return a bound socket in a network namespace, which a thread enters for this."""
 
@@ -75,11 +80,9 @@ def test_packets_refused_by_a_full_output_queue_are_counted(
         emulator = emulate(to, *words, listen=listen, inside=hosts.inside(0))
         for _ in range(MANY):
             client.sendto(bytes(500), (here, emulator.port))
-        while unread_bytes(emulator.process.pid)[emulator.port]:
-            time.sleep(0.02)
+        wait_for(lambda: not unread_bytes(emulator.process.pid)[emulator.port])
         link, status, stderr = emulator.end()
-        while json.loads(run(hosts, "tc", "-s", "-j", "qdisc", "show", "dev", "line"))[0]["qlen"]:
-            time.sleep(0.02)
+        wait_for(lambda: not queue_length(hosts))
         server.settimeout(0.3)  # longer than the last datagram travels after the queue
         received = 0
         with suppress(TimeoutError):

@@ -11,6 +11,7 @@ from netem.tc_words import settings_of
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.link_settings import LinkSettings
+from noack.protocol.record_tables import Fate
 from tests.oracles.link import Link
 
 MS = 10**6
@@ -81,6 +82,17 @@ def test_each_packet_leaves_as_in_mahimahi(seed: int, mansd: int | None) -> None
     model.run_until(now_ns + 2_000 * MS)  # 40 packets need at most 120 opportunities
     expected = [model.departures[number] for number in range(40)]
     assert found == [-1 if at < 0 else at - offset_ms * MS for at in expected]
+
+
+def test_the_last_byte_of_an_opportunity_and_of_the_queue_is_used() -> None:
+    """An opportunity carries 1504 bytes; packets have 32 more bytes on the link."""
+    link = Link(LinkSettings(impairments=(Opportunities(times_ms=(1,), queue=9),)), 0, "test")
+    sizes = (1503, 32, 1473)  # one byte is left, which the second uses; then 1473 of the next are left
+    assert [link.decide(0, size - OVERHEAD_BYTES, 1).release_ns for size in sizes] == [MS, 2 * MS, 2 * MS]
+    settings = Opportunities(times_ms=(1,), queue=9, queue_bytes=100)
+    link = Link(LinkSettings(impairments=(settings,)), 0, "test")
+    fates = [link.decide(0, size - OVERHEAD_BYTES, 1).fate for size in (50, 50, 32)]
+    assert fates == [Fate.DELIVERED, Fate.DELIVERED, Fate.OVERFLOWED]
 
 
 def test_the_longest_delay_is_that_of_a_full_queue() -> None:

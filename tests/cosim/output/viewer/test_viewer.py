@@ -39,7 +39,8 @@ from noack.core.errors import CallerError, ExitStatus
 from tests.cosim.output.test_texts import compare
 from tests.helpers.shipped import resolved
 from tests.helpers.summaries import summary_of
-from tests.integration.conftest import noack_command, wait_for
+from tests.helpers.waiting import wait_for
+from tests.integration.conftest import noack_command
 
 Floats = NDArray[np.float64]
 
