@@ -44,7 +44,7 @@ NAMES = (
 """Parts of the names of tests that reach other parts of the core."""
 
 
-def test_these_tests_run_clean() -> None:
+def test_the_tests_of_the_core_run_clean_under_sanitizers() -> None:
     """One process for all of them: with sanitizers, its start takes as long as many tests."""
     done = run(*PYTEST, *FILES, "-k", " or ".join(NAMES))
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[:4000]

@@ -42,7 +42,7 @@ def plain(value: Any) -> bytes | int:
 
 
 @given(any_link, any_link, st.none() | any_link, arrivals, st.sampled_from([0, 2**40]))
-def test_it_does_what_the_plain_network_does(
+def test_the_channel_does_what_the_plain_network_does(
     first: LinkSettings,
     second: LinkSettings,
     later: LinkSettings | None,
@@ -76,7 +76,7 @@ def test_it_does_what_the_plain_network_does(
     assert [one.counters for one in channel.channel.links] == [forward.counters, reverse.counters]
 
 
-def test_room_for_delayed_datagrams_grows(content: dict[str, Any]) -> None:
+def test_the_channel_makes_room_for_any_number_of_delayed_datagrams(content: dict[str, Any]) -> None:
     delay = {"kind": "delay", "delay_s": 1.0}
     network = content["network"] | {"loss": {"model": "lossless"}, "impairments": [delay]}
     channel = SteppedChannel(channel_of(resolve(validate(content | {"network": network}, ""))))

@@ -246,7 +246,7 @@ def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "hosts.toml"
 
 
-def test_processes_without_a_table_stay_here(hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_without_a_table_run_on_this_host(hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hosts.write_text(f'listen = "192.0.2.1:7400"\n{ROBOT}')
     found = remote_access.listening_for(hosts)
     assert found.address == ("192.0.2.1", 7400)

@@ -82,7 +82,7 @@ def cases(draw: st.DrawFn) -> Case:
 
 @given(cases())
 @settings(max_examples=15)
-def test_what_holds_between_events(case: Case) -> None:
+def test_the_threshold_is_reached_at_events_only_and_i1_holds_between_them(case: Case) -> None:
     """The threshold is never exceeded, and reached at each event; (I1) gives x_c − x_s."""
     run, H = case.run(), case.loop.H
     t_s = np.linspace(0, run.reached_s, 101)
@@ -167,7 +167,7 @@ def test_very_short_crossings_are_found(depth: float, omega: float, floored: boo
     assert turning(-depth, omega, floored).run().event_s.size == 0
 
 
-def test_dense_output_is_right_continuous() -> None:
+def test_samples_at_the_time_of_an_event_are_those_after_it() -> None:
     case = turning(0.3, 7.0, False)
     run = case.run()
     assert len(run.before) >= 1

@@ -85,7 +85,7 @@ def step_by_step(record: RunRecord, schedule: StepSchedule, *, delay: bool) -> t
 
 
 @pytest.mark.parametrize("delay", [False, True])
-def test_it_is_what_one_exponential_after_another_gives(delay: bool) -> None:
+def test_the_plant_grid_loop_is_what_one_exponential_after_another_gives(delay: bool) -> None:
     for number in range(POLICIES.index("decaying"), 120, len(POLICIES)):
         record = simulated(number)
         whole = recorded_loop(record).schedule
@@ -100,7 +100,7 @@ def test_it_is_what_one_exponential_after_another_gives(delay: bool) -> None:
 
 
 @pytest.mark.parametrize("first", range(len(POLICIES)))
-def test_with_all_effects_it_is_what_the_machines_do(first: int) -> None:
+def test_the_plant_grid_loop_with_all_effects_is_what_the_machines_do(first: int) -> None:
     """Losses, delays, reordering, all kinds of rates and phases."""
     for number in range(first, 4 * len(POLICIES), len(POLICIES)):
         record = simulated(number)

@@ -61,7 +61,7 @@ def test_a_live_run_in_which_no_loop_sent_anything_has_not_failed(
     assert summary.exit.status == ExitStatus.OK
 
 
-def test_the_summary_adds_up(run_dir: Path) -> None:
+def test_the_counts_of_the_loops_add_up_to_those_of_the_network(run_dir: Path) -> None:
     summary = json.loads((run_dir / "summary.json").read_text())
     assert read_summary(summary) is not None
     assert read_summary(summary | {"loops": summary["loops"][::-1]}) is None
@@ -115,7 +115,7 @@ def test_a_report_is_refused_if_the_scenario_has_other_loops_than_the_record(run
 
 
 @pytest.mark.usefixtures("no_recording")
-def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:
+def test_the_summary_of_all_loops_says_why_claims_are_void(tmp_path: Path) -> None:
     settings = ("horizon_s=1", "certificate.late_periods=20", 'loops=[{ name = "p", count = 3 }]')
     late = simulated(tmp_path, *settings, options=["--no-report"])
     claims = [claim for one in json.loads(late.stdout)["loops"] for claim in one["claims"]]

@@ -46,13 +46,13 @@ def require_equal(found: RunRecord, expected: RunRecord) -> None:
 
 
 @pytest.mark.parametrize("first", range(len(POLICIES)))
-def test_random_loops(first: int) -> None:
+def test_random_loops_run_as_by_the_plain_driver(first: int) -> None:
     for number in range(first, 2 * len(POLICIES), len(POLICIES)):
         scenario = resolve(validate(random_scenario(number), "random"))
         require_equal(simulate(scenario), shuttled(scenario))
 
 
-def test_a_scripted_network() -> None:
+def test_a_scripted_network_decides_as_in_the_plain_driver() -> None:
     scenario = resolved("unstable_pendulum", "horizon_s=3.0")
 
     def decide(data: bytes, now_ns: int) -> int | None:
@@ -61,7 +61,7 @@ def test_a_scripted_network() -> None:
     require_equal(simulate(scenario, decide), shuttled(scenario, decide))
 
 
-def test_loops_of_different_sizes_on_one_network() -> None:
+def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
     given = shipped("unstable_pendulum", "horizon_s=1.0").model_dump(mode="json", exclude_none=True)
     rate = {"kind": "rate", "rate_bps": 50_000, "queue": 6}
     network = given["network"] | {

@@ -32,7 +32,7 @@ LONGEST_S = 2.0
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
-def test_a_shipped_scenario(path: Path) -> None:
+def test_a_shipped_scenario_runs_as_the_reference_loop(path: Path) -> None:
     scenario = load(path)
     if scenario.horizon_s > LONGEST_S and path.stem != "lane_5g_rural":  # it has an outage later
         scenario = load(path, [f"horizon_s={LONGEST_S}"])
@@ -56,7 +56,7 @@ def compared(number: int) -> Comparison:
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-def test_random_scenarios(policy: str) -> None:
+def test_random_scenarios_run_as_the_reference_loop(policy: str) -> None:
     first = POLICIES.index(policy)
     found = [compared(number) for number in range(first, RANDOM, len(POLICIES))]
     assert sum(one.tie_ns is not None for one in found) <= 1

@@ -90,7 +90,7 @@ def test_a_checksum_of_0_is_sent_as_ffff() -> None:
 
 
 @pytest.mark.parametrize(("family", "most"), [(4, 65_507), (6, 65_527)])
-def test_the_largest_datagram_fits(family: int, most: int) -> None:
+def test_a_capture_holds_the_largest_datagram(family: int, most: int) -> None:
     table, data = batch({"family": family, "payload": bytes(most)})
     section = PcapngSection(INTERFACES)
     file = read(section.header() + bytes(section.packets(table, data)))
@@ -158,7 +158,7 @@ def capturing(path: Path | str, **options: int) -> Iterator[CaptureWriter]:
         capture.close()
 
 
-def test_the_file_holds_the_batches(tmp_path: Path) -> None:
+def test_a_new_capture_replaces_an_older_file(tmp_path: Path) -> None:
     path = tmp_path / "capture.pcapng"
     path.write_bytes(b"an older capture" * 1000)
     with capturing(path) as capture:

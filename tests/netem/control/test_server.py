@@ -61,7 +61,7 @@ def test_a_session_is_found_while_it_lasts() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 65])
-def test_unfit_names_are_refused(name: str) -> None:
+def test_names_that_are_unsafe_as_file_names_are_refused(name: str) -> None:
     with pytest.raises(CallerError, match="use letters, digits"), registered_emulator(name):
         pass
 

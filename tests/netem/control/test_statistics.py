@@ -164,7 +164,7 @@ def sample(elapsed_s: float, rate: float | None, seconds: float = 1.0) -> Statis
     return cast(Statistics, document)
 
 
-def test_the_history_of_the_last_minute() -> None:
+def test_a_sample_of_the_history_applies_to_the_time_since_the_one_before() -> None:
     """A sample applies to the time since the previous one."""
     every_second, every_ten = History(), History()
     assert series(every_second, 3) == [None] * 3

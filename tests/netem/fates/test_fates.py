@@ -166,7 +166,7 @@ def test_a_wrong_trace_is_refused_with_the_approved_line(path: Path) -> None:
     compare_lines(Path(__file__).with_name("mistakes.txt"), refusal)
 
 
-def test_other_files_are_refused(path: Path, tmp_path: Path) -> None:
+def test_files_that_are_no_fate_traces_are_refused(path: Path, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"cannot be read \(.*No such file"):
         read_fates(tmp_path / "none")
     with pytest.raises(CallerError, match="cannot be read"):

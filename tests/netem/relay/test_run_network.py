@@ -123,7 +123,7 @@ CROSSING = st.sampled_from([
     any_settings.harsh, any_settings.harsh, CROSSING, arrivals, st.integers(0, 2),
     st.sampled_from([1, 1, 2, 200]),
 )  # fmt: skip
-def test_any_arrivals_give_the_same_rows_and_datagrams(
+def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_the_plain_machine(
     forward: LinkSettings,
     reverse: LinkSettings,
     crossing: tuple[Flow, ...],
@@ -273,7 +273,7 @@ def replayed(
     sizes=st.lists(st.sampled_from([0, 1, 8, 72, 1472, 9000]), min_size=20, max_size=60),
     segment=st.booleans(),
 )
-def test_fates_and_order_are_the_machines(
+def test_the_relay_gives_datagrams_the_fates_and_the_order_of_the_plain_machine(
     forward: LinkSettings, reverse: LinkSettings, sizes: list[int], segment: bool
 ) -> None:
     tap = KeepAll()

@@ -97,7 +97,7 @@ def random_guarantee(rng: np.random.Generator) -> LossGuarantee:
     return LossGuarantee(tuple(rules[int(len(rules) > 1 and rng.random() < 0.3) :]))
 
 
-def test_implications_are_those_of_all_patterns() -> None:
+def test_a_guarantee_implies_another_if_no_pattern_keeps_only_the_first() -> None:
     rng, longest, implied = np.random.default_rng(0), 9, 0
     patterns = [one for k in range(longest + 1) for one in product((True, False), repeat=k)]
     for _ in range(60):
@@ -115,7 +115,7 @@ def test_implications_are_those_of_all_patterns() -> None:
     assert 5 < implied < 55
 
 
-def test_windows_against_the_closed_form() -> None:
+def test_one_window_implies_another_as_the_closed_form_says() -> None:
     """At most m in K allow at most m ⌊k/K⌋ + min(m, k mod K) losses in k packets."""
     for (window, other), losses in product(product(range(2, 6), range(1, 10)), range(3)):
         most = losses * (other // window) + min(losses, other % window)

@@ -136,7 +136,7 @@ def test_exactly_the_packets_of_a_script_are_lost(numbers: set[int], extra: int)
 
 
 @given(st.integers(1, 30), st.data(), st.integers(0, 50))
-def test_of_every_period_a_burst_is_lost(period: int, data: st.DataObject, first: int) -> None:
+def test_periodic_loss_drops_a_burst_in_every_period(period: int, data: st.DataObject, first: int) -> None:
     burst = data.draw(st.integers(0, period))
     found = lost_packets(f"loss periodic {burst}/{period} from {first}", range(200))
     assert found == [k >= first and (k - first) % period < burst for k in range(200)]
@@ -176,7 +176,9 @@ def test_common_states_at_a_distance_follow_the_powers_of_the_matrix(every: int)
 
 
 @given(st.sets(st.integers(0, 50), min_size=2), st.none() | st.integers(0, 30))
-def test_every_packet_is_lost_from_begin_until_just_before_end(borders: set[int], extra: int | None) -> None:
+def test_a_blackout_loses_every_packet_from_its_begin_until_just_before_its_end(
+    borders: set[int], extra: int | None
+) -> None:
     ends = sorted(borders)[: len(borders) // 2 * 2]
     intervals = list(zip(ends[::2], ends[1::2], strict=True))
     period = None if extra is None else ends[-1] + extra

@@ -69,7 +69,7 @@ def predicted_loss(words: str) -> float | None:
     return predict(settings_of(words)).rate
 
 
-def test_losses_follow_the_closed_form() -> None:
+def test_predicted_losses_are_those_of_the_closed_form() -> None:
     for words, rate in EXACT.items():
         assert predicted_loss(words) == pytest.approx(rate, rel=1e-9), words
     for p in (0.05, 0.5, 0.97):
@@ -170,7 +170,7 @@ def test_a_kept_loss_is_predicted_as_it_was_asked(words: str, asked: float) -> N
     assert expected_loss(asking).rate == pytest.approx(asked, abs=1e-9)
 
 
-def test_what_another_process_found_is_not_computed_again(monkeypatch: Any) -> None:
+def test_a_probability_that_another_process_found_is_not_computed_again(monkeypatch: Any) -> None:
     """Not even by the loops of a run; but other settings have another probability."""
     settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
     found = found_probabilities(settings, settings_of("delay 1ms"))
@@ -246,6 +246,6 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
         assert all_lost <= longest * (1 + 1e-9)
 
 
-def test_losses_that_depend_on_times_are_refused() -> None:
+def test_losses_that_depend_on_times_have_no_prediction() -> None:
     with pytest.raises(NotPredictableError):
         process(INDEPENDENT, {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.05})

@@ -78,7 +78,9 @@ def departures(rate: Rate, arrivals: Sequence[tuple[int, int, bool]]) -> list[in
         max_size=40,
     ),
 )  # fmt: skip
-def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
+def test_departures_at_a_rate_are_those_of_a_queue_in_fractions(
+    rate: Rate, steps: list[tuple[int, int, bool]]
+) -> None:
     times = np.cumsum([step[0] for step in steps]).tolist()
     arrivals = [(t, size, forced) for t, (_, size, forced) in zip(times, steps, strict=True)]
     other = Rate(rate_bps=1000, queue=3)  # so that the ring buffer's offset is not 0
@@ -246,7 +248,7 @@ def emulated(arrivals: Sequence[tuple[int, int]], codel: Codel, mansd: int | Non
     st.sampled_from([0.0001, 0.002, 0.02]),
     st.sampled_from([None, 1, 3]),
 )
-def test_any_arrivals_and_any_cap(
+def test_codel_drops_what_the_rfc_drops_and_serves_what_must_pass(
     steps: list[tuple[int, int]], target_s: float, interval_s: float, mansd: int | None
 ) -> None:
     """Packets that must pass are served, and the law drops the next packet that need not pass."""
@@ -256,7 +258,7 @@ def test_any_arrivals_and_any_cap(
     assert emulated(arrivals, codel, mansd) == reference(arrivals, codel, ahead(100), mansd)
 
 
-def test_the_law_drops_copies_of_delivered_packets() -> None:
+def test_codel_drops_copies_of_delivered_packets() -> None:
     words = "duplicate 100% rate 8mbit 0 codel target 1us interval 1us mtu 0"
     link, found = Link(settings_of(words), 0, "a"), set()
     for k in range(50):
@@ -345,7 +347,7 @@ def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
 @example(9_600, 6, (1,), [(0, flow, 72, level) for flow, level in ON_THE_RIGHT], None)
 @example(9_600, 6, (2, 0), [(0, 1, 1472, 0), (0, 0, 72, 0), (100 * MS, 1, 72, 0)], None)
 @example(9_600, 2, (1,), [*((0, flow, 72, 0) for flow in (0, 1, 2, 2, 3, 3)), (100 * MS, 0, 72, 0)], 1)
-def test_the_first_of_what_waits_is_sent_when_the_link_is_free(
+def test_a_scheduler_sends_the_first_of_what_waits_when_the_link_is_free(
     kind: type[Scheduler], rate_bps: int, queue: int, numbers: Any, steps: Any, mansd: int | None
 ) -> None:
     """Of each flow in order of arrival; at most mansd successive packets of a flow are lost."""

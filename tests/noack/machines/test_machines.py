@@ -198,7 +198,7 @@ def test_a_sensor_that_waits_without_acknowledgements_is_refused() -> None:
     assert text_of(own) == NOT_ACKNOWLEDGED
 
 
-def test_each_text_is_in_the_table() -> None:
+def test_every_text_of_the_machine_check_is_in_the_approved_file() -> None:
     texts = re.findall(r'(?:return|:) "([^"]+)"', SOURCE.read_text())
     told = {line.strip() for line in WRONG.read_text().splitlines() if line.startswith("    ")}
     assert told | {NOT_ACKNOWLEDGED} == {*texts}
@@ -212,6 +212,6 @@ def test_a_layout_with_a_word_that_the_machine_does_not_write_is_refused(word: i
     assert text_of(own) == "the rows of a table have another size than the machines write"
 
 
-def test_python_is_told_what_is_wrong() -> None:
+def test_a_machine_that_the_core_refuses_raises_its_text() -> None:
     with pytest.raises(ValueError, match=r"^controller: an actuation has more than 64 entries$"):
         LoopMachines([controller(1, OF._replace(predictions=31))])

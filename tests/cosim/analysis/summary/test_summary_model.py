@@ -170,7 +170,7 @@ def test_restarts_and_their_missing_first_rows_are_listed(content: dict[str, Any
     }  # fmt: skip
 
 
-def test_the_number_in_flight_over_time() -> None:
+def test_the_number_in_flight_is_that_of_overlapping_delays() -> None:
     """Two datagrams overlap from 10 to 20 s; a third did not wait, a fourth was lost."""
     packets = np.zeros(4, network_tables()[NETEM_PACKET])
     packets["copy_ns"] = -1

@@ -35,7 +35,7 @@ def started(server: ForkServer, folder: Path, *arguments: str) -> Iterator[Forke
     process.wait()
 
 
-def test_its_standard_input_ends_with_the_launchers_end(server: ForkServer, tmp_path: Path) -> None:
+def test_the_standard_input_of_a_process_ends_with_the_launcher(server: ForkServer, tmp_path: Path) -> None:
     """No other process, and not the server, may hold a lifeline open."""
     with ExitStack() as stack:
         processes = [stack.enter_context(started(server, tmp_path)) for _ in range(3)]

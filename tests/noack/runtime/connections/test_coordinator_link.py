@@ -96,7 +96,7 @@ def unix_socket(path: str) -> socket.socket:
     return one
 
 
-def test_a_port_where_nothing_listens() -> None:
+def test_a_port_where_nothing_listens_is_named() -> None:
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
         assert reason(destination(bound)).startswith("nothing listens there")
@@ -115,7 +115,7 @@ def test_a_port_where_nothing_listens() -> None:
         (b"HTTP/1.1 400", "a program listens there, but does not accept this invitation"),
     ],
 )
-def test_a_connection_that_ends_before_its_handshake(
+def test_a_connection_that_ends_before_its_handshake_is_reported_with_its_cause(
     listening: socket.socket, answer: bytes, text: str
 ) -> None:
     def end_it() -> None:
@@ -131,7 +131,7 @@ def test_a_connection_that_ends_before_its_handshake(
 
 
 @pytest.mark.parametrize("other", [{"key": b"\1" * 32}, {"keys": OTHER_KEYS}])
-def test_a_run_with_another_key_or_other_certificates(
+def test_a_run_with_another_key_or_certificate_does_not_accept_the_invitation(
     listening: socket.socket, other: dict[str, object]
 ) -> None:
     with forwarding(listening, nowhere, PROTECTION):
@@ -139,7 +139,9 @@ def test_a_run_with_another_key_or_other_certificates(
     assert "does not accept this invitation" in found
 
 
-def test_no_answer(monkeypatch: pytest.MonkeyPatch, listening: socket.socket) -> None:
+def test_a_host_that_does_not_answer_is_reported(
+    monkeypatch: pytest.MonkeyPatch, listening: socket.socket
+) -> None:
     monkeypatch.setattr(link_module, "_OPEN_S", 0.01)
     assert reason(destination(listening)).startswith("no answer; is it the recording host's")
 
@@ -220,7 +222,9 @@ def echoed(connection: socket.socket, message: bytes = b"hello") -> bytes:
 
 @pytest.mark.parametrize("kind", ["connect", "garbage", "half a proof", "a foreign proof"])
 @pytest.mark.parametrize("addresses", [1, 200])
-def test_a_flood_keeps_nobody_out(monkeypatch: pytest.MonkeyPatch, kind: str, addresses: int) -> None:
+def test_a_flood_of_connections_keeps_no_process_from_joining(
+    monkeypatch: pytest.MonkeyPatch, kind: str, addresses: int
+) -> None:
     """The flood fills all places between any two steps of one who joins, from his address too."""
     monkeypatch.setattr(connection_gate, "_MOST_WAITING", 64)
     monkeypatch.setattr(connection_gate, "_ROOM", 16)

@@ -114,7 +114,7 @@ def test_a_reply_is_accepted_once_and_a_repeated_request_does_no_harm(
     assert interval.lower_ns <= true_ns - own_ns <= interval.upper_ns
 
 
-def test_what_is_read_in_one_call_is_bounded(stack: ExitStack) -> None:
+def test_the_number_of_datagrams_read_in_one_call_is_bounded(stack: ExitStack) -> None:
     pair = Pair(stack, HostClocks())
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for _ in range(2 * MOST_AT_ONCE):
@@ -309,7 +309,7 @@ def test_a_bound_without_answers_is_lost_and_found_again(stack: ExitStack) -> No
     assert "the reference has another clock than before" in causes
 
 
-def test_it_does_not_begin_without_an_answer_or_with_a_wide_bound(stack: ExitStack) -> None:
+def test_a_reference_clock_does_not_begin_without_an_answer_or_with_a_wide_bound(stack: ExitStack) -> None:
     silent = stack.enter_context(closing(TimeReference(("127.0.0.1", 0), KEY)))
     clock = stack.enter_context(closing(ReferenceClock(silent.address, KEY, ROOMY)))
     with pytest.raises(PeerError, match=r"clock with the coordinator's: no answer from 127\.0"):
@@ -341,7 +341,7 @@ class Scripted(ReferenceClock):
         return self.reports.pop(0)
 
 
-def test_rows_and_lines_of_the_log() -> None:
+def test_each_clock_report_is_a_row_and_each_change_a_line_of_the_log() -> None:
     ms = 10**6
     reports = [
         ClockReport(0, 50 * ms, 7, 3000, 10),

@@ -35,7 +35,7 @@ def edge(source: int, target: int, matrix: Matrix, duration: int = 1) -> Edge:
         ([[[3]], [[-5]]], 5.0),
     ],
 )
-def test_closed_forms(matrices: list[Matrix], value: float) -> None:
+def test_the_joint_spectral_radius_is_that_of_the_closed_form(matrices: list[Matrix], value: float) -> None:
     found = joint_spectral_radius([edge(0, 0, matrix) for matrix in matrices], accuracy=1e-6)
     assert found.lower <= value * (1 + 1e-15)
     assert found.upper >= value
@@ -52,7 +52,7 @@ def random_graph(rng: np.random.Generator) -> list[Edge]:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_no_polytopes_prove_too_much(seed: int) -> None:
+def test_no_polytope_proves_a_bound_below_the_growth(seed: int) -> None:
     """The bound is valid for any vertices, also if they were not grown to the end."""
     rng = np.random.default_rng(seed)
     edges = random_graph(rng)
@@ -114,7 +114,7 @@ def test_a_growth_that_is_the_threshold_is_undecided() -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_no_norms_and_no_products_prove_too_much(seed: int) -> None:
+def test_no_norms_and_no_products_prove_a_bound_below_the_growth(seed: int) -> None:
     """Their bounds hold in any coordinates; a broken copy without the best cycle is caught."""
     rng = np.random.default_rng(seed)
     edges = random_graph(rng)
@@ -206,7 +206,7 @@ def test_singular_matrices_have_no_inverse() -> None:
     assert inverse(np.array([[1.0, 2.0], [2.0, 4.0 + 1e-15]])) is None
 
 
-def test_exponentials_in_closed_form() -> None:
+def test_an_enclosed_exponential_contains_that_of_the_closed_form() -> None:
     shear = exponential(np.array([[0.0, 3.0], [0.0, 0.0]]), 2_500_000_000).interval()
     assert contains(shear, rational(np.array([[1.0, 7.5], [0.0, 1.0]])))
     assert shear.radius.max() < 1e-14
@@ -227,7 +227,7 @@ def test_nilpotent_systems_do_not_grow() -> None:
     assert found.upper < 0.01
 
 
-def test_maps_that_are_zero_have_norms() -> None:
+def test_maps_that_are_zero_have_norms_near_0() -> None:
     zeros = SwitchedSystem.of([edge(0, 0, np.zeros((2, 2))), edge(0, 0, np.zeros((2, 2)), 2)])
     assert NormSearch(zeros).improve(1.0).growths.max() < 1e-70
 
@@ -243,12 +243,12 @@ def test_sizes_beyond_the_range_of_doubles_prove_nothing_false() -> None:
     assert found.upper >= 1
 
 
-def test_paths_that_end_do_not_count() -> None:
+def test_edges_that_are_on_no_cycle_do_not_count() -> None:
     edges = [edge(0, 0, [[0.5]]), edge(0, 1, [[100.0]]), edge(1, 2, [[100.0]])]
     assert joint_spectral_radius(edges).upper < 0.51
 
 
-def test_one_cycle_that_forgets_or_has_one_direction() -> None:
+def test_a_nilpotent_or_defective_cycle_is_bounded_tightly() -> None:
     nilpotent = joint_spectral_radius([edge(0, 0, np.diag([1e-3, 1e3], k=1))])
     assert (nilpotent.lower, nilpotent.cycle) == (0, ())
     assert 0 < nilpotent.upper < 1e-9

@@ -56,7 +56,7 @@ def integrator() -> tuple[MomentStep, MomentStep]:
     return flow(G, unit, unit[None], 0.1), jump(sampler, 1).then(jump(controller, 1))
 
 
-def test_first_example_of_jitter_time() -> None:
+def test_moments_are_those_of_the_first_example_of_jitter_time() -> None:
     """The figures are those of X-N-C/JitterTime.jl, test/example_1_test.jl and test_periodic.jl."""
     tenth, sample = integrator()
     period = repeated(tenth, 10).then(sample)
@@ -69,7 +69,7 @@ def test_first_example_of_jitter_time() -> None:
     assert stationary[0, 0] == pytest.approx(1.077350269189626, rel=1e-13)
 
 
-def test_second_example_of_jitter_time() -> None:
+def test_moments_are_those_of_the_second_example_of_jitter_time() -> None:
     """Pendulum with two observers, as in test/example_2_test.jl of X-N-C/JitterTime.jl.
 
     The state is (x (2), sensors (2 each), observer (3) and its output (3), input).
@@ -163,7 +163,7 @@ def test_the_maps_with_all_rounding_contain_those_of_the_moments(delay: float) -
         assert np.trace(enclosed.radius) < 1e-11
 
 
-def test_the_moments_in_other_units_of_the_states() -> None:
+def test_moments_do_not_depend_on_the_units_of_the_states() -> None:
     given = scenario(**NOISE, network={"mansd": 2, "loss": BURSTS}, **{"controller.rate_hz": 16.0})
     outcomes = loss_process(given.network.link).outcomes(join_guarantee(2, ()))
     loop, unit = loop_of(given), 2.0 ** np.array([-25, 20])
@@ -200,7 +200,7 @@ def patterns(packets: int, longest: int, forced: int) -> dict[tuple[bool, ...], 
 @pytest.mark.parametrize(
     ("mode", "sync"), [("model", "first_packet"), ("zoh", "first_packet"), ("model", "known_state")]
 )
-def test_the_mean_over_all_patterns_of_simulated_runs(mode: str, sync: str) -> None:
+def test_the_mean_cost_is_that_of_all_patterns_of_simulated_runs(mode: str, sync: str) -> None:
     """With a delay, ticks that drift, and a horizon within a period: three slots."""
     constraint = {"kind": "at_most", "losses": 2, "window": 4}
     timing = {"mode": mode, "controller.rate_hz": 16.0, "horizon_s": 1.4}
@@ -217,7 +217,7 @@ def test_the_mean_over_all_patterns_of_simulated_runs(mode: str, sync: str) -> N
     assert found.horizon_cost == pytest.approx(mean, rel=1e-9)
 
 
-def test_the_mean_of_noisy_runs() -> None:
+def test_the_mean_cost_of_noisy_runs_is_that_of_a_campaign() -> None:
     """A campaign of 200 draws; by chance 5.5 standard errors are exceeded once in 10⁷."""
     given = scenario(**NOISE, network={"mansd": 2, "loss": BURSTS})
     Q, R = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([[0.3]])
@@ -253,7 +253,9 @@ def test_the_transient_and_the_stationary_part_are_limits() -> None:
         (["lane_crosswind"], 2, "plant.disturbances"),
     ],
 )
-def test_the_command(words: list[str], status: int, message: str) -> None:
+def test_noack_cost_prints_the_result_or_why_there_is_none(
+    words: list[str], status: int, message: str
+) -> None:
     done = invoke("cost", *words)
     assert done.exit_code == status, done.output
     assert message in done.output
