@@ -166,7 +166,7 @@ def driver_of(program: Path, content: dict[str, Any]) -> NodeDriver:
         ("echo noack node 7 8", "says 'noack node 7 8'; a node of this version says"),
     ],
 )
-def test_a_program_that_is_no_node_is_refused_in_one_line(
+def test_a_program_that_is_no_node_is_refused(
     commands: str, line: str, tmp_path: Path, content: dict[str, Any]
 ) -> None:
     (error,) = lines_of_error(lambda: driver_of(script(tmp_path, commands), content).__enter__())

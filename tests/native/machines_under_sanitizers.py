@@ -120,7 +120,7 @@ def drive(own: SteppedMachines, given_inputs: list[Any]) -> None:
     roles, st.lists(st.tuples(sizes(), st.integers(0, 2**16)), min_size=1, max_size=3), scales,
     st.sampled_from([1, 5, 1024]), inputs,
 )  # fmt: skip
-def test_random_machines_run_clean(
+def test_random_machines_are_clean(
     role: str, loops: list[tuple[Sizes, int]], scale: float, rows: int, given_inputs: list[Any]
 ) -> None:
     with np.errstate(all="ignore"):

@@ -56,7 +56,7 @@ def _near(center: float, largest: int) -> Callable[[np.random.Generator], np.nda
         ("cube_root", _uniform(0.4, 8.1), 0.501),
     ],
 )
-def test_elementary_functions_have_the_stated_errors_in_units_of_the_last_place(
+def test_errors_are_within_the_stated_units_in_the_last_place(
     name: str, draw: Callable[[np.random.Generator], np.ndarray], most_ulps: float
 ) -> None:
     function = getattr(core, f"noack_{name}")

@@ -5,14 +5,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import pytest
 
 from noack.core.core_library import core, ffi
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, tables
 from noack.protocol.roles import Output, Record
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from sensor_node.sensor import Sensor
 from tests.helpers.example_rules import decaying_rule
@@ -61,24 +59,11 @@ def test_the_reading_time_of_a_datagram_does_not_matter() -> None:
     assert runs[0] == runs[1]
 
 
-@pytest.fixture
-def observed(content: dict[str, Any]) -> dict[str, Any]:
-    """The double integrator with a noisy position measurement."""
-    content["plant"] |= {"rate_hz": 100.0, "measurement": {"C": [[1.0, 0.0]], "noise_std": [0.01]}}
-    content["controller"] = {"rate_hz": 100.0}
-    content["observer"] = {
-        "kind": "kalman", "input_std": [0.2], "initial_std": [1.0, 1.0],
-    }  # fmt: skip
-    return content
-
-
-def resolved(content: dict[str, Any]) -> Scenario:
-    return resolve(validate(content, "test"))
-
-
-def test_a_measurement_after_the_runs_end_is_rejected(observed: dict[str, Any]) -> None:
+def test_a_measurement_after_the_runs_end_is_rejected(content: dict[str, Any]) -> None:
     """An authentic one of any time cannot keep the observer busy with the steps up to it."""
-    scenario = resolved(observed)
+    content["plant"]["measurement"] = {"C": [[1.0, 0.0]], "noise_std": [0.01]}
+    content["observer"] = {"kind": "kalman", "input_std": [0.2], "initial_std": [1.0, 1.0]}
+    scenario = resolve(validate(content, "test"))
     own, horizon_ns = sensor_of(scenario), scenario.timing.horizon_ns
     wire, encoder = Wire(1, bytes(32)), Encoder(1, bytes(32))
     reception, message = own.machines[0].machine.received, ffi.new("noack_message *")

@@ -241,9 +241,7 @@ def test_a_record_that_cannot_be_completed_changes_nothing(
     assert contents(run_dir.parent) == before
 
 
-def test_a_folder_that_does_not_hold_kept_rows_of_this_run_is_refused(
-    run_dir: Path, kept: Kept, tmp_path: Path
-) -> None:
+def test_a_folder_without_kept_rows_of_this_run_is_refused(run_dir: Path, kept: Kept, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="nothing was kept there"):
         collect(run_dir, str(tmp_path), finish_record)
     kept.keep()

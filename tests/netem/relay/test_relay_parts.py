@@ -143,7 +143,7 @@ def test_the_table_of_clients_is_a_dictionary(
     assert sorted(table[table >= 0].tolist()) == sorted(model.values())
 
 
-def test_the_relay_reuses_the_memory_of_departed_datagrams_and_expired_clients(
+def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Half of the datagrams are delayed or copied; clients appear and expire."""

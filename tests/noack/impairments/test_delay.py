@@ -32,9 +32,7 @@ def assert_distributed(found: Any, shape: Any) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
-def test_delays_have_the_distribution_and_the_correlation_of_the_settings(
-    decide: Any, shape: str, correlation: float
-) -> None:
+def test_delays_have_the_set_shape_and_correlation(decide: Any, shape: str, correlation: float) -> None:
     """The normal scores of successive delays are an autoregressive process of order one."""
     found = random_parts(decide, f"{100 * correlation}% distribution {shape}")
     assert_distributed(found[:: 1 if correlation == 0 else 20], SHAPES[shape])  # 0.6²⁰: independent

@@ -176,9 +176,7 @@ def test_common_states_at_a_distance_follow_the_powers_of_the_matrix(every: int)
 
 
 @given(st.sets(st.integers(0, 50), min_size=2), st.none() | st.integers(0, 30))
-def test_a_blackout_loses_every_packet_from_its_begin_until_just_before_its_end(
-    borders: set[int], extra: int | None
-) -> None:
+def test_a_blackout_loses_packets_from_begin_to_just_before_end(borders: set[int], extra: int | None) -> None:
     ends = sorted(borders)[: len(borders) // 2 * 2]
     intervals = list(zip(ends[::2], ends[1::2], strict=True))
     period = None if extra is None else ends[-1] + extra

@@ -119,7 +119,7 @@ def assert_kept(settings: LinkSettings, link: Link, observer: Observer, sent: An
     st.lists(links, min_size=2, max_size=4), arrivals, st.integers(0, 2**32),
     st.sampled_from([0.0, 0.3, 0.9]),
 )  # fmt: skip
-def test_the_guarantee_holds_with_late_timers_and_changed_settings(
+def test_the_guarantee_holds_with_late_timers_and_changes(
     change: str, stages: list[LinkSettings], steps: list[tuple[int, int]], seed: int, late: float
 ) -> None:
     """Even if datagrams arrive before overdue timers are served, and if the settings change.

@@ -78,9 +78,7 @@ def departures(rate: Rate, arrivals: Sequence[tuple[int, int, bool]]) -> list[in
         max_size=40,
     ),
 )  # fmt: skip
-def test_departures_at_a_rate_are_those_of_a_queue_in_fractions(
-    rate: Rate, steps: list[tuple[int, int, bool]]
-) -> None:
+def test_a_rate_serves_packets_as_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
     times = np.cumsum([step[0] for step in steps]).tolist()
     arrivals = [(t, size, forced) for t, (_, size, forced) in zip(times, steps, strict=True)]
     other = Rate(rate_bps=1000, queue=3)  # so that the ring buffer's offset is not 0

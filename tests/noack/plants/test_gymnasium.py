@@ -18,7 +18,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.toml_file import validated
 from tests.command_line import invoke
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.helpers.extras import skip_without_plant
+from tests.helpers.shipped import skip_without_plant
 
 gymnasium = pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
 SCENARIOS = Path(__file__).parents[3] / "scenarios"

@@ -23,7 +23,7 @@ from noack.scenario.scenario_file import dumps, load, put, validate, value_of
 from noack.settings.section import ScenarioSection
 from noack.settings.user_files import NamedFile
 from tests.helpers.approved import compare_lines
-from tests.helpers.extras import skip_without_plant
+from tests.helpers.shipped import skip_without_plant
 
 SHIPPED = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
 Content = dict[str, Any]

@@ -171,7 +171,7 @@ def document(count: int = COUNT) -> dict[str, Any]:
 
 @pytest.mark.parametrize("indent", [None, 4])
 @pytest.mark.parametrize("compress", [False, True])
-def test_an_irtt_file_gives_the_losses_and_delays_of_its_round_trips(
+def test_irtt_gives_losses_and_delays_of_round_trips(
     indent: int | None, compress: bool, tmp_path: Path
 ) -> None:
     data = json.dumps(document(), indent=indent, ensure_ascii=False).encode()

@@ -131,7 +131,7 @@ def test_a_connection_that_ends_before_its_handshake_is_reported_with_its_cause(
 
 
 @pytest.mark.parametrize("other", [{"key": b"\1" * 32}, {"keys": OTHER_KEYS}])
-def test_a_run_with_another_key_or_certificate_does_not_accept_the_invitation(
+def test_a_run_with_another_key_refuses_the_invitation(
     listening: socket.socket, other: dict[str, object]
 ) -> None:
     with forwarding(listening, nowhere, PROTECTION):
@@ -139,9 +139,7 @@ def test_a_run_with_another_key_or_certificate_does_not_accept_the_invitation(
     assert "does not accept this invitation" in found
 
 
-def test_a_host_that_does_not_answer_is_reported(
-    monkeypatch: pytest.MonkeyPatch, listening: socket.socket
-) -> None:
+def test_a_host_without_answer_is_named(monkeypatch: pytest.MonkeyPatch, listening: socket.socket) -> None:
     monkeypatch.setattr(link_module, "_OPEN_S", 0.01)
     assert reason(destination(listening)).startswith("no answer; is it the recording host's")
 
@@ -222,7 +220,7 @@ def echoed(connection: socket.socket, message: bytes = b"hello") -> bytes:
 
 @pytest.mark.parametrize("kind", ["connect", "garbage", "half a proof", "a foreign proof"])
 @pytest.mark.parametrize("addresses", [1, 200])
-def test_a_flood_of_connections_keeps_no_process_from_joining(
+def test_a_flood_keeps_no_process_from_joining(
     monkeypatch: pytest.MonkeyPatch, kind: str, addresses: int
 ) -> None:
     """The flood fills all places between any two steps of one who joins, from his address too."""

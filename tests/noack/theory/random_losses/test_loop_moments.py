@@ -253,9 +253,7 @@ def test_the_transient_and_the_stationary_part_are_limits() -> None:
         (["lane_crosswind"], 2, "plant.disturbances"),
     ],
 )
-def test_noack_cost_prints_the_result_or_why_there_is_none(
-    words: list[str], status: int, message: str
-) -> None:
+def test_noack_cost_prints_the_result_or_the_reason(words: list[str], status: int, message: str) -> None:
     done = invoke("cost", *words)
     assert done.exit_code == status, done.output
     assert message in done.output
