@@ -1,6 +1,8 @@
 """Delays, corruption, duplicates and reordering, against SciPy's distributions and closed forms."""
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,11 @@ from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
 from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.trace import TraceLoss
+from noack.impairments.loss_prediction import read_files
+from tests.helpers.approved import compare_lines, lines_of_error
 
 COUNT = 100_000
 FIXED_NS, JITTER_NS = 50_000_000, 2_000_000
@@ -156,3 +162,39 @@ def test_reordered_packets_leave_at_once(decide: Any, share_is: Callable[..., No
     share_is(at_once[turns], 0.3)
     # Only delays before the reorder are skipped.
     assert (decide("delay 10ms reorder 100% delay 3ms", 10).delays_ns == 3_000_000).all()
+
+
+def read_delay(folder: Path, **settings: Any) -> Delay:
+    delay = Delay(distribution="empirical", **settings)
+    (read,) = read_files(LinkSettings(impairments=(delay,)), folder).impairments
+    assert isinstance(read, Delay)
+    return read
+
+
+def test_observed_delays_have_units_comments_and_signs(tmp_path: Path) -> None:
+    (tmp_path / "delays.txt").write_text("# from a ping\n0.01\n12.5ms\n\n300 us\n-5ns\n1e-3\n")
+    delay = read_delay(tmp_path, delay_s=0.02, file="delays.txt")
+    assert delay.samples_s == pytest.approx((0.01, 0.0125, 3e-4, -5e-9, 1e-3), rel=1e-15)
+    assert (delay.file, delay.longest_s) == (None, pytest.approx(0.0325))
+    assert Delay(jitter_s=0.1, distribution="normal").shortest_s == 0.0
+    assert delay.delay_s == 0.02
+
+
+def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None:
+    (tmp_path / "some.dist").write_text("# a table\n -8192 -4096 0\n 8192 16384\n")
+    delay = read_delay(tmp_path, delay_s=0.02, jitter_s=0.002, file="some.dist")
+    assert delay.samples_s == pytest.approx((-0.002, -0.001, 0, 0.002, 0.004), rel=1e-15)
+
+
+def test_a_mistake_in_a_file_of_delays_or_losses_gives_the_approved_line(tmp_path: Path) -> None:
+    def mistake(line: str) -> list[str]:
+        name, jitter_s, content = json.loads(line)
+        (tmp_path / name).unlink(missing_ok=True)
+        if content is not None:
+            (tmp_path / name).write_bytes(content.encode("latin-1"))
+        if jitter_s is not None:
+            return lines_of_error(lambda: read_delay(tmp_path, jitter_s=jitter_s, file=name))
+        losses = LinkSettings(impairments=(LossOf(loss=TraceLoss(file=name)),))
+        return lines_of_error(lambda: read_files(losses, tmp_path, "links.toml: link.0.reverse"))
+
+    compare_lines(Path(__file__).with_name("delay_mistakes.txt"), mistake)

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from scipy import stats
 
 from netem.tc_words import settings_of
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.loss_prediction import read_files
+from noack.protocol.record_tables import Fate
 from tests.oracles.link import Link
 
 COUNT = 400_000
@@ -197,3 +200,26 @@ def test_outages_of_a_file_are_a_blackout_of_these_intervals(tmp_path: Path) -> 
     link = Link(read_files(settings_of("outages outages.txt"), tmp_path), 0, "a")
     lost = [t_ms for t_ms in range(20) if link.decide(0, 1, t_ms * 10**6).fate == 5]
     assert lost == [3, 4, 9]
+
+
+@given(st.floats(0, 0.99), st.floats(1, 1000))
+def test_means_determine_the_chain(loss: float, burst: float) -> None:
+    """Bursts last 1/r on average, the loss rate is p/(p + r); refused exactly if p exceeds 1."""
+    if loss / (1 - loss) > burst:
+        with pytest.raises(ValidationError, match="needs longer bursts"):
+            GilbertElliottLoss(mean_loss=loss, mean_burst=burst)
+        return
+    p, r = GilbertElliottLoss(mean_loss=loss, mean_burst=burst).transitions
+    assert 1 / r == pytest.approx(burst)
+    assert p / (p + r) == pytest.approx(loss)
+
+
+@pytest.mark.parametrize("repeat", [True, False])
+def test_a_trace_drops_the_packets_it_marks(repeat: bool, tmp_path: Path) -> None:
+    (tmp_path / "trace.txt").write_text("0100 1\n11\t0\r\n")
+    settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="trace.txt", repeat=repeat)),))
+    link = Link(read_files(settings, tmp_path), 0, "test")
+    fates = [link.decide(0, 100, 0).fate for _ in range(20)]
+    marks = [int(mark) for mark in "01001110"]
+    assert fates == (marks * 3 if repeat else marks + [0] * 12)[:20]
+    assert Fate.DROPPED == 1

@@ -1,99 +1,27 @@
-"""Settings of a link that depend on each other or on files; what loops need of a bottleneck."""
+"""What loops need of a bottleneck, and the largest delay of their updates."""
 
-import json
 import math
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from noack.core.errors import CallerError
 from noack.impairments.feature import Impairment
-from noack.impairments.kinds.delay import Delay
-from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.schedule import Schedule
-from noack.impairments.link_settings import LinkSettings, require_scores
-from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
-from noack.impairments.loss_models.trace import TraceLoss
-from noack.impairments.loss_prediction import read_files
-from noack.protocol.record_tables import Fate
+from noack.impairments.link_settings import require_scores
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.link_load import link_loads, load_warnings, require_capacity, update_delay
 from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import certified_delay_s
-from tests.helpers.approved import compare_lines, lines_of_error
 from tests.noack.impairments.feature_examples import IMPAIRED, keeps_loss, names_file
 from tests.oracles.link import Datagram, Link
-
-
-@given(st.floats(0, 0.99), st.floats(1, 1000))
-def test_means_determine_the_chain(loss: float, burst: float) -> None:
-    """Bursts last 1/r on average, the loss rate is p/(p + r); refused exactly if p exceeds 1."""
-    if loss / (1 - loss) > burst:
-        with pytest.raises(ValidationError, match="needs longer bursts"):
-            GilbertElliottLoss(mean_loss=loss, mean_burst=burst)
-        return
-    p, r = GilbertElliottLoss(mean_loss=loss, mean_burst=burst).transitions
-    assert 1 / r == pytest.approx(burst)
-    assert p / (p + r) == pytest.approx(loss)
-
-
-def read_delay(folder: Path, **settings: Any) -> Delay:
-    delay = Delay(distribution="empirical", **settings)
-    (read,) = read_files(LinkSettings(impairments=(delay,)), folder).impairments
-    assert isinstance(read, Delay)
-    return read
-
-
-@pytest.mark.parametrize("repeat", [True, False])
-def test_a_trace_drops_the_packets_it_marks(repeat: bool, tmp_path: Path) -> None:
-    (tmp_path / "trace.txt").write_text("0100 1\n11\t0\r\n")
-    settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="trace.txt", repeat=repeat)),))
-    link = Link(read_files(settings, tmp_path), 0, "test")
-    fates = [link.decide(0, 100, 0).fate for _ in range(20)]
-    marks = [int(mark) for mark in "01001110"]
-    assert fates == (marks * 3 if repeat else marks + [0] * 12)[:20]
-    assert Fate.DROPPED == 1
-
-
-def test_observed_delays_have_units_comments_and_signs(tmp_path: Path) -> None:
-    (tmp_path / "delays.txt").write_text("# from a ping\n0.01\n12.5ms\n\n300 us\n-5ns\n1e-3\n")
-    delay = read_delay(tmp_path, delay_s=0.02, file="delays.txt")
-    assert delay.samples_s == pytest.approx((0.01, 0.0125, 3e-4, -5e-9, 1e-3), rel=1e-15)
-    assert (delay.file, delay.longest_s) == (None, pytest.approx(0.0325))
-    assert Delay(jitter_s=0.1, distribution="normal").shortest_s == 0.0
-    assert delay.delay_s == 0.02
-
-
-def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None:
-    (tmp_path / "some.dist").write_text("# a table\n -8192 -4096 0\n 8192 16384\n")
-    delay = read_delay(tmp_path, delay_s=0.02, jitter_s=0.002, file="some.dist")
-    assert delay.samples_s == pytest.approx((-0.002, -0.001, 0, 0.002, 0.004), rel=1e-15)
-
-
-def test_a_mistake_in_a_file_of_delays_or_losses_gives_the_approved_line(tmp_path: Path) -> None:
-    def mistake(line: str) -> list[str]:
-        name, jitter_s, content = json.loads(line)
-        (tmp_path / name).unlink(missing_ok=True)
-        if content is not None:
-            (tmp_path / name).write_bytes(content.encode("latin-1"))
-        if jitter_s is not None:
-            return lines_of_error(lambda: read_delay(tmp_path, jitter_s=jitter_s, file=name))
-        losses = LinkSettings(impairments=(LossOf(loss=TraceLoss(file=name)),))
-        return lines_of_error(lambda: read_files(losses, tmp_path, "links.toml: link.0.reverse"))
-
-    compare_lines(Path(__file__).with_name("delay_mistakes.txt"), mistake)
-
-
-# --- what loops need of a bottleneck --------------------------------------------------------------
 
 PERIODIC = {"policy": "periodic", "period_s": 0.05}
 BITS = 8 * (datagram_bytes(2) + 28)
