@@ -130,12 +130,12 @@ class Packet:
 
 
 @dataclass
-class Reference:
+class RfcCodel:
     """A line with CoDel: names and control flow of the RFC; ``spare`` replaces the MTU rule."""
 
     target_ns: int
     interval_ns: int
-    spare: Callable[["Reference", Packet, int], bool]
+    spare: Callable[["RfcCodel", Packet, int], bool]
     must_pass: Callable[[int], bool]
     queue: deque[Packet] = field(default_factory=deque)
     free_ns: int = 0
@@ -207,12 +207,12 @@ class Reference:
             self.dequeue(self.free_ns)
 
 
-def ahead(mtu_bytes: int) -> Callable[[Reference, Packet, int], bool]:
+def at_most_one_mtu_ahead(mtu_bytes: int) -> Callable[[RfcCodel, Packet, int], bool]:
     """The rule of this emulator: at most one MTU was before the packet on arrival."""
     return lambda line, packet, sojourn: sojourn <= mtu_bytes * PER_BYTE_NS
 
 
-def reference(
+def codel_departures(
     arrivals: Sequence[tuple[int, int]], codel: Codel, spare: Any, mansd: int | None = None
 ) -> list[int | None]:
     """Return departures in ns, None if dropped; arrivals are (ns, bytes), ascending."""
@@ -222,7 +222,7 @@ def reference(
         before = range(number - mansd, number) if mansd is not None else range(-1, 0)
         return all(leaves_ns.get(one, 0) is None for one in before)
 
-    line = Reference(
+    line = RfcCodel(
         round(codel.target_s * 1e9), round(codel.interval_s * 1e9), spare, must_pass,
         leaves_ns=leaves_ns,
     )  # fmt: skip
@@ -233,7 +233,9 @@ def reference(
     return [leaves_ns[number] for number in range(len(arrivals))]
 
 
-def emulated(arrivals: Sequence[tuple[int, int]], codel: Codel, mansd: int | None = None) -> list[int | None]:
+def emulated_departures(
+    arrivals: Sequence[tuple[int, int]], codel: Codel, mansd: int | None = None
+) -> list[int | None]:
     rate = Rate(rate_bps=RATE_BPS, queue=100_000, overhead_bytes=0, discipline=codel)
     link = Link(LinkSettings(impairments=(rate,), mansd=mansd, limit=1_000_000), 0, "a")
     found = [link.decide(0, size, t).release_ns for t, size in arrivals]
@@ -253,7 +255,9 @@ def test_codel_drops_what_the_rfc_drops_and_serves_what_must_pass(
     times = np.cumsum([gap for gap, _ in steps]).tolist()
     arrivals = [(t, size) for t, (_, size) in zip(times, steps, strict=True)]
     codel = Codel(target_s=target_s, interval_s=interval_s, mtu_bytes=100)
-    assert emulated(arrivals, codel, mansd) == reference(arrivals, codel, ahead(100), mansd)
+    assert emulated_departures(arrivals, codel, mansd) == codel_departures(
+        arrivals, codel, at_most_one_mtu_ahead(100), mansd
+    )
 
 
 def test_codel_drops_copies_of_delivered_packets() -> None:
@@ -265,7 +269,7 @@ def test_codel_drops_copies_of_delivered_packets() -> None:
     assert found == {(0, True), (0, False), (4, False)}
 
 
-def chosen(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[list[int], list[int]]:
+def scheduled_departures(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[list[int], list[int]]:
     """Return the departures in ns, and the consecutive losses up to each packet, one by one.
 
     The oldest of a flow is sent; by errors, a flow counts as the largest of what it has waiting.
@@ -306,8 +310,8 @@ ON_THE_RIGHT = (3, 0), (0, 200), (1, 1), (1, 100), (2, 50)
 """The same; what counts as what comes after it is a right child in the core's heap."""
 
 
-def left(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
-    """The same of the core."""
+def core_departures(settings: LinkSettings, arrivals: Any) -> tuple[list[int], list[int]]:
+    """Return the same of the core: the departures in ns, and the consecutive losses."""
     link = LinkState(settings, 0, "a", rows=4)
     channel = Channel([link], loops=4)
     numbers: dict[tuple[int, int], int] = {}
@@ -357,15 +361,17 @@ def test_a_scheduler_sends_the_first_of_what_waits_when_the_link_is_free(
     rate = Rate(rate_bps=rate_bps, queue=queue, discipline=discipline)
     now = np.cumsum([0, *(gap for gap, *_ in steps)])[1:].tolist()
     arrivals = [(t, *one) for t, (_, *one) in zip(now, steps, strict=True)]
-    found = left(LinkSettings(impairments=(rate,), mansd=mansd), arrivals)
-    assert found == chosen(rate, mansd, arrivals)
+    found = core_departures(LinkSettings(impairments=(rate,), mansd=mansd), arrivals)
+    assert found == scheduled_departures(rate, mansd, arrivals)
     for flow in range(4):
         of_flow = [t for t, one in zip(found[0], arrivals, strict=True) if one[1] == flow and t > 0]
         assert of_flow == sorted(of_flow)
     # As many wait in any order: of packets of one size, the same are lost as by tail drop.
     alike = [(t, flow, 72, level) for t, flow, _, level in arrivals]
     plain = rate.model_copy(update={"discipline": TailDrop()})
-    of_both = [left(LinkSettings(impairments=(one,), mansd=mansd), alike)[1] for one in (rate, plain)]
+    of_both = [
+        core_departures(LinkSettings(impairments=(one,), mansd=mansd), alike)[1] for one in (rate, plain)
+    ]
     assert of_both[0] == of_both[1]
 
 
