@@ -30,7 +30,7 @@ from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, ClaimD
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, RunPart, Samples, late_certificates
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
-from cosim.analysis.value_reduction import decimate
+from cosim.record.decimation import decimate
 from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S

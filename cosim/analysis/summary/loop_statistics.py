@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import DROPOUTS, AssumptionViolation
+from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.analysis.summary.summary_model import (
     DisturbancePart,
     EstimationPart,
@@ -26,7 +27,6 @@ from cosim.analysis.summary.summary_model import (
     ViolationPart,
     WatchdogPart,
 )
-from cosim.analysis.value_reduction import QuantileSketch
 from cosim.record.align import (
     AlignedPart,
     AlignedRun,

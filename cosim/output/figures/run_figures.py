@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.analysis.fidelity import Fidelity
-from cosim.analysis.value_reduction import decimate_all
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     DASHES,
@@ -47,6 +46,7 @@ from cosim.output.figures.timing_figures import (
     times_figure,
 )
 from cosim.record.align import AlignedRun, Reals, aligned_parts
+from cosim.record.decimation import decimate_all
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S

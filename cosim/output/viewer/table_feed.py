@@ -7,7 +7,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.value_reduction import decimate_all
 from cosim.output.viewer.pictures.picture import Frames
 from cosim.output.viewer.recording import LoopView
 from cosim.record.align import (
@@ -20,6 +19,7 @@ from cosim.record.align import (
     initial_track,
     true_states,
 )
+from cosim.record.decimation import decimate_all
 from cosim.record.record_source import concatenate_rows
 from cosim.record.run_events import claimed_until_s, model_flow, updates_in
 from cosim.record.run_record import Rows
