@@ -51,12 +51,12 @@ def idle_lateness_ns(period_ns: int, duration_s: float, spin_us: float = 0.0) ->
     }
     plant = plants_of((resolve(validate(resting, "the plant of a measurement")),))
     driver = LiveDriver(plant, Wire(0, bytes(KEY_BYTES)), spin_ns=round(spin_us * 1000))
-    ticks, clock = _Ticks(), RunClock(time.monotonic_ns())
+    ticks, clock = _TickRecord(), RunClock(time.monotonic_ns())
     run_loop(driver, ticks, clock, ticks, end_ns=end_ns, stop=lambda: False)
     return ticks.late_ns[_WARM_UP:]
 
 
-class _Ticks:
+class _TickRecord:
     """A record that keeps the lateness of each tick, and sockets that do nothing."""
 
     def __init__(self) -> None:

@@ -21,7 +21,7 @@ from cosim.output.figures.figure_description import (
     Line,
     Marks,
     Panel,
-    Row,
+    PanelRow,
     time_axis,
 )
 from cosim.output.figures.palette import CERTIFIED, CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD
@@ -54,7 +54,7 @@ def exploration_figure(shown: ExploredRun) -> FigureDescription:
 
     A name that several panels show is in the legend of the first.
     """
-    known, rows = {"‖x‖"}, list[Row]()
+    known, rows = {"‖x‖"}, list[PanelRow]()
     parts = [_state(shown), _errors(shown), _norm(shown), _events(shown)]
     horizon_s = np.array([0.0, shown.run.scenario.horizon_s])
     for (title, items, y), height_in in zip(parts, _HEIGHTS_IN, strict=True):
@@ -64,7 +64,7 @@ def exploration_figure(shown: ExploredRun) -> FigureDescription:
         known |= {*names}
         x = time_axis(horizon_s, numbers=len(rows) == len(parts) - 1)
         panel = Panel(title=title, items=drawn, x=x, y=y, legend=legend)
-        rows.append(Row(panels=[panel], height_in=height_in))
+        rows.append(PanelRow(panels=[panel], height_in=height_in))
     description = "; ".join(title for title, _, _ in parts)
     return FigureDescription(name="exploration", rows=rows, description=description)
 

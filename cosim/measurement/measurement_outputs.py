@@ -10,7 +10,8 @@ from rich.markup import escape
 
 from cosim.live.monitoring.progress import error_console
 from cosim.measurement.certificate_time import CertificateTime
-from cosim.measurement.loss_bursts import LEVEL, IntervalEstimate, histogram, most_losses
+from cosim.measurement.interval_estimates import LEVEL, IntervalEstimate
+from cosim.measurement.loss_bursts import histogram, most_losses
 from cosim.measurement.network_measurement import NetworkMeasurement
 from cosim.measurement.network_section import Form, write_network
 from cosim.output.figures import palette

@@ -21,11 +21,10 @@ from cosim.measurement.chain_fits import (
     fit_outages,
     outages_longer_than,
 )
+from cosim.measurement.interval_estimates import LEVEL, IntervalEstimate
 from cosim.measurement.loss_bursts import (
-    LEVEL,
     WINDOWS,
     Flags,
-    IntervalEstimate,
     LossBursts,
     Outcomes,
     QuantileM,
@@ -38,10 +37,8 @@ from cosim.measurement.loss_bursts import (
 from noack.scenario.scenario import Scenario
 from noack.traces.packet_trace import PacketTrace
 
-Times = NDArray[np.int64]
-DELAY, ORDER, START = "delay", " (out of order)", "start"
-QUANTILES = (0.5, 0.9, 0.99, 0.999)
 Reals = NDArray[np.float64]
+QUANTILES = (0.5, 0.9, 0.99, 0.999)
 SHARES = (0.0, 0.05, 0.5, 0.9, 0.95, 0.99, 0.999, 1.0)
 _MOST_LAGS, _LARGEST_LAG = 40, 1000
 _FEWEST_PAIRS = 30

@@ -389,7 +389,7 @@ def expected_loss(settings: LinkSettings) -> LossPrediction:
     return predict(with_kept_loss(settings))
 
 
-class _Kept(NamedTuple):
+class _TargetLoss(NamedTuple):
     """A loss whose rate is kept."""
 
     number: int
@@ -404,7 +404,7 @@ def with_kept_loss(settings: LinkSettings) -> LinkSettings:
         ValueError: there is none; one line.
     """
     kept_losses = [
-        _Kept(number, impairment, impairment.loss)
+        _TargetLoss(number, impairment, impairment.loss)
         for number, impairment in enumerate(settings.impairments)
         if isinstance(impairment, LossOf)
         and isinstance(impairment.loss, BernoulliLoss)
@@ -448,14 +448,14 @@ def _matters(impairment: Impairment) -> bool:
         return True
 
 
-def _with_probability(settings: LinkSettings, kept_loss: _Kept, probability: float) -> LinkSettings:
+def _with_probability(settings: LinkSettings, kept_loss: _TargetLoss, probability: float) -> LinkSettings:
     loss = kept_loss.loss.model_copy(update={"probability": probability, "keep": False})
     impairments: list[Impairment] = list(settings.impairments)
     impairments[kept_loss.number] = kept_loss.impairment.model_copy(update={"loss": loss})
     return settings.model_copy(update={"impairments": tuple(impairments)})
 
 
-def _probability(settings: LinkSettings, kept_loss: _Kept) -> float:
+def _probability(settings: LinkSettings, kept_loss: _TargetLoss) -> float:
     from scipy.optimize import brentq  # slow to import
 
     text, target = kept_loss.impairment.text(), kept_loss.loss.probability

@@ -216,14 +216,14 @@ class FmuSystem:
             )
 
 
-class _Kept(NamedTuple):
+class _UnpackedFmus(NamedTuple):
     """Folders of unpacked FMUs by path and SHA-256, and when they are removed."""
 
     folders: dict[tuple[Path, str | None], Path]
     end: ExitStack
 
 
-_KEPT = ContextVar[_Kept | None]("kept", default=None)
+_KEPT = ContextVar[_UnpackedFmus | None]("kept", default=None)
 
 
 @contextmanager
@@ -233,7 +233,7 @@ def unpacked_once() -> Iterator[None]:
     The instances share the FMU's library: they should follow one another.
     """
     with ExitStack() as end:
-        end.callback(_KEPT.reset, _KEPT.set(_Kept({}, end)))
+        end.callback(_KEPT.reset, _KEPT.set(_UnpackedFmus({}, end)))
         yield
 
 
@@ -241,7 +241,7 @@ def _unpacked(path: Path, settings: FmuSettings, description: "ModelDescription"
     """Return a folder with the content of an FMU; without a context for it, it is removed at the end."""
     kept, key = _KEPT.get(), (path, settings.sha256)
     if kept is None or description.coSimulation.canBeInstantiatedOnlyOncePerProcess:
-        kept = _Kept({}, end)
+        kept = _UnpackedFmus({}, end)
     if key not in kept.folders:
         folder = kept.end.enter_context(temporary_folder())
         _fmpy().extract(str(path), str(folder))

@@ -52,7 +52,7 @@ class Demand(NamedTuple):
     largest_s: float  # Largest time between two transmissions; infinite if there is none
 
 
-class _Stage(NamedTuple):
+class _RunPart(NamedTuple):
     """A part of the run, between two changes of settings."""
 
     begin: str  # Where it begins, in words; empty: at the start of the run
@@ -154,25 +154,25 @@ def proven_delays(scenario: Scenario) -> list[ProvenDelay | None]:
     return [ProvenDelay(delay_s, count) for delay_s in loops_s]
 
 
-def _stages(scenario: Scenario) -> tuple[list[_Stage], list[_Stage]]:
+def _stages(scenario: Scenario) -> tuple[list[_RunPart], list[_RunPart]]:
     """Return the parts of the run between changes of settings: updates, actuations."""
     sections = loop_sections(scenario)
     loops = [loop_scenario(scenario, section) for section in sections]
     counts = [section.count for section in sections]
-    updates, actuations = list[_Stage](), list[_Stage]()
+    updates, actuations = list[_RunPart](), list[_RunPart]()
     for number in range(len(scenario.changes) + 1):
         begin = f"from changes.{number - 1} on, " if number else ""
         if number:
             loops = [with_settings(loop, scenario.changes[number - 1].set) for loop in loops]
         network = loops[0].network
-        updates.append(_Stage(begin, network, [*map(_demand, loops, counts)]))
+        updates.append(_RunPart(begin, network, [*map(_demand, loops, counts)]))
         if network.actuation is not None:
             demands = [*map(_actuations, loops, counts)]
-            actuations.append(_Stage(begin, network.actuation, demands))
+            actuations.append(_RunPart(begin, network.actuation, demands))
     return updates, actuations
 
 
-def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str, names: Sequence[str]) -> list[LinkLoad]:
+def _link_loads(stages: Sequence[_RunPart], flow: Flow, path: str, names: Sequence[str]) -> list[LinkLoad]:
     loads: list[LinkLoad] = []
     if not stages:
         return loads
@@ -222,7 +222,7 @@ def _largest_bound(delays_s: Sequence[float]) -> float | None:
 
 def _slot_loads(
     schedule: Schedule,
-    stages: Sequence[_Stage],
+    stages: Sequence[_RunPart],
     path: tuple[str, Flow],
     delays_of: Sequence[tuple[str, float]],
 ) -> Iterator[LinkLoad]:
@@ -253,7 +253,7 @@ def _slot_loads(
             )
 
 
-def _slots(schedule: Schedule, stages: Sequence[_Stage]) -> list[list[int]]:
+def _slots(schedule: Schedule, stages: Sequence[_RunPart]) -> list[list[int]]:
     """Return the slots of each loop of the run."""
     loops = sum(demand.loops for demand in stages[0].loops)
     return [*schedule.slots, *([] for _ in range(loops))][:loops]
@@ -269,7 +269,7 @@ def _share(window: LossWindow) -> float:
     return (window.packets - window.losses) / window.packets
 
 
-def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], list[float]]:
+def _largest_delays(stages: Sequence[_RunPart]) -> tuple[list[list[float]], list[float]]:
     """Return the bounds of the delay in each impairment, and of each loop in all, in seconds.
 
     A schedule, and a rate that chooses what it sends, have a bound for each loop; another
@@ -299,7 +299,7 @@ def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], list[f
 
 
 def _slot_delays_s(
-    schedule: Schedule, stages: Sequence[_Stage], spread_s: float, *, copied: bool
+    schedule: Schedule, stages: Sequence[_RunPart], spread_s: float, *, copied: bool
 ) -> list[float]:
     """Return the bounds for the slots of each loop; see :func:`_queue_delay_s`."""
     least_s = [
@@ -327,7 +327,7 @@ def _slot_delays_s(
     return delays_s
 
 
-def _chosen_delays_s(rate: Rate, scheduler: Scheduler, stages: Sequence[_Stage]) -> list[float]:
+def _chosen_delays_s(rate: Rate, scheduler: Scheduler, stages: Sequence[_RunPart]) -> list[float]:
     """Return the bounds for each loop of a rate that chooses what it sends.
 
     A change of the direction's settings makes the order of what waits final, so that any may go first.
@@ -356,7 +356,7 @@ def _chosen_delays_s(rate: Rate, scheduler: Scheduler, stages: Sequence[_Stage])
     return [bounds_s[kind] for kind in kinds]
 
 
-def _queue_delay_s(rate: Rate, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> float:
+def _queue_delay_s(rate: Rate, stages: Sequence[_RunPart], spread_s: float, *, copied: bool) -> float:
     """Return the bound for the least M and the shortest times between transmissions of the run.
 
     What waits in the queue at a change was sent before it, so no stage has a bound of its own.

@@ -157,7 +157,7 @@ def _end_s(part: RunPart) -> float | None:
     return round(part.from_s + part.until_s, 9) if math.isfinite(part.until_s) else None
 
 
-class _Instance(NamedTuple):
+class _ClaimInstance(NamedTuple):
     """A claim about a run, by a certificate or without one."""
 
     find: Callable[[RunEvidence, Samples], Findings]
@@ -207,7 +207,7 @@ class ClaimEvaluation(RunEvidence):
         return claims
 
     @cached_property
-    def _checked(self) -> list[_Instance]:
+    def _checked(self) -> list[_ClaimInstance]:
         """All claims, checked in one pass over the run."""
         instances = list(self._instances())
         for samples in self.samples():
@@ -215,7 +215,7 @@ class ClaimEvaluation(RunEvidence):
                 instance.take(self, samples)
         return instances
 
-    def _instances(self) -> Iterator[_Instance]:
+    def _instances(self) -> Iterator[_ClaimInstance]:
         """Yield the claims of each certificate, and those that need none."""
         scenario = self.record.scenario
         for certificate in self.certificates:
@@ -225,10 +225,10 @@ class ClaimEvaluation(RunEvidence):
             for claim in definitions(CertifiedClaim):
                 check = ClaimCheck(claim.statement, certificate.source, self.part)
                 find = partial(claim.find, certificate=certificate, constants=constants)
-                yield _Instance(find, check, [], certificate, outside)
+                yield _ClaimInstance(find, check, [], certificate, outside)
         for claim in definitions(ClaimDefinition):
             unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
-            yield _Instance(claim.find, ClaimCheck(claim.statement, claim.source, self.part, unmet), [])
+            yield _ClaimInstance(claim.find, ClaimCheck(claim.statement, claim.source, self.part, unmet), [])
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds; those of a long run are thinned."""

@@ -115,7 +115,7 @@ class MessagesReplay(SummaryPart):
     difference: ReplayDifference | None
 
 
-class Replay(SummaryPart):
+class ReplayResult(SummaryPart):
     """The result of a replay."""
 
     processes: tuple[ProcessReplay, ...]
@@ -158,7 +158,7 @@ class Replay(SummaryPart):
         return verdict | {"gaps": self.gaps} | self.model_dump()
 
 
-def print_replay(console: Console, replay: Replay, changed: Sequence[str]) -> None:
+def print_replay(console: Console, replay: ReplayResult, changed: Sequence[str]) -> None:
     """Print the result of a replay, and what ``changed`` since the run on its computer."""
     table = Table(title="replay, compared bit for bit")
     for heading in ("process or link", "recorded", "compared", "verdict"):

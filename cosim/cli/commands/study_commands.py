@@ -477,7 +477,7 @@ class StudyOptions(opt.ScenarioOptions):
             depth = depth._replace(amplitude=self.disturbance)
         return depth
 
-    def _policies(self, kinds: "Sequence[capacity_plan.Kind]") -> dict[str, dict[str, Any]]:
+    def _policies(self, kinds: "Sequence[capacity_plan.LoopKind]") -> dict[str, dict[str, Any]]:
         """Return the settings of the policies that are compared, too, by name."""
         known = {capacity_plan.PERIODIC, capacity_plan.ZOH, capacity_plan.MODEL}
         by_name: dict[str, dict[str, Any]] = {}

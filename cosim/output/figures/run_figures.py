@@ -27,7 +27,7 @@ from cosim.output.figures.figure_description import (
     Line,
     Marks,
     Panel,
-    Row,
+    PanelRow,
     Rule,
     bound_lines,
     finite,
@@ -252,7 +252,7 @@ def states_figure(
     ]
     head = "MB-ET" if mode == "model" else "ZOH-ET"
     note = f" ({drawn} of {n} states)" if drawn < n else ""
-    of_states = Row(
+    of_states = PanelRow(
         panels=panels,
         height_in=1.45 if drawn <= 2 * columns else 1.15,
         columns=columns,
@@ -262,7 +262,7 @@ def states_figure(
     return FigureDescription(
         name="states",
         heading=": ".join(filter(None, (head, plain(title, _LONGEST_TITLE)))) + note,
-        rows=[of_states, *(Row(panels=[panel], height_in=1.2) for panel in intervals)],
+        rows=[of_states, *(PanelRow(panels=[panel], height_in=1.2) for panel in intervals)],
     )
 
 
@@ -455,7 +455,7 @@ def _losses(record: RunRecord) -> FigureDescription:
         panels.append(_loss_panel("Of actuations", label, "bursts", lost, limit))
         both = " Last panel: the same of actuations."
     narrowest_in, widest_in = _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN
-    row = Row(panels=panels, height_in=1.9, narrowest_in=narrowest_in, widest_in=widest_in)
+    row = PanelRow(panels=panels, height_in=1.9, narrowest_in=narrowest_in, widest_in=widest_in)
     kept = "the guarantee" if network.enforce_mansd else "the assumption (not enforced)"
     return FigureDescription(name="losses", rows=[row]).captioned(
         "Effective losses of updates: dropped, corrupted, or delivered out of order. "

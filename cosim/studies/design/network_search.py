@@ -66,7 +66,7 @@ _STARTS = 4
 _UNSTABLE = 1e3
 
 
-class Candidate(NamedTuple):
+class GainCandidate(NamedTuple):
     """A gain and what the controller does between updates."""
 
     hold: Hold
@@ -113,7 +113,7 @@ class Wish:
 class Reached(NamedTuple):
     """A loop with the highest rung that it is proven to reach."""
 
-    candidate: Candidate
+    candidate: GainCandidate
     rung: int
     """Its number in the ladder; −1: none."""
     stability: Stability | None
@@ -214,7 +214,7 @@ class NetworkSearch:
         self.weights = wish.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
         self.holds = tuple(itertools.chain(*HOLDS.values())) if wish.holds is None else tuple(wish.holds)
-        self.original = Candidate(given_hold(self.scenario), rows_of(self.plant.K))
+        self.original = GainCandidate(given_hold(self.scenario), rows_of(self.plant.K))
         base = self.quick_loop(self.original, margin.longest_ns).cost(self.plant.x0)
         self.limit = wish.cost * base
         """Largest cost; infinite if the given loop is unstable without losses."""
@@ -223,7 +223,7 @@ class NetworkSearch:
         """By hold strategy: the highest rung on which a loop was tried and is not excluded."""
         self._graphs: dict[tuple[LossGuarantee, int, Hold, int], PatternGraph] = {}
 
-    def quick_loop(self, candidate: Candidate, period_ns: int) -> QuickLoop:
+    def quick_loop(self, candidate: GainCandidate, period_ns: int) -> QuickLoop:
         """Return the loop of a candidate in double precision."""
         plant, K = self.plant, np.array(candidate.K)
         H = plant.A_model + plant.B_model @ K
@@ -244,7 +244,7 @@ class NetworkSearch:
             self._graphs[key] = PatternGraph(list_bursts(rung.guarantee, times))
         return self._graphs[key]
 
-    def growth(self, candidate: Candidate, rung: int) -> float:
+    def growth(self, candidate: GainCandidate, rung: int) -> float:
         """Return a lower bound of the logarithm of the growth per period."""
         self.tried += 1
         setting = self.ladder[rung]
@@ -252,11 +252,11 @@ class NetworkSearch:
         graph = self.graph(setting, candidate.hold)
         return graph.growth(loop.maps(graph.bursts))
 
-    def cost(self, candidate: Candidate, rung: int) -> float:
+    def cost(self, candidate: GainCandidate, rung: int) -> float:
         """Return the cost without losses."""
         return self.quick_loop(candidate, self.ladder[max(rung, 0)].period_ns).cost(self.plant.x0)
 
-    def excess(self, candidate: Candidate, rung: int) -> float:
+    def excess(self, candidate: GainCandidate, rung: int) -> float:
         """Return what is minimised: the growth, and by how much the cost exceeds its limit."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             plant = self.plant
@@ -273,7 +273,7 @@ class NetworkSearch:
             return growth
         return max(growth, -_SLACK) + _SLACK + math.log(cost / self.limit)
 
-    def climb(self, candidate: Candidate, rung: int) -> tuple[int, float]:
+    def climb(self, candidate: GainCandidate, rung: int) -> tuple[int, float]:
         """Return the highest rung that is not excluded, from one on, and the excess at the next."""
         while rung < len(self.ladder):
             if (excess := self.excess(candidate, rung)) >= -_SLACK:
@@ -281,7 +281,7 @@ class NetworkSearch:
             rung += 1
         return rung - 1, -math.inf
 
-    def scenario_of(self, candidate: Candidate, rung: int) -> Scenario:
+    def scenario_of(self, candidate: GainCandidate, rung: int) -> Scenario:
         """Return the scenario of a loop on a rung, not resolved."""
         setting, scenario = self.ladder[max(rung, 0)], self.scenario
         trigger = scenario.trigger.model_copy(update={"period_s": setting.period_ns / NS_PER_S})
@@ -294,14 +294,14 @@ class NetworkSearch:
             }
         )
 
-    def judge(self, candidate: Candidate, rung: int) -> Stability:
+    def judge(self, candidate: GainCandidate, rung: int) -> Stability:
         """Return the certified bounds of a loop on a rung."""
         self.judged += 1
         margin = LossMargin(resolve(self.scenario_of(candidate, rung)))
         stability = margin.first_bounds()
         return margin.coarse_bounds() if stability.verdict == "undecided" else stability
 
-    def reach(self, candidate: Candidate, most: int, least: int = -1) -> tuple[int, Stability | None]:
+    def reach(self, candidate: GainCandidate, most: int, least: int = -1) -> tuple[int, Stability | None]:
         """Return the highest certified rung from ``most`` down to above ``least``."""
         for rung in range(most, least, -1):
             if (stability := self.judge(candidate, rung)).verdict == "stable":
@@ -319,7 +319,7 @@ class NetworkSearch:
             top = next((i for i in range(start, -1, -1) if self.climb(self.original, i)[0] >= i), -1)
         return self.completed(self.original, top)
 
-    def completed(self, candidate: Candidate, most: int) -> Reached:
+    def completed(self, candidate: GainCandidate, most: int) -> Reached:
         """Return a loop with refined bounds on its rung and on the next one.
 
         A designed loop stays on a rung beyond which its cost would exceed the limit.
@@ -336,7 +336,7 @@ class NetworkSearch:
             rung, stability, following = rung + 1, following, None
         return Reached(candidate, rung, stability, following, self.cost(candidate, rung))
 
-    def regulators(self) -> list[Candidate]:
+    def regulators(self) -> list[GainCandidate]:
         """Return LQR gains of the model with all hold strategies."""
         plant, (Q, R) = self.plant, self.weights
         gains = [lqr_gain(plant.A_model, plant.B_model, Q, c * R) for c in COSTS_OF_INPUT]
@@ -358,7 +358,7 @@ class NetworkSearch:
         if self.keeps_given_hold:
             rung = original.rung
         progress(0.1)
-        starts = [Candidate(hold, original.candidate.K) for hold in self.holds]
+        starts = [GainCandidate(hold, original.candidate.K) for hold in self.holds]
         starts += self.regulators()
         ranked = sorted(
             ((*self.climb(start, max(rung, 0)), start) for start in starts),
@@ -402,7 +402,7 @@ class NetworkSearch:
             rung = self.highest.get(hold, -1)
             yield hold.text, self.ladder[rung].name if rung >= 0 else "nothing"
 
-    def _improve(self, start: Candidate, rung: int, most: int) -> Candidate | None:
+    def _improve(self, start: GainCandidate, rung: int, most: int) -> GainCandidate | None:
         """Return a loop near ``start`` whose lower bound is below 1 on a rung; None: none found."""
         K = np.array(start.K)
         scale = scaled_steps(K)
@@ -449,15 +449,15 @@ def scaled_steps(K: Matrix) -> Vector:
     return np.ravel(np.maximum(np.abs(K), 0.1 * np.abs(K).max(axis=1, keepdims=True)))
 
 
-def _rounded(hold: Hold, K: Matrix) -> Candidate:
+def _rounded(hold: Hold, K: Matrix) -> GainCandidate:
     """Return a candidate with six digits: what is judged is what is printed."""
-    return Candidate(hold, tuple(tuple(float(f"{entry:.6g}") for entry in row) for row in K))
+    return GainCandidate(hold, tuple(tuple(float(f"{entry:.6g}") for entry in row) for row in K))
 
 
 class _FoundError(Exception):
     """Ends a minimisation."""
 
-    def __init__(self, candidate: Candidate) -> None:
+    def __init__(self, candidate: GainCandidate) -> None:
         super().__init__()
         self.candidate = candidate
 

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
-from noack.theory.bounds.terms import Constants, NetworkConditions, Part
+from noack.theory.bounds.terms import CertificatePart, Constants, NetworkConditions
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 
 _SIGNALS = 6
@@ -153,7 +153,7 @@ class ErrorInequalities:
     trigger and conditions; spacings and solutions are those of each loop.
     """
 
-    def __init__(self, part: Part, conditions: NetworkConditions, earlier_error: float) -> None:
+    def __init__(self, part: CertificatePart, conditions: NetworkConditions, earlier_error: float) -> None:
         self._error, self._plant, self._bound, self._estimation = error, plant, bound, _ = part
         self._conditions = conditions
         self.age_gains = error.age_gains(conditions.hold_s)

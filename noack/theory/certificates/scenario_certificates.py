@@ -20,7 +20,7 @@ from noack.settings.section import Rows
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part
+from noack.theory.bounds.terms import CertificatePart, Constants, NetworkConditions, NoCertificateError
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -387,7 +387,7 @@ class CertificateScope:
         plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
-        part = Part(plant.error, plant, self._trigger.bound(conditions, level, reached))
+        part = CertificatePart(plant.error, plant, self._trigger.bound(conditions, level, reached))
         return (
             yield from sharpened(
                 Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)

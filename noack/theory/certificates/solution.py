@@ -23,11 +23,11 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import (
     MEASURED,
+    CertificatePart,
     Constants,
     EstimationBound,
     NetworkConditions,
     NoCertificateError,
-    Part,
     TriggerBound,
 )
 from noack.theory.bounds.trigger_bounds import LONGEST_S
@@ -47,7 +47,7 @@ class Problem(NamedTuple):
     least the sum of the parts' ``reached``, so the next event needs one part that reaches its own.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[CertificatePart, ...]
     conditions: NetworkConditions
     earlier_error: float = 0.0
     """Bound of sup‖p‖ of the first part while the plant still applies inputs of an earlier run."""
@@ -149,7 +149,7 @@ def solve(
         NoCertificateError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
-    part = Part(error, plant, bound, estimation)
+    part = CertificatePart(error, plant, bound, estimation)
     return completed_alone(sharpened(Problem((part,), conditions, earlier_error, structured, longest)))
 
 
@@ -174,7 +174,7 @@ class _Sharpening:
 
     key: Hashable
     constants: Constants = field(compare=False)
-    part: Part = field(compare=False)
+    part: CertificatePart = field(compare=False)
     conditions: NetworkConditions = field(compare=False)
 
 

@@ -95,7 +95,7 @@ def mean_squares(
         NotDecayingError: α is not below the decay rate of the models, or of A + BK.
     """
     try:
-        inequalities = _Inequalities(error, plant, conditions, beta, largest_probability)
+        inequalities = _MomentInequalities(error, plant, conditions, beta, largest_probability)
         bounds, loop_gain = inequalities.solve()
     except (np.linalg.LinAlgError, OverflowError):
         raise NoCertificateError("numbers overflow: an input is too old for the fastest mode") from None
@@ -124,7 +124,7 @@ class _Bounds(NamedTuple):
         return np.array([self.sensor_error, self.input_error, 1.0])
 
 
-class _Inequalities:
+class _MomentInequalities:
     """The inequalities; every signal is bounded by a row: multiples of a and π, and a constant."""
 
     def __init__(

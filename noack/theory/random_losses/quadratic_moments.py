@@ -215,7 +215,9 @@ class _Search:
         """The function for the smallest bound that was found; None if it cannot be confirmed."""
         try:
             first = self._first()
-            found = None if first is None else _Inequalities(self._blocks, len(first)).maximise_last(first)
+            found = (
+                None if first is None else _MatrixInequalities(self._blocks, len(first)).maximise_last(first)
+            )
         except np.linalg.LinAlgError:  # a matrix is singular to rounding
             return None
         if found is None:
@@ -335,7 +337,7 @@ class _Search:
         return np.asarray(-(M.T @ form + form @ M) - 2 * self._rate * form)
 
 
-class _Inequalities:
+class _MatrixInequalities:
     """Numbers and matrices that are affine in a vector, and are to be positive."""
 
     def __init__(self, blocks: Callable[[Vector], Blocks], size: int) -> None:

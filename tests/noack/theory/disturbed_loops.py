@@ -13,7 +13,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains
-from noack.theory.bounds.terms import Constants, EstimationBound, Part, TriggerBound
+from noack.theory.bounds.terms import CertificatePart, Constants, EstimationBound, TriggerBound
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.disturbed import solve_two_parts
 from noack.theory.certificates.scenario_certificates import own_plant
@@ -65,8 +65,8 @@ class DisturbedLoop:
         models = pushed.error
         estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ self.noise)))
         first, rest = completed_alone(solve_two_parts(
-            Part(decaying.error, decaying, TriggerBound(system.beta, None)),
-            Part(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
+            CertificatePart(decaying.error, decaying, TriggerBound(system.beta, None)),
+            CertificatePart(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
             system.conditions,
         ))  # fmt: skip
         return Sum(self.system, first, rest)

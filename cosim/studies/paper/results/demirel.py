@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from cosim.studies.paper.published_result import PublishedResult, Row, stored_matrices, value_row
+from cosim.studies.paper.published_result import ComparedValue, PublishedResult, stored_matrices, value_row
 from noack.core.linear_systems import Matrix
 
 _WHERE = "authors' README.md"
@@ -84,7 +84,7 @@ def drawn_loops(seed: int = 20, n: int = 2, count: int = 3) -> list[ScheduledLoo
     return loops
 
 
-def _rows() -> list[Row]:
+def _rows() -> list[ComparedValue]:
     drawn, rows = list(zip("123", drawn_loops(), strict=True)), []
     for schedule, published in stored_matrices("demirel")["losses"].items():
         turns = schedule.split(",")

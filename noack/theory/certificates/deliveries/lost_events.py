@@ -93,7 +93,7 @@ def errors_after_losses(
     for lost, size in enumerate(sensor.sizes.tolist()):
         earlier = float(errors[lost - 1]) if lost else max(_NOTHING * size, reach.effects.late)
         window_s = min(max(since_s, 0.0), most_s)
-        stage = _Stage(reach, window_s, earlier, size_of_x, outputs, r_s, flows)
+        stage = _LostEvent(reach, window_s, earlier, size_of_x, outputs, r_s, flows)
         # e_c until the next delivery, if at most so many events are lost.
         if lost:
             added = size + kernel.sups(r_s) * earlier
@@ -128,7 +128,7 @@ def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float, grid_s: floa
     return grid_s * np.unique(np.rint(r_s / grid_s)) if grid_s else r_s
 
 
-class _Stage:
+class _LostEvent:
     """What follows an event, a time w or more after the delivery, for times r since it.
 
     z is e^{Fw} ζ at the event. What q has changed since some time before is bounded with e^{−Fs} (BU, −BU).

@@ -23,7 +23,7 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.gains import Output
-from noack.theory.bounds.terms import MEASURED, Constants, NetworkConditions, Part
+from noack.theory.bounds.terms import MEASURED, CertificatePart, Constants, NetworkConditions
 from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, InputEffects, error_after
 from noack.theory.certificates.deliveries.delivery_reach import Reach, Starts
 from noack.theory.certificates.deliveries.inserted_bounds import InsertedInequalities
@@ -36,7 +36,7 @@ _SHORTEST_S, _LEAST_SHARE, _LEAST = 1e-9, 1e-6, 1e-200
 _SHORT, _MOST_STEPS = 0.005, 16
 
 
-def is_scheduled_flow(part: Part) -> bool:
+def is_scheduled_flow(part: CertificatePart) -> bool:
     """Return whether the constants of a loop without inputs can be sharpened."""
     error, plant, bound, estimation = part
     is_known = plant.is_one_plant and plant.forcing is None and estimation == MEASURED
@@ -48,7 +48,9 @@ def is_scheduled_flow(part: Part) -> bool:
     )
 
 
-def scheduled_constants(constants: Constants, part: Part, conditions: NetworkConditions) -> Constants:
+def scheduled_constants(
+    constants: Constants, part: CertificatePart, conditions: NetworkConditions
+) -> Constants:
     """Return the constants with the bounds from the flow between updates."""
     spacing_s = constants.inter_event_s or conditions.spacing_s
     if spacing_s == 0 and conditions.delay_s > 0:
@@ -83,7 +85,7 @@ def scheduled_constants(constants: Constants, part: Part, conditions: NetworkCon
 class _ScheduledFlow:
     """The bounds of one loop, made smaller in turns; events are ``spacing_s`` apart."""
 
-    def __init__(self, part: Part, conditions: NetworkConditions, spacing_s: float) -> None:
+    def __init__(self, part: CertificatePart, conditions: NetworkConditions, spacing_s: float) -> None:
         self._part, self._conditions, self.spacing_s = part, conditions, spacing_s
         self._step = InsertedInequalities(part, conditions, 0.0)
         self.known = self._step.known(spacing_s)
