@@ -28,7 +28,7 @@ from noack.theory.certificates.conditions import (
 )
 from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import NetworkLimits, box, network_limits, own_plant
-from noack.theory.certificates.weight import choose_weight
+from noack.theory.certificates.trigger_weight import choose_weight
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
 from noack.theory.random_losses.moments import UnlimitedLosses, unlimited_losses

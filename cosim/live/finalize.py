@@ -50,7 +50,7 @@ from noack.core.file_access import write_whole
 from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.assumptions import Assumption, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 

@@ -27,7 +27,7 @@ from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.measurement.loss_bursts import outcomes
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.conditions import allowed_conditions, network_delay_ns
 from noack.traces.packet_trace import PacketTrace
 

@@ -51,8 +51,8 @@ from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.runtime_parameters import text_of
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.disturbances import bound_forcing
-from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, about_setpoint, allowed_conditions, void_at_setpoint
 from noack.theory.certificates.scenario_certificates import outside_box

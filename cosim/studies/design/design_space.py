@@ -16,9 +16,9 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.certificates.weight import choose_weight
+from noack.theory.certificates.trigger_weight import choose_weight
 
 RATE_STEP, RATE_STEPS, MOST_RATE = 1.5, 6, 0.95
 """α of the grid: MOST_RATE of the decay rate, divided by powers of RATE_STEP; RATE_STEPS values."""

@@ -20,8 +20,8 @@ an interval, for G = H + αI (the models) and G = A + BK + αI (the plant's loop
    disturbances in ``free``.
 4. ``box.py``: the same gains for every plant of an uncertainty box; the model error is one more
    input, bounded by a small-gain argument over its entries.
-5. ``terms.py``: the data of a certificate: its assumptions on the network, the bound of ‖e_s‖ that
-   a trigger guarantees, and the certified bounds.
+5. ``certificate_terms.py``: the data of a certificate: its assumptions on the network, the bound of
+   ‖e_s‖ that a trigger guarantees, and the certified bounds.
 6. ``trigger_bounds.py``: the bound of ‖e_s‖ after each test, for every trigger rule; and the growth
    of e_s from this bound until the next test, or from 0 after an event until the rule can transmit
    again (Volterra's inequality, iterated).

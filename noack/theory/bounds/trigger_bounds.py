@@ -22,9 +22,9 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.gains import Columns, Growth, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.trigger.trigger_rule import QuadraticForm, TriggerRule
 
 _ROUNDING = 1.0 + 1e-9

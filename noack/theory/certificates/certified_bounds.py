@@ -29,10 +29,10 @@ from noack.core.number_format import at_least, at_most
 from noack.plants.systems.jacobian_enclosure import Inclusion
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.enclosure import KernelBounds, response
 from noack.theory.bounds.gains import Output, PlantGains, error_gains
-from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import Assumption
 from noack.theory.certificates.conditions import BOX, OWN_PLANT
 

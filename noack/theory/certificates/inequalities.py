@@ -36,8 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.certificate_terms import CertificatePart, Constants, NetworkConditions
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
-from noack.theory.bounds.terms import CertificatePart, Constants, NetworkConditions
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 
 _SIGNALS = 6

@@ -18,15 +18,20 @@ from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows
 from noack.theory.bounds.box import BoxGains
+from noack.theory.bounds.certificate_terms import (
+    CertificatePart,
+    Constants,
+    NetworkConditions,
+    NoCertificateError,
+)
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
-from noack.theory.bounds.terms import CertificatePart, Constants, NetworkConditions, NoCertificateError
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
-from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate
+from noack.theory.certificates.persistent_bounds import DisturbedCertificate, PlantAt, choose_rate
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 MOST_S = 10.0

@@ -4,7 +4,7 @@ The bounds are the solution of the inequalities of :mod:`noack.theory.certificat
 The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
 assumed δ gives a time of at least δ, it holds by induction over the events; the largest such δ is
 used. The constants are sharpened by the flow between two updates
-(:mod:`noack.theory.certificates.deliveries.scheduled_flow`).
+(:mod:`noack.theory.certificates.deliveries.sharpened_constants`).
 """
 
 import contextlib
@@ -19,9 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Vector
-from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.bounds.terms import (
+from noack.theory.bounds.certificate_terms import (
     MEASURED,
     CertificatePart,
     Constants,
@@ -30,8 +28,10 @@ from noack.theory.bounds.terms import (
     NoCertificateError,
     TriggerBound,
 )
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.trigger_bounds import LONGEST_S
-from noack.theory.certificates.deliveries.scheduled_flow import is_scheduled_flow, scheduled_constants
+from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 
 _SETTLED = 1e-3
@@ -161,7 +161,7 @@ def sharpened(problem: Problem) -> Search[Constants]:
     (constants,) = yield problem
     (part,), conditions, *_ = problem
     is_plain = problem.structured and problem.earlier_error == 0.0
-    if problem.longest and is_plain and is_scheduled_flow(part):
+    if problem.longest and is_plain and can_be_sharpened(part):
         key = id(part.plant), constants, repr((part.bound, conditions))
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
             return sharpened_once(_Sharpening(key, constants, part, conditions))
@@ -170,7 +170,7 @@ def sharpened(problem: Problem) -> Search[Constants]:
 
 @dataclass(frozen=True)
 class _Sharpening:
-    """What :func:`scheduled_constants` needs. The key has the plant's id: the part keeps the plant."""
+    """What :func:`sharpened_constants` needs. The key has the plant's id: the part keeps the plant."""
 
     key: Hashable
     constants: Constants = field(compare=False)
@@ -181,7 +181,7 @@ class _Sharpening:
 @lru_cache(maxsize=32)
 def sharpened_once(known: _Sharpening) -> Constants:
     """Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
-    return scheduled_constants(known.constants, known.part, known.conditions)
+    return sharpened_constants(known.constants, known.part, known.conditions)
 
 
 def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:

@@ -32,10 +32,10 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from noack.core.linear_systems import Vector, exponential
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.certificates.inequalities import solve_inequalities
 from noack.theory.random_losses.quadratic_moments import (
     Known,

@@ -31,8 +31,8 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.random_losses.mean_square_growth import from_triangles, triangles
 
 _OF_STATE, _OF_ERROR = (0.1, 0.35), (0.35, 0.75)

@@ -9,18 +9,18 @@ import pytest
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.bounds.box import BoxGains
-from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import ErrorGains, Forcing, NormalForcing, PlantGains
-from noack.theory.bounds.terms import (
+from noack.theory.bounds.certificate_terms import (
     CertificatePart,
     Constants,
     NetworkConditions,
     NoCertificateError,
     TriggerBound,
 )
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import ErrorGains, Forcing, NormalForcing, PlantGains
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions
-from noack.theory.certificates.disturbed import solve_two_parts
+from noack.theory.certificates.persistent_bounds import solve_two_parts
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.certificates.solution import completed_alone, solve
 from tests.noack.theory.disturbed_loops import Sum, random_disturbed_loop, signals

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import Outputs, response_until
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
 
 ROUNDING = 1 + 1e-9
 _MOST_GAPS, _MOST_CELLS = 256, 640

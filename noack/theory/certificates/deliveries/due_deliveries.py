@@ -21,10 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
+from noack.theory.bounds.certificate_terms import (
+    Constants,
+    NetworkConditions,
+    NoCertificateError,
+    TriggerBound,
+)
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, Outputs, response_until
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.bounds.trigger_bounds import ErrorGrowth
 from noack.theory.certificates.deliveries.delivery_gaps import ERROR, INPUT, ROUNDING, GapLoop, Gaps, of_cells
 

@@ -20,16 +20,16 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.disturbances import EstimationError, bound_forcing
-from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains
-from noack.theory.bounds.terms import (
+from noack.theory.bounds.certificate_terms import (
     CertificatePart,
     Constants,
     NetworkConditions,
     NoCertificateError,
     TriggerBound,
 )
+from noack.theory.bounds.disturbances import EstimationError, bound_forcing
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.solution import Problem, Search, sharpened
 
