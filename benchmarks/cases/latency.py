@@ -131,7 +131,7 @@ def wake_ups() -> Figures:
     """Return the lateness of a round of a run's loop with real-time settings, µs."""
     numbers = map(str, (1000 * PERIOD_US, ROUND_S, PRIORITY, 0))
     lateness = json.loads(execute([sys.executable, "-m", "cosim.doctor.probe", "wake", *numbers]).stdout)
-    if (answer := lateness["granted"]["sched_fifo"]) != "applied":
+    if (answer := lateness["settings"]["sched_fifo"]) != "applied":
         raise MeasurementError(f"SCHED_FIFO {answer}")
     return quantiles_us(lateness["realtime"])
 
