@@ -61,11 +61,9 @@ def trigger_bounds(resolved: Scenario) -> TriggerBounds:
     return TriggerBounds(rule_of(resolved), weight, fastest)
 
 
-def certify(
-    resolved: Scenario, conditions: NetworkConditions, start_error: float = 0.0
-) -> ScenarioCertificate:
+def certify(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCertificate:
     """The certificate of a scenario's own plant; see :class:`CertificateScope`."""
-    return own_plant(resolved, start_error).certificate(conditions)
+    return own_plant(resolved).certificate(conditions)
 
 
 def certify_box(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCertificate | None:

@@ -20,10 +20,8 @@ from numpy.typing import NDArray
 
 from noack.core.linear_systems import Vector
 from noack.theory.bounds.certificate_terms import (
-    MEASURED,
     CertificatePart,
     Constants,
-    EstimationBound,
     NetworkConditions,
     NoCertificateError,
     TriggerBound,
@@ -137,11 +135,8 @@ def solve(
     plant: PlantGains,
     conditions: NetworkConditions,
     bound: TriggerBound,
-    earlier_error: float = 0.0,
     *,
-    estimation: EstimationBound = MEASURED,
     structured: bool = True,
-    longest: bool = True,
 ) -> Constants:
     """Return the constants of one part that are certified for all times; see :class:`Problem`.
 
@@ -149,8 +144,8 @@ def solve(
         NoCertificateError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
-    part = CertificatePart(error, plant, bound, estimation)
-    return completed_alone(sharpened(Problem((part,), conditions, earlier_error, structured, longest)))
+    problem = Problem((CertificatePart(error, plant, bound),), conditions, structured=structured)
+    return completed_alone(sharpened(problem))
 
 
 def sharpened(problem: Problem) -> Search[Constants]:

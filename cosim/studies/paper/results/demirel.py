@@ -66,16 +66,16 @@ class ScheduledLoop(NamedTuple):
         return total / len(steps)
 
 
-def drawn_loops(seed: int = 20, n: int = 2, count: int = 3) -> list[ScheduledLoop]:
-    """Return the plants that the authors' program draws, each with an unstable A, and n states."""
-    random = np.random.RandomState(seed)  # as the authors' program
+def drawn_loops(seed: int = 20) -> list[ScheduledLoop]:
+    """Return the three plants that the authors' program draws, each with an unstable A, and two states."""
+    random, n = np.random.RandomState(seed), 2  # as the authors' program
 
     def positive(size: int) -> Matrix:
         drawn = random.rand(size, size)
         return np.asarray((drawn + drawn.T) / 2 + size * np.eye(size))
 
     loops: list[ScheduledLoop] = []
-    while len(loops) < count:
+    while len(loops) < 3:
         A = random.rand(n, n)
         while np.linalg.eigvals(A).real.max() < 1:
             A = random.rand(n, n)
