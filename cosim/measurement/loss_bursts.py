@@ -173,8 +173,8 @@ def most_losses(bursts: LossBursts, windows: Sequence[int], left_out: Flags | No
 
     Windows that touch a burst that is left out do not count; a K without a window has no entry.
     """
-    lost = _before(bursts)
-    skipped = None if left_out is None or not left_out.any() else _before(bursts.only(left_out))
+    lost = _losses_before(bursts)
+    skipped = None if left_out is None or not left_out.any() else _losses_before(bursts.only(left_out))
     by_window = {}
     for window in windows:
         if window > bursts.packets:
@@ -187,7 +187,7 @@ def most_losses(bursts: LossBursts, windows: Sequence[int], left_out: Flags | No
     return by_window
 
 
-def _before(bursts: LossBursts) -> NDArray[np.int32]:
+def _losses_before(bursts: LossBursts) -> NDArray[np.int32]:
     """Return the number of losses before each of the k packets, and in all, (k + 1,)."""
     steps = np.zeros(bursts.packets + 1, np.int32)
     steps[bursts.first] = 1

@@ -216,7 +216,7 @@ def _claims(verdict: str) -> Callable[[LoopSummary], int]:
     return lambda loop: sum(claim.verdict == verdict for claim in loop.claims)
 
 
-def _missed(loop: LoopSummary) -> int | None:
+def _count_late_steps(loop: LoopSummary) -> int | None:
     late = loop.lateness_us
     return sum(role.late_steps for role in late.values()) if late else None
 
@@ -242,7 +242,7 @@ _NUMBERS: dict[str, Callable[[LoopSummary], float | None]] = {
     "largest ‖e_c‖": lambda s: s.sup_e_c_norm,
     "latency p50, µs": lambda s: None if s.latency_us is None else s.latency_us.p50,
     "latency p99, µs": lambda s: None if s.latency_us is None else s.latency_us.p99,
-    "deadlines missed": _missed,
+    "deadlines missed": _count_late_steps,
     "claims held": _claims("held"),
     "claims violated": _claims("violated"),
     "claims void": _claims("void"),

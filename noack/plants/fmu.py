@@ -124,7 +124,7 @@ class FmuSystem:
         weakref.finalize(self, end.close)  # when the object is deleted, or the process ends
         try:
             description = _described(path)
-            self.about = _about(description)
+            self.about = _description_text(description)
             self._instance = self._load(_unpacked(path, settings, description, end), end, description)
             self._start(settings, x0, description)
         except CallerError:
@@ -424,7 +424,7 @@ def _not_initial(variable: "ScalarVariable") -> str | None:
     return reason and f"{reason}; name variables whose initial is exact or approx, or none: []"
 
 
-def _about(description: "ModelDescription") -> str:
+def _description_text(description: "ModelDescription") -> str:
     tool = description.generationTool or "a tool that it does not name"
     needs = "; it needs that tool to run" if description.coSimulation.needsExecutionTool else ""
     return f"FMU {description.modelName}, FMI {description.fmiVersion}, by {tool}{needs}"

@@ -295,7 +295,7 @@ class RunClaims:
         parts: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
-            parts.append(self._after(made, until_ns))
+            parts.append(self._claims_after(made, until_ns))
         return parts
 
     @property
@@ -349,10 +349,12 @@ class RunClaims:
         for evaluation in self.parts:
             # Other bounds hold for deviations from another set-point, or start later.
             if not isinstance(evaluation, Claim) and evaluation.part.from_s == 0 and self._setpoint is None:
-                envelopes += [_until(curve, evaluation.part.until_s) for curve in evaluation.envelopes()]
+                envelopes += [
+                    _envelope_until(curve, evaluation.part.until_s) for curve in evaluation.envelopes()
+                ]
         return envelopes
 
-    def _after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
+    def _claims_after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
         """The claims about the part of the run that follows a change."""
         record = self._judged
         known = record.events()["event"]
@@ -364,10 +366,10 @@ class RunClaims:
         )
         after = after[np.isin(after["sequence"], known)]
         if made.everywhere_ns == NEVER_NS:
-            return _nothing_after(made, until_ns, "not every process received the change")
+            return _void_after(made, until_ns, "not every process received the change")
         if not len(after) or after["t_ns"][0] >= until_ns:
             up_to = "" if until_ns == NEVER_NS else f", up to {until_ns / NS_PER_S:.3f} s"
-            return _nothing_after(made, until_ns, f"no update was delivered after it{up_to}")
+            return _void_after(made, until_ns, f"no update was delivered after it{up_to}")
         origin_ns, sequence = int(after["t_ns"][0]), int(after["sequence"][0])
         own = _part_of(record, made.scenario, origin_ns, sequence)
         part = RunPart(
@@ -400,7 +402,7 @@ def claims_of(record: RunRecord) -> "RunClaims":
     return RunClaims(record)
 
 
-def _nothing_after(made: RecordedChange, until_ns: int, why: str) -> Claim:
+def _void_after(made: RecordedChange, until_ns: int, why: str) -> Claim:
     """Return a void claim for the part after a change, with the reason for having no claims."""
     at_s, text = made.first_ns / NS_PER_S, text_of(made.change.settings)
     until_s = None if until_ns == NEVER_NS else until_ns / NS_PER_S
@@ -413,7 +415,7 @@ def _until_s(until_ns: int, origin_ns: int) -> float:
     return math.inf if until_ns == NEVER_NS else (until_ns - origin_ns) * 1e-9
 
 
-def _until(envelope: Envelope, until_s: float) -> Envelope:
+def _envelope_until(envelope: Envelope, until_s: float) -> Envelope:
     if envelope.quantity == "inter_event":  # two ends of a line
         return envelope._replace(t_s=np.minimum(envelope.t_s, until_s))
     return envelope._replace(values=np.where(envelope.t_s < until_s, envelope.values, np.nan))

@@ -362,14 +362,14 @@ def design(
             outcome = event_design.design_for_network(loaded, wish, seed, bar)
         written = design_page.write_outcome(outcome, page, figure_files)
         written += files.write(outcome.written()) if outcome.is_certified else []
-        cli.show_with_files(json, outcome.to_json(), written, design_page.print_design, outcome)
+        cli.show_with_files(json, outcome.to_json(), written, design_page.print_loop_design, outcome)
         return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
     network.refuse()
     page = files.page_of(loaded.name)
     result = _trigger_of(loaded, requirements.limits(), weights, feedback, draws, seed)
     written = design_page.write_page(result, page, figure_files)
     written += files.write(scenario_file.dumps(result.scenario)) if result.feasible else []
-    cli.show_with_files(json, result.document(), written, design_page.print_found, result)
+    cli.show_with_files(json, result.document(), written, design_page.print_trigger_design, result)
     if not result.confirmed:
         print_to_stderr(f"noack: {result.verdict()}")
     return ExitStatus.OK if result.confirmed else ExitStatus.FAILED

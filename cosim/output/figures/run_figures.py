@@ -302,7 +302,7 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
         "States, and the times between transmissions and between deliveries: each stem is the time "
         "since the one before, so the first packet has none. "
         + scenario.protocol.states_caption.format(known=known)
-        + _known(scenario)
+        + _estimate_text(scenario)
         + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",
         f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. "
         f"Below, stems for {len(events)} transmissions, of which {int(sent.lost.sum())} were "
@@ -311,7 +311,7 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
     )
 
 
-def _known(scenario: Scenario) -> str:
+def _estimate_text(scenario: Scenario) -> str:
     """Explain x̂, if the sensor does not measure x exactly."""
     if scenario.coverage.knows_state:
         return ""

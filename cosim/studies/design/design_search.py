@@ -235,7 +235,7 @@ class Search:
 
         share, rounds, best = 0.5, 0, best_of_family()
         while share > _SMALLEST_STEP and rounds < _MOST_ROUNDS:
-            self._try(self.space.around(best.candidate, share))
+            self._try(self.space.neighbours(best.candidate, share))
             previous, best = best, best_of_family()
             if best is previous:
                 share /= 2

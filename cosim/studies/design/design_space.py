@@ -82,7 +82,7 @@ class DesignSpace:
                 if self.contains(candidate):
                     yield candidate
 
-    def around(self, centre: TriggerCandidate, share: float) -> Iterator[TriggerCandidate]:
+    def neighbours(self, centre: TriggerCandidate, share: float) -> Iterator[TriggerCandidate]:
         """Return a candidate's neighbours, at a distance of this share of the grid's steps."""
         family, alpha_per_s, beta = centre
         for i, j in itertools.product((-share, 0, share), repeat=2):

@@ -499,7 +499,7 @@ def _loop_result(search: NetworkSearch, reached: Reached, *, is_excluded: bool =
     cells = {
         "proven stable for": reach,
         "growth per period there": growth,
-        "the next one": _beyond(ladder, reached),
+        "the next one": _next_rung_text(ladder, reached),
         "cost without losses": f"{reached.cost:.4g}",
         "share of measurements sent": f"{100 * sent:.3g} %",
         "between updates": hold.text + " (not in --holds)" * is_excluded,
@@ -528,7 +528,7 @@ def _notes(search: NetworkSearch, original: Reached, best: Reached) -> Iterator[
         yield f"--period {search.wish.period_s:g}: updates are sent at measurements, every {period_s:g} s"
 
 
-def _beyond(ladder: Sequence[Rung], reached: Reached) -> str:
+def _next_rung_text(ladder: Sequence[Rung], reached: Reached) -> str:
     if reached.rung + 1 == len(ladder):
         return "not examined"
     if reached.beyond is None:

@@ -372,7 +372,7 @@ class _MatrixInequalities:
         while True:
             for _ in range(_NEWTON_STEPS):
                 step, decrement = self._newton_step(values, weight)
-                moved = self._moved(values, step, weight, decrement) if decrement > _CENTERED else None
+                moved = self._step_along(values, step, weight, decrement) if decrement > _CENTERED else None
                 if moved is None:
                     break
                 values = moved
@@ -404,7 +404,7 @@ class _MatrixInequalities:
         step = scales * np.linalg.solve(R, np.linalg.solve(R.T, scales * gradient))
         return step, float(gradient @ step)
 
-    def _moved(self, values: Vector, step: Vector, weight: float, decrement: float) -> Vector | None:
+    def _step_along(self, values: Vector, step: Vector, weight: float, decrement: float) -> Vector | None:
         """Return the values after a step along which the objective grows, shortened if need be."""
         length, now = 1.0, self._objective(values, weight)
         while length > _SHORTEST:
