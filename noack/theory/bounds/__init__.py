@@ -8,8 +8,9 @@ an interval, for G = H + αI (the models) and G = A + BK + αI (the plant's loop
    from a Lyapunov equation or from eigenvectors; ν is computed from the final L, so nothing depends
    on how L was found.
 2. ``enclosure.py``: the suprema and integrals. Between two nodes the distance of a response from
-   its chord is bounded by its second derivative; beyond the last node ν bounds the response. Why
-   samples are not sufficient: docs/theory.md, "Why the suprema are enclosed, not sampled".
+   its chord (``sag`` in names) is bounded by its second derivative (``bend``); beyond the last node
+   ν bounds the response. Why samples are not sufficient: docs/theory.md, "Why the suprema are
+   enclosed, not sampled".
 3. ``gains.py``: the names of these numbers. With K = U R the input error p = u − Kx acts through B
    U (docs/theory.md, "The loop", eq:miet_errdyn in the form of the three equations there):
 
