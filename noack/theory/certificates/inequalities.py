@@ -121,7 +121,7 @@ class BoundMethod(Enum):
 
 
 class LoopConstants(NamedTuple):
-    """The constants of several loops but δ, (loops,) each: see ``Constants`` in ``terms``."""
+    """The constants of several loops but δ, (loops,) each: see ``Constants`` in ``certificate_terms``."""
 
     missing_events: Counts
     delta: Vector
@@ -158,7 +158,7 @@ class ErrorInequalities:
         self._conditions = conditions
         self.age_gains = error.age_gains(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
-        self._beyond = np.maximum(self._start_error, earlier_error)
+        self._first_input_error = np.maximum(self._start_error, earlier_error)
         self._states = {
             output: Coefficients(free + start[output], gain) for output, (free, gain) in plant.states.items()
         }
@@ -329,7 +329,7 @@ class ErrorInequalities:
         ``highest`` bounds what a p of 1 adds in a unit of time.
         """
         begun = np.fmin(row[..., 3], self._begin_s * highest)
-        return np.asarray(row + (self._beyond * begun)[..., None] * _ONE)
+        return np.asarray(row + (self._first_input_error * begun)[..., None] * _ONE)
 
     def _input_effects(
         self, output: Output, count: int, spacing_s: Vector, own_growth: ErrorGrowth
@@ -380,7 +380,7 @@ class ErrorInequalities:
 
     def _solved(self, signals: "_Signals", growing: ErrorGrowth, own_growth: ErrorGrowth | None) -> Solution:
         """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
-        errors, beyond, held = signals.errors, self._beyond, self.age_gains
+        errors, beyond, held = signals.errors, self._first_input_error, self.age_gains
         estimated, input_error = np.eye(_SIGNALS)[2], signals.input_error
 
         through, free = self._through(signals, {str(C): gain for C, gain in held.items()})
@@ -430,7 +430,7 @@ class ErrorInequalities:
                     self._plant,
                     np.where(searched, bound.reached - estimation, 0.0),
                     np.where(searched, constants.mismatch, 0.0),
-                    np.where(searched, np.maximum(other_input_error, self._beyond), 0.0),
+                    np.where(searched, np.maximum(other_input_error, self._first_input_error), 0.0),
                     error_gain,
                     estimation,
                 ),

@@ -365,7 +365,7 @@ class InsertedInequalities(ErrorInequalities):
     @property
     def start_error(self) -> float:
         """sup‖u − Kx‖ of one loop before the first input."""
-        return float(self._beyond)
+        return float(self._first_input_error)
 
     def next_event_s(self, known: KnownBounds) -> float:
         """Return the time between two events that follows from bounds; 0 if there is none."""
