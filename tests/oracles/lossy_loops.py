@@ -21,8 +21,13 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
+from noack.theory.bounds.certificate_terms import (
+    Constants,
+    NetworkConditions,
+    NoCertificateError,
+    TriggerBound,
+)
 from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.certificates.solution import solve
 
 Reals = NDArray[np.float64]

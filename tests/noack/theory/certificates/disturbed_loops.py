@@ -13,10 +13,10 @@ from noack.core.linear_systems import spectral_abscissa
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
+from noack.theory.bounds.certificate_terms import CertificatePart, Constants, EstimationBound, TriggerBound
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains
-from noack.theory.bounds.terms import Constants, EstimationBound, Part, TriggerBound
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.disturbed import solve_two_parts
+from noack.theory.certificates.persistent_bounds import solve_two_parts
 from noack.theory.certificates.scenario_certificates import own_plant
 from noack.theory.certificates.solution import completed_alone
 from tests.oracles.lossy_loops import (
@@ -67,8 +67,8 @@ class DisturbedLoop:
         models = pushed.error
         estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ self.noise)))
         first, rest = completed_alone(solve_two_parts(
-            Part(decaying.error, decaying, TriggerBound(system.beta, None)),
-            Part(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
+            CertificatePart(decaying.error, decaying, TriggerBound(system.beta, None)),
+            CertificatePart(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
             system.conditions,
         ))  # fmt: skip
         return Sum(self.system, first, rest)

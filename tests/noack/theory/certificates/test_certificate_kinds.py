@@ -6,7 +6,7 @@ from functools import cache, reduce
 import numpy as np
 import pytest
 
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from tests.noack.theory.certificates.certificate_kinds import Tally
 from tests.noack.theory.certificates.certificate_kinds.comparison import KINDS, examine
 from tests.noack.theory.certificates.certificate_kinds.continuous import CONTINUOUS, constants_of

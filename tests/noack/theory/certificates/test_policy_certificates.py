@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from cosim.simulation.continuous import ContinuousLoop, TooManyEventsError, simulate_continuous
 from noack.scenario.resolution import loop_of, policy_of, resolve
 from noack.scenario.scenario_file import load
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.trigger_bounds import comparison_bound
 from noack.theory.certificates.certified_bounds import known_state_bounds
 from noack.theory.certificates.conditions import allowed_conditions

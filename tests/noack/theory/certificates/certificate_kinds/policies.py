@@ -19,7 +19,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.bounds import trigger_bounds as bounds_of_triggers
-from noack.theory.bounds.terms import NetworkConditions, TriggerBound
+from noack.theory.bounds.certificate_terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
