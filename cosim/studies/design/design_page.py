@@ -145,18 +145,16 @@ def rows(result: DesignResult) -> list[tuple[str, ...]]:
 
 def print_found(console: Console, result: DesignResult) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
-    title = f"{result.name}: trade-off of transmissions and settling time"
     all_rows = rows(result)
     step = -(-len(all_rows) // _MOST_ROWS)
     table_rows = [row for i, row in enumerate(all_rows) if i % step == 0 or result.front[i] is result.best]
+    title = f"{result.name}: trade-off, {len(table_rows)} of {len(all_rows)} rows"
     if all_rows:
         words = range(len(HEADINGS) - 2, len(HEADINGS))
         console.print(terminal_table(ResultTable("design", title, HEADINGS, table_rows), left=words))
     lines = []
-    if len(table_rows) < len(all_rows):
-        lines = [f"{len(table_rows)} of the {len(all_rows)} trade-offs; the page has all of them"]
     if result.feasible:
-        lines += [
+        lines = [
             result.verdict(),
             f"chosen among {len(result.trials):,} candidates on {result.best.measured.draws:,} "
             f"draws; the numbers are from {result.fresh.draws:,} other draws",

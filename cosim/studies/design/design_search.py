@@ -320,10 +320,7 @@ class DesignResult:
     def conditions(self) -> str:
         """The conditions of the certified bounds."""
         kind = "the scenario's schedule" if self.limits.schedule else "the paper's conditions"
-        plant = self.space.families[0].scenario.plant
-        has_box = plant.uncertainty_A is not None or plant.uncertainty_B is not None
-        covered = "the whole box" if has_box else "the scenario's own plant"
-        return f"under {kind}, for {covered}"
+        return f"under {kind}, for every plant that is drawn"
 
     def verdict(self) -> str:
         """The verdict in one line."""
