@@ -145,9 +145,10 @@ def rows(result: DesignResult) -> list[tuple[str, ...]]:
 
 def print_trigger_design(console: Console, result: DesignResult) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
-    title = f"{result.name}: trade-off of transmissions and settling time"
     all_rows = rows(result)
-    table_rows = all_rows[:: -(-len(all_rows) // _MOST_ROWS) or 1]
+    step = -(-len(all_rows) // _MOST_ROWS)
+    table_rows = [row for i, row in enumerate(all_rows) if i % step == 0 or result.front[i] is result.best]
+    title = f"{result.name}: trade-off, {len(table_rows)} of {len(all_rows)} rows"
     if all_rows:
         words = range(len(HEADINGS) - 2, len(HEADINGS))
         console.print(terminal_table(ResultTable("design", title, HEADINGS, table_rows), left=words))

@@ -253,10 +253,10 @@ class Search:
             self._measure_more(best)
         return best
 
-    def _rank(self, trial: Trial) -> tuple[float, float, float, TriggerCandidate]:
+    def _rank(self, trial: Trial) -> tuple[float, float, float, float, TriggerCandidate]:
         excess, measured = trial.excess(self.limits), trial.measured
         unsettled = 1.0 - measured.settled if excess > 0 else 0.0
-        return excess, unsettled, measured.transmissions, trial.candidate
+        return excess, unsettled, measured.transmissions, measured.settling_s, trial.candidate
 
     def _is_exact(self, trial: Trial) -> bool:
         return trial.full and (not self.limits.bounds or bool(trial.bounds))
@@ -320,7 +320,7 @@ class DesignResult:
     def conditions(self) -> str:
         """The conditions of the certified bounds."""
         kind = "the scenario's schedule" if self.limits.schedule else "the paper's conditions"
-        return f"under {kind}, for the whole box"
+        return f"under {kind}, for every plant that is drawn"
 
     def verdict(self) -> str:
         """The verdict in one line."""

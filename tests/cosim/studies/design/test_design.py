@@ -17,7 +17,14 @@ from scipy.linalg import solve_continuous_lyapunov
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.design_search import DesignLimits, DesignResult, design, measure, require_draws
+from cosim.studies.design.design_search import (
+    DesignLimits,
+    DesignResult,
+    Search,
+    design,
+    measure,
+    require_draws,
+)
 from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
@@ -237,6 +244,17 @@ def test_the_trade_off_curve_contains_the_nondominated_candidates(found: DesignR
             assert not any(sent < a and settling_s < b for a, b in points)
             better = any(a <= sent and b <= settling_s for a, b in points)
             assert better or trial in found.front or settling_s == math.inf
+
+
+def test_of_equal_transmissions_the_earlier_settling_is_chosen(found: DesignResult) -> None:
+    best = found.best
+    later = replace(
+        best,
+        candidate=best.candidate._replace(alpha_per_s=best.candidate.alpha_per_s / 2),
+        measured=best.measured._replace(settling_s=best.measured.settling_s + 0.001),
+    )
+    search = Search(found.space, found.limits, box_of(found.scenario), found.seed, 200)
+    assert search._best([later, best]) is best
 
 
 def test_too_few_draws_for_a_quantile_are_refused_with_the_required_number() -> None:
