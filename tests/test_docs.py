@@ -37,7 +37,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES, AnyDisturbance, AnyObserver
 from noack.scenario.toml_file import json_schema
-from tests.pages import PAGES, ROOT, blocks
+from tests.helpers.pages import PAGES, ROOT, blocks
 
 
 def keys_of(section: type[BaseModel], prefix: str = "") -> Iterator[str]:

@@ -31,7 +31,7 @@ from noack.runtime.host_clocks.time_exchange import TimeClient, TimeReference, a
 from noack.runtime.real_time_loop import realtime
 from tests.attacks.attacked import Run
 from tests.attacks.kinds import enter_namespace
-from tests.two_hosts import DrivenClocks, TwoHosts, two_hosts
+from tests.helpers.two_hosts import DrivenClocks, TwoHosts, two_hosts
 
 KEY = bytes(range(32))
 CHECKS_AT_ONCE = 25

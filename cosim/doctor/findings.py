@@ -179,7 +179,7 @@ def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, in_force: 
     )
     if not in_force:
         return GOOD, late, f"{means}. Runs use real-time settings"
-    remedy = "raise certificate.late_periods, lower speed or rates, or permit SCHED_FIFO"
+    remedy = "raise certificate.late_periods, or lower speed or rates"
     return LIMITED, late, means, remedy
 
 

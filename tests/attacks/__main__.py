@@ -9,7 +9,7 @@ from pathlib import Path
 
 from noack.protocol.roles import LOOP_ROLES, RECEIVES, sender_to
 from tests.attacks.attacked import CHECKS, Attacked, attack, may_forge_addresses
-from tests.two_hosts import two_hosts
+from tests.helpers.two_hosts import two_hosts
 
 
 def counts_at(run: Attacked, role: str) -> Counter[str]:

@@ -33,8 +33,9 @@ from noack.runtime.join_ticket import Ticket, loads
 from noack.runtime.udp_sockets import SHED
 from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Plan, Sent, Target, carry_out
-from tests.integration.conftest import PATIENCE_S, starting, udp_port, wait_for
-from tests.two_hosts import TwoHosts
+from tests.helpers.two_hosts import TwoHosts
+from tests.helpers.waiting import PATIENCE_S, wait_for
+from tests.integration.conftest import starting, udp_port
 
 AWAY = "controller"
 """The process on the second host."""

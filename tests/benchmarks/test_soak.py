@@ -89,7 +89,7 @@ def judged(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Tren
         (lambda t: noise(t) + 0.05 * t, 24 * HOUR_S, True, 256 * (24 - 1 / 12)),
     ],
 )
-def test_the_trend_of_memory(
+def test_memory_may_grow_by_its_noise_and_not_more(
     kib_of_s: Callable[[float], float], length_s: float, flat: bool, allowed_kib: float
 ) -> None:
     found = judged(kib_of_s, length_s)

@@ -18,7 +18,7 @@ from noack.impairments.loss_guarantee import (
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
 from noack.protocol.roles import Notice, Output, Record
 from noack.protocol.wire_format import Flow, Message
-from tests.machine_parts import OneLoop, machine
+from tests.helpers.machine_parts import OneLoop, machine
 
 MS = 1_000_000
 H = np.array([[-0.5, 2.0], [-1.0, 0.3]])

@@ -29,8 +29,7 @@ from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.link_load import require_capacity
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.theory.certificates.conditions import allowed_conditions
-from tests.extras import skip_without_plant
-from tests.shipped import resolved, shipped
+from tests.helpers.shipped import resolved, shipped, skip_without_plant
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHARED = (

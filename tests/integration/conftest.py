@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,11 +14,11 @@ import psutil
 import pytest
 
 from noack.protocol.roles import ROLES
+from tests.helpers.waiting import PATIENCE_S, wait_for
 
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
 """Without a report; tests that need one add ``--report``."""
-PATIENCE_S = 300.0
 WITHOUT_VIEWER = {"PYTHONPATH": str(Path(__file__).with_name("without_viewer"))}
 """Of commands whose recording is not looked at."""
 
@@ -228,13 +227,6 @@ class Running:
     def left_behind(self) -> list[psutil.Process]:
         _, alive = psutil.wait_procs(self._children, timeout=PATIENCE_S)
         return [child for child in alive if not is_over(child)]
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s, "timed out"
-        time.sleep(0.02)
 
 
 @pytest.fixture

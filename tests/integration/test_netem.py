@@ -9,7 +9,7 @@ from pathlib import Path
 from tests.netem.relay.relays import endpoints
 
 
-def test_several_links_a_capture_and_statistics(tmp_path: Path) -> None:
+def test_several_links_are_captured_and_counted(tmp_path: Path) -> None:
     links, capture = tmp_path / "links.toml", tmp_path / "all.pcapng"
     lines = tmp_path / "lines.json"
     with endpoints(*["127.0.0.1"] * 2) as (there, here):

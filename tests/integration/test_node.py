@@ -30,8 +30,8 @@ from noack.runtime.live_driver import LoopChannel
 from noack.runtime.node_driver import NodeDriver
 from noack.runtime.udp_sockets import bind
 from noack.settings.user_files import located
-from tests.approved import lines_of_error
 from tests.command_line import invoke
+from tests.helpers.approved import lines_of_error
 from tests.integration import conftest as live
 from tests.integration.test_restarts import goes_on, spooled
 from tests.noack.runtime.live_loops import KEY, RUN_ID, Rows, scenario
@@ -166,7 +166,7 @@ def driver_of(program: Path, content: dict[str, Any]) -> NodeDriver:
         ("echo noack node 7 8", "says 'noack node 7 8'; a node of this version says"),
     ],
 )
-def test_what_is_no_node_is_refused_in_one_line(
+def test_a_program_that_is_no_node_is_refused(
     commands: str, line: str, tmp_path: Path, content: dict[str, Any]
 ) -> None:
     (error,) = lines_of_error(lambda: driver_of(script(tmp_path, commands), content).__enter__())

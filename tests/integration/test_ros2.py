@@ -92,7 +92,7 @@ def test_a_controller_in_ros2_controls(port: int) -> None:
     assert run.replay().bit_exact
 
 
-def test_who_does_not_answer_is_named(port: int) -> None:
+def test_a_ros2_node_that_does_not_answer_is_named(port: int) -> None:
     given = LOOP | {"controller": {"rate_hz": 100.0} | peer(port, start_timeout_s=0.3)}
     with pytest.raises(CallerError, match="no answer on /noack/controller/input"):
         noack.simulate(noack.load(given))

@@ -18,7 +18,7 @@ from noack.core.linear_systems import exponential
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from tests.cosim.simulation.exact_populations import random_population, random_setting
-from tests.example_rules import TABLES, random_rule
+from tests.helpers.example_rules import TABLES, random_rule
 
 LANES = ("following", "acknowledged", "actuation_loss", "crosswind")
 """Of the scenarios of the lane, those with machines of their own."""

@@ -16,10 +16,10 @@ from noack.core.errors import CallerError
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.exact_populations import random_population, random_setting
-from tests.example_rules import TABLES, area_rule, decaying_rule, random_rule
-from tests.machine_parts import SteppedMachines
+from tests.helpers.example_rules import TABLES, area_rule, decaying_rule, random_rule
+from tests.helpers.machine_parts import SteppedMachines
+from tests.helpers.wire_decoder import NO_VECTOR
 from tests.noack.machines.any_machines import MS, Sizes, controller, plant, sensor, set_number, sizes, text_of
-from tests.wire_decoder import NO_VECTOR
 
 TIMES_NS, NUMBERS = 2**62, 2**63
 """Times and numbers of messages are less."""
@@ -120,7 +120,7 @@ def drive(own: SteppedMachines, given_inputs: list[Any]) -> None:
     roles, st.lists(st.tuples(sizes(), st.integers(0, 2**16)), min_size=1, max_size=3), scales,
     st.sampled_from([1, 5, 1024]), inputs,
 )  # fmt: skip
-def test_random_machines(
+def test_random_machines_are_clean(
     role: str, loops: list[tuple[Sizes, int]], scale: float, rows: int, given_inputs: list[Any]
 ) -> None:
     with np.errstate(all="ignore"):
@@ -129,7 +129,9 @@ def test_random_machines(
 
 @settings(max_examples=5)
 @given(roles, sizes(64), st.integers(0, 2**16), st.sampled_from([1.0, 1e308]), inputs)
-def test_large_machines(role: str, of: Sizes, seed: int, scale: float, given_inputs: list[Any]) -> None:
+def test_large_machines_run_clean(
+    role: str, of: Sizes, seed: int, scale: float, given_inputs: list[Any]
+) -> None:
     with np.errstate(all="ignore"):
         try:
             machines = machines_of(role, [(of, seed)], scale)
@@ -168,7 +170,7 @@ sizes_and_policies = st.one_of(
 
 @settings(max_examples=8)
 @given(st.integers(0, 2**32), sizes_and_policies, st.integers(1, 3))
-def test_random_batches(seed: int, size_and_policy: tuple[int, str], m: int) -> None:
+def test_random_batches_run_clean(seed: int, size_and_policy: tuple[int, str], m: int) -> None:
     (n, policy), rng = size_and_policy, np.random.default_rng(seed)
     setting = random_setting(rng, n, m)
     if policy:
@@ -180,7 +182,9 @@ def test_random_batches(seed: int, size_and_policy: tuple[int, str], m: int) -> 
 
 @settings(max_examples=40)
 @given(st.data(), st.integers(1, 9), st.sampled_from(range(5)), st.booleans())
-def test_matrices_and_states_of_any_numbers(data: st.DataObject, n: int, measure: int, area: bool) -> None:
+def test_matrices_and_states_of_any_numbers_run_clean(
+    data: st.DataObject, n: int, measure: int, area: bool
+) -> None:
     """Infinite and undefined numbers end a run; they do not lead astray."""
 
     def any_of(*shape: int) -> np.ndarray:
@@ -199,7 +203,7 @@ def test_matrices_and_states_of_any_numbers(data: st.DataObject, n: int, measure
     simulation.sample(A[0], B[0], t_s[:2], any_of(2, 3, n), t_s)
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_batches_with_impossible_numbers_or_sizes_are_refused() -> None:
     plain = {"horizon_s": 1.0, "known_start": True}
     one, trigger = np.eye(2), decaying_rule(0.5, 1.0)
     for wrong in (

@@ -16,7 +16,7 @@ from noack.core.errors import CallerError
 from noack.impairments.feature import StageTables
 from noack.impairments.link_settings import Counters, RecordedDecision
 from noack.protocol.record_tables import Fate
-from tests.netem.feature_examples import IMPAIRED, names_file
+from tests.noack.impairments.feature_examples import IMPAIRED, names_file
 
 ROOT = Path(__file__).parents[2]
 
@@ -121,7 +121,7 @@ def test_the_core_of_this_repository_is_that_of_its_sources() -> None:
 
 
 @needs_compiler
-def test_it_builds_only_what_has_changed_and_says_so_in_one_line(copy: Path) -> None:
+def test_a_build_compiles_only_what_has_changed_and_says_so_in_one_line(copy: Path) -> None:
     first = build(copy, "--library")
     assert (first.returncode, first.stderr) == (0, "")
     assert len(first.stdout.splitlines()) == 1
@@ -154,7 +154,7 @@ def test_a_mistake_leaves_the_earlier_core_as_it_was(copy: Path) -> None:
 
 
 @needs_compiler
-def test_of_two_builds_at_a_time_one_finds_it_built(copy: Path) -> None:
+def test_the_second_of_two_builds_at_a_time_compiles_nothing(copy: Path) -> None:
     """What a killed build has left is removed."""
     left = copy.parent / "core" / ".building-x"
     left.mkdir(parents=True)
@@ -166,7 +166,7 @@ def test_of_two_builds_at_a_time_one_finds_it_built(copy: Path) -> None:
     assert files(copy).keys() == {LIBRARY.name, HEADER}
 
 
-def test_without_a_compiler_it_says_what_to_install(copy: Path, tmp_path: Path) -> None:
+def test_a_build_without_a_compiler_says_what_to_install(copy: Path, tmp_path: Path) -> None:
     """Without the installed packages (-S), among them ziglang; test_same_bits.py builds with it."""
     command = [sys.executable, "-S", copy / "build.py", "--into", copy.parent / "core"]
     done = subprocess.run(

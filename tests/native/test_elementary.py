@@ -56,7 +56,7 @@ def _near(center: float, largest: int) -> Callable[[np.random.Generator], np.nda
         ("cube_root", _uniform(0.4, 8.1), 0.501),
     ],
 )
-def test_errors_in_units_of_the_last_place(
+def test_errors_are_within_the_stated_units_in_the_last_place(
     name: str, draw: Callable[[np.random.Generator], np.ndarray], most_ulps: float
 ) -> None:
     function = getattr(core, f"noack_{name}")
@@ -69,7 +69,7 @@ def test_errors_in_units_of_the_last_place(
 
 
 @pytest.mark.parametrize("name", ["exp", "expm1", "log"])
-def test_special_values(name: str) -> None:
+def test_special_values_are_those_of_the_c_standard(name: str) -> None:
     """They are as the C standard's Annex F has them."""
     function, reference = getattr(core, f"noack_{name}"), getattr(math, name)
     values = [0.0, -0.0, math.inf, -math.inf, math.nan, 1.0, -1.0, 5e-324, -5e-324]
@@ -105,7 +105,7 @@ def test_the_normal_distribution_and_its_quantile_are_those_of_scipy() -> None:
     assert ends[0] == pytest.approx(ndtri(2.0**-54), rel=1e-14)
 
 
-def test_cube_roots_of_cubes_and_special_values() -> None:
+def test_cube_roots_of_cubes_are_exact() -> None:
     for k in range(1, 2000):
         assert core.noack_cube_root(float(k**3)) == k
         assert core.noack_cube_root(float(k**3) * 2.0**-300) == k * 2.0**-100

@@ -45,14 +45,14 @@ def own_digests() -> list[str]:
     ],
     ids=["BLAS", "numpy and C"],
 )
-def test_on_processors_of_which_the_libraries_compute_differently(processor: dict[str, str]) -> None:
+def test_runs_have_the_same_bits_on_processors_whose_libraries_differ(processor: dict[str, str]) -> None:
     """The settings have an effect on x86-64 only. Others' matrices and users' classes come from scipy."""
     linear = run([sys.executable, "-m", MODULE, "linear"], **processor)
     assert len(linear) > 70
     assert set(linear) <= set(own_digests())
 
 
-def test_with_sanitizers_and_little_optimisation() -> None:
+def test_runs_have_the_same_bits_with_sanitizers_and_little_optimisation() -> None:
     command: Sequence[str]
     environment: Mapping[str, str]
     try:
@@ -63,7 +63,7 @@ def test_with_sanitizers_and_little_optimisation() -> None:
 
 
 @pytest.mark.skipif(find_spec("ziglang") is None, reason="the package ziglang is not installed")
-def test_built_by_ziglang(tmp_path: Path) -> None:
+def test_runs_have_the_same_bits_if_ziglang_builds_the_core(tmp_path: Path) -> None:
     build = [sys.executable, ROOT / "native" / "build.py", "--into", tmp_path]
     run(build, CC="", PATH=str(tmp_path))  # as on a machine that has no compiler
     other = ["tests.native.sanitized_core", str(tmp_path / LIBRARY), MODULE]

@@ -26,7 +26,8 @@ def run(*module: str) -> subprocess.CompletedProcess[str]:
 FILES = (
     "tests/native/machines_under_sanitizers.py", "tests/fuzz/test_parsers.py",
     "tests/netem/capture/test_pcapng.py", "tests/noack/protocol/test_wire_format.py",
-    "tests/netem/test_link.py", "tests/netem/test_mansd.py", "tests/cosim/simulation/test_event_order.py",
+    "tests/netem/test_link_state.py", "tests/netem/test_channel.py", "tests/noack/impairments/test_mansd.py",
+    "tests/cosim/simulation/test_virtual_time.py",
     "tests/cosim/simulation/test_several_loops.py", "tests/cosim/analysis/test_replay.py",
     "tests/cosim/analysis/adversary/test_worst_patterns.py", "tests/noack/runtime/test_live_driver.py",
     "tests/noack/runtime/test_peer_sockets.py", "tests/cosim/output/export/test_fmu_export.py",
@@ -43,7 +44,7 @@ NAMES = (
 """Parts of the names of tests that reach other parts of the core."""
 
 
-def test_these_tests_run_clean() -> None:
+def test_the_tests_of_the_core_run_clean_under_sanitizers() -> None:
     """One process for all of them: with sanitizers, its start takes as long as many tests."""
     done = run(*PYTEST, *FILES, "-k", " or ".join(NAMES))
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[:4000]

@@ -13,9 +13,11 @@ import pytest
 
 import noack
 from netem import pytest_plugin
+from netem.link_state import LinkState
+from netem.tc_words import settings_of
 from noack.core.errors import NoackError
-from tests.netem.conftest import Decide
-from tests.pages import blocks
+from tests.helpers.pages import blocks
+from tests.helpers.waiting import wait_for
 
 PATIENCE_S = 120.0
 
@@ -55,8 +57,7 @@ def arrived(ends: Ends, words: str, seed: int, count: int = 300) -> list[bool]:
     """Return which of the datagrams arrive, by the receiver."""
     with noack.LossyUdp(ends.server.getsockname(), words, seed=seed) as link:
         ends.send(link, range(count))
-        while link.forward["received"] < count:
-            pass
+        wait_for(lambda: link.forward["received"] == count)
         received = ends.received(intact(link.forward["fates"]))
     assert link.forward["received"] == count  # also after the end
     lost = [len(list(run)) for kept, run in groupby(range(count), received.__contains__) if not kept]
@@ -64,13 +65,14 @@ def arrived(ends: Ends, words: str, seed: int, count: int = 300) -> list[bool]:
     return [number in received for number in range(count)]
 
 
-def test_the_losses_are_those_of_the_seed_and_of_the_rules(ends: Ends, decide: Decide) -> None:
+def test_the_losses_are_those_of_the_seed_and_of_the_rules(ends: Ends) -> None:
     words = "loss 60% mansd 3"
     first = arrived(ends, words, 7)
     assert arrived(ends, words, 7) == first
     assert arrived(ends, words, 8) != first
-    decided = decide(words, 300, seed=7, name=("relay", "forward"))
-    assert first == [release_ns >= 0 for release_ns in decided.decisions["release_ns"]]
+    link = LinkState(settings_of(words), 7, "relay", "forward")
+    link.start_flow(0, 0)
+    assert first == [link.decide(0, 4, 0).release_ns >= 0 for _ in first]
 
 
 def test_a_change_does_not_reset_the_guarantee(ends: Ends) -> None:
@@ -78,8 +80,7 @@ def test_a_change_does_not_reset_the_guarantee(ends: Ends) -> None:
         count = 0
         for _ in range(20):  # each change would allow three more losses if it forgot the others
             ends.send(link, range(count, count := count + 2))
-            while link.forward["received"] < count:
-                pass
+            wait_for(lambda count=count: link.forward["received"] == count)
             link.change("loss 100% mansd 3")
         assert ends.received(10) == list(range(3, 40, 4))
 

@@ -24,7 +24,7 @@ from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETT
 from noack.protocol.roles import BEGINNING, Notice, Record, Start
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
-from tests.machine_parts import Machine
+from tests.helpers.machine_parts import Machine
 
 
 class _InFlight(NamedTuple):

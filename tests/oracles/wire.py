@@ -10,7 +10,7 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from noack.protocol.wire_format import TIMES_NS, Flow, Message, Rejection
-from tests.wire_decoder import Decoder
+from tests.helpers.wire_decoder import Decoder
 
 KEY = bytes(range(32))
 """The key of all published datagrams."""

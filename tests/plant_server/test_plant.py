@@ -1,18 +1,25 @@
 """The plant: its disturbances, its measurement noise, and the watchdog of the last actuation."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from cosim.analysis.fidelity import IncomparableError, recorded_loop
+from cosim.analysis.replay import replay
+from cosim.analysis.summary.run_summary import summarise
+from cosim.record.run_record import RunRecord
 from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from plant_server.plant import BLOCK, MeasurementModel, disturbance_of
-from tests.machine_parts import OneLoop, plant_of
+from tests.cosim.simulation.outage import CASES, POLICIES, at_the_end, with_outage
+from tests.helpers.machine_parts import OneLoop, plant_of
+from tests.helpers.shipped import resolved
 
 STEPS = 4000
 
@@ -33,7 +40,7 @@ def disturbed(content: dict[str, Any]) -> dict[str, Any]:
     return content
 
 
-def resolved(content: dict[str, Any]) -> Scenario:
+def scenario_of(content: dict[str, Any]) -> Scenario:
     return resolve(validate(content, "test"))
 
 
@@ -52,7 +59,7 @@ def steps_of(plant: OneLoop, scenario: Scenario, count: int) -> tuple[Any, list[
 def test_disturbances_have_their_distributions_and_are_independent(
     disturbed: dict[str, Any],
 ) -> None:
-    disturbance = disturbance_of(resolved(disturbed))
+    disturbance = disturbance_of(scenario_of(disturbed))
     assert disturbance is not None
     d, w = disturbance.values(range(STEPS))
     d = d[:, 0]
@@ -72,7 +79,7 @@ def test_disturbances_have_their_distributions_and_are_independent(
 
 
 def test_a_disturbance_does_not_depend_on_the_order_of_the_steps(disturbed: dict[str, Any]) -> None:
-    one, other = disturbance_of(resolved(disturbed)), disturbance_of(resolved(disturbed))
+    one, other = disturbance_of(scenario_of(disturbed)), disturbance_of(scenario_of(disturbed))
     assert one is not None
     assert other is not None
     d, w = one.values(range(BLOCK, 3 * BLOCK))
@@ -83,7 +90,7 @@ def test_a_disturbance_does_not_depend_on_the_order_of_the_steps(disturbed: dict
 
 
 def test_a_seed_changes_only_its_own_disturbance(disturbed: dict[str, Any]) -> None:
-    base = resolved(disturbed)
+    base = scenario_of(disturbed)
     rows, sent = steps_of(plant_of(base), base, 20)
     noise = base.model_copy(update={"seeds": base.seeds.model_copy(update={"noise": 1})})
     other, heard = steps_of(plant_of(noise), noise, 20)
@@ -109,7 +116,7 @@ def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout(
 ) -> None:
     watchdog = {"policy": policy, "timeout_s": 0.05}
     content["plant"] |= {"rate_hz": 100.0, "watchdog": watchdog}
-    scenario = resolved(content)
+    scenario = scenario_of(content)
     plant, outputs = plant_of(scenario), []
     plant.handle(Message(Flow.ACTUATION, 0, sent_ns, np.array([2.0])), sent_ns)
     for t_ns in range(0, 70 * MS, 10 * MS):
@@ -119,3 +126,42 @@ def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout(
     assert (u[5], u[6]) == (2.0, then if trips else 2.0)
     notices = [(one.t_ns, one.level) for one in outputs if isinstance(one, Notice)]
     assert notices == [(60 * MS, "watchdog")] * trips
+
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.fixture(scope="module", params=["hold", "zero", "model"])
+def run(request: pytest.FixtureRequest) -> RunRecord:
+    """The controller stands still from 1 s to 1.4 s; its last tick before that is at 0.999 s."""
+    changes = [f"plant.watchdog.policy={request.param}", "horizon_s=2"]
+    return with_outage(resolved("lane_following", *changes), 1.0, 1.4)
+
+
+def test_the_beginning_and_end_of_a_trip_are_reported_and_replayed(run: RunRecord) -> None:
+    trips = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
+    assert trips == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
+    policy = run.scenario.plant.watchdog.policy
+    assert summarise(run, 0, "horizon").to_json()["watchdog"] == {
+        "policy": policy, "timeout_s": pytest.approx(0.1), "trips": 1,
+        "first_s": pytest.approx(1.1), "total_s": pytest.approx(0.302),
+    }  # fmt: skip
+    assert replay(run).bit_exact
+    if policy == "hold":
+        recorded_loop(run)
+        return
+    with pytest.raises(IncomparableError, match="no watchdog and no safe input"):
+        recorded_loop(run)
+
+
+def test_the_table_in_the_documentation_is_the_simulated_one() -> None:
+    """One number is simulated again; `python -m tests.cosim.simulation.outage` prints all rows."""
+    lines = (DOCS / "network.md").read_text().splitlines()
+    rows = [
+        [line for line in lines if line.startswith(f"| `{name}`, `{mode}` | {lasts_s:g} s |")]
+        for name, mode, lasts_s in CASES
+    ]
+    assert [len(row) for row in rows] == [1] * len(CASES)
+    name, mode, lasts_s = CASES[4]
+    held = rows[4][0].split(" | ")[2 + POLICIES.index("hold") + 1]
+    assert held == f"{at_the_end(name, mode, 'hold', lasts_s):.2g}"

@@ -193,7 +193,7 @@ def alter(runs: Path, table: str, column: str, by: float) -> None:
     rewrite(runs, table, changed)
 
 
-def test_the_last_run_is_replayed_and_compared_with_the_ideal_loop(simulated: Path) -> None:
+def test_the_commands_replay_and_fidelity_take_the_last_run(simulated: Path) -> None:
     for command, text in (("replay", "bit-exact: "), ("fidelity", "held actuation")):
         done = invoke(command, "--runs", simulated)
         assert (done.exit_code, done.stderr) == (0, "")

@@ -66,7 +66,7 @@ def test_verdicts_agree_with_the_bounds() -> None:
     assert f"M ≤ {margin.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(margin)
 
 
-def test_constraints_that_cap_the_losses_themselves() -> None:
+def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
     constraints = [{"kind": "at_most", "losses": 1, "window": 4}]
     settings = {"network.constraints": constraints, "network.mansd": 5}
     margin = noack.margin(held_integrator(**settings), period=False)
@@ -78,7 +78,7 @@ def test_constraints_that_cap_the_losses_themselves() -> None:
         noack.margin("lane_periodic", most_m=0)
 
 
-def test_events_at_unknown_times() -> None:
+def test_a_loop_with_events_has_a_margin_for_all_times_between_them() -> None:
     result = invoke("margin", "double_integrator", *DEADLINE, "--json")
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
@@ -92,7 +92,7 @@ def test_events_at_unknown_times() -> None:
     assert "proven stable for every loss pattern with M ≤ 2" in invoke(*words).output
 
 
-def test_a_loop_that_no_m_keeps_stable_and_a_pattern_without_times() -> None:
+def test_a_loop_that_no_m_stabilises_fails_and_a_pattern_without_times_is_not_played() -> None:
     result = invoke("margin", "lane_periodic", "--set", "trigger.period_s=9", "--no-period")
     assert (result.exit_code, "destabilises M = 1" in result.output) == (1, True), result.output
     result = invoke("margin", "double_integrator", *DEADLINE, "--play", "--no-period")
@@ -111,7 +111,7 @@ def test_the_played_settings_are_the_pattern() -> None:
     assert received[:-1] == expected[:-1]
 
 
-def test_guarantees_are_compared() -> None:
+def test_stronger_and_weaker_guarantees_are_compared_with_the_scenarios() -> None:
     words = ["atmost 6 in 7", "mansd 4 recover 2"]
     margin = noack.margin("lane_periodic", most_m=1, period=False, guarantees=words)
     own, weaker, stronger = margin.compared.guarantees

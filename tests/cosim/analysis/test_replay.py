@@ -30,9 +30,9 @@ from noack.protocol.record_tables import (
 from noack.protocol.roles import GENERATION, LOOP_ROLES, RESTART, Start
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
-from tests.cosim.live.outage import Reborn, simulate_with
 from tests.cosim.record.changed_records import changed, flipped
-from tests.machine_parts import controller_of
+from tests.cosim.simulation.outage import Reborn, simulate_with
+from tests.helpers.machine_parts import controller_of
 
 ROOT = Path(__file__).parents[3]
 SHORT = (

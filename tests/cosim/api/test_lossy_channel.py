@@ -130,7 +130,7 @@ def test_a_seed_gives_the_same_bits_and_each_episode_has_other_losses() -> None:
 
 @pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
 @pytest.mark.filterwarnings("ignore:.*WARN:UserWarning")  # of the environments' own spaces
-def test_it_passes_the_check_of_gymnasium(name: str) -> None:
+def test_the_environment_passes_the_check_of_gymnasium(name: str) -> None:
     env = noack.LossyChannel(gymnasium.make(name), {**HALF, "actuation": HALF}, step_s=STEP_S)
     check_env(env, skip_render_check=True)
     made_again = gymnasium.make(env.spec)  # it records how it was made

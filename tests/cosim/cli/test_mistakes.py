@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from tests.approved import compare_lines
 from tests.command_line import invoke
+from tests.helpers.approved import compare_lines
 
 
 def noack(line: str) -> Result:

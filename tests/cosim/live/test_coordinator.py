@@ -15,9 +15,9 @@ from noack.core.errors import CallerError
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import load
-from tests.approved import compare_lines, lines_of_error
 from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
+from tests.helpers.approved import compare_lines, lines_of_error
 
 JUNK: list[bytes | None] = [
     None, b"", b"{", b"\xff", b"[]", b"{}", b"null", b'{"rows": 1}', b"[" * 100_000,
@@ -246,7 +246,7 @@ def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "hosts.toml"
 
 
-def test_processes_without_a_table_stay_here(hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_without_a_table_run_on_this_host(hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hosts.write_text(f'listen = "192.0.2.1:7400"\n{ROBOT}')
     found = remote_access.listening_for(hosts)
     assert found.address == ("192.0.2.1", 7400)

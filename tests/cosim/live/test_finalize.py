@@ -39,8 +39,8 @@ from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.scenario_file import dumps, load
 from tests.cosim.record.changed_records import changed
-from tests.cosim.summaries import alone
-from tests.shipped import resolved, shipped
+from tests.helpers.shipped import resolved, shipped
+from tests.helpers.summaries import alone
 
 pytestmark = pytest.mark.usefixtures("no_report")
 

@@ -48,14 +48,14 @@ def test_the_likelihood_is_that_of_the_forward_algorithm(
     assert LossLikelihood(bursts, left_out)(one) == pytest.approx(expected, abs=1e-9)
 
 
-def test_the_chain_is_the_emulators() -> None:
+def test_the_fitted_chain_has_the_matrices_of_the_emulators() -> None:
     chain = GilbertElliottLoss(**ELLIOTT._asdict()).chains()[0]
     _, delivers, loses = ELLIOTT.matrices()
     np.testing.assert_allclose(delivers + loses, chain.moves)
     np.testing.assert_allclose(loses, chain.moves * chain.acts)
 
 
-def test_gilberts_chain_in_closed_form() -> None:
+def test_the_fit_of_gilberts_chain_is_the_share_of_its_moves() -> None:
     lost = np.array([0, 0, 1, 1, 0, 1, 0, 0, 0, 1], bool)  # by hand: 6 from good, 3 of them to bad
     fit = ChainFits(loss_bursts(~lost)).gilbert.estimates
     assert (fit["good_to_bad"].value, fit["bad_to_good"].value) == (3 / 6, 2 / 3)  # type: ignore[union-attr]
@@ -111,13 +111,13 @@ def test_the_test_of_lengths_rejects_at_its_level_and_wrong_models() -> None:
 
 
 @pytest.mark.parametrize(("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39)])
-def test_poisson_intervals_are_garwoods(count: int, low: float, high: float) -> None:
+def test_poisson_intervals_are_those_of_garwood(count: int, low: float, high: float) -> None:
     """Garwood, Biometrika 28, 1936, and every table since."""
     estimate = poisson_estimate(count, 2.0)
     np.testing.assert_allclose(estimate, [count / 2, low / 2, high / 2], rtol=2e-3)
 
 
-def test_binomial_and_exponential_intervals_at_their_edges() -> None:
+def test_intervals_of_0_and_of_all_events_are_those_of_the_likelihood() -> None:
     assert binomial_estimate(0, 0) is None
     assert exponential_estimate(0, 3.0) is None
     never, always = binomial_estimate(0, 50), binomial_estimate(50, 50)

@@ -246,7 +246,7 @@ def test_opportunities_delay_a_probe_until_the_next_one(tmp_path: Path) -> None:
     assert "5 in 0.2 s, 0.3008 Mbit/s; longest time without one: 100 ms, before 0.2 s" in trace.notes[0]
 
 
-def test_sources_that_are_none(tmp_path: Path) -> None:
+def test_files_that_cannot_be_measured_are_refused_in_one_line(tmp_path: Path) -> None:
     csv = tmp_path / "a.csv"
     csv.write_text("sent_ms,received_ms\n0,1\n")
     for paths, options, message in (

@@ -24,7 +24,7 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import most_events
 from noack.theory.certificates.scenario_certificates import outside_box
 from tests.command_line import invoke
-from tests.shipped import resolved, shipped
+from tests.helpers.shipped import resolved, shipped
 
 ROOT = Path(__file__).parents[3]
 

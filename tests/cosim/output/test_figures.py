@@ -39,7 +39,7 @@ from noack.core.errors import CallerError
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from tests.cosim.output.conftest import CASES, HOSTILE, scenario_of
 from tests.cosim.record.changed_records import changed
-from tests.cosim.summaries import summary_of
+from tests.helpers.summaries import summary_of
 
 T_S = np.arange(1.0, 5.0)
 

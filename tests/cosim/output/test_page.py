@@ -24,7 +24,7 @@ from noack.scenario.scenario_file import dumps as scenario_toml
 from tests.command_line import invoke
 from tests.cosim.lab.conftest import started
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
-from tests.cosim.summaries import alone, summary_of
+from tests.helpers.summaries import alone, summary_of
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]

@@ -17,9 +17,9 @@ from cosim.live.finalize import finalize, reopen
 from cosim.output.run_tables import short_numbers
 from cosim.output.run_verdict import print_outcome, remarks, state_text, verdict
 from cosim.simulation.virtual_time import simulate_run
-from tests.approved import compare_lines
-from tests.cosim.summaries import with_values
-from tests.shipped import shipped
+from tests.helpers.approved import compare_lines
+from tests.helpers.shipped import shipped
+from tests.helpers.summaries import with_values
 
 RED, RED_STYLE = "\x1b[1;31m", "bold red"
 LOST = {"t_s": 2.5, "process": "controller", "cause": "dropouts", "what": "MANSD violated: 6 lost"}

@@ -15,9 +15,9 @@ import noack
 from cosim.output import result_tables
 from cosim.output.run_tables import summary_tables
 from noack.core.errors import CallerError
-from tests.approved import compare_text
 from tests.command_line import invoke
 from tests.cosim.output.test_page import Page
+from tests.helpers.approved import compare_text
 
 APPROVED = Path(__file__).with_name("approved")
 _STARTED = re.compile(r"started [\w:+-]+")

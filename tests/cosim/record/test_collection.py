@@ -23,7 +23,7 @@ from noack.runtime.spool import SPOOL, SpoolWriter, writer_of
 from noack.runtime.telemetry import OwnSpool
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario_file import validate
-from tests.cosim.summaries import alone
+from tests.helpers.summaries import alone
 
 RUN = "0123456789abcdef"
 SECRETS = {"controller": "known to the controller", "plant": "known to the plant"}
@@ -241,7 +241,7 @@ def test_a_record_that_cannot_be_completed_changes_nothing(
     assert contents(run_dir.parent) == before
 
 
-def test_what_is_no_kept_folder_of_this_run_is_refused(run_dir: Path, kept: Kept, tmp_path: Path) -> None:
+def test_a_folder_without_kept_rows_of_this_run_is_refused(run_dir: Path, kept: Kept, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="nothing was kept there"):
         collect(run_dir, str(tmp_path), finish_record)
     kept.keep()

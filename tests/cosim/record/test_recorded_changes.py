@@ -22,7 +22,7 @@ from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed, identity_residual
 from tests.cosim.simulation.shuttle import Shuttle
-from tests.machine_parts import controller_of, sensor_of
+from tests.helpers.machine_parts import controller_of, sensor_of
 
 MS = 1_000_000
 CONTENT: dict[str, Any] = {

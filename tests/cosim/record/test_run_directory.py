@@ -134,7 +134,7 @@ def test_a_run_of_another_user_is_not_opened(runs: Path, whose: str) -> None:
     assert chosen_run(runs / "first", runs) == runs / "first"  # the link's name identifies the run
 
 
-def test_names_of_folders_and_of_files_of_loops(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_utf8_is_refused_and_a_loops_file_names_it(tmp_path: Path) -> None:
     folder = tmp_path / os.fsdecode(b"r\xff")
     for refused in (lambda: new_run_dir(folder, "x"), lambda: chosen_run(folder, tmp_path)):
         with pytest.raises(CallerError, match="is not UTF-8; rename it"):

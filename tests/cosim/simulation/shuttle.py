@@ -19,9 +19,9 @@ from noack.runtime.life_cycle import HORIZON
 from noack.scenario.parameter_changes import change_notice, scheduled
 from noack.scenario.resolution import tables_of
 from noack.scenario.scenario import Scenario, phases_ns
-from tests.machine_parts import Machine, controller_of, plant_of, sensor_of
+from tests.helpers.machine_parts import Machine, controller_of, plant_of, sensor_of
+from tests.helpers.wire_decoder import Decoder
 from tests.netem.stepped_channel import SteppedChannel
-from tests.wire_decoder import Decoder
 
 KEY = bytes(KEY_BYTES)
 MACHINES: Mapping[str, Callable[[Scenario], Machine[Any]]] = {

@@ -1,12 +1,10 @@
-"""Exact event times against closed forms; the loop on the plant grid against exponentials."""
+"""Exact event times against closed forms, and the output of `noack simulate --trigger continuous`."""
 
 import itertools
 import json
 import math
-from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,8 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from cosim.analysis.fidelity import recorded_loop
-from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import (
     POINTS,
     ContinuousLoop,
@@ -26,17 +22,15 @@ from cosim.simulation.continuous import (
     run_continuous,
     simulate_continuous,
 )
-from cosim.simulation.plant_grid_loop import PlantGridLoop, PlantGridRun, StepSchedule
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
-from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP, Fate
-from noack.scenario.resolution import LoopMatrices, policy_of, resolve
+from noack.protocol.record_tables import NETEM_PACKET, Fate
+from noack.scenario.resolution import LoopMatrices, resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load, validate
+from noack.scenario.scenario_file import load
 from noack.trigger.trigger_rule import TriggerRule
-from tests.example_rules import decaying_rule
-from tests.oracles.random_scenarios import POLICIES, random_scenario
+from tests.helpers.example_rules import decaying_rule
 
 
 def loop_with(
@@ -88,7 +82,7 @@ def cases(draw: st.DrawFn) -> Case:
 
 @given(cases())
 @settings(max_examples=15)
-def test_what_holds_between_events(case: Case) -> None:
+def test_the_threshold_is_reached_at_events_only_and_i1_holds_between_them(case: Case) -> None:
     """The threshold is never exceeded, and reached at each event; (I1) gives x_c − x_s."""
     run, H = case.run(), case.loop.H
     t_s = np.linspace(0, run.reached_s, 101)
@@ -173,7 +167,7 @@ def test_very_short_crossings_are_found(depth: float, omega: float, floored: boo
     assert turning(-depth, omega, floored).run().event_s.size == 0
 
 
-def test_dense_output_is_right_continuous() -> None:
+def test_samples_at_the_time_of_an_event_are_those_after_it() -> None:
     case = turning(0.3, 7.0, False)
     run = case.run()
     assert len(run.before) >= 1
@@ -245,98 +239,3 @@ def test_the_json_document_agrees_with_the_run(resolved: Scenario) -> None:
     assert np.max(np.array(samples["e_s_norm"]) / samples["threshold"]) <= 1 + 1e-12
     errors = np.array(samples["x_c"]) - np.array(samples["x"])
     np.testing.assert_allclose(np.linalg.norm(errors, axis=1), samples["e_c_norm"], atol=1e-12)
-
-
-# --- the loop on the plant grid -------------------------------------------------------------------
-
-
-def simulated(number: int) -> RunRecord:
-    """A random scenario without what the loop on the plant's grid does not have."""
-    content: dict[str, Any] = random_scenario(number)
-    for section, keys in (
-        (content, ("observer", "changes")),
-        (content["plant"], ("disturbances", "measurement", "watchdog")),
-        (content["network"], ("protocol", "acknowledgements", "actuation")),
-        (content["controller"], ("setpoint", "safe_input", "predictions", "update_timeout_s")),
-    ):
-        for key in keys:
-            section.pop(key, None)
-    return simulate(resolve(validate(content, "random")))
-
-
-def is_known(record: RunRecord) -> bool:
-    return record.scenario.network.initial_sync == "known_state"
-
-
-def on_the_grid(record: RunRecord, schedule: StepSchedule, *, delay: bool, hold: bool) -> PlantGridRun:
-    system = ContinuousLoop(record.loop, policy_of(record.scenario))
-    loop = PlantGridLoop(system, schedule, known_start=is_known(record))
-    return loop.run(delay=delay, hold=hold)
-
-
-def step_by_step(record: RunRecord, schedule: StepSchedule, *, delay: bool) -> tuple[Matrix, list[int]]:
-    """x at each step and the events of the decaying rule, one exponential at a time."""
-    loop, n, trigger = record.loop, record.loop.n, record.scenario.decaying
-    W = np.eye(n) if loop.weight is None else loop.weight
-    both = np.block([[loop.A, loop.B @ loop.K], [np.zeros((n, n)), loop.H]])
-
-    @lru_cache(None)
-    def transition(dt_ns: int) -> Matrix:
-        return np.asarray(expm(both * (dt_ns * 1e-9)))
-
-    x_s, common = loop.x0, is_known(record)
-    z = np.concatenate([loop.x0, loop.x0 if common else 0 * loop.x0])
-    in_flight: list[tuple[int, int, int, Any]] = []
-    newest, events, states = -1, [], []
-    for step, is_measured in enumerate(schedule.measured):
-        now_ns = step * schedule.period_ns
-        states.append(z[:n])
-        error = float(np.linalg.norm(W @ (x_s - z[:n])))
-        level = max(trigger.beta * np.exp(-trigger.alpha_per_s * now_ns * 1e-9), trigger.floor)
-        if is_measured and (not common or error > level):
-            x_s, common = z[:n], True
-            if schedule.delivered(len(events)):
-                wait_ns = schedule.delay_ns(len(events)) if delay else 0
-                in_flight.append((now_ns + wait_ns, len(events), now_ns, z[:n]))
-            events.append(step)
-        at_ns = now_ns
-        for acts_ns, number, event_ns, x in sorted(in_flight, key=lambda entry: entry[:2]):
-            if acts_ns >= now_ns + schedule.period_ns:
-                continue
-            z = transition(acts_ns - at_ns) @ z
-            at_ns = acts_ns
-            if number > newest:
-                newest = number
-                z = np.concatenate([z[:n], transition(acts_ns - event_ns)[n:, n:] @ x])
-            in_flight = [entry for entry in in_flight if entry[1] != number]
-        z = transition(now_ns + schedule.period_ns - at_ns) @ z
-        x_s = transition(schedule.period_ns)[n:, n:] @ x_s
-    return np.array(states), events
-
-
-@pytest.mark.parametrize("delay", [False, True])
-def test_it_is_what_one_exponential_after_another_gives(delay: bool) -> None:
-    for number in range(POLICIES.index("decaying"), 120, len(POLICIES)):
-        record = simulated(number)
-        whole = recorded_loop(record).schedule
-        late = replace(whole, measured=whole.measured & (np.arange(len(whole.measured)) > 3))
-        for schedule in (whole, late):
-            found = on_the_grid(record, schedule, delay=delay, hold=False)
-            expected, events = step_by_step(record, schedule, delay=delay)
-            assert found.event_steps.tolist() == events
-            # Products, each with an error of about 1e-16 of the state, which may grow.
-            size = np.abs(expected).max()
-            np.testing.assert_allclose(found.x, expected, rtol=0, atol=1e-12 * size)
-
-
-@pytest.mark.parametrize("first", range(len(POLICIES)))
-def test_with_all_effects_it_is_what_the_machines_do(first: int) -> None:
-    """Losses, delays, reordering, all kinds of rates and phases."""
-    for number in range(first, 4 * len(POLICIES), len(POLICIES)):
-        record = simulated(number)
-        live = recorded_loop(record)
-        found = on_the_grid(record, live.schedule, delay=True, hold=True)
-        expected = record[PLANT_STEP]["x"][: len(found.x)]
-        np.testing.assert_allclose(found.x, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-        period_s = record.scenario.timing.plant_period_ns * 1e-9
-        np.testing.assert_allclose(found.event_steps * period_s, live.event_s, rtol=1e-12)

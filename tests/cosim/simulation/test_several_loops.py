@@ -19,7 +19,7 @@ Content = dict[str, Any]
 UDP_AND_IP_BYTES = 28
 
 
-def same(alone: RunRecord, record: RunRecord) -> None:
+def require_same_rows(alone: RunRecord, record: RunRecord) -> None:
     """Compare all rows; the heads of the packets have the loop's number."""
     for table in alone.tables:
         for name in alone[table].dtype.names or ():
@@ -57,7 +57,7 @@ def test_the_first_loop_is_the_run_without_loops(short: Content, protocol: str, 
     assert all(only[t].tobytes() == alone[t].tobytes() for t in alone.tables)
     assert (only.notices, only.reports) == (alone.notices, alone.reports)
     if protocol == "none":  # the flow of an acknowledgement has another number among four loops
-        same(alone, run(short, {"name": "a", "count": 4}).loops[0])
+        require_same_rows(alone, run(short, {"name": "a", "count": 4}).loops[0])
 
 
 @pytest.fixture
@@ -120,8 +120,24 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     assert found.first_difference.column == "head"
 
 
+def shares_of(level: int) -> tuple[float, float]:
+    """Return the shares of the threshold for which an error level stands, by docs/wire.md.
+
+    Level 128 + 16 k + j stands for shares from 2^k (1 + j/16) to the next one; 1 also for smaller
+    ones, 255 also for larger ones.
+    """
+    least, following = (2.0 ** (k // 16 - 8) * (1 + k % 16 / 16) for k in (level, level + 1))
+    return 0.0 if level == 1 else least, np.inf if level == 255 else following
+
+
+def error_levels(record: RunRecord) -> list[int]:
+    """Return the error level in the header of each update of a loop."""
+    heads = np.ascontiguousarray(record[NETEM_PACKET]["head"])
+    levels: list[int] = heads.view(HEADER_ROW)["error_level"].tolist()
+    return levels
+
+
 def test_updates_report_their_errors_to_a_queue_that_chooses_by_them(crowded: Content) -> None:
-    """Level 128 + 16 k + j stands for shares of the threshold from 2^k (1 + j/16) to the next one."""
     triggers: Content = {
         "decaying": {"beta": 0.01, "alpha_per_s": 0.2, "floor": 0.01},
         "periodic": {"period_s": 0.03},
@@ -129,23 +145,22 @@ def test_updates_report_their_errors_to_a_queue_that_chooses_by_them(crowded: Co
         "send_on_area": {"delta_s": 0.002},
     }
     loops = [{"name": name, "trigger": {"policy": name, **keys}} for name, keys in triggers.items()]
-    plain = run(crowded, *loops)
+    tail_drop = run(crowded, *loops)
     crowded["network"]["impairments"][0]["discipline"] = {"kind": "maximum_error"}
     shared = run(crowded, *loops)
     assert replay(shared.network).bit_exact
+    assert all(set(error_levels(record)) == {0} for record in tail_drop.loops)
     seen: set[int] = set()
-    for before, record in zip(plain.loops, shared.loops, strict=True):
-        assert not np.ascontiguousarray(before[NETEM_PACKET]["head"]).view(HEADER_ROW)["error_level"].any()
+    for record in shared.loops:
         assert replay(record).bit_exact
-        events = record[SENSOR_MEASUREMENT][record[SENSOR_MEASUREMENT]["event"] >= 0]
-        levels = np.ascontiguousarray(record[NETEM_PACKET]["head"]).view(HEADER_ROW)["error_level"]
-        assert levels[0] == 255  # the controller knows nothing yet
-        sides = zip(events["e_s_norm"], events["compared"], events["threshold"], strict=True)
-        for level, (error, left, right) in list(zip(levels.tolist(), sides, strict=True))[1:]:
-            share = left / right if right else error  # a periodic trigger has no threshold
-            least, following = (2.0 ** (k // 16 - 8) * (1 + k % 16 / 16) for k in (level, level + 1))
-            assert level == 1 or least <= share
-            assert level == 255 or share < following
-            seen.add(level)
+        first_level, *levels = error_levels(record)
+        assert first_level == 255  # the controller knows nothing yet
+        events = record[SENSOR_MEASUREMENT][record[SENSOR_MEASUREMENT]["event"] >= 0][1:]
+        for level, event in zip(levels, events, strict=True):
+            # A periodic trigger has no threshold: its level is that of the error itself.
+            share = event["compared"] / event["threshold"] if event["threshold"] else event["e_s_norm"]
+            least, following = shares_of(level)
+            assert least <= share < following
+        seen.update(levels)
     assert min(seen) < 120
     assert max(seen) > 136

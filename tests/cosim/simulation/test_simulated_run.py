@@ -5,13 +5,11 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 import rerun.chunk
 from typer.testing import Result
 
 from cosim.analysis.summary import network_summary
-from cosim.analysis.summary.network_summary import in_flight
 from cosim.analysis.summary.summary_model import ReplayPart, read_summary
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint
@@ -20,8 +18,8 @@ from cosim.record.run_record import RecordedRun, RunRecord, load_record
 from cosim.simulation.virtual_time import Progress, simulate, simulate_run
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.number_format import number as written
-from noack.protocol.record_tables import NETEM_PACKET, tables
-from noack.scenario.resolution import network_tables, resolve
+from noack.protocol.record_tables import tables
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.command_line import invoke
@@ -63,7 +61,7 @@ def test_a_live_run_in_which_no_loop_sent_anything_has_not_failed(
     assert summary.exit.status == ExitStatus.OK
 
 
-def test_the_summary_adds_up(run_dir: Path) -> None:
+def test_the_counts_of_the_loops_add_up_to_those_of_the_network(run_dir: Path) -> None:
     summary = json.loads((run_dir / "summary.json").read_text())
     assert read_summary(summary) is not None
     assert read_summary(summary | {"loops": summary["loops"][::-1]}) is None
@@ -80,27 +78,34 @@ def test_the_summary_adds_up(run_dir: Path) -> None:
     assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.02)
 
 
-@pytest.mark.usefixtures("no_drawing")
-def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
-    loop = (run_dir, "--loop", "periodic")
-    for words in ((run_dir,), loop):
-        shown = invoke("summary", *words)
+def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> None:
+    for options in ((), ("--loop", "periodic")):
+        shown = invoke("summary", run_dir, *options)
         assert shown.exit_code == 0, shown.output
-        assert shown.stdout.count("--loop periodic --verbose") == (words == loop)
-        replayed = invoke("replay", *words, "--json")
+        assert ("--loop periodic --verbose" in shown.stdout) == bool(options)
+        replayed = invoke("replay", run_dir, *options, "--json")
         assert replayed.exit_code == 0, replayed.output
         assert json.loads(replayed.stdout)["gaps"] == []
-    refused = invoke("summary", run_dir, "--loop", "x")
-    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
-    assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
     shown = invoke("summary", run_dir).stdout
     assert "bottleneck" in shown
     assert "guarantee not checkable in 11 of 11 loops: pendulum-01: no certificate: " in shown
-    assert invoke("report", *loop).exit_code == 0
+    refused = invoke("summary", run_dir, "--loop", "x")
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_the_summary_and_the_page_of_a_run_name_the_pages_of_its_loops(run_dir: Path) -> None:
+    assert invoke("report", run_dir, "--loop", "periodic").exit_code == 0
+    shown = "".join(invoke("summary", run_dir, "--loop", "periodic").stdout.split())
+    assert f"more:{run_dir}/report-periodic.htmland" in shown
     assert invoke("report", run_dir).exit_code == 0
     page = (run_dir / "report.html").read_text()
     assert '<a href="report-periodic.html">periodic</a>' in page
     assert "report-pendulum-01.html" not in page  # no report of that loop was written
+
+
+def test_a_report_is_refused_if_the_scenario_has_other_loops_than_the_record(run_dir: Path) -> None:
     scenario = run_dir / "scenario.toml"
     given = scenario.read_text()
     scenario.write_text(given.replace("count = 10", "count = 9"))
@@ -110,7 +115,7 @@ def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_recording")
-def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:
+def test_the_summary_of_all_loops_says_why_claims_are_void(tmp_path: Path) -> None:
     settings = ("horizon_s=1", "certificate.late_periods=20", 'loops=[{ name = "p", count = 3 }]')
     late = simulated(tmp_path, *settings, options=["--no-report"])
     claims = [claim for one in json.loads(late.stdout)["loops"] for claim in one["claims"]]
@@ -164,20 +169,6 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     assert re.match(r"guarantee not checkable in \d of 3 loops: ", shown[1])
     sent = sum(one["actuations"]["sent"] for one in summary["loops"])
     assert any(f" {sent} (" in line for line in shown)
-
-
-def test_the_number_in_flight_over_time() -> None:
-    """Two datagrams overlap from 10 to 20 s; a third did not wait, a fourth was lost."""
-    packets = np.zeros(4, network_tables()[NETEM_PACKET])
-    packets["copy_ns"] = -1
-    packets["now_ns"] = np.array([0, 10, 50, 60]) * 10**9
-    packets["release_ns"] = np.array([20 * 10**9, 30 * 10**9, 50 * 10**9, -1])
-    found = in_flight(packets, 100 * 10**9, 100 * 10**9)
-    assert (found.mean, found.max, found.width_s) == (pytest.approx(0.4), 2, 0.5)
-    assert found.max_by_interval[:60] == [1] * 20 + [2] * 20 + [1] * 20
-    assert not any(found.max_by_interval[61:])
-    assert found.mean_by_interval[20:40] == [2.0] * 20
-    assert in_flight(packets, 100 * 10**9, 40 * 10**9).mean == pytest.approx(1.0)  # stopped
 
 
 # --- one loop -------------------------------------------------------------------------------------

@@ -1,40 +1,103 @@
-"""Simulated runs: violations, long runs, a controller that stands still, acknowledgements."""
+"""Runs in virtual time: bit for bit those of the plain driver in Python; violations; long runs."""
 
-from functools import cache
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from cosim.analysis.certificates import Certificates
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.fidelity import IncomparableError, recorded_loop
-from cosim.analysis.replay import replay
 from cosim.analysis.summary.run_summary import summarise
-from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
-from cosim.simulation.continuous import continuous_loop_of
-from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.protocol.record_tables import (
-    ACKNOWLEDGEMENTS,
-    CONTROLLER_DELIVERY,
-    NETEM_PACKET,
-    SENSOR_ACKNOWLEDGEMENT,
-    SENSOR_MEASUREMENT,
-    UPDATES,
-    Fate,
-)
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario import Scenario
+from cosim.simulation.virtual_time import VirtualRun, simulate, simulate_loops
+from noack.core.core_library import core, ffi
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, OWNER, SENSOR_MEASUREMENT
+from noack.scenario.resolution import resolve, tables_of
+from noack.scenario.scenario import loops_of
 from noack.scenario.scenario_file import validate
-from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
-from tests.cosim.live.outage import CASES, POLICIES, at_the_end, with_outage
-from tests.oracles.link import Link
-from tests.shipped import resolved
+from tests.cosim.simulation.shuttle import Shuttle, shuttled
+from tests.helpers.shipped import resolved, shipped
+from tests.oracles.random_scenarios import POLICIES, random_scenario
+
+IMPAIRMENTS = [
+    {"kind": "duplicate", "probability": 0.3},
+    {"kind": "corrupt", "probability": 0.3},
+    {"kind": "delay", "delay_s": 0.01, "jitter_s": 0.01},
+]
+LOOPS = [
+    {"name": "pendulum", "count": 3},
+    {"name": "periodic", "trigger": {"policy": "periodic", "period_s": 0.1}},
+    {
+        "name": "oscillator",
+        "model": {"A": [[0.0, 1.0, 0.0], [-1.0, -0.1, 0.0], [0.0, 0.0, -1.0]],
+                  "B": [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
+                  "gain": [[-1.0, -1.0, 0.0], [0.0, 0.0, -1.0]]},
+        "plant": {"initial_state": [0.1, 0.0, 0.1], "initial_state_halfwidth": [0.0, 0.0, 0.0],
+                  "uncertainty_A": [[0.0] * 3] * 3, "uncertainty_B": [[0.0] * 2] * 3},
+    },
+]  # fmt: skip
+"""Those of the last entry have vectors of other lengths."""
+
+
+def require_equal(found: RunRecord, expected: RunRecord) -> None:
+    for table in expected.tables:
+        assert found[table].dtype == expected[table].dtype
+        assert found[table].tobytes() == expected[table].tobytes(), table
+    assert found.reports == expected.reports
+    assert found.notices == expected.notices
+
+
+@pytest.mark.parametrize("first", range(len(POLICIES)))
+def test_random_loops_run_as_by_the_plain_driver(first: int) -> None:
+    for number in range(first, 2 * len(POLICIES), len(POLICIES)):
+        scenario = resolve(validate(random_scenario(number), "random"))
+        require_equal(simulate(scenario), shuttled(scenario))
+
+
+def test_a_scripted_network_decides_as_in_the_plain_driver() -> None:
+    scenario = resolved("unstable_pendulum", "horizon_s=3.0")
+
+    def decide(data: bytes, now_ns: int) -> int | None:
+        return None if data[16] % 3 == 1 else now_ns % 70_000_000
+
+    require_equal(simulate(scenario, decide), shuttled(scenario, decide))
+
+
+def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
+    given = shipped("unstable_pendulum", "horizon_s=1.0").model_dump(mode="json", exclude_none=True)
+    rate = {"kind": "rate", "rate_bps": 50_000, "queue": 6}
+    network = given["network"] | {
+        "impairments": [rate, IMPAIRMENTS[1]], "actuation": {"impairments": IMPAIRMENTS},
+    }  # fmt: skip
+    scenario = validate(given | {"network": network, "loops": LOOPS}, "")
+    shuttle = Shuttle(scenario, [resolve(one) for one in loops_of(scenario)], numbered=True)
+    shuttle.run()
+    found = simulate_loops(scenario)
+    for table in ("netem_packet", "netem_release"):
+        rows = np.array(shuttle.rows.get(table, []), found.network[table].dtype)
+        assert rows.tobytes() == found.network[table].tobytes()
+    for number, record in enumerate(found.loops):
+        for table, dtype in tables_of(record.scenario).items():
+            if OWNER[table] != "netem":
+                own = [row[1:] for row in shuttle.rows.get(table, []) if row[0] == number]
+                assert np.array(own, dtype).tobytes() == record[table].tobytes(), table
+        received = record.reports["controller"]["channel"]
+        assert received == shuttle.decoders["controller"][number].report()
+    assert found.loops[4]["plant_step"]["x"].shape[1] == 3
+
+
+def test_numbers_of_no_simulation_are_refused() -> None:
+    scenario = resolved("unstable_pendulum", "horizon_s=1.0")
+    run = VirtualRun(scenario, (scenario,))
+    own = run.core
+    for name, value in (("loops", 2), ("sent_places", 3), ("sent_count", -1)):
+        before = getattr(own, name)
+        setattr(own, name, value)
+        assert core.noack_simulation_check(own) != ffi.NULL
+        setattr(own, name, before)
+    own.directions[2] = 1
+    assert core.noack_simulation_check(own) != ffi.NULL
+    own.directions[2] = 0
+    own.processes[1] = own.processes[0]
+    assert core.noack_simulation_check(own) != ffi.NULL
 
 
 @pytest.fixture
@@ -89,113 +152,3 @@ def test_each_packet_of_a_long_run_is_recorded_once_and_progress_is_reported(
     assert len(reported_ns) > 2
     assert reported_ns == sorted(reported_ns)
     assert 0 <= reported_ns[0] < reported_ns[-1] <= record.scenario.timing.horizon_ns
-
-
-# --- a controller that stands still ---------------------------------------------------------------
-
-
-DOCS = Path(__file__).parents[3] / "docs"
-
-
-@pytest.fixture(scope="module", params=["hold", "zero", "model"])
-def run(request: pytest.FixtureRequest) -> RunRecord:
-    """The controller stands still from 1 s to 1.4 s; its last tick before that is at 0.999 s."""
-    changes = [f"plant.watchdog.policy={request.param}", "horizon_s=2"]
-    return with_outage(resolved("lane_following", *changes), 1.0, 1.4)
-
-
-def test_the_beginning_and_end_of_a_trip_are_reported_and_replayed(run: RunRecord) -> None:
-    trips = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
-    assert trips == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
-    policy = run.scenario.plant.watchdog.policy
-    assert summarise(run, 0, "horizon").to_json()["watchdog"] == {
-        "policy": policy, "timeout_s": pytest.approx(0.1), "trips": 1,
-        "first_s": pytest.approx(1.1), "total_s": pytest.approx(0.302),
-    }  # fmt: skip
-    assert replay(run).bit_exact
-    if policy == "hold":
-        recorded_loop(run)
-        return
-    with pytest.raises(IncomparableError, match="no watchdog and no safe input"):
-        recorded_loop(run)
-
-
-def test_the_table_in_the_documentation_is_the_simulated_one() -> None:
-    """One number is simulated again; `python -m tests.cosim.live.outage` prints all rows."""
-    lines = (DOCS / "network.md").read_text().splitlines()
-    rows = [
-        [line for line in lines if line.startswith(f"| `{name}`, `{mode}` | {lasts_s:g} s |")]
-        for name, mode, lasts_s in CASES
-    ]
-    assert [len(row) for row in rows] == [1] * len(CASES)
-    name, mode, lasts_s = CASES[4]
-    held = rows[4][0].split(" | ")[2 + POLICIES.index("hold") + 1]
-    assert held == f"{at_the_end(name, mode, 'hold', lasts_s):.2g}"
-
-
-# --- acknowledgements (the baseline) --------------------------------------------------------------
-
-
-COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=6")
-
-
-def acknowledged(*overrides: str) -> Scenario:
-    return resolved("lane_acknowledged", *COARSE, *overrides)
-
-
-def plain(*overrides: str) -> Scenario:
-    return resolved("lane_following", *COARSE, *overrides)
-
-
-@cache
-def run_of(*overrides: str) -> RunRecord:
-    return simulate(acknowledged(*overrides))
-
-
-def fates(record: RunRecord, flow: int) -> list[int]:
-    rows = record[NETEM_PACKET]
-    found: list[int] = rows["fate"][rows["flow"] == flow].tolist()
-    return found
-
-
-def test_each_direction_has_its_own_random_stream() -> None:
-    record, other = run_of(), simulate(plain())
-    count = min(len(fates(record, UPDATES)), len(fates(other, UPDATES)))
-    assert count > 5
-    assert fates(record, UPDATES)[:count] == fates(other, UPDATES)[:count]
-    settings = LinkSettings(impairments=(LossOf(loss=BernoulliLoss(probability=0.5)),))
-    link = Link(settings, record.scenario.seeds.loss, "acknowledgement")
-    answers = fates(record, ACKNOWLEDGEMENTS)
-    expected = [Fate(link.decide(ACKNOWLEDGEMENTS, 48, 0).fate) for _ in answers]
-    assert answers == expected
-    assert {Fate.DELIVERED, Fate.DROPPED} == set(answers)
-
-
-def test_the_summary_counts_acknowledgements() -> None:
-    record = run_of()
-    summary = summarise(record, 0, "horizon").to_json()
-    found = summary["acknowledgements"]
-    assert found["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
-    assert found["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
-    assert found["lost"] > 0
-    assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # in flight at the end
-    assert summary["unintended_losses"] == summary["missing_samples"] == 0
-    assert summary["identity_residual_max"] is None
-    assert summarise(simulate(plain()), 0, "horizon").acknowledgements is None
-
-
-def test_the_baseline_has_no_claims() -> None:
-    record = run_of()
-    (claim,) = ClaimEvaluation(record).judge()
-    assert claim.verdict is ClaimVerdict.VOID
-    assert 'network.protocol = "ack"' in claim.why
-    assert ClaimEvaluation(record).envelopes() == []
-    (assumption,) = [a for a in assumptions(record.scenario) if "acknowledged" in a.what]
-    assert assumption.verdict is AssumptionStatus.VIOLATED
-    for refuse in (continuous_loop_of, lambda scenario: Certificates(scenario, 2)):
-        with pytest.raises(CallerError, match=r'network\.protocol = "ack": x_s is reset'):
-            refuse(record.scenario)
-    with pytest.raises(CallerError, match=r"network\.acknowledgements.*there are none unless"):
-        plain("network.acknowledgements.timeout_s=0.1")
-    back = ("network.protocol=none", "network.acknowledgements.timeout_s=0.1")
-    assert not plain(*back).protocol.acknowledges

@@ -18,12 +18,12 @@ from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from noack.scenario.sections import POLICIES as POLICY_KINDS
+from tests.helpers.wire_decoder import Decoder
 from tests.oracles.comparison import Comparison
 from tests.oracles.random_scenarios import POLICIES, random_scenario
 from tests.oracles.reference_run import settings_of, why_not
 from tests.oracles.trigger_rules import Array
 from tests.oracles.whole_loop import NONE
-from tests.wire_decoder import Decoder
 
 SCENARIOS = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
 RANDOM = 96
@@ -32,7 +32,7 @@ LONGEST_S = 2.0
 
 
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
-def test_a_shipped_scenario(path: Path) -> None:
+def test_a_shipped_scenario_runs_as_the_reference_loop(path: Path) -> None:
     scenario = load(path)
     if scenario.horizon_s > LONGEST_S and path.stem != "lane_5g_rural":  # it has an outage later
         scenario = load(path, [f"horizon_s={LONGEST_S}"])
@@ -56,7 +56,7 @@ def compared(number: int) -> Comparison:
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-def test_random_scenarios(policy: str) -> None:
+def test_random_scenarios_run_as_the_reference_loop(policy: str) -> None:
     first = POLICIES.index(policy)
     found = [compared(number) for number in range(first, RANDOM, len(POLICIES))]
     assert sum(one.tie_ns is not None for one in found) <= 1

@@ -100,7 +100,7 @@ def test_a_live_run_is_replayed_beside_a_simulation(tmp_path: Path) -> None:
     assert found.bit_exact
 
 
-def test_what_differs_is_named(archive: Path, tmp_path: Path) -> None:
+def test_a_repetition_names_what_differs(archive: Path, tmp_path: Path) -> None:
     files = files_of(archive)
     scenario = files["scenario.toml"].replace(b"beta = 0.5", b"beta = 0.25")
     environment = json.loads(files["environment.json"])

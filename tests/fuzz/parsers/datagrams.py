@@ -12,8 +12,8 @@ from noack.protocol.wire_format import Encoder, Flow, Message, Rejection, loop_n
 from noack.runtime.host_clocks.time_exchange import TIME_BYTES, TimeDatagram, TimeFormat, TimeKind
 from tests.fuzz.edits import Choices
 from tests.fuzz.harness import Harness, refusal
+from tests.helpers.wire_decoder import Decoder
 from tests.oracles.wire import KEY, RUN, BothReceivers, tag
-from tests.wire_decoder import Decoder
 
 WIRE_WORDS = (b"NA\x01", struct.pack("<Q", RUN))
 

@@ -13,7 +13,7 @@ from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from tests.fuzz.edits import Choices
 from tests.fuzz.harness import Harness
-from tests.netem.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
+from tests.noack.impairments.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
 
 SEEDS = (
     b"", bytes(range(256)), bytes(range(255, -1, -1)) * 2,

@@ -29,9 +29,9 @@ from tests.fuzz.edits import (
 )
 from tests.fuzz.harness import Harness, refusal, workspace
 from tests.fuzz.plane import Query
-from tests.netem.any_settings import words_can_say
-from tests.netem.control.relays import FakeRelay
-from tests.netem.feature_examples import CONSTRAINED, IMPAIRED
+from tests.netem.control.fake_relay import FakeRelay
+from tests.noack.impairments.any_link_settings import words_can_say
+from tests.noack.impairments.feature_examples import CONSTRAINED, IMPAIRED
 
 EXAMPLES = (
     *(one.text() for one in (*IMPAIRED, *CONSTRAINED)),

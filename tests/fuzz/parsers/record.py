@@ -38,10 +38,10 @@ from noack.protocol.record_tables import OWNER
 from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, batch_of, notices_of
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario_file import dumps, validate
-from tests.cosim.summaries import alone
 from tests.fuzz.edits import Choices, Vocabulary, damaged, edited, edited_table, written
 from tests.fuzz.harness import Harness, refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample
+from tests.helpers.summaries import alone
 
 SCENARIO = {
     "name": "short", "horizon_s": 0.05, "model": {"name": "double_integrator"},

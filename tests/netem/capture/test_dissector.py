@@ -71,7 +71,7 @@ def shown(fields: Fields, name: str) -> str:
 
 
 @pytest.mark.parametrize("encrypted", [False, True])
-def test_every_field_is_shown(tshark: Tshark, tmp_path: Path, encrypted: bool) -> None:
+def test_the_dissector_shows_every_field(tshark: Tshark, tmp_path: Path, encrypted: bool) -> None:
     messages = [
         Message(Flow.UPDATE, 2**64 - 1, -1, np.array([-0.0, 5e-324, -1.5e308]), error_level=255),
         Message(Flow.ACTUATION, 0, -(2**63), np.array([1.0])),
@@ -130,7 +130,7 @@ def test_a_damaged_datagram_is_shown_with_its_fault(tshark: Tshark, tmp_path: Pa
 
 
 @pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
-def test_the_documented_command_and_the_packet_list(tshark: Tshark, tmp_path: Path) -> None:
+def test_the_documented_command_shows_the_packet_list(tshark: Tshark, tmp_path: Path) -> None:
     (command,) = re.findall(r"^```sh\n(.*?)\n```", (DOCS / "wire.md").read_text(), re.DOTALL | re.M)
     (tmp_path / "docs").symlink_to(DOCS)
     encoder = Encoder(RUN, bytes(32))

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from netem.capture import CaptureWriter, PcapngSection
 from netem.relay_links import DIRECTIONS, EVENT, Bytes, Events
 from noack.core.errors import CallerError
-from tests.approved import compare_lines
+from tests.helpers.approved import compare_lines
+from tests.helpers.waiting import wait_for
 from tests.netem.capture.reader import (
     INTERFACES,
     SPECS,
@@ -89,7 +90,7 @@ def test_a_checksum_of_0_is_sent_as_ffff() -> None:
 
 
 @pytest.mark.parametrize(("family", "most"), [(4, 65_507), (6, 65_527)])
-def test_the_largest_datagram_fits(family: int, most: int) -> None:
+def test_a_capture_holds_the_largest_datagram(family: int, most: int) -> None:
     table, data = batch({"family": family, "payload": bytes(most)})
     section = PcapngSection(INTERFACES)
     file = read(section.header() + bytes(section.packets(table, data)))
@@ -157,7 +158,7 @@ def capturing(path: Path | str, **options: int) -> Iterator[CaptureWriter]:
         capture.close()
 
 
-def test_the_file_holds_the_batches(tmp_path: Path) -> None:
+def test_a_new_capture_replaces_an_older_file(tmp_path: Path) -> None:
     path = tmp_path / "capture.pcapng"
     path.write_bytes(b"an older capture" * 1000)
     with capturing(path) as capture:
@@ -197,8 +198,7 @@ def test_events_that_overflow_the_queue_are_reported_missing(
         capture.take(*batch({"interface": 1}))
         assert capture.missing_events == 3
         free.set()
-        while capture.written < 3:
-            pass
+        wait_for(lambda: capture.written == 3)
         capture.take(*batch({"interface": 1}, {"interface": 1}, {}))
     assert (capture.missing_events, capture.written, capture.error) == (3, 6, None)
     drop_counts = [packet.options.get(4, [b""])[0] for packet in read(path.read_bytes()).packets]

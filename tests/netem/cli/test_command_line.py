@@ -17,7 +17,7 @@ from netem.relay import Relay
 from netem.relay_links import LinkSpec
 from netem.tc_words import EXAMPLES, KEYWORDS, load_links, parse, settings_of
 from noack.impairments.kinds.loss import LOSS_WORDS
-from tests.approved import compare_lines
+from tests.helpers.approved import compare_lines
 
 ADDRESSES = "--listen :9000 --to :9001"
 

@@ -5,7 +5,7 @@ import pytest
 
 from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import CommandQueue
-from tests.netem.control.relays import FakeRelay, running
+from tests.netem.control.fake_relay import FakeRelay, running
 
 
 @pytest.fixture(autouse=True)

@@ -4,7 +4,6 @@ import io
 import json
 import sys
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, redirect_stderr
@@ -24,7 +23,8 @@ from netem.tc_words import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.runtime.address import address_text
 from noack.runtime.connections import metrics_server as servers
-from tests.netem.control.relays import FakeRelay, options, press_q, read_until, terminal
+from tests.helpers.waiting import wait_for
+from tests.netem.control.fake_relay import FakeRelay, options, press_q, read_until, terminal
 from tests.noack.runtime.test_log_and_metrics import read, slow_reader
 
 Values = dict[str, float]
@@ -85,8 +85,7 @@ def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(
         stack.enter_context(slow_reader(asked[0]))
         relay.counters["up", "forward"].received = 4
         reading = pool.submit(read, asked[0])
-        while not reading.done():
-            side.commands.run_pending()
+        wait_for(lambda: side.commands.run_pending() or reading.done())
         values = values_of(reading.result())
     assert threading.active_count() == threads
     assert values["noack_netem_received_datagrams_total,forward,up"] == 4
@@ -132,8 +131,7 @@ def test_a_full_disk_is_reported_and_the_relay_continues(relay: FakeRelay) -> No
         redirect_stderr(error),
         attached(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as side,
     ):
-        while not error.getvalue().endswith("\n"):
-            side.commands.run_pending()
+        wait_for(lambda: side.commands.run_pending() or error.getvalue().endswith("\n"))
     assert "cannot be written to /dev/full (No space left" in error.getvalue()
 
 
@@ -146,11 +144,7 @@ def test_the_view_shows_the_relay_and_later_messages_until_q(
             drawn = threads.submit(press_q, user, "q ends", "→ up", "a message")
             with attached(relay, options("--view")) as side:
                 print("a message", file=sys.stderr)
-                late_s = time.monotonic() + 20
-                while not side.quit_requested and time.monotonic() < late_s:
-                    side.commands.run_pending()
-                    time.sleep(0.01)
-                assert side.quit_requested
+                wait_for(lambda: side.commands.run_pending() or side.quit_requested)
             assert drawn.exception() is None
         read_until(user, lambda text: "forward →" in text.partition("\x1b[?1049l")[2])
     assert capsys.readouterr().err == "a message\n"

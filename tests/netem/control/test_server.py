@@ -23,10 +23,10 @@ from netem.fates import FateRecorder
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.control_plane import open_session
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.conftest import Emulate
-from tests.netem.control import relays
-from tests.netem.control.relays import FakeRelay, press_q, read_until, terminal
+from tests.netem.control import fake_relay as relays
+from tests.netem.control.fake_relay import FakeRelay, press_q, read_until, terminal
 from tests.netem.fates.links import spec_of
 from tests.netem.relay.relays import endpoints
 
@@ -61,7 +61,7 @@ def test_a_session_is_found_while_it_lasts() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 65])
-def test_unfit_names_are_refused(name: str) -> None:
+def test_names_that_are_unsafe_as_file_names_are_refused(name: str) -> None:
     with pytest.raises(CallerError, match="use letters, digits"), registered_emulator(name):
         pass
 

@@ -29,8 +29,8 @@ from netem.relay_links import FlowReport
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
-from tests.approved import compare_text
-from tests.netem.control.relays import FakeRelay, running, times
+from tests.helpers.approved import compare_text
+from tests.netem.control.fake_relay import FakeRelay, running, times
 from tests.netem.fates.links import spec_of
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
@@ -164,7 +164,7 @@ def sample(elapsed_s: float, rate: float | None, seconds: float = 1.0) -> Statis
     return cast(Statistics, document)
 
 
-def test_the_history_of_the_last_minute() -> None:
+def test_a_sample_of_the_history_applies_to_the_time_since_the_one_before() -> None:
     """A sample applies to the time since the previous one."""
     every_second, every_ten = History(), History()
     assert series(every_second, 3) == [None] * 3

@@ -21,10 +21,10 @@ from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.protocol.record_tables import Fate
-from tests.approved import compare_lines, lines_of_error
 from tests.fuzz.parsers.fates import DOCUMENT, TABLE
-from tests.netem.any_settings import harsh
+from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record, spec_of
+from tests.noack.impairments.any_link_settings import harsh
 from tests.oracles.link import Link
 
 NOTHING = np.zeros(0, np.uint8)
@@ -166,7 +166,7 @@ def test_a_wrong_trace_is_refused_with_the_approved_line(path: Path) -> None:
     compare_lines(Path(__file__).with_name("mistakes.txt"), refusal)
 
 
-def test_other_files_are_refused(path: Path, tmp_path: Path) -> None:
+def test_files_that_are_no_fate_traces_are_refused(path: Path, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"cannot be read \(.*No such file"):
         read_fates(tmp_path / "none")
     with pytest.raises(CallerError, match="cannot be read"):
@@ -219,7 +219,7 @@ def test_the_same_arrivals_have_the_same_fates(
 def test_at_other_times_the_delays_are_the_same(
     folder: Path, link: LinkSettings, came: list[Arrival], data: st.DataObject
 ) -> None:
-    """tests/netem/test_mansd.py checks that the replay keeps the cap."""
+    """tests/noack/impairments/test_mansd.py checks that the replay keeps the cap."""
     before = record(folder / "fates.parquet", link, came)
     gaps = st.lists(st.integers(0, MAX_GAP_NS), min_size=len(came), max_size=len(came))
     mansd = data.draw(st.sampled_from([link.mansd, 0, 1, 2]))

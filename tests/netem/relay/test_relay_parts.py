@@ -98,7 +98,7 @@ def test_links_may_form_a_chain_but_not_a_cycle() -> None:
         open_and_close(chain("a", "b", "c", "b"))
 
 
-def test_an_impossible_link_is_refused() -> None:
+def test_a_link_whose_address_cannot_be_used_is_refused() -> None:
     there = ("127.0.0.1", 9)
     with endpoints(HOSTS[4]) as (other,):
         for specs, message in (
@@ -143,7 +143,9 @@ def test_the_table_of_clients_is_a_dictionary(
     assert sorted(table[table >= 0].tolist()) == sorted(model.values())
 
 
-def test_memory_is_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Half of the datagrams are delayed or copied; clients appear and expire."""
     rounds, size, most_clients = 8, 300, 5
     monkeypatch.setattr("netem.relay._RARE_PERIOD_NS", 0)

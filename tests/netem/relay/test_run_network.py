@@ -29,9 +29,9 @@ from noack.runtime.udp_sockets import bind
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from tests.machine_parts import Machine
-from tests.netem import any_settings
+from tests.helpers.machine_parts import Machine
 from tests.netem.relay.relays import PATIENCE_S, KeepAll, Received, drain, endpoints, name_of, relayed
+from tests.noack.impairments import any_link_settings as any_settings
 from tests.oracles.link import Datagram, Link, network_of
 
 NEVER_NS = 2**61
@@ -123,7 +123,7 @@ CROSSING = st.sampled_from([
     any_settings.harsh, any_settings.harsh, CROSSING, arrivals, st.integers(0, 2),
     st.sampled_from([1, 1, 2, 200]),
 )  # fmt: skip
-def test_any_arrivals_give_the_same_rows_and_datagrams(
+def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_the_plain_machine(
     forward: LinkSettings,
     reverse: LinkSettings,
     crossing: tuple[Flow, ...],
@@ -273,7 +273,7 @@ def replayed(
     sizes=st.lists(st.sampled_from([0, 1, 8, 72, 1472, 9000]), min_size=20, max_size=60),
     segment=st.booleans(),
 )
-def test_fates_and_order_are_the_machines(
+def test_the_relay_gives_datagrams_the_fates_and_the_order_of_the_plain_machine(
     forward: LinkSettings, reverse: LinkSettings, sizes: list[int], segment: bool
 ) -> None:
     tap = KeepAll()

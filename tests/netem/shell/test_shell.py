@@ -190,7 +190,7 @@ def test_a_system_that_does_not_permit_it_is_one_line_with_the_remedy() -> None:
 
 
 @pytest.mark.parametrize("killed", ["relay", "guard", "group", "all", "terminated"])
-def test_no_process_is_left(killed: str) -> None:
+def test_the_shell_leaves_no_process_behind(killed: str) -> None:
     """All of them have the pipe: its end is the end of the last one."""
     script = "(setsid sleep 1000 &) ; sleep 1000 & echo $PPID; wait"
     with subprocess.Popen(

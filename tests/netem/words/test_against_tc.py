@@ -14,7 +14,7 @@ from noack.core.errors import CallerError
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.lossless import NoLoss
-from tests.netem.any_settings import settings as any_settings
+from tests.noack.impairments.any_link_settings import settings as any_settings
 
 _SHIM = """
 #include <sys/socket.h>

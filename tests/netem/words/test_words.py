@@ -13,8 +13,8 @@ from netem.relay_links import LinkSpec
 from netem.tc_words import LinksFile, json_schema, load_links, parse, settings_of, words_of
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario import toml_file
-from tests.approved import compare_lines, lines_of_error
-from tests.netem.any_settings import settings, words_can_say
+from tests.helpers.approved import compare_lines, lines_of_error
+from tests.noack.impairments.any_link_settings import settings, words_can_say
 
 
 def test_words_are_the_approved_impairments() -> None:

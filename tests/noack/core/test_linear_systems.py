@@ -140,7 +140,7 @@ def test_without_a_set_point_the_flow_is_the_propagator_bit_for_bit() -> None:
 
 
 @given(st.lists(st.integers(0, 5 * 10**9), min_size=2, max_size=8))
-def test_changes_on_the_way_are_taken_where_they_are(times: list[int]) -> None:
+def test_changes_of_the_set_point_during_the_flow_apply_from_their_times(times: list[int]) -> None:
     *inner, end_ns = sorted(times)
     flow, by_hand, now_ns, x_r = ModelFlow(H), X, 0, np.zeros(2)
     for number, t_ns in enumerate(inner):

@@ -31,9 +31,9 @@ from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import CodedPolicy, Policy, TriggerDecision
 from plant_server.plant import Disturbance, MeasurementModel, Plant, Watchdog
 from sensor_node.sensor import Observer, Sensor
-from tests.example_rules import TABLES, random_rule
-from tests.machine_parts import OneLoop, SteppedMachines
-from tests.wire_decoder import NO_VECTOR
+from tests.helpers.example_rules import TABLES, random_rule
+from tests.helpers.machine_parts import OneLoop, SteppedMachines
+from tests.helpers.wire_decoder import NO_VECTOR
 
 MS = 1_000_000
 Rng = np.random.Generator

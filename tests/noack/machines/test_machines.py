@@ -22,9 +22,9 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from plant_server.plant import Plant
 from sensor_node.sensor import Sensor, sensors_of
-from tests.approved import compare_lines
-from tests.example_rules import TABLES
-from tests.machine_parts import OneLoop, SteppedMachines, machine
+from tests.helpers.approved import compare_lines
+from tests.helpers.example_rules import TABLES
+from tests.helpers.machine_parts import OneLoop, SteppedMachines, machine
 from tests.noack.machines.any_machines import (
     MS,
     Inputs,
@@ -198,7 +198,7 @@ def test_a_sensor_that_waits_without_acknowledgements_is_refused() -> None:
     assert text_of(own) == NOT_ACKNOWLEDGED
 
 
-def test_each_text_is_in_the_table() -> None:
+def test_every_text_of_the_machine_check_is_in_the_approved_file() -> None:
     texts = re.findall(r'(?:return|:) "([^"]+)"', SOURCE.read_text())
     told = {line.strip() for line in WRONG.read_text().splitlines() if line.startswith("    ")}
     assert told | {NOT_ACKNOWLEDGED} == {*texts}
@@ -212,6 +212,6 @@ def test_a_layout_with_a_word_that_the_machine_does_not_write_is_refused(word: i
     assert text_of(own) == "the rows of a table have another size than the machines write"
 
 
-def test_python_is_told_what_is_wrong() -> None:
+def test_a_machine_that_the_core_refuses_raises_its_text() -> None:
     with pytest.raises(ValueError, match=r"^controller: an actuation has more than 64 entries$"):
         LoopMachines([controller(1, OF._replace(predictions=31))])

@@ -16,7 +16,7 @@ from noack.plants.fmu import FmuSettings, FmuSystem
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import OdeSystem, PlantEquations, SystemFailedError
 from noack.settings.user_files import located
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 from tests.noack.plants.motion import motion
 from tests.plant_server.fmus.build import build
 

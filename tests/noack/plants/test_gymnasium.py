@@ -16,9 +16,9 @@ from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.plant_settings import PlantStart
 from noack.scenario.resolution import resolve
 from noack.scenario.toml_file import validated
-from tests.approved import compare_lines, lines_of_error
 from tests.command_line import invoke
-from tests.extras import skip_without_plant
+from tests.helpers.approved import compare_lines, lines_of_error
+from tests.helpers.shipped import skip_without_plant
 
 gymnasium = pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
 SCENARIOS = Path(__file__).parents[3] / "scenarios"

@@ -21,8 +21,8 @@ from noack.plants.systems.linearisation import linearise
 from noack.scenario.scenario import Scenario
 from noack.scenario.sections import PLANTS
 from plant_server.plant import system_of
+from tests.helpers.shipped import resolved
 from tests.noack.plants.motion import H_NS, motion
-from tests.shipped import resolved
 
 INDUCTANCES = (2.75e-6, 1e-3, 0.5)
 """The last one makes speed and current oscillate."""

@@ -16,7 +16,7 @@ from noack.plants.plant_settings import SystemFailedError
 from noack.plants.python_plant import PythonPlantSettings, PythonSystem
 from noack.plants.systems.code_cache import _one_at_a_time, cache_folder, compiler
 from noack.settings.user_files import located
-from tests.approved import compare_lines
+from tests.helpers.approved import compare_lines
 from tests.noack.plants.motion import H_NS, motion
 
 X0 = np.array([0.3, 0.0])

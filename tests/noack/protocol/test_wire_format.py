@@ -17,7 +17,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from noack.protocol.wire_format import Encoder, Flow, Header, Message, Rejection, loop_number, read_header
-from tests.approved import compare_text
+from tests.helpers.approved import compare_text
 from tests.oracles.wire import ACCEPTED, KEY, RUN, BothReceivers, datagram
 
 DOCS = Path(__file__).parents[3] / "docs"

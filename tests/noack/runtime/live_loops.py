@@ -20,7 +20,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
-from tests.machine_parts import SteppedMachines
+from tests.helpers.machine_parts import SteppedMachines
 
 RUN_ID, KEY = 7, bytes(range(32))
 HOUR_NS = 3600 * 10**9

@@ -29,7 +29,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import needs_root, output_of_another_user
 from tests.fuzz.plane import FakePlane
-from tests.integration.conftest import wait_for
+from tests.helpers.waiting import wait_for
 
 
 @pytest.fixture

@@ -20,8 +20,8 @@ from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEA
 from noack.protocol.roles import Record
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.live_driver import LiveDriver
+from tests.helpers.wire_decoder import NO_VECTOR
 from tests.noack.runtime.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
-from tests.wire_decoder import NO_VECTOR
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NOW = "now_ns"

@@ -26,8 +26,8 @@ from noack.runtime.command_line import LogFormat, failed, log_event, log_format,
 from noack.runtime.connections import connection_gate
 from noack.runtime.connections import metrics_server as servers
 from noack.runtime.connections.metrics_server import metrics_server
-from tests.approved import lines_of_error
 from tests.command_line import invoke
+from tests.helpers.approved import lines_of_error
 
 Object = dict[str, Any]
 
@@ -46,7 +46,7 @@ def standard_error(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     return stream
 
 
-def test_lines_become_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_line_of_the_log_becomes_a_json_object(monkeypatch: pytest.MonkeyPatch) -> None:
     error = standard_error(monkeypatch)
     with log_format(LogFormat.JSONL):
         print_to_stderr("noack: warning: no disk")
@@ -78,7 +78,7 @@ def test_an_event_has_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (found["event"], found["x"], found["n"], found["p"]) == ("progress", None, 3, "a")
 
 
-def test_a_mistake_is_an_object() -> None:
+def test_a_mistake_becomes_a_json_object() -> None:
     done = invoke("run", "nowhere", "--log-format", "jsonl")
     (found,) = objects(done.stderr)
     assert (done.exit_code, found["level"]) == (2, "error")
@@ -180,7 +180,7 @@ def test_a_request_has_a_time_limit_however_it_arrives(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("sent", [b"\n\n", b"GET\r\n\r\n", b"\0 \0 \0\n\n", b"a" * 20_000])
-def test_what_is_no_request_is_refused(sent: bytes) -> None:
+def test_a_message_that_is_no_http_request_is_refused(sent: bytes) -> None:
     with metrics_server(":0", collect) as address, socket.create_connection(address) as reader:
         reader.settimeout(60)
         with suppress(ConnectionError):

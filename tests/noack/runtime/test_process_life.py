@@ -36,7 +36,7 @@ NEXT = {(row[0], event): state for row in ROWS for event, state in zip(HEAD, row
 
 
 @pytest.mark.parametrize(("state", "event"), list(product(State, Event)))
-def test_every_state_with_every_event(state: State, event: Event) -> None:
+def test_every_event_in_every_state_does_what_the_table_says(state: State, event: Event) -> None:
     for side in Side:
         life = LifeCycle("sensor", side)
         life.state, expected = state, NEXT[state.name, event.name]

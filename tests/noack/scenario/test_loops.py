@@ -11,7 +11,7 @@ from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario, loop_names, loops_of, phases_ns
 from noack.scenario.scenario_file import load, toml_text, validate
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 
 
 def with_loops(content: dict[str, Any], *loops: dict[str, Any]) -> Scenario:

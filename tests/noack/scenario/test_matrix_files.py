@@ -18,7 +18,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load
 from noack.scenario.sections import ModelSection
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 
 A = np.array([[0.0, 1.0], [4.0, -0.25]])
 B = np.array([[0.0], [1.0]])

@@ -27,7 +27,7 @@ from noack.scenario.runtime_parameters import is_of_loss_alone, text_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.scenario_file import load, validate
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 SEEDS = range(60)

@@ -23,8 +23,8 @@ from noack.scenario.resolution import loop_named, resolve, resolved_loops
 from noack.scenario.response_times import Sender, response_ns
 from noack.scenario.scenario import Scenario, loop_names
 from noack.theory.certificates.conditions import allowed_conditions, certified_delay_s, network_delay_texts
+from tests.helpers.shipped import shipped
 from tests.netem.stepped_channel import send
-from tests.shipped import shipped
 
 US = 1000
 LOWER, HIGHER = -math.inf, math.inf

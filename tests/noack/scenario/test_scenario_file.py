@@ -22,8 +22,8 @@ from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import dumps, load, put, validate, value_of
 from noack.settings.section import ScenarioSection
 from noack.settings.user_files import NamedFile
-from tests.approved import compare_lines
-from tests.extras import skip_without_plant
+from tests.helpers.approved import compare_lines
+from tests.helpers.shipped import skip_without_plant
 
 SHIPPED = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
 Content = dict[str, Any]
@@ -204,7 +204,7 @@ LIMITED = """
 import resource, sys
 from pathlib import Path
 from noack.scenario.toml_file import read
-from tests.approved import compare_lines
+from tests.helpers.approved import compare_lines
 from noack.core.errors import CallerError
 usage = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 limit = usage + 64 * 2**20

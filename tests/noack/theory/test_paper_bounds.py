@@ -23,8 +23,9 @@ from noack.theory.paper import (
     theorem_2,
 )
 from noack.trigger.trigger_rule import TriggerRule
-from tests.example_rules import decaying_rule
-from tests.noack.theory.certificate_kinds.policies import INSTANT
+from tests.helpers.example_rules import decaying_rule
+from tests.helpers.shipped import resolved
+from tests.noack.theory.certificates.certificate_kinds.policies import INSTANT
 from tests.oracles.continuous_loops import simulate_continuous_time
 from tests.oracles.lossy_loops import (
     ROUNDING,
@@ -36,7 +37,6 @@ from tests.oracles.lossy_loops import (
     systems,
     times_s,
 )
-from tests.shipped import resolved
 
 
 def norm(matrix: Matrix) -> float:

@@ -29,11 +29,11 @@ from noack.traces.packet_trace import (
     read_trace,
     relative_delays,
 )
-from tests.approved import compare_lines, lines_of_error
+from tests.helpers.approved import compare_lines, lines_of_error
 from tests.oracles.capture_files import LINKS, Sent, pcap_of, pcapng_of
 
 
-def test_units_order_and_lost_packets(tmp_path: Path) -> None:
+def test_columns_of_any_unit_and_order_give_the_trace_with_its_lost_packets(tmp_path: Path) -> None:
     file = tmp_path / "trace.csv"
     file.write_text(
         "\ufeffsent_s, note,received_us,sequence\r\n"
@@ -141,7 +141,7 @@ def test_an_unknown_name_of_a_trace_gets_the_known_ones(tmp_path: Path) -> None:
         Replay(file="rural").without_files(tmp_path, "")
 
 
-def test_nothing_received() -> None:
+def test_a_trace_of_which_nothing_was_received_has_only_losses() -> None:
     trace = packet_trace(np.arange(3), np.zeros(3, np.int64), np.ones(3, bool))
     assert relative_delays(trace).lost.all()
 
@@ -171,7 +171,9 @@ def document(count: int = COUNT) -> dict[str, Any]:
 
 @pytest.mark.parametrize("indent", [None, 4])
 @pytest.mark.parametrize("compress", [False, True])
-def test_round_trips_are_read(indent: int | None, compress: bool, tmp_path: Path) -> None:
+def test_irtt_gives_losses_and_delays_of_round_trips(
+    indent: int | None, compress: bool, tmp_path: Path
+) -> None:
     data = json.dumps(document(), indent=indent, ensure_ascii=False).encode()
     path = tmp_path / "irtt.json"
     path.write_bytes(gzip.compress(data) if compress else data)
@@ -193,7 +195,7 @@ def test_round_trips_are_read(indent: int | None, compress: bool, tmp_path: Path
         (lambda d: d["round_trips"][0].update(ipdv="x" * 200_000), "more than 65536 characters"),
     ],
 )
-def test_wrong_documents(change: Any, message: str) -> None:
+def test_a_wrong_irtt_document_is_refused_with_the_reason(change: Any, message: str) -> None:
     content = document(20)
     content["system_info"] = {}
     change(content)
@@ -201,7 +203,7 @@ def test_wrong_documents(change: Any, message: str) -> None:
         read_irtt(io.BytesIO(json.dumps(content).encode()), MAX_PACKETS)
 
 
-def test_cut_and_damaged_files(tmp_path: Path) -> None:
+def test_a_cut_or_damaged_irtt_file_is_refused(tmp_path: Path) -> None:
     data = json.dumps(document()).encode()
     path = tmp_path / "irtt.json"
     for wrong in (data[:-2000], gzip.compress(data)[:-2000], gzip.compress(data)[:40] + b"x" * 99):
@@ -260,7 +262,7 @@ def test_one_capture_of_both_ends_is_matched_in_the_right_direction() -> None:
     assert delays_in(trace) == delays
 
 
-def test_numbers_at_a_known_place_that_wrap_around() -> None:
+def test_numbers_at_a_known_place_may_wrap_around() -> None:
     period_ns = 20_000_137
     arrivals = [
         Sent(
@@ -308,7 +310,7 @@ def test_a_capture_of_the_sender_alone_is_refused() -> None:
         trace_of(pcapng_of(*(one._replace(direction=2) for one in probes(9))))
 
 
-def test_captures_that_do_not_say_what_was_lost() -> None:
+def test_captures_that_do_not_show_what_was_lost_are_refused() -> None:
     sent, arrived, _ = network()
     same = [one._replace(payload=b"same") for one in sent]
     for files, message in (

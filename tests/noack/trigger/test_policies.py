@@ -27,8 +27,8 @@ from noack.scenario.sections import POLICIES
 from noack.trigger.deadline import DeadlineSettings
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import ModelMatrices
-from tests.approved import compare_lines, lines_of_error
-from tests.example_rules import TABLES
+from tests.helpers.approved import compare_lines, lines_of_error
+from tests.helpers.example_rules import TABLES
 
 
 def test_every_rule_is_in_the_table() -> None:
@@ -47,7 +47,7 @@ def test_a_lyapunov_function_beyond_rounding_is_refused() -> None:
         settings.trigger_policy(ModelMatrices(np.zeros((2, 2)), B, K))
 
 
-def test_the_same_threshold_from_a_later_origin() -> None:
+def test_a_deadlines_threshold_is_the_same_from_a_later_origin() -> None:
     rule = {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.25}
     deadline = DeadlineSettings(policy="deadline", rule=rule, interval_s=1.0)
     assert deadline.at_origin(3.0).rule.beta == pytest.approx(0.5 * np.exp(-0.75), rel=1e-12)

@@ -21,7 +21,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.scenario_certificates import certify
-from tests.example_rules import EXAMPLES
+from tests.helpers.example_rules import EXAMPLES
 
 OWN = {
     "periodic": {"period_s": 0.25},

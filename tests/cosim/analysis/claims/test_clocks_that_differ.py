@@ -25,7 +25,7 @@ from noack.scenario.scenario import Scenario
 from tests.cosim.analysis.claims.conftest import Make
 from tests.cosim.record.changed_records import changed
 from tests.cosim.simulation.shuttle import shuttled
-from tests.machine_parts import Machine
+from tests.helpers.machine_parts import Machine
 
 MS = 1_000_000
 PPB = 10**9

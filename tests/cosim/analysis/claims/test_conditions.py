@@ -37,9 +37,9 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions, nominal_conditions
 from tests.cosim.analysis.claims.conftest import Make, event_s, network_of, without
-from tests.cosim.live.outage import Deaf, Reborn, simulate_with, with_outage
 from tests.cosim.record.changed_records import changed
-from tests.machine_parts import controller_of, sensor_of
+from tests.cosim.simulation.outage import Deaf, Reborn, simulate_with, with_outage
+from tests.helpers.machine_parts import controller_of, sensor_of
 
 Batches = Iterator[tuple[str, Rows] | None]
 """A table and some of its rows; None where the result so far is queried."""

@@ -32,8 +32,8 @@ from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import MS, Make, event_s, without
 from tests.cosim.record.changed_records import changed
 from tests.cosim.record.test_recorded_changes import CONTENT as CHANGING
+from tests.helpers.shipped import resolved
 from tests.oracles.random_scenarios import POLICIES, random_scenario
-from tests.shipped import resolved
 
 HELD, VIOLATED, VOID = ClaimVerdict.HELD, ClaimVerdict.VIOLATED, ClaimVerdict.VOID
 

@@ -3,7 +3,6 @@
 import json
 import socket
 import threading
-import time
 import urllib.error
 from contextlib import ExitStack
 from pathlib import Path
@@ -65,12 +64,12 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
             try:
                 values = values_of(read(address))
             except (urllib.error.URLError, ConnectionError):
-                time.sleep(0.02)
+                done.wait(0.02)
                 continue
             if not found:
                 stack.enter_context(slow_reader(address))
             found.update(values)
-            time.sleep(0.1)
+            done.wait(0.1)
 
     reader = threading.Thread(target=scrape)
     stack = ExitStack()

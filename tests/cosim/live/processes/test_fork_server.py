@@ -13,7 +13,7 @@ import pytest
 
 from cosim.live.processes.fork_server import ForkedProcess, ForkServer, fork_server
 from noack.core.errors import ExitStatus, MachineError
-from tests.integration.conftest import wait_for
+from tests.helpers.waiting import wait_for
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the fork server is for Linux")
 PLANT = "plant_server.__main__"
@@ -35,7 +35,7 @@ def started(server: ForkServer, folder: Path, *arguments: str) -> Iterator[Forke
     process.wait()
 
 
-def test_its_standard_input_ends_with_the_launchers_end(server: ForkServer, tmp_path: Path) -> None:
+def test_the_standard_input_of_a_process_ends_with_the_launcher(server: ForkServer, tmp_path: Path) -> None:
     """No other process, and not the server, may hold a lifeline open."""
     with ExitStack() as stack:
         processes = [stack.enter_context(started(server, tmp_path)) for _ in range(3)]
@@ -77,7 +77,7 @@ def test_a_command_forks_the_server_of_itself(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("before", "environment"),
-    [("import threading, time; threading.Thread(target=time.sleep, args=(5,), daemon=True).start()",
+    [("import threading, time; threading.Thread(target=time.sleep, args=(3600,), daemon=True).start()",
       {}), ("", {"LC_ALL": "de_DE.ISO-8859-1", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"})],
 )  # fmt: skip
 def test_a_command_with_threads_or_another_encoding_starts_the_server_as_a_program(

@@ -73,7 +73,7 @@ def test_a_mat_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
     assert run.export(path)[0].read_bytes() == path.read_bytes()
 
 
-def test_any_document_becomes_structures(tmp_path: Path) -> None:
+def test_any_document_becomes_structures_of_a_mat_file(tmp_path: Path) -> None:
     content = {
         "a b": None, "a_b": [1, 2.5], "1": [[1, 2], [3, 4]], "_x": ["p", "", None], "n" * 80: True,
         "n" * 31 + "x": 2, "n" * 31 + "y": 3,
@@ -120,7 +120,7 @@ def test_rerun_finds_no_fault_in_an_mcap_file(run: noack.Run, tmp_path: Path) ->
     assert program.wait(timeout=120) == 0
 
 
-def test_several_loops_have_their_names(loops: noack.Run, tmp_path: Path) -> None:
+def test_channels_of_several_loops_have_the_loops_names(loops: noack.Run, tmp_path: Path) -> None:
     found = messages(loops.export(tmp_path / "a.mcap")[0])
     name, loop = list(loops.loops.items())[-1]
     steps = loop.table("plant_step")["now_ns"].to_pylist()

@@ -20,7 +20,7 @@ from noack.protocol.wire_format import Flow, Message
 from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
 from tests.command_line import invoke
-from tests.machine_parts import plant_of, sensor_of
+from tests.helpers.machine_parts import plant_of, sensor_of
 
 fmpy = pytest.importorskip("fmpy", reason="the extra `fmi` is not installed")
 from fmpy.fmi1 import FMICallException  # noqa: E402

@@ -16,7 +16,7 @@ from cosim.output.viewer.pictures.tanks_picture import TanksPicture
 from noack.core.linear_systems import Propagator
 from noack.protocol.record_tables import Fate
 from noack.scenario.resolution import loop_of
-from tests.shipped import resolved
+from tests.helpers.shipped import resolved
 
 S = 1_000_000_000
 PICTURES: dict[str, tuple[Picture, int, int]] = {

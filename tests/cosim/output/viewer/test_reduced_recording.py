@@ -19,8 +19,8 @@ from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from tests.cosim.output.viewer.test_viewer import read, series
 from tests.cosim.record.changed_records import changed, copied
-from tests.cosim.summaries import alone
-from tests.shipped import resolved
+from tests.helpers.shipped import resolved
+from tests.helpers.summaries import alone
 
 PART_STEPS, COLUMNS = 500, 10
 S = 1_000_000_000

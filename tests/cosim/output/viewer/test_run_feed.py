@@ -20,7 +20,7 @@ from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.scenario.resolution import loop_of
 from tests.cosim.live.recording.test_claim_monitor import live_rows
 from tests.cosim.output.viewer.test_viewer import Chunks, read, series
-from tests.shipped import resolved, shipped
+from tests.helpers.shipped import resolved, shipped
 
 
 @pytest.fixture(autouse=True)

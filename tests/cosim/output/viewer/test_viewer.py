@@ -37,9 +37,10 @@ from cosim.record.align import AlignedRun
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus
 from tests.cosim.output.test_texts import compare
-from tests.cosim.summaries import summary_of
-from tests.integration.conftest import noack_command, wait_for
-from tests.shipped import resolved
+from tests.helpers.shipped import resolved
+from tests.helpers.summaries import summary_of
+from tests.helpers.waiting import wait_for
+from tests.integration.conftest import noack_command
 
 Floats = NDArray[np.float64]
 

@@ -213,7 +213,7 @@ def test_draws_depend_neither_on_the_chunk_nor_on_the_grid_point(campaign: Few) 
     assert first.population(11, range(10**8, 10**8 + 1)).x0.shape == (1, 2)
 
 
-def test_draws_are_uniform_in_the_box(campaign: Few) -> None:
+def test_plants_are_drawn_uniformly_in_the_box(campaign: Few) -> None:
     point = campaign[1][0]
     found = point.work.box.population(11, range(20_000))
     centre, half = loop_of(drawn_scenario(with_plant(point.scenario, draw="nominal"), 0, 0)), 0.2

@@ -11,8 +11,8 @@ import pytest
 from cosim.studies.campaign.campaign_file import json_schema, load
 from cosim.studies.campaign.campaign_grid import grid
 from noack.core.errors import CallerError
-from tests.approved import compare_lines, lines_of_error
 from tests.cosim.studies.campaign.conftest import Write, few_of
+from tests.helpers.approved import compare_lines, lines_of_error
 
 ROOT = Path(__file__).parents[4]
 SHIPPED = sorted((ROOT / "campaigns").glob("*.toml"))

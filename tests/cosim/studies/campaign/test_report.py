@@ -46,8 +46,8 @@ from noack.scenario.scenario_file import load as load_scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
-from tests.approved import compare_lines, lines_of_error
 from tests.cosim.studies.campaign.conftest import Command, Few, Write, few_of
+from tests.helpers.approved import compare_lines, lines_of_error
 
 ROOT = Path(__file__).parents[4]
 HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""

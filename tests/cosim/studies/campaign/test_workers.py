@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from cosim.studies.campaign.chunk_store import Store, run_campaign
 from noack.core.errors import CallerError, PeerError
 from tests.cosim.studies.campaign.conftest import Command, Write, few_of
 from tests.cosim.studies.campaign.test_store import files
+from tests.helpers.waiting import wait_for
 
 Start = Callable[[], "subprocess.Popen[str]"]
 RUNS = 320
@@ -110,9 +110,8 @@ def start(many: Path, tmp_path: Path) -> Iterator[Start]:
 
 def when_files(folder: Path, count: int, process: "subprocess.Popen[str]") -> list[psutil.Process]:
     """Wait for this number of files; return the children of the process."""
-    while len(files(folder)) < count:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.01)
+    wait_for(lambda: len(files(folder)) >= count or process.poll() is not None)
+    assert process.poll() is None, process.communicate()
     return psutil.Process(process.pid).children(recursive=True)
 
 

@@ -71,7 +71,7 @@ def test_a_queue_carries_as_many_periodic_loops_as_the_rate_allows(tmp_path: Pat
     assert found.limited_by == "guarantee"
 
 
-def test_the_cost_of_each_kind_counts() -> None:
+def test_a_policy_must_keep_the_cost_of_each_kind_of_loop() -> None:
     """Kind b costs a hundred times as much as a; a alone doubles its cost in the mixture."""
     kinds = kinds_of(load(FILE, ["loops=[{ name = 'a' }, { name = 'b' }]"]), PERIOD_S)
     plan = plans.CapacityPlan(load(FILE), kinds, FILE, {}, 0.1, (2, 4), policies_of(kinds), 0.0, 3, 0)

@@ -1,6 +1,6 @@
 """``noack design --for network``: what is found is proven, and no worse than what was given.
 
-``tests/noack/theory/certificate_kinds/designs.py`` attacks what is said of random loops.
+``tests/noack/theory/certificates/certificate_kinds/designs.py`` attacks what is said of random loops.
 """
 
 import json
@@ -26,9 +26,9 @@ from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify_box
 from noack.theory.margins.loss_margin import LossMargin
-from tests.approved import compare_lines
 from tests.command_line import invoke
-from tests.shipped import shipped
+from tests.helpers.approved import compare_lines
+from tests.helpers.shipped import shipped
 
 ROOT = Path(__file__).parents[4]
 ZERO = "mode=zoh", "controller.update_timeout_s=0.252"

@@ -17,8 +17,8 @@ import noack
 from cosim.studies.new_loop.linear_model import controllable_states
 from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of, resolve
-from tests.approved import compare_lines
 from tests.command_line import invoke
+from tests.helpers.approved import compare_lines
 from tests.plant_server.fmus.build import build
 
 POLE = '''
@@ -113,7 +113,7 @@ def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
 @pytest.mark.parametrize(
     "name", ["cart_pole", "quadrotor", "dc_motor", "four_tank", "vehicle", "unstable_pendulum"]
 )
-def test_a_scenario_for_each_plant_that_comes_with_noack(name: str) -> None:
+def test_each_plant_of_noack_gets_a_scenario(name: str) -> None:
     if name == "vehicle":
         pytest.importorskip("vehiclemodels")
     made = noack.new(name, "made.toml")
@@ -173,7 +173,7 @@ def test_the_regulator_solves_the_riccati_equation(name: str) -> None:
 
 
 @pytest.mark.parametrize("poles", [[-1, -2, -3, -4], [-2 + 1j, -2 - 1j, -3 + 2j, -3 - 2j]])
-def test_poles_are_placed(poles: list[complex]) -> None:
+def test_a_regulator_has_the_poles_that_were_asked_for(poles: list[complex]) -> None:
     found = noack.gain("cart_pole", poles=poles)
     np.testing.assert_allclose(np.sort_complex(found.eigenvalues), np.sort_complex(poles), atol=1e-5)
 
@@ -209,7 +209,7 @@ def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(
     assert noack.simulate(noack.load("made.toml", {"horizon_s": 0.5})).ok
 
 
-def test_a_simulator_is_moved() -> None:
+def test_a_plant_that_makes_its_own_steps_is_linearised() -> None:
     found = noack.linearise("pole.py:Stepped")
     np.testing.assert_allclose([found.A[0, 0], found.B[0, 0]], [-2.0, 1.0], atol=1e-6)
 

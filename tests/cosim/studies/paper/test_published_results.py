@@ -21,7 +21,7 @@ from cosim.studies.paper.results import (
 )
 from noack.core.errors import ExitStatus
 from tests.command_line import invoke
-from tests.pages import ROOT
+from tests.helpers.pages import ROOT
 
 PAGE = (ROOT / "docs/published.md").read_text()
 

@@ -1,0 +1,93 @@
+"""Simulated runs of the baseline with acknowledgements: its streams, counts and missing claims."""
+
+from functools import cache
+
+import pytest
+
+from cosim.analysis.certificates import Certificates
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.summary_model import ClaimVerdict
+from cosim.record.run_record import RunRecord
+from cosim.simulation.continuous import continuous_loop_of
+from cosim.simulation.virtual_time import simulate
+from noack.core.errors import CallerError
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.protocol.record_tables import (
+    ACKNOWLEDGEMENTS,
+    CONTROLLER_DELIVERY,
+    NETEM_PACKET,
+    SENSOR_ACKNOWLEDGEMENT,
+    UPDATES,
+    Fate,
+)
+from noack.scenario.scenario import Scenario
+from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
+from tests.helpers.shipped import resolved
+from tests.oracles.link import Link
+
+COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=6")
+
+
+def acknowledged(*overrides: str) -> Scenario:
+    return resolved("lane_acknowledged", *COARSE, *overrides)
+
+
+def plain(*overrides: str) -> Scenario:
+    return resolved("lane_following", *COARSE, *overrides)
+
+
+@cache
+def run_of(*overrides: str) -> RunRecord:
+    return simulate(acknowledged(*overrides))
+
+
+def fates(record: RunRecord, flow: int) -> list[int]:
+    rows = record[NETEM_PACKET]
+    found: list[int] = rows["fate"][rows["flow"] == flow].tolist()
+    return found
+
+
+def test_each_direction_has_its_own_random_stream() -> None:
+    record, other = run_of(), simulate(plain())
+    count = min(len(fates(record, UPDATES)), len(fates(other, UPDATES)))
+    assert count > 5
+    assert fates(record, UPDATES)[:count] == fates(other, UPDATES)[:count]
+    settings = LinkSettings(impairments=(LossOf(loss=BernoulliLoss(probability=0.5)),))
+    link = Link(settings, record.scenario.seeds.loss, "acknowledgement")
+    answers = fates(record, ACKNOWLEDGEMENTS)
+    expected = [Fate(link.decide(ACKNOWLEDGEMENTS, 48, 0).fate) for _ in answers]
+    assert answers == expected
+    assert {Fate.DELIVERED, Fate.DROPPED} == set(answers)
+
+
+def test_the_summary_counts_acknowledgements() -> None:
+    record = run_of()
+    summary = summarise(record, 0, "horizon").to_json()
+    found = summary["acknowledgements"]
+    assert found["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
+    assert found["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
+    assert found["lost"] > 0
+    assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # in flight at the end
+    assert summary["unintended_losses"] == summary["missing_samples"] == 0
+    assert summary["identity_residual_max"] is None
+    assert summarise(simulate(plain()), 0, "horizon").acknowledgements is None
+
+
+def test_the_baseline_has_no_claims() -> None:
+    record = run_of()
+    (claim,) = ClaimEvaluation(record).judge()
+    assert claim.verdict is ClaimVerdict.VOID
+    assert 'network.protocol = "ack"' in claim.why
+    assert ClaimEvaluation(record).envelopes() == []
+    (assumption,) = [a for a in assumptions(record.scenario) if "acknowledged" in a.what]
+    assert assumption.verdict is AssumptionStatus.VIOLATED
+    for refuse in (continuous_loop_of, lambda scenario: Certificates(scenario, 2)):
+        with pytest.raises(CallerError, match=r'network\.protocol = "ack": x_s is reset'):
+            refuse(record.scenario)
+    with pytest.raises(CallerError, match=r"network\.acknowledgements.*there are none unless"):
+        plain("network.acknowledgements.timeout_s=0.1")
+    back = ("network.protocol=none", "network.acknowledgements.timeout_s=0.1")
+    assert not plain(*back).protocol.acknowledges

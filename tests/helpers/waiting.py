@@ -1,0 +1,15 @@
+"""Waiting for what other processes and threads do, with a deadline."""
+
+import time
+from collections.abc import Callable
+
+PATIENCE_S = 300.0
+"""Timeout for events that never happen; no test measures time with it."""
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    """Return once a condition holds; fail if it still does not after ``PATIENCE_S``."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, "timed out"
+        time.sleep(0.02)

@@ -1,0 +1,179 @@
+"""One direction of a link: random streams, limits, counters, and changes of its settings."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from netem import link_state
+from netem.link_state import LinkState
+from netem.tc_words import settings_of
+from noack.core.core_library import address_of, core
+from noack.impairments.kinds.opportunities import Opportunities
+from noack.impairments.link_settings import LinkSettings
+from noack.protocol.record_tables import NETEM_PACKET, Fate, tables
+from noack.protocol.roles import Notice, Record
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
+from tests.oracles.link import Datagram, Link, update_link_of
+
+MS = 1_000_000
+LOSSES = [
+    "loss 60%", "loss gemodel 30% 20%", "loss 40% 70%", "loss state 30% 20% 30% 50% 20%",
+    "loss worst",
+]  # fmt: skip
+TIMELESS = {
+    "loss": "loss 60%",
+    "duplicate": "duplicate 30% 50%",
+    "corrupt": "corrupt 30%",
+    "delay": "delay 10ms 5ms 30% distribution normal",
+    "reorder": "reorder 20%",
+}
+ALL_TIMELESS = " ".join(TIMELESS.values())
+
+Outputs = Sequence[Datagram | Record | Notice]
+
+
+def new_link(words: str) -> Link:
+    return Link(settings_of(words), 5, "a")
+
+
+def rows_of(outputs: Outputs, table: str = NETEM_PACKET) -> Any:
+    found = [one.row for one in outputs if isinstance(one, Record) and one.table == table]
+    return np.array(found, tables(1, 1)[table])
+
+
+def sent(outputs: Outputs) -> list[Datagram]:
+    return [one for one in outputs if isinstance(one, Datagram)]
+
+
+def fate_of(link: Link, flow: int, now_ns: int = 0) -> Fate:
+    (row,) = rows_of(link.handle(Datagram(flow, b""), now_ns))
+    return Fate(row["fate"])
+
+
+def fates(link: Link, flow: int, count: int) -> list[Fate]:
+    return [fate_of(link, flow) for _ in range(count)]
+
+
+def drain(link: Link) -> list[tuple[int, Outputs]]:
+    """Release all datagrams in flight, each at its due time."""
+    found = []
+    while (due := link.next_deadline_ns()) is not None:
+        found.append((due, link.on_timer(due)))
+    return found
+
+
+@given(
+    st.sampled_from([*LOSSES, ALL_TIMELESS]), st.none() | st.integers(0, 4),
+    st.lists(st.tuples(st.integers(0, 3), st.integers(0, 10**12)), max_size=60),
+)  # fmt: skip
+def test_a_flows_fates_depend_on_nothing_but_its_own_order(
+    words: str, mansd: int | None, arrivals: list[tuple[int, int]]
+) -> None:
+    """Other flows and arrival times change no fate, bit, copy or delay, except with rates,
+    blackouts and the limit. Delays are without the time that the guarantee adds."""
+    words += "" if mansd is None else f" mansd {mansd}"
+    link, found = new_link(words), dict[int, list[tuple[int, ...]]]()
+
+    def decided(by: Link, flow: int, now_ns: int) -> tuple[int, ...]:
+        one = by.decide(flow, 100, now_ns)
+        delay_ns = one.release_ns - one.hold_back_ns - now_ns if one.bit < 0 else -1
+        return one.fate, one.consecutive_losses, one.bit, one.copy_bit, max(delay_ns, -1)
+
+    for flow, now_ns in arrivals:
+        found.setdefault(flow, []).append(decided(link, flow, now_ns))
+    for flow, of_flow in found.items():
+        alone = new_link(words)
+        assert of_flow == [decided(alone, flow, k * 10**9) for k in range(len(of_flow))]
+
+
+@pytest.mark.parametrize("words", LOSSES[:-1])
+def test_every_seed_name_and_flow_has_a_stream_of_its_own(words: str) -> None:
+    """Which no other impairment changes."""
+    sequences = [
+        tuple(fates(Link(settings_of(words), seed, *name), flow, 100))
+        for seed, name, flow in itertools.product((5, 6), (("a",), ("b",), ("a", "b")), (0, 1))
+    ]
+    assert len(set(sequences)) == 12
+    for one in (words, f"delay 10ms 5ms {words}", f"{words} duplicate 50%"):
+        assert tuple(fates(new_link(one), 0, 100)) == sequences[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "overflowed"),
+    [
+        ("delay 10ms", 15),
+        ("duplicate 100% delay 10ms", 17),
+        ("duplicate 100% delay 10ms reorder 100% mansd 3", 0),  # only copies are delayed
+    ],
+)
+def test_the_limit_bounds_the_datagrams_and_copies_in_flight(words: str, overflowed: int) -> None:
+    link = new_link(f"{words} limit 5")
+    assert fates(link, 0, 20).count(Fate.OVERFLOWED) == overflowed
+    assert link.counters.most_in_flight == 5
+    assert len(drain(link)) == 5
+    assert fate_of(link, 0, 20 * MS) is Fate.DELIVERED
+
+
+@given(st.lists(st.integers(0, 2), max_size=60), st.none() | st.integers(0, 3))
+def test_every_datagram_is_counted_once(order: list[int], mansd: int | None) -> None:
+    cap = "" if mansd is None else f"mansd {mansd}"
+    link = new_link(f"{ALL_TIMELESS} rate 1mbit queue 3 blackout 10ms-30ms {cap}")
+    found = [fate_of(link, flow, k * MS) for k, flow in enumerate(order)]
+    drain(link)
+    of = link.counters
+    counted = (
+        of.delivered, of.dropped, of.forced, of.corrupted, of.overflowed, of.blacked_out,
+    )  # fmt: skip
+    assert list(counted) == [found.count(fate) for fate in Fate]
+    assert of.received == len(order)
+    assert of.forwarded == of.delivered + of.forced + of.corrupted + of.duplicated
+
+
+@pytest.mark.parametrize(
+    ("network", "expected"),
+    [
+        ({}, "FddFddF"),
+        ({"initial_sync": "known_state"}, "ddFddFd"),
+        ({"mansd": 0}, "FFFFFFF"),
+        ({"enforce_mansd": False, "initial_sync": "known_state"}, "ddddddd"),
+        ({"enforce_mansd": False}, "Fdddddd"),
+    ],
+)
+def test_the_link_of_a_scenario_keeps_its_mansd(
+    content: dict[str, Any], network: dict[str, Any], expected: str
+) -> None:
+    content["network"] |= {"loss": {"model": "worst_case"}, **network}
+    link = update_link_of(resolve(validate(content, "here")))
+    found = "".join("dF"[fate is Fate.FORCED] for fate in fates(link, 0, 7))
+    assert found == expected
+
+
+def test_a_refused_change_leaves_a_link_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = LinkState(settings_of("delay 1ms"), 1, "any")
+    link.start_flow(0, 0)
+    begin = address_of(link.core.memory), address_of(link.core.stages)
+
+    def refuse(wrong: object) -> None:
+        raise ValueError("link: refused")
+
+    monkeypatch.setattr(link_state, "_require", refuse)
+    with pytest.raises(ValueError, match="refused"):
+        link.change(LinkSettings(), np.full(1, core.NOACK_NEVER_NS))
+    assert (link._memory["memory"].ctypes.data, address_of(link._stages)) == begin
+    assert link.decide(0, 72, 0).release_ns == MS
+
+
+def test_packets_that_must_pass_pass_a_queue_that_cannot_be_served_in_time() -> None:
+    served = Opportunities(times_ms=(0, 10**12), overhead_bytes=65_535, queue=2)
+    link = LinkState(LinkSettings(impairments=(served,), mansd=0), 1, "late")
+    link.start_flow(0, 0)
+    count = 250_000
+    rows, sizes = np.zeros(count, np.int64), np.full(count, 65_535, np.int64)
+    decisions = link.decide_many(rows, sizes, np.full(count, 2**61 - 10**9))
+    assert (decisions["fate"] <= core.NOACK_FORCED).all()

@@ -1,0 +1,153 @@
+"""The rules of a guarantee: what they allow, what they imply, and that no more is lost."""
+
+import itertools
+from itertools import groupby, product
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from netem.tc_words import settings_of
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossAutomaton,
+    LossesInWindow,
+    LossGuarantee,
+    LossHistory,
+    LossRule,
+    find_pattern_beyond,
+)
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.protocol.record_tables import Fate
+from tests.oracles.loss_language import allowed_rows
+
+SEQUENCE_LENGTH = 11
+
+GUARANTEES = [
+    (LongestBurst(0),),
+    (LongestBurst(3),),
+    (LossesInWindow(1, 2),),
+    (LossesInWindow(2, 5),),
+    (LossesInWindow(3, 4), LossesInWindow(4, 9)),
+    (LongestBurst(2), DeliveriesBetweenBursts(3)),
+    (LossesInWindow(3, 7), DeliveriesBetweenBursts(2), LongestBurst(2)),
+]
+
+
+def keeps(lost: tuple[bool, ...], rule: LossRule) -> bool:
+    """Judge a whole sequence, from the definition."""
+    runs = [(value, len(list(run))) for value, run in groupby(lost)]
+    if isinstance(rule, LongestBurst):
+        return all(length <= rule.limit for value, length in runs if value)
+    if isinstance(rule, LossesInWindow):
+        ends = range(1, len(lost) + 1)
+        return all(sum(lost[max(i - rule.window, 0) : i]) <= rule.limit for i in ends)
+    assert isinstance(rule, DeliveriesBetweenBursts)
+    return all(length >= rule.deliveries for value, length in runs[1:-1] if not value)
+
+
+@pytest.mark.parametrize("rules", GUARANTEES, ids=str)
+def test_the_automaton_allows_exactly_the_sequences_that_keep_every_rule(
+    rules: tuple[LossRule, ...],
+) -> None:
+    automaton = LossAutomaton(LossGuarantee(rules))
+    sequences = np.array(list(product([False, True], repeat=SEQUENCE_LENGTH)))
+    states, allowed = np.zeros(len(sequences), np.int64), np.ones(len(sequences), bool)
+    for lost in sequences.T:
+        after_loss = automaton.after_loss(states)
+        allowed &= ~lost | (after_loss >= 0)
+        states = np.where(lost & (after_loss >= 0), after_loss, automaton.after_delivery(states))
+    expected = [all(keeps(tuple(one), rule) for rule in rules) for one in sequences.tolist()]
+    assert allowed.tolist() == expected
+
+
+@given(st.lists(st.booleans(), max_size=30), st.sampled_from(GUARANTEES))
+def test_a_history_finds_the_first_violation_of_each_rule(
+    lost: list[bool], rules: tuple[LossRule, ...]
+) -> None:
+    history, first = LossHistory(rules), dict.fromkeys(rules, len(lost))
+    for i, one in enumerate(lost):
+        for rule, _ in history.add(one):
+            first[rule] = min(first[rule], i)
+    for rule, at in first.items():
+        assert keeps(tuple(lost[:at]), rule)
+        assert at == len(lost) or not keeps(tuple(lost[: at + 1]), rule)
+
+
+def guarantee(*rules: LossRule) -> LossGuarantee:
+    return LossGuarantee(rules)
+
+
+def allows(rules: LossGuarantee, delivered: tuple[bool, ...]) -> bool:
+    history = LossHistory(rules.rules)
+    return not any(history.add(not outcome) for outcome in delivered)
+
+
+def random_guarantee(rng: np.random.Generator) -> LossGuarantee:
+    rules: list[LossRule] = [LongestBurst(int(rng.integers(1, 5)))]
+    if rng.random() < 0.6:
+        window = int(rng.integers(2, 8))
+        rules.append(LossesInWindow(int(rng.integers(1, window + 1)), window))
+    if rng.random() < 0.5:
+        rules.append(DeliveriesBetweenBursts(int(rng.integers(1, 5))))
+    return LossGuarantee(tuple(rules[int(len(rules) > 1 and rng.random() < 0.3) :]))
+
+
+def test_a_guarantee_implies_another_if_no_pattern_keeps_only_the_first() -> None:
+    rng, longest, implied = np.random.default_rng(0), 9, 0
+    patterns = [one for k in range(longest + 1) for one in product((True, False), repeat=k)]
+    for _ in range(60):
+        one, other = random_guarantee(rng), random_guarantee(rng)
+        beyond = (p for p in patterns if allows(one, p) and not allows(other, p))
+        shortest, found = next(beyond, None), find_pattern_beyond(one, other)
+        if found is None:
+            implied += 1
+            assert shortest is None
+        else:
+            assert allows(one, found)
+            assert not allows(other, found)
+            assert allows(other, found[:-1])
+            assert len(found) > longest if shortest is None else len(found) == len(shortest)
+    assert 5 < implied < 55
+
+
+def test_one_window_implies_another_as_the_closed_form_says() -> None:
+    """At most m in K allow at most m ⌊k/K⌋ + min(m, k mod K) losses in k packets."""
+    for (window, other), losses in product(product(range(2, 6), range(1, 10)), range(3)):
+        most = losses * (other // window) + min(losses, other % window)
+        for limit in range(other):
+            one = guarantee(LossesInWindow(losses, window))
+            implied = find_pattern_beyond(one, guarantee(LossesInWindow(limit, other))) is None
+            assert implied == (limit >= min(most, other)) or losses >= window
+
+
+LENGTH = 12
+"""More than the longest window, and than a burst with the deliveries that must follow it."""
+APART = 9
+WISHES = np.array(list(itertools.product([False, True], repeat=LENGTH)))
+LOST = np.flatnonzero(np.pad(WISHES, ((0, 0), (0, APART)))).tolist()
+SCRIPT = (LossOf(loss=ScriptedLoss(lost=tuple(LOST))),)
+WINDOWS = [f"atmost {m} in {k}" for k in range(1, 9) for m in range(k)]
+
+
+@pytest.mark.parametrize("window", [*WINDOWS, "atmost 2 in 4 atmost 3 in 8"])
+def test_exactly_the_allowed_sequences_occur(decide: Any, window: str) -> None:
+    """For each pair (m, K) with K ≤ 8, and two: alone, with a cap, with recovery, and with both."""
+    for cap, recovery in itertools.product(["", "mansd 2"], ["", "recover 3"]):
+        own = settings_of(f"{window} {cap} {recovery}")
+        scripted = own.model_copy(update={"impairments": SCRIPT})
+        fates = decide(scripted, len(WISHES) * (LENGTH + APART)).fates
+        lost = ~np.isin(fates, (Fate.DELIVERED, Fate.FORCED))
+        occurred = lost.reshape(len(WISHES), LENGTH + APART)[:, :LENGTH]
+        allowed, is_wish = allowed_rows(WISHES, own), (occurred == WISHES).all(axis=1)
+        assert allowed_rows(occurred, own).all()
+        # What is allowed occurs, what is not does not; and nothing is changed before it must be.
+        assert (allowed == is_wish).all()
+        first = np.argmax(occurred != WISHES, axis=1)[:, None]
+        assert np.take_along_axis(WISHES, first, axis=1)[~is_wish].all()
+        begun = WISHES & (np.arange(LENGTH) <= first)
+        assert not allowed_rows(begun[~is_wish], own).any()

@@ -1,0 +1,251 @@
+"""Predicted and kept loss rates, and probabilities of bursts, against closed forms and many decisions."""
+
+import json
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from netem.tc_words import settings_of
+from noack.impairments import loss_prediction
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossesInWindow,
+    LossGuarantee,
+    LossHistory,
+)
+from noack.impairments.loss_prediction import (
+    LossProcess,
+    expected_loss,
+    found_probabilities,
+    loss_process,
+    predict,
+    read_files,
+    remember,
+    with_target_loss,
+)
+from noack.impairments.markov_chain import NotPredictableError
+from noack.protocol.record_tables import Fate
+from tests.helpers.approved import compare_lines, lines_of_error
+from tests.oracles.link import Link
+
+DECISIONS = 400_000
+EXACT = {
+    "": 0.0,
+    "loss none mansd 3": 0.0,
+    "loss worst": 1.0,
+    "loss worst mansd 4": 4 / 5,
+    "loss worst mansd 0": 0.0,
+    "loss 100% 50% mansd 1000000": 1_000_000 / 1_000_001,
+    "loss periodic 2/100": 0.02,
+    "loss periodic 100/100 mansd 3": 3 / 4,
+    "loss periodic 7/100 from 3 mansd 2": 5 / 100,  # lost, lost, not, lost, lost, not, lost
+    "loss script 0,1,2,7,8,9 every 10 mansd 4": 5 / 10,  # six losses, across the end
+    "loss script none every 10": 0.0,
+    "loss periodic 1/2 loss periodic 1/3": 4 / 6,
+    "loss 0% 50% atmost 3 in 11": 0.0,
+    "loss 100% atmost 3 in 10 mansd 2": 3 / 10,
+    "loss worst mansd 2 recover 3": 2 / 5,
+    "loss periodic 1/2 atmost 1 in 3": 1 / 4,  # only every other loss
+    "loss worst atmost 2 in 4 recover 1 mansd 1": 1 / 2,
+    # Of a reducible chain, the prediction depends on its start.
+    "loss gemodel 0% 0% 100% 10%": 0.1,  # stays good
+    "loss gemodel 10% 0% 60% 10%": 0.6,  # ends up bad
+    "loss gemodel 100% 100% 100% 0% mansd 1": 0.5,  # alternates
+    "loss gemodel 0.0001% 0.0001%": 0.5,
+    "loss state 100% 100% 0% 100% 0%": 0.5,
+    "loss state 0% 0% 0% 0% 100%": 0.5,  # every other is a single loss
+    "replay records 0s+1ms,1s+lost,2s+lost,3s+lost,4s+1ms": 3 / 5,
+    "replay records 0s+1ms,1s+lost,2s+lost,3s+lost,4s+1ms mansd 2": 2 / 5,
+    "replay records 0s+1ms,1s+2ms by time": 0.0,
+}
+
+
+def predicted_loss(words: str) -> float | None:
+    return predict(settings_of(words)).rate
+
+
+def test_predicted_losses_are_those_of_the_closed_form() -> None:
+    for words, rate in EXACT.items():
+        assert predicted_loss(words) == pytest.approx(rate, rel=1e-9), words
+    for p in (0.05, 0.5, 0.97):
+        for m in (0, 1, 4, 17):
+            rate = p * (1 - p**m) / (1 - p ** (m + 1))
+            found = predicted_loss(f"loss {100 * p}% mansd {m}")
+            assert found == pytest.approx(rate, rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "loss gemodel 5% 2% 97% 10% mansd 4",
+        "loss state 10% 20% 3% 40% 5% mansd 2",
+        "loss 20% 90% mansd 3",
+        "loss 85% 30% mansd 6",
+        "loss burst 10% 3 loss burst 10% 5 loss 3% mansd 4",
+        "loss periodic 3/20 loss 20% mansd 3",
+        "loss script 1,2,3,4,5 every 9 loss gemodel 10% 30% mansd 5",
+        "corrupt 10% 50% mansd 1",
+        "loss 20% corrupt 30% mansd 2",
+        "corrupt 20% duplicate 50% corrupt 40% duplicate 30% mansd 2",
+        "duplicate 40% 60% corrupt 30%",
+        "delay 1ms 1ms loss 30% reorder 20% mansd 2",
+        "loss 40% atmost 3 in 8 atmost 5 in 16 recover 2 mansd 2",
+        "loss 30% 60% atmost 2 in 9",
+        "loss 60% mansd 3 recover 4",
+        "loss burst 20% 4 mansd 3 recover 2",
+        "loss gemodel 5% 2% 97% 10% atmost 4 in 12",
+        "loss periodic 3/20 loss 20% atmost 2 in 7",
+        "corrupt 20% duplicate 50% loss 20% mansd 2 recover 3",
+    ],
+)
+def test_many_decisions_have_the_predicted_loss(decide: Any, share_is: Any, words: str) -> None:
+    predicted = predicted_loss(words)
+    assert predicted is not None
+    fates = decide(words, DECISIONS, seed=5).fates
+    share_is(~np.isin(fates, (Fate.DELIVERED, Fate.FORCED)), predicted)
+
+
+def test_a_missing_prediction_has_the_approved_reason() -> None:
+    def reason(words: str) -> list[str]:
+        if "keep" in words:
+            return lines_of_error(lambda: read_files(settings_of(words), Path(), "FILE"))
+        prediction = predict(settings_of(words))
+        assert prediction.rate is None
+        return [prediction.note]
+
+    compare_lines(Path(__file__).with_name("predictions.txt"), reason)
+
+
+QUEUE = "as long as no queue overflows"
+OUT_OF_ORDER = "not counting packets delivered out of order (stale)"
+
+
+@pytest.mark.parametrize(
+    ("words", "note"),
+    [
+        ("loss 5% delay 10ms", ""),
+        ("loss 5% rate 1mbit codel", "as long as no queue overflows or CoDel drops"),
+        ("delay 10ms 2ms loss 5%", OUT_OF_ORDER),
+        ("delay 10ms 2ms mansd 0", ""),
+        ("delay 0 samples 1ms,2ms", OUT_OF_ORDER),
+        ("delay 10ms reorder 5%", OUT_OF_ORDER),
+        ("delay 10ms reorder 0%", ""),
+        ("delay 0 reorder 5%", ""),
+        ("rate 1mbit reorder 5%", f"{QUEUE}; {OUT_OF_ORDER}"),
+        ("delay 10ms 2ms reorder 5% rate 1mbit", QUEUE),
+        ("rate 1mbit delay 10ms 2ms", f"{QUEUE}; {OUT_OF_ORDER}"),
+    ],
+)
+def test_the_note_states_what_the_prediction_excludes(words: str, note: str) -> None:
+    assert predict(settings_of(words)).note == note
+    assert makes_stale(settings_of(words)) == (OUT_OF_ORDER in note)
+
+
+def makes_stale(settings: LinkSettings) -> bool:
+    """Whether one of 2000 datagrams, 10 µs apart, leaves before an earlier one."""
+    link = Link(settings, 1, "test")
+    leaves_ns = [link.decide(0, 100, 10_000 * packet).release_ns for packet in range(2000)]
+    left_ns = [t_ns for t_ns in leaves_ns if t_ns >= 0]
+    return left_ns != sorted(left_ns)
+
+
+@pytest.mark.parametrize(
+    ("words", "asked"),
+    [
+        ("loss 30% keep mansd 2", 0.3),
+        ("loss 80% keep mansd 4", 0.8),
+        ("loss 30% keep atmost 3 in 10", 0.3),
+        ("loss 25% 50% keep mansd 3 corrupt 5% duplicate 10%", 0.25),
+        ("loss 40% keep loss burst 10% 3 mansd 4 atmost 6 in 9", 0.4),
+    ],
+)
+def test_a_kept_loss_is_predicted_as_it_was_asked(words: str, asked: float) -> None:
+    asking = settings_of(words)
+    assert predict(with_target_loss(asking)).rate == pytest.approx(asked, abs=1e-9)
+    assert expected_loss(asking).rate == pytest.approx(asked, abs=1e-9)
+
+
+def test_a_probability_that_another_process_found_is_not_computed_again(monkeypatch: Any) -> None:
+    """Not even by the loops of a run; but other settings have another probability."""
+    settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
+    found = found_probabilities(settings, settings_of("delay 1ms"))
+    assert list(found.values()) == [with_target_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
+    monkeypatch.setattr(loss_prediction, "_found", {})
+    monkeypatch.setattr(loss_prediction, "predict", None)
+    remember(json.loads(json.dumps(found)))
+    assert found_probabilities(settings_of("loss 10% keep loss 5% delay 9ms mansd 1")) == found
+    for other in ("loss 10% keep loss 5% mansd 2", "loss 10% keep mansd 1"):
+        with pytest.raises(TypeError):
+            with_target_loss(settings_of(other))
+
+
+P = 0.3
+INDEPENDENT = {"kind": "loss", "loss": {"model": "bernoulli", "probability": P}}
+BURSTY = {
+    "kind": "loss",
+    "loss": {
+        "model": "gilbert_elliott", "good_to_bad": 0.2, "bad_to_good": 0.4,
+        "loss_in_good": 0.1, "loss_in_bad": 0.9,
+    },
+}  # fmt: skip
+KEPT = [
+    LossGuarantee((LongestBurst(2),)),
+    LossGuarantee((LongestBurst(3), LossesInWindow(3, 6))),
+    LossGuarantee((LongestBurst(2), DeliveriesBetweenBursts(2))),
+]
+
+
+def process(*impairments: dict[str, object], first: bool = False) -> LossProcess:
+    return loss_process(LinkSettings.model_validate({"impairments": impairments, "first_delivered": first}))
+
+
+def probability(losses: LossProcess, outcomes: tuple[bool, ...]) -> float:
+    """The probability of these outcomes (True: lost), following every state of the chain."""
+    weights = losses.start
+    for number, lost in enumerate(outcomes):
+        weights = weights @ losses.moves
+        forced = number == 0 and losses.first_delivered
+        weights = weights * (float(not lost) if forced else losses.lost if lost else 1 - losses.lost)
+    return float(weights.sum())
+
+
+def is_kept(guarantee: LossGuarantee, outcomes: tuple[bool, ...]) -> bool:
+    history = LossHistory(guarantee.rules)
+    return not any(history.add(lost) for lost in outcomes)
+
+
+@pytest.mark.parametrize("first", [False, True])
+@pytest.mark.parametrize("guarantee", KEPT, ids=lambda one: one.meaning)
+@pytest.mark.parametrize("impairments", [[INDEPENDENT], [BURSTY], [BURSTY, INDEPENDENT]])
+def test_a_guarantee_is_kept_with_the_total_probability_of_all_patterns_that_keep_it(
+    impairments: list[dict[str, object]], guarantee: LossGuarantee, first: bool
+) -> None:
+    losses = process(*impairments, first=first)
+    patterns = list(product([False, True], repeat=8))
+    expected = sum(probability(losses, one) for one in patterns if is_kept(guarantee, one))
+    assert losses.keeps(guarantee, 8) == pytest.approx(expected, rel=1e-9)
+
+
+def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_past() -> None:
+    losses = process(BURSTY)
+    assert not losses.is_independent
+    tails, longest = losses.tails(4)
+    for j in range(1, 5):
+        for k in range(j, 9):
+            ends = [one for one in product([False, True], repeat=k) if all(one[k - j :])]
+            assert sum(probability(losses, one) for one in ends) <= tails[j - 1] * (1 + 1e-9)
+    for past in product([False, True], repeat=5):
+        given = probability(losses, (*past, True)) / probability(losses, past)
+        assert given <= losses.largest_probability * (1 + 1e-9)
+        all_lost = probability(losses, (*past, *[True] * 4)) / probability(losses, past)
+        assert all_lost <= longest * (1 + 1e-9)
+
+
+def test_losses_that_depend_on_times_have_no_prediction() -> None:
+    with pytest.raises(NotPredictableError):
+        process(INDEPENDENT, {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.05})

@@ -1,0 +1,290 @@
+"""The guarantee, checked by an observer at the receiver without access to the link's decisions."""
+
+import itertools
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from netem.link_state import LinkState
+from netem.tc_words import settings_of
+from noack.core.core_library import core, ffi
+from noack.impairments.link_settings import LinkSettings, RecordedDecision
+from noack.protocol.record_tables import Fate
+from tests.noack.impairments import any_link_settings as any_settings
+from tests.oracles.link import Datagram, Link
+from tests.oracles.loss_language import is_allowed, longest_burst
+
+MS = 1_000_000
+OUT_OF_ORDER = settings_of("delay 5ms 20ms reorder 50%").impairments
+
+
+def often_out_of_order(link: LinkSettings, more: bool) -> LinkSettings:
+    return link.model_copy(update={"impairments": link.impairments + OUT_OF_ORDER * more})
+
+
+links = st.builds(
+    often_out_of_order, any_settings.harsh.filter(lambda one: one.longest_burst is not None),
+    st.booleans(),
+)  # fmt: skip
+GAPS_NS = [0, 1, 1000, MS // 3, MS, 5 * MS, 100 * MS]
+
+
+def steps_of(seed: int, count: int) -> list[tuple[int, int]]:
+    """Flows and gaps, from a seed: most lists that Hypothesis draws itself are short."""
+    rng = np.random.default_rng(seed)
+    gaps = rng.choice(GAPS_NS, count)
+    return list(zip(rng.integers(0, 3, count).tolist(), gaps.tolist(), strict=True))
+
+
+arrivals = st.builds(steps_of, st.integers(0, 2**32), st.integers(1, 80))
+
+
+def payload(flow: int, number: int) -> bytes:
+    return struct.pack("<HI", flow, number) * 3
+
+
+class Observer:
+    """Records the numbers of the delivered datagrams of each flow."""
+
+    def __init__(self) -> None:
+        self.counted: dict[int, list[int]] = {}
+
+    def see(self, outputs: Sequence[Any]) -> None:
+        for one in outputs:
+            if not isinstance(one, Datagram):
+                continue
+            parts = {one.data[k : k + 6] for k in (0, 6, 12)}
+            if len(parts) > 1:
+                continue
+            flow, number = struct.unpack("<HI", parts.pop())
+            assert flow == one.flow
+            counted = self.counted.setdefault(flow, [])
+            if not counted or number > counted[-1]:
+                counted.append(number)
+
+    def lost(self, flow: int, sent: int, since: int = 0) -> list[bool]:
+        """Return the outcomes of a flow's datagrams from number ``since`` on."""
+        counted = set(self.counted.get(flow, ()))
+        return [number not in counted for number in range(since, sent)]
+
+
+def send_all(
+    link: Link,
+    steps: Sequence[tuple[int, int]],
+    late: Callable[[], bool] = lambda: False,
+    before_each: Callable[[], None] = lambda: None,
+) -> tuple[Observer, dict[int, int]]:
+    """Send datagrams at their times; before each, serve the due timers unless ``late()``."""
+    observer, sent = Observer(), dict[int, int]()
+    now_ns = 0
+    for flow, gap_ns in steps:
+        now_ns += gap_ns
+        while (due := link.next_deadline_ns()) is not None and due <= now_ns and not late():
+            observer.see(link.on_timer(now_ns))
+        before_each()
+        number = sent.get(flow, 0)
+        sent[flow] = number + 1
+        observer.see(link.handle(Datagram(flow, payload(flow, number)), now_ns))
+    while (due := link.next_deadline_ns()) is not None:
+        now_ns = max(now_ns, due)
+        observer.see(link.on_timer(now_ns))
+    return observer, sent
+
+
+def assert_kept(settings: LinkSettings, link: Link, observer: Observer, sent: Any) -> None:
+    """The guarantee holds since the last change; the link counts the bursts that are observed."""
+    assert settings.longest_burst is not None
+    longest = 0
+    for flow, count in sent.items():
+        of_flow = link.flow(flow)
+        assert of_flow is not None
+        lost = observer.lost(flow, count, of_flow.since)
+        assert of_flow.longest_loss_burst == longest_burst(np.array(lost, bool))
+        longest = max(longest, of_flow.longest_loss_burst)
+        assert is_allowed(lost, settings)
+        if settings.first_delivered and of_flow.since == 0:
+            assert observer.counted[flow][0] == 0
+    assert link.counters.longest_loss_burst == longest <= settings.longest_burst
+
+
+@pytest.mark.parametrize("change", ["no", "with the same guarantee", "with another guarantee"])
+@settings(max_examples=40)
+@given(
+    st.lists(links, min_size=2, max_size=4), arrivals, st.integers(0, 2**32),
+    st.sampled_from([0.0, 0.3, 0.9]),
+)  # fmt: skip
+def test_the_guarantee_holds_with_late_timers_and_changes(
+    change: str, stages: list[LinkSettings], steps: list[tuple[int, int]], seed: int, late: float
+) -> None:
+    """Even if datagrams arrive before overdue timers are served, and if the settings change.
+
+    Another guarantee holds for all later arrivals, whatever is in flight or was lost before.
+    """
+    rng = np.random.default_rng(seed)
+    in_force = stages[0]
+    link = Link(in_force, seed, "a")
+    own = {name: getattr(in_force, name) for name in ("mansd", "constraints", "first_delivered")}
+    same = change != "with another guarantee"
+
+    def change_sometimes() -> None:
+        nonlocal in_force
+        if change != "no" and rng.random() < 0.1:
+            assert link.counters.longest_loss_burst <= (in_force.longest_burst or 0)
+            in_force = stages[int(rng.integers(len(stages)))]
+            in_force = in_force.model_copy(update=own) if same else in_force
+            link.change(in_force)
+
+    observer, sent = send_all(link, steps, lambda: rng.random() < late, change_sometimes)
+    assert_kept(in_force, link, observer, sent)
+    if same:  # the same guarantee holds across the changes, too
+        assert all(is_allowed(observer.lost(*of_flow), in_force) for of_flow in sent.items())
+
+
+@settings(max_examples=50)
+@given(links, st.integers(0, 2**32), st.integers(1, 80))
+def test_the_guarantee_needs_no_clock(settings: LinkSettings, seed: int, count: int) -> None:
+    """Arrival times in any order, timers served too early."""
+    link = Link(settings, 1, "a")
+    rng = np.random.default_rng(seed)
+    observer, sent = Observer(), [0, 0]
+    for flow, now_ns in zip(
+        rng.integers(0, 2, count).tolist(), rng.integers(0, 10 * MS, count).tolist(), strict=True
+    ):
+        observer.see(link.handle(Datagram(flow, payload(flow, sent[flow])), now_ns))
+        sent[flow] += 1
+        if link.next_deadline_ns() is not None and rng.random() < 0.5:
+            observer.see(link.on_timer(0))
+    while link.next_deadline_ns() is not None:
+        observer.see(link.on_timer(0))
+    for flow, of_flow in enumerate(sent):
+        assert is_allowed(observer.lost(flow, of_flow), settings)
+
+
+decisions = st.builds(
+    RecordedDecision,
+    fate=st.integers(0, 5),
+    delay_ns=st.sampled_from([-1, 0, 1, MS, 5 * MS]),
+    copy_delay_ns=st.sampled_from([-1, -1, 5 * MS]),
+    bit=st.sampled_from([-1, -1, 3]),
+    copy_bit=st.sampled_from([-1, 5]),
+)
+
+
+@given(
+    st.lists(decisions, max_size=40), st.lists(st.sampled_from(GAPS_NS), min_size=1, max_size=60),
+    st.integers(0, 4), any_settings.constraints, st.booleans(),
+)  # fmt: skip
+def test_the_guarantee_holds_in_any_replay(
+    recorded: list[RecordedDecision], gaps: list[int], mansd: int, constraints: Any, first: bool
+) -> None:
+    """Also of decisions that no link makes, at other times."""
+    update = {"mansd": mansd, "constraints": constraints}
+    settings = settings_of(f"loss worst {'first' * first}").model_copy(update=update)
+    link = Link(settings, 1, "a", decisions=[recorded])
+    observer, sent = send_all(link, [(0, gap) for gap in gaps])
+    assert_kept(settings, link, observer, sent)
+
+
+HISTORIES = list(itertools.product([False, True], repeat=9))
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["mansd 2", "atmost 3 in 10", "mansd 2 recover 4", "atmost 3 in 8 atmost 4 in 9 recover 3"],
+)
+def test_a_restarted_link_keeps_the_guarantee_behind_any_history(words: str) -> None:
+    """And no longer than necessary: some history makes each forced datagram necessary."""
+    settings = settings_of(f"loss worst first {words}")
+    link = Link(settings, 1, "a", restarted=True)
+    lost = [link.decide(0, 100, t_ns).fate == core.NOACK_DROPPED for t_ns in range(30)]
+    before = [list(one) for one in HISTORIES if is_allowed(one, settings)]
+    assert all(is_allowed([*one, *lost], settings) for one in before)
+    earlier = lost.index(True) - 1
+    assert earlier == 0 or any(not is_allowed([*one, *[False] * earlier, True], settings) for one in before)
+
+
+def lost_of(releases: Sequence[int | None]) -> list[bool]:
+    """Return the outcomes for the given release times, by brute force."""
+    return [
+        time is None or any(later is not None and later < time for later in releases[number + 1 :])
+        for number, time in enumerate(releases)
+    ]
+
+
+def settle(link: LinkState, packet: int, release_ns: int | None) -> Any:
+    """Settle a packet that leaves at a time, or is dropped (None); return its decision."""
+    fate = core.NOACK_DROPPED if release_ns is None else core.NOACK_DELIVERED
+    never = {"copy_ns": -1, "bit": -1, "copy_bit": -1}
+    decision = ffi.new("noack_decision *", {"fate": fate, "packet": packet, **never})
+    decision.release_ns = -1 if release_ns is None else release_ns
+    core.noack_settle(link.core, 0, decision)
+    link.flow(0).packets += 1
+    return decision
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(st.none() | st.integers(0, 12), max_size=24), st.integers(0, 4),
+    any_settings.constraints,
+)  # fmt: skip
+def test_a_datagram_is_held_back_no_longer_than_necessary(
+    wishes: list[int | None], mansd: int, constraints: Any
+) -> None:
+    """Compare all times: the earliest at or after the wish that keeps the guarantee is chosen.
+
+    And a datagram must pass only if its loss would break the guarantee.
+    """
+    own = settings_of(f"delay 1s mansd {mansd}").model_copy(update={"constraints": constraints})
+    link = LinkState(own, 0, "a")
+    link.start_flow(0, 0)
+    releases: list[int | None] = []
+    for packet, wish in enumerate(wishes):
+        if wish is None:
+            must_pass = core.noack_must_pass(link.core, 0)
+            assert must_pass != is_allowed([*lost_of(releases), True], own)
+            wish = 0 if must_pass else None
+        if wish is None:
+            settle(link, packet, None)
+            releases.append(None)
+        else:
+            decision = settle(link, packet, wish)
+            alternatives = sorted({wish, *(t for t in releases if t is not None and t > wish)})
+            least = next(t for t in alternatives if is_allowed(lost_of([*releases, t]), own))
+            assert decision.release_ns == least
+            assert decision.hold_back_ns == least - wish
+            releases.append(least)
+        assert is_allowed(lost_of(releases), own)
+
+
+PAGE = (Path(__file__).parents[3] / "docs/mansd.md").read_text()
+NEVER = "–"
+
+
+def ns(text: str) -> int:
+    return core.NOACK_NEVER_NS if text == NEVER else int(text) * 1_000_000
+
+
+@pytest.mark.parametrize(("words", "column"), [("mansd 1", 3), ("mansd 1 first", 5)])
+def test_the_link_decides_the_example_as_documented(words: str, column: int) -> None:
+    lines = PAGE.partition("## An example")[2].partition("## Proof")[0].splitlines()
+    cells = [line.strip("| ").split(" | ") for line in lines if "|" in line]
+    rows = [[cell.strip() for cell in row] for row in cells[2:]]
+    assert [int(row[0]) for row in rows] == list(range(6))
+    decisions = []
+    for k, comes, wish, *_ in rows:
+        fate = Fate.DROPPED if k in ("3", "4") else Fate.DELIVERED  # as the text states
+        delay_ns = core.NOACK_NEVER_NS if wish == NEVER else ns(wish) - ns(comes)
+        decisions.append(RecordedDecision(fate, delay_ns, -1, -1, -1))
+    link = Link(settings_of(words), 0, "test", decisions=[decisions])
+    for row in rows:
+        decision = link.decide(0, 100, ns(row[1]))
+        assert decision.release_ns == ns(row[column])
+        if column == 3:
+            assert (decision.hold_back_ns > 0) == ("held back" in row[4])
+            assert (decision.fate == Fate.FORCED) == ("forced" in row[4])

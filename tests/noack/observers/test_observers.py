@@ -1,0 +1,219 @@
+"""Gains of observers, their estimates in whole loops with disturbances and noise, and the claims."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.stats import chi2
+
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.fidelity import recorded_loop
+from cosim.analysis.replay import replay
+from cosim.analysis.summary.run_summary import summarise
+from cosim.record.align import align_tables, true_states
+from cosim.record.run_record import RunRecord
+from cosim.simulation.continuous import continuous_loop_of
+from cosim.simulation.exact_simulation import setting_of
+from cosim.simulation.virtual_time import simulate
+from noack.core.errors import CallerError
+from noack.core.linear_systems import row_norms
+from noack.observers.observer_settings import observer_gain, unobservable_mode
+from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.roles import GENERATION, RESTART, Start
+from noack.scenario.resolution import assumed_model, resolve, steady_state, true_model
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
+from tests.cosim.record.changed_records import changed
+from tests.cosim.simulation.outage import Deaf, Reborn, simulate_with
+from tests.helpers.machine_parts import sensor_of
+
+NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
+KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}
+GUSTS = {"kind": "gaussian", "std": [0.5]}
+
+
+def estimation_error(record: RunRecord) -> NDArray[np.float64]:
+    """x̂ − x at each measurement."""
+    rows = record["sensor_measurement"]
+    found: NDArray[np.float64] = rows["x"] - true_states(record["plant_step"], rows["t_ns"])
+    return found
+
+
+@pytest.fixture
+def observed(content: dict[str, Any]) -> dict[str, Any]:
+    """The double integrator with gusts, a noisy position measurement and a loss rate of ½."""
+    content["plant"] |= {"rate_hz": 100.0, "measurement": NOISE, "disturbances": [GUSTS]}
+    content["controller"] = {"rate_hz": 100.0}
+    content["trigger"] |= {"beta": 0.1, "floor": 0.1}
+    content["observer"] = KALMAN
+    return content
+
+
+def resolved(content: dict[str, Any], **seeds: int) -> Scenario:
+    return resolve(validate(content | {"seeds": seeds}, "test"))
+
+
+def run(content: dict[str, Any], **seeds: int) -> RunRecord:
+    return simulate(resolved(content, **seeds))
+
+
+def test_the_estimation_error_agrees_with_the_filters_covariance(observed: dict[str, Any]) -> None:
+    """Over N runs Σ eᵀP⁻¹e is χ² with 2N degrees of freedom (Bar-Shalom, Li, Kirubarajan 2001)."""
+    N, covariance = 80, steady_state(resolved(observed)).covariance
+    ends = np.array([estimation_error(run(observed, disturbance=s, noise=s + 1000))[-1] for s in range(N)])
+    distance = float(np.einsum("ki,ij,kj->", ends, np.linalg.inv(covariance), ends))
+    low, high = chi2.ppf([5e-4, 1 - 5e-4], 2 * N)
+    assert low < distance < high
+    # so an error that is 30 % off would be detected
+    assert 2 * N / 1.3**2 < low < high < 2 * N * 1.3**2
+
+
+def test_a_restarted_sensor_restarts_its_estimate_and_is_replayed(
+    observed: dict[str, Any],
+) -> None:
+    observed["horizon_s"] = 2.0
+    observed["observer"] = KALMAN | {"initial_estimate": [0.5, 0.0]}
+    scenario, at_ns = resolved(observed), 800_000_000
+    successor = sensor_of(scenario, Start(1, at_ns))
+    record = simulate_with(scenario, "sensor", lambda one: Reborn(one, successor, at_ns))
+    notices = [one for one in record.notices if "observer" in one["text"]]
+    assert [(one["t_ns"], one["process"]) for one in notices] == [(at_ns, "sensor")]
+    rows = record[SENSOR_MEASUREMENT]
+    again = np.flatnonzero(rows["input"] >= GENERATION)[0]
+    assert rows["t_ns"][again] == at_ns
+    assert rows["event"][again] == GENERATION
+    weight = 0.4**2 / (0.4**2 + 0.02**2)  # of the first estimate relative to the first output
+    expected = 0.5 + weight * (rows["y"][again, 0] - 0.5)
+    np.testing.assert_allclose(rows["x"][again], [expected, 0.0], rtol=1e-12)
+    notice = {"process": "sensor", "level": RESTART, "t_ns": at_ns, "text": "started anew"}
+    again_record = changed(record, notices=[notice], reports={}, kind="live")
+    found = replay(again_record)
+    assert found.bit_exact, found.first_difference
+    assert found.inputs == sum(map(record.count, record.tables))
+    verdicts = {str(claim.verdict) for claim in ClaimEvaluation(again_record).judge()}
+    assert verdicts <= {"held", "void"}
+
+
+def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str, Any]) -> None:
+    observed["plant"]["disturbances"] = [{"kind": "gaussian", "std": [1e-9]}]
+    observed["plant"]["measurement"] = {"C": [[1.0, 0.0]], "noise_std": [1e-9]}
+    scenario = resolved(observed)
+    lost = {30, 31, 32, 33, 70}
+    record = simulate_with(scenario, "sensor", lambda one: Deaf(one, lambda k: k not in lost))
+    assert len(record[SENSOR_MEASUREMENT]) == 101 - len(lost)
+    assert replay(record).bit_exact
+    # The input during the gap is unknown: it changes as the model decays.
+    error = row_norms(estimation_error(record))
+    moved = np.abs(np.diff(record[PLANT_STEP]["u"][:, 0])).max() * 4 * 0.04
+    assert error[60:].max() < moved
+    assert error[20:30].max() < 1e-6
+
+
+def test_i1_and_the_certificate_are_claimed_of_the_estimate(
+    observed: dict[str, Any],
+) -> None:
+    observed["horizon_s"] = 4.0
+    record = run(observed)
+    claims = ClaimEvaluation(record)
+    found = claims.judge()
+    assert {claim.source for claim in found} == {"(I1)", "certificate"}
+    assert any("‖x̂ − x‖" in claim.bound for claim in found)
+    assert all(claim.verdict == "held" for claim in found)
+    assert any("x_c − x̂" in claim.bound for claim in found)
+    # Relative to the plant's own state the claim of (I1) would not hold, so it is not claimed.
+    joined = align_tables(record)
+    e_c = row_norms(joined.x_c - true_states(record[PLANT_STEP], joined.t_ns))
+    assert (e_c > joined.e_c_norm + 1e-6).any()
+    assert (e_c <= joined.e_c_norm + row_norms(estimation_error(record)) + 1e-12).all()
+
+
+def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> None:
+    record = run(observed, disturbance=1, noise=2)
+    found = summarise(record, 0, "horizon").to_json()["estimation"]
+    norms = np.linalg.norm(estimation_error(record), axis=1)
+    assert found["max"] == pytest.approx(norms.max())
+    assert found["rms"] == pytest.approx(np.sqrt((norms**2).mean()))
+    assert (found["observer"], found["outputs"], found["noise_std"]) == ("kalman", 1, [0.02])
+    assert found["expected_rms"] == pytest.approx(np.sqrt(np.trace(steady_state(record.scenario).covariance)))
+    assert found["sup_e_c_norm"] > 0
+    # Without an observer, noisy measurements are used as x.
+    del observed["observer"]
+    observed["plant"]["measurement"] = {"noise_std": [0.02, 0.05]}
+    noisy = run(observed)
+    sizes = estimation_error(noisy).std(axis=0)
+    assert 0.01 < sizes[0] < 0.03 < sizes[1] < 0.08
+    assert {claim.verdict for claim in ClaimEvaluation(noisy).judge()} == {"held"}
+    assert summarise(noisy, 0, "horizon").to_json()["estimation"]["observer"] is None
+
+
+def test_exact_simulation_is_refused_in_one_line(
+    observed: dict[str, Any],
+) -> None:
+    disturbed = resolved(observed)
+    del observed["plant"]["disturbances"]
+    observed["observer"] = KALMAN | {"input_std": [0.5]}
+    for take in (continuous_loop_of, setting_of, lambda one: recorded_loop(simulate(one))):
+        for one, key in ((disturbed, r"plant\.disturbances"), (resolved(observed), "observer")):
+            with pytest.raises(CallerError, match=key) as refusal:
+                take(one)
+            assert "\n" not in str(refusal.value)
+
+
+def test_complex_poles_and_several_outputs_are_placed() -> None:
+    Ad = expm(np.array([[0.0, 1, 0], [0, 0, 1], [1, -2, 0.5]]) * 0.01)
+    wanted = (np.exp((-3 + 4j) * 0.01), np.exp((-3 - 4j) * 0.01), np.exp(-9 * 0.01 + 0j))
+    for outputs in (np.eye(3)[:1], np.eye(3)[[0, 2]], np.eye(3)):
+        L = observer_gain(Ad, outputs, wanted)
+        found = np.linalg.eigvals((np.eye(3) - L @ outputs) @ Ad)
+        np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), atol=1e-7)
+
+
+def test_an_unobservable_mode_is_reported_by_its_eigenvalue() -> None:
+    Ad = np.diag([1.5, 0.5, 0.9])
+    assert unobservable_mode(Ad, np.array([[1.0, 0.0, 0.0]])) is None
+    assert unobservable_mode(Ad, np.array([[0.0, 1.0, 1.0]])) == 1.5
+    assert unobservable_mode(Ad, np.array([[1.0, 1.0, 0.0]]), stable_too=True) == 0.9
+
+
+def test_filter_settings_default_to_the_scenarios_noise_and_disturbances(observed: dict[str, Any]) -> None:
+    observed["plant"]["disturbances"] = [
+        {"kind": "gaussian", "at": "input", "std": [0.3]},
+        {"kind": "uniform", "at": "state", "bound": [0.0, 0.6]},
+        {"kind": "sine", "amplitude": [5.0], "hz": 1.0},
+    ]
+    scenario = resolved(observed)
+    believed, h = assumed_model(scenario), 0.01
+    into = np.array([h**2 / 2, h])  # of the double integrator with a held input
+    expected = (0.3**2 + 0.6**2 / 3) * np.outer(into, into)
+    np.testing.assert_allclose(believed.Q, expected, rtol=1e-9)
+    assert believed.R.tolist() == [[0.02**2]]
+    observed["observer"] = KALMAN | {
+        "process_std": [0.0, 0.0], "input_std": [1.0], "noise_std": [0.5],
+    }  # fmt: skip
+    told = assumed_model(resolved(observed))
+    np.testing.assert_allclose(told.Q, np.outer(into, into), rtol=1e-9)
+    assert told.R.tolist() == [[0.25]]
+    np.testing.assert_allclose(true_model(resolved(observed)).Q, expected, rtol=1e-9)
+
+
+def test_the_scalar_steady_state_solves_the_quadratic_equation(content: dict[str, Any]) -> None:
+    """P⁻ = a²P⁻R/(P⁻ + R) + q, solved by hand."""
+    a, h, r, q = 2.0, 0.01, 0.04, 9e-4
+    content["model"] = {"A": [[a]], "B": [[1.0]], "gain": [[-3.0]]}
+    content["plant"] = {
+        "initial_state": [0.0], "rate_hz": 100.0,
+        "measurement": {"noise_std": [0.2]},
+    }  # fmt: skip
+    content["observer"] = {"kind": "kalman", "Q": [[q]], "initial_std": [1.0]}
+    content["plant"]["disturbances"] = [
+        {"kind": "gaussian", "at": "state", "std": [np.sqrt(q) * a / np.expm1(a * h)]}
+    ]
+    f = np.exp(2 * a * h)
+    b = r * (1 - f) - q
+    before = (-b + np.sqrt(b**2 + 4 * q * r)) / 2
+    found = steady_state(resolved(content))
+    assert found.covariance[0, 0] == pytest.approx(before * r / (before + r), rel=1e-9)
+    assert found.gain[0, 0] == pytest.approx(before / (before + r), rel=1e-9)
+    assert found.radius == pytest.approx(np.exp(a * h) * r / (before + r), rel=1e-9)

@@ -1,0 +1,158 @@
+"""Runs with a user's plant, a class or an FMU: moved, stored, replayed, failed, refused."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.replay import replay
+from cosim.analysis.summary.run_summary import linearisation
+from cosim.analysis.summary.summary_model import NoLinearisationPart
+from cosim.live.finalize import finalize
+from cosim.record.run_record import load_record
+from cosim.simulation.virtual_time import simulate_run
+from noack.core.errors import CallerError
+from noack.protocol.record_tables import PLANT_STEP
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
+from tests.command_line import invoke
+from tests.plant_server.fmus.build import build
+
+PLANT_SCENARIO = """
+name = "own"
+horizon_s = 1.0
+[model]
+A = [[0.0, 1.0], [-1.0, 1.0]]
+B = [[0.0], [1.0]]
+gain = [[-3.0, -5.0]]
+[plant]
+system = SYSTEM
+initial_state = [1.0, 0.0]
+[trigger]
+beta = 0.05
+alpha_per_s = 0.5
+floor = 0.002
+[network]
+mansd = 3
+loss = { model = "bernoulli", probability = 0.5 }
+"""
+FMU = (
+    '{ kind = "fmu", file = "models/oscillator.fmu", on_record = ["energy"], '
+    'state_variables = ["x0", "x1"], input_variables = ["u"], parameters = PARAMETERS }'
+)
+PYTHON = '{ kind = "python", file = "models/mine.py", name = "VanDerPol", parameters = PARAMETERS }'
+PLANT_CODE = """
+class VanDerPol:
+    def __init__(self, mu=1.0, broken_at_s=1e9):
+        self.mu, self.broken_at_s = mu, broken_at_s
+
+    def derivative(self, t_s, z, u):
+        if t_s > self.broken_at_s:
+            raise RuntimeError("no more grease")
+        return z[1], self.mu * (1 - z[0] ** 2) * z[1] - z[0] + u[0]
+"""
+
+
+def prepared(folder: Path, system: str, parameters: str) -> Path:
+    path = folder / "own.toml"
+    path.write_text(PLANT_SCENARIO.replace("SYSTEM", system).replace("PARAMETERS", parameters))
+    (folder / "models").mkdir()
+    (folder / "models" / "mine.py").write_text(PLANT_CODE)
+    return path
+
+
+def simulated(path: Path, horizon_s: float = 1.0) -> Path:
+    return simulate_run(load(path, [f"horizon_s={horizon_s}"]), path.parent / "runs").run_dir
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_fmu_moves_like_a_python_class_with_the_same_equations(version: int, tmp_path: Path) -> None:
+    path = prepared(tmp_path, FMU, "{ mu = 1.0 }")
+    build(tmp_path, version).rename(tmp_path / "models" / "oscillator.fmu")
+    of_fmu = load_record(simulated(path, 3.0))
+    path.write_text(PLANT_SCENARIO.replace("SYSTEM", PYTHON).replace("PARAMETERS", "{ mu = 1.0 }"))
+    of_class = load_record(simulated(path, 3.0))
+    x = of_fmu[PLANT_STEP]["x"]
+    np.testing.assert_allclose(x, of_class[PLANT_STEP]["x"], atol=1e-9)
+    assert np.linalg.norm(x[-1]) < 0.2  # the loop is closed
+    energy = (x**2).sum(axis=1, keepdims=True) / 2
+    np.testing.assert_allclose(of_fmu[PLANT_STEP]["z"], energy, rtol=1e-12)
+    assert replay(of_fmu).bit_exact
+    assert replay(of_class).bit_exact
+    path.write_text(PLANT_SCENARIO.replace("SYSTEM", FMU).replace("PARAMETERS", "{}, initial_variables = []"))
+    at_rest = resolve(load(path, ["plant.initial_state=[0.0, 0.0]"]))
+    assert isinstance(linearisation(at_rest), NoLinearisationPart)
+
+
+@pytest.mark.parametrize("kind", ["fmu", "python"])
+def test_a_run_stores_its_plant_and_is_replayed_without_the_original(kind: str, tmp_path: Path) -> None:
+    path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, "{ mu = 2.0 }")
+    build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
+    run_dir = simulated(path)
+    shutil.rmtree(tmp_path / "models")
+    elsewhere = tmp_path / "elsewhere"
+    run_dir.rename(elsewhere)
+    assert replay(load_record(elsewhere)).bit_exact
+    (kept,) = (elsewhere / "plant").iterdir()
+    kept.write_bytes(kept.read_bytes() + b"\n")
+    record = load_record(elsewhere)  # the record is still readable
+    with pytest.raises(CallerError, match="has changed: its SHA-256 is") as refused:
+        replay(record)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "expected"),
+    [
+        ("fmu", "{ fail_at_s = 0.5, fail_status = 3 }",
+         'the plant failed at 0.502 s: plant.system.file = "oscillator.fmu": fmi2DoStep failed '
+         "with status 3 (error). (the spring broke at 0.5)"),
+        ("python", "{ broken_at_s = 0.5 }",
+         'the plant failed at 0.502 s: plant.system.name = "VanDerPol": RuntimeError: no more '
+         "grease (mine.py, line 8)"),
+    ],
+)  # fmt: skip
+def test_a_failed_plant_stops_moving_and_the_run_is_recorded(
+    kind: str, parameters: str, expected: str, tmp_path: Path
+) -> None:
+    path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, parameters)
+    build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
+    ending = simulate_run(load(path), tmp_path / "runs")
+    outcome = finalize(ending, report=False, view=False)
+    assert outcome.status == 1
+    assert outcome.reason == expected
+    record = load_record(ending.run_dir)
+    x = record[PLANT_STEP]["x"]
+    assert len(x) == 501
+    assert np.isfinite(x[:251]).all()
+    assert np.isnan(x[251:]).all()
+    (notice,) = [one for one in record.notices if one["level"] == "failed"]
+    assert notice["t_ns"] == 502_000_000
+    assert replay(record).bit_exact
+    (loop,) = outcome.summary.loops
+    assert loop.rejected_datagrams["sensor"]["not_finite"] > 0
+    assert loop.unintended_losses == 0  # what is rejected has arrived
+
+
+def test_check_describes_the_plant_and_refuses_invalid_settings(tmp_path: Path) -> None:
+    path = prepared(tmp_path, PYTHON, "{}")
+    done = invoke("check", path)
+    assert done.exit_code == 0
+    assert "the plant: class VanDerPol of mine.py" in " ".join(done.stdout.split())
+    done = invoke("check", path, "--json")
+    system: dict[str, Any] = json.loads(done.stdout)["plant"]["system"]
+    assert (system["kind"], len(system["sha256"])) == ("python", 64)
+    for wrong, expected in (
+        (FMU, 'plant.system.file = "models/oscillator.fmu": cannot be read: No such'),
+        (FMU.replace('"x0", ', ""), 'plant.system.state_variables = ["x1"]: expected 2 entries'),
+        ('{ kind = "python", name = "a b" }', "use an entry point's name, or package.module:Class"),
+        (f'{{ kind = "python", name = "a", sha256 = "{64 * "0"}" }}', "give file, too"),
+        ('{ kind = "python", file = ".", name = "a" }', "cannot be read: not a regular file"),
+    ):
+        path.write_text(PLANT_SCENARIO.replace("SYSTEM", wrong).replace("PARAMETERS", "{}"))
+        with pytest.raises(CallerError) as refused:
+            load(path)
+        assert expected in str(refused.value)

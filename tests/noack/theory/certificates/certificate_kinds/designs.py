@@ -1,0 +1,206 @@
+"""Designs for a network: what ``noack design --for network`` says of the given and the best loop.
+
+With periodic updates each growth is compared with repeated patterns, as for margins, on the rung
+that is reached and on the next one; the cost is integrated anew. With events, the bounds for the
+largest M are compared with runs. The searches are short: what they say is attacked, not how good
+they are.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+
+from cosim.studies.design import event_design
+from cosim.studies.design.event_design import Certified, EventSearch
+from cosim.studies.design.network_search import DesignRequest, NetworkSearch, ReachedRung
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certificate_kinds.decaying import search as search_losses
+from tests.noack.theory.certificates.certificate_kinds.margins import growth_shares, random_scenario
+from tests.noack.theory.certificates.certificate_kinds.policies import FAR, policy_shares, scenario_of
+from tests.noack.theory.certificates.certificate_kinds.shares import Case
+from tests.oracles.lossy_loops import System, Trace, random_system
+from tests.oracles.time_triggered_loops import LoopMaps
+
+Rng = np.random.Generator
+
+
+class Wanted(NamedTuple):
+    """A loop and what is asked for."""
+
+    scenario: Scenario
+    request: DesignRequest
+    system: System | None = None
+    """The same loop, with events."""
+
+
+class Design(NamedTuple):
+    """What is said of both loops with periodic updates."""
+
+    search: NetworkSearch
+    given: ReachedRung
+    best: ReachedRung
+
+    def maps(self, reached: ReachedRung, rung: int) -> LoopMaps:
+        """Return a loop on a rung."""
+        resolved = resolve(self.search.scenario_of(reached.candidate, rung))
+        return LoopMaps(resolved, self.search.ladder[max(rung, 0)].period_ns)
+
+
+class EventDesign(NamedTuple):
+    """What is said of the best loop with events."""
+
+    search: EventSearch
+    best: Certified
+    certificate: ScenarioCertificate
+
+
+def _random_periodic(rng: Rng, **fixed: Any) -> Wanted:
+    scenario, unit_ns, *_ = random_scenario(
+        rng,
+        **({"n": int(rng.choice([1, 1, 2])), "periodic": True, "rate_per_s": rng.uniform(-0.1, 1)} | fixed),
+    )
+    n, m = np.shape(scenario.model.B)
+    weights = np.diag(10 ** rng.uniform(-1, 1, n)), np.diag(10 ** rng.uniform(-1, 1, m))
+    fewest = rng.random() < 0.2
+    window = None if fewest or rng.random() < 0.7 else int(rng.integers(2, 6))
+    most = int(rng.integers(2, 7))
+    request = DesignRequest(
+        "transmissions" if fewest else "network", window, most=None if fewest or window else most,
+        weights=weights, cost=float(rng.choice([1.0, 1.2, 3.0])), effort=int(rng.integers(16)),
+    )  # fmt: skip
+    horizon_s = 4e-9 * unit_ns if fewest else 1.0  # the longest period
+    return Wanted(scenario.model_copy(update={"horizon_s": horizon_s}), request)
+
+
+def _random_events(rng: Rng, **fixed: Any) -> Wanted:
+    """The certificate is that of the loop's own plant, or of a box which just contains it."""
+    given = {
+        "n": int(rng.integers(1, 3)), "m": 1, "sample_steps": int(rng.integers(1, 4)), "mansd": 0,
+        "delay_steps": int(rng.integers(3)), "hold_steps": 1, "lag_steps": 0, "known_start": False,
+        "window": (1, 1), "recovery": 0, "beta": float(rng.choice([0.001, 0.01, 0.1])),
+    }  # fmt: skip
+    system = random_system(rng, **(given | fixed))
+    step_ns = round(system.step_s * 1e9)
+    system, rate_hz = replace(system, step_s=step_ns * 1e-9), 1e9 / step_ns
+    change = np.abs(system.A - (system.H - system.B @ system.K)) * (1 + 1e-9)
+    box = {"draw": "vertex", "uncertainty_A": change.tolist()} if rng.random() < 0.5 else {}
+    scenario = scenario_of(
+        system,
+        {"beta": system.beta, "alpha_per_s": system.alpha, "weight": system.weight.tolist()},
+        plant={"rate_hz": rate_hz, "measure_every": system.sample_steps, **box},
+        controller={"rate_hz": rate_hz}, network={"loss": {"model": "bernoulli", "probability": 0.5}},
+        certificate={"late_periods": 0, "network_delay_s": system.delay_steps * system.step_s},
+    )  # fmt: skip
+    return Wanted(scenario, DesignRequest(most=int(rng.integers(1, 5)), effort=0), system)
+
+
+def _designed(wanted: Wanted) -> Design | EventDesign | None:
+    """Search, briefly; None: nothing is certified."""
+    if wanted.system is None:
+        search = NetworkSearch(wanted.scenario, wanted.request)
+        found = Design(search, *search.run())
+        return found if found.best.stability else None
+    with patch.multiple(event_design, COSTS_OF_INPUT=(1.0,), _ALPHAS=(0.5,)):
+        events = EventSearch(wanted.scenario, wanted.request, 0, draws=4)
+        events.certificate = cache(events.certificate)  # type: ignore[method-assign]
+        _, best = events.run()
+    certificate = events.certificate(best.loop, best.m) if best.m else None
+    if certificate is None or certificate.constants is None:
+        return None
+    return EventDesign(events, best, certificate)
+
+
+def _certify(case: Case, change: Callable[[Any], Any] = lambda found: found) -> Bounds | None:
+    found = _designed(case.loop)
+    if found is None:
+        return None
+    case.found = change(found)
+    if isinstance(found, EventDesign):
+        return dict.fromkeys(("e_s", "e_c", "x", "1/δ"), 1.0)
+    return {"growth": 1.0, "pattern": 1.0, "cost": 1 + 1e-6, "rung": 1.0, "limit": 1 + 1e-6}
+
+
+def _simulate(case: Case, rng: Rng) -> Observed:
+    wanted, found = case.loop, case.found
+    if isinstance(found, EventDesign):
+        return _simulate_events(wanted.system, found, rng)
+    worst, runs = dict.fromkeys(("growth", "pattern", "cost", "limit"), 0.0), 0
+    worst["rung"] = (found.given.rung + 2) / (found.best.rung + 2)
+    if found.best != found.given:
+        worst["limit"] = found.best.cost / found.search.limit
+    for one in (found.given, found.best):
+        cost = found.maps(one, one.rung).cost(found.search.plant.x0, *found.search.weights)
+        if cost != one.cost:  # both may be infinite
+            worst["cost"] = max(worst["cost"], cost / one.cost, one.cost / cost)
+        for rung, stability in ((one.rung, one.stability), (one.rung + 1, one.beyond)):
+            if stability is not None:
+                tried, shares = growth_shares(found.maps(one, rung), stability, rng)
+                runs, worst = runs + tried, worst | {name: max(shares[name], worst[name]) for name in shares}
+    return Observed(runs, worst)
+
+
+def _simulate_events(given: System, found: EventDesign, rng: Rng) -> Observed:
+    """The plant is on the edge of the box; without a certificate of the box it is the one drawn."""
+    certificate, (K, alpha, beta) = found.certificate, found.best.loop
+    drawn = loop_of(resolve(found.search.scenario_of(found.best.loop, found.best.m)))
+    system = replace(
+        given, A=given.A if found.search.of_box else drawn.A, alpha=alpha, beta=beta,
+        K=np.array(K), H=given.H + given.B @ (np.array(K) - given.K),
+        mansd=found.best.m - 1, delay_steps=int(certificate.conditions.delay_s / given.step_s + 1e-6),
+    )  # fmt: skip
+
+    def worst(system: System, trace: Trace) -> dict[str, float]:
+        return policy_shares(trace, certificate, system)
+
+    return search_losses(system, rng, worst_of=worst)
+
+
+def _one_rung_further(found: Design) -> Design:
+    rung = min(found.best.rung + 1, len(found.search.ladder) - 1)
+    return found._replace(best=found.best._replace(rung=rung, beyond=None))
+
+
+def _given_gain(found: Design) -> Design:
+    return found._replace(best=found.best._replace(candidate=found.given.candidate, beyond=None))
+
+
+def _given_hold(found: Design) -> Design:
+    candidate = found.best.candidate._replace(hold=found.given.candidate.hold)
+    return found._replace(best=found.best._replace(candidate=candidate, beyond=None))
+
+
+def _no_cost_of_inputs(found: Design) -> Design:
+    Q, R = found.search.weights
+    with patch.object(found.search, "weights", (Q, 0 * R)):
+        cost = found.search.cost(found.best.candidate, found.best.rung)
+    return found._replace(best=found.best._replace(cost=cost))
+
+
+def _one_loss_less(found: EventDesign) -> EventDesign:
+    certificate = found.search.certificate(found.best.loop, max(found.best.m - 1, 1))
+    assert certificate is not None
+    return found._replace(certificate=certificate)
+
+
+DESIGNS = Kind(
+    "design", lambda rng: Case((_random_events if rng.random() < 0.1 else _random_periodic)(rng)),
+    _certify, _simulate,
+    {
+        mistake: Broken(partial(_certify, change=change), lambda rng, draw=draw: Case(draw(rng)))
+        for mistake, change, draw in (
+            # The first one is tried by pytest: it is the quickest to be detected.
+            ("no cost of inputs", _no_cost_of_inputs, _random_periodic),
+            ("one rung further", _one_rung_further, partial(_random_periodic, rate_per_s=1.0)),
+            ("the gain of the given loop", _given_gain, _random_periodic),
+            ("the hold of the given loop", _given_hold, _random_periodic),
+            ("one loss less, with events", _one_loss_less, partial(_random_events, **FAR)),
+        )
+    },
+)  # fmt: skip

@@ -1,0 +1,218 @@
+"""Certificates of scenarios: across the floor, where α is too large, in zero-order hold, as JSON.
+
+tests/cosim/analysis/claims compares ``nominal_conditions`` with the machines.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from noack.core.linear_systems import spectral_abscissa
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario, loops_of
+from noack.scenario.scenario_file import load, validate
+from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
+from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
+from noack.theory.certificates.scenario_certificates import (
+    MOST_S,
+    box,
+    certify,
+    certify_box,
+    largest,
+    own_plant,
+)
+from noack.theory.certificates.solution import completed
+from tests.noack.theory.certificates.certificate_kinds.policies import exceeded_by, scenario_with
+from tests.oracles.lossy_loops import SEARCH, STEPS, System, Trace, networks, seeds, simulate, systems
+
+ROOT = Path(__file__).parents[4]
+
+
+def shipped(name: str = "lane_following", *overrides: str) -> Scenario:
+    return resolve(load(ROOT / f"scenarios/{name}.toml", list(overrides)))
+
+
+def scenario(system: System, *, floor: float = 0.0) -> Scenario:
+    threshold = {"beta": system.beta, "alpha_per_s": system.alpha, "floor": floor}
+    return scenario_with(system, threshold)
+
+
+def certified(system: System, floor: float = 0.0) -> tuple[ScenarioCertificate, Constants]:
+    certificate = certify(scenario(system, floor=floor), system.conditions)
+    if certificate.constants is None:
+        assume(False)
+    assert certificate.constants is not None
+    return certificate, certificate.constants
+
+
+def run(system: System, seed: int, floor: float = 0.0) -> Trace:
+    return simulate(system, *networks(seed, system), floor=floor)
+
+
+LATE_INPUT = systems(hold_steps=4, lag_steps=2, step_share=0.03, beta=0.01)
+
+
+@settings(SEARCH, max_examples=8)
+@given(systems() | LATE_INPUT, st.sampled_from([0.002, 0.02, 0.1, 0.5, 0.9]), seeds)
+def test_a_run_across_the_floor_exceeds_no_bound(system: System, share: float, seed: int) -> None:
+    """t_ε lies anywhere in the run, also before the plant applies its first input."""
+    floor = system.beta * math.exp(-system.alpha * share * STEPS * system.step_s)
+    certificate, first = certified(system, floor)
+    late = certificate.floor_constants
+    assert late is not None
+    # An event of the first phase may still be missing in the second.
+    assert (late.inter_event_s or 0.0) <= (first.inter_event_s or 0.0)
+    assert certificate.floor_from_s == pytest.approx(share * STEPS * system.step_s)
+    assert exceeded_by(run(system, seed, floor), certificate, system) == []
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 2.0])
+@settings(SEARCH, max_examples=3)
+@given(system=systems(), factor=st.sampled_from([1.0, 1.5, 4.0]), seed=seeds)
+def test_where_alpha_is_too_large_bounds_fall_more_slowly(
+    system: System, factor: float, share: float, seed: int
+) -> None:
+    """With a floor, even if it is above β, they are constant and keep the events apart."""
+    closed = system.A + system.B @ system.K
+    rate = min(-spectral_abscissa(system.H), -spectral_abscissa(closed))
+    system = replace(system, alpha=factor * rate)
+    floor = share * system.beta
+    certificate, constants = certified(system, floor)
+    assert constants.rate_per_s < system.alpha
+    assert (constants.rate_per_s == 0) == (floor > 0)
+    assert (certificate.inter_event_s is None) == (floor == 0)
+    assert AssumptionStatus.VIOLATED in [a.verdict for a in certificate.assumptions]
+    assert exceeded_by(run(system, seed, floor), certificate, system) == []
+
+
+def test_a_hold_under_the_papers_conditions_misses_m_thresholds() -> None:
+    """‖e_c‖ ≤ Mβ: each of at most M missing jumps stays and is at most β."""
+    resolved = shipped("lane_following", 'mode="zoh"')
+    constants = certify(resolved, ideal_conditions(resolved)).constants
+    assert constants is not None
+    assert constants.delta == pytest.approx(5.0, rel=1e-9)
+    assert constants.overshoot == pytest.approx(1.0, rel=1e-12)
+
+
+def test_a_void_certificate_gives_the_reason_and_no_bounds() -> None:
+    no_gain = ["model.gain=[[0,0,0,0],[0,0,0,0]]", "model.allow_unstable=true"]
+    resolved = shipped("lane_following", *no_gain)
+    found = certify(resolved, ideal_conditions(resolved))
+    assert found.constants is None
+    assert "grows" in str(found.void)
+    assert found.inter_event_s is None
+    observed = shipped("pendulum_observed", "plant.uncertainty_A=[[0, 0], [0, 0.1]]")
+    boxed = certify_box(observed, allowed_conditions(observed))
+    assert boxed is not None
+    assert "for one plant only, not for a box" in (boxed.void or "")
+    for envelope in (found.sensor_error, found.controller_error, found.state):
+        assert np.isnan(envelope(np.linspace(0, 9, 4))).all()
+    assert (found.assumptions[-2].what, found.assumptions[-2].verdict) == (
+        "there is a certificate", AssumptionStatus.VIOLATED,
+    )  # fmt: skip
+    assert "not below 1" in str(certify(shipped(), NetworkConditions(4, 0.5, 0.5)).void)
+
+
+LOOPS = 'loops=[{name="loop", count=2}]'
+
+
+FILES = {
+    "lane_following": ["trigger.floor=0.001", LOOPS],
+    "tabuada_dynamic": ["plant.initial_state_halfwidth=[0.2, 0.1]", LOOPS],
+    "lane_crosswind": ["horizon_s=10"],
+    "different_loops": [],
+}
+
+
+def test_certificates_that_are_computed_together_are_those_of_each_loop() -> None:
+    loops = [
+        resolve(loop)
+        for name, overrides in FILES.items()
+        for loop in loops_of(load(ROOT / f"scenarios/{name}.toml", overrides))
+    ]
+    scopes = [
+        (scope, allowed_conditions(loop))
+        for loop in loops
+        for scope in (own_plant(loop), box(loop))
+        if scope is not None
+    ]
+    found = completed([scope.search(conditions) for scope, conditions in scopes])
+    assert any(one.constants is not None for one in found)
+    for together, (scope, conditions) in zip(found, scopes, strict=True):
+        # Sums over grids that end at different times are rounded differently.
+        alone = leaves(scope.certificate(conditions).to_json())
+        for one, other in zip(leaves(together.to_json()), alone, strict=True):
+            is_real = isinstance(other, float)
+            assert one == (pytest.approx(other, rel=1e-12, abs=0.0) if is_real else other)
+
+
+def leaves(value: Any) -> list[Any]:
+    """The entries of tables and lists within each other, in one list."""
+    if isinstance(value, dict):
+        value = [*value, *value.values()]
+    return [x for one in value for x in leaves(one)] if isinstance(value, list | tuple) else [value]
+
+
+@pytest.mark.parametrize("late_periods", [0, 2])
+def test_the_networks_delay_adds_to_the_delay_of_updates(content: dict[str, Any], late_periods: int) -> None:
+    at_once = nominal_conditions(resolve(validate(content, "here")), late_periods)
+    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.02, "jitter_s": 0.01}]
+    resolved = resolve(validate(content, "here"))
+    delayed = nominal_conditions(resolved, late_periods)
+    step_s, tick_s = (
+        resolved.timing.plant_period_ns * 1e-9,
+        resolved.timing.controller_period_ns * 1e-9,
+    )
+    assert delayed.delay_s - at_once.delay_s == pytest.approx(0.03, abs=step_s + tick_s)
+    assert delayed.delay_s >= 0.03 + late_periods * step_s
+    # The input does not pass through this network.
+    assert delayed.hold_s == at_once.hold_s
+    assert any("up to 30 ms" in assumption.why for assumption in assumptions(resolved))
+
+
+GAINS: dict[str, Callable[[float], float]] = {
+    "proportional": lambda share: share,
+    "steep": lambda share: share**9,
+    "exponential": lambda share: math.exp(min(share, 500.0) - 1),
+    "unknown above": lambda share: share if share < 1 else math.inf,
+    "in steps": lambda share: 0.3 + 0.8 * math.floor(share),
+    "without a gain": lambda share: 0.0 if share < 1 else 5.0,
+}
+
+
+@pytest.mark.parametrize("name", GAINS)
+@pytest.mark.parametrize("limit_s", [3e-6, 0.04, 3.0])
+@pytest.mark.parametrize("usual_s", [0.0, 1.0])
+def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s: float) -> None:
+    tried: list[float] = []
+
+    def gain(value_s: float) -> float:
+        tried.append(value_s)
+        return GAINS[name](value_s / limit_s)
+
+    assert (1 - 1.1e-3) * limit_s <= largest(gain, usual_s) < limit_s
+    assert len(tried) < 40
+
+
+def test_all_times_or_none_may_have_a_certificate() -> None:
+    assert largest(lambda value_s: 0.5, 0.01) == MOST_S
+    assert largest(lambda value_s: math.inf, 0.01) == 0.0
+
+
+def test_events_that_are_due_may_come_as_soon_as_they_are_due() -> None:
+    """Where measurements may be missing, the longest time between two events is longer."""
+    trigger = 'trigger={policy="deadline", interval_s=0.04, rule={policy="absolute", delta=5.0}}'
+    resolved = resolve(load(ROOT / "scenarios" / "double_integrator.toml", [trigger, "network.mansd=0"]))
+    conditions = nominal_conditions(resolved)
+    missing = conditions._replace(sampling_s=5 * conditions.spacing_s)
+    for one in (conditions, missing):
+        assert own_plant(resolved).certificate(one).inter_event_s == pytest.approx(0.04)

@@ -1,0 +1,106 @@
+"""The maps of the time-triggered loop against simulated runs, and the margin against patterns."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cosim.simulation.virtual_time import simulate
+from noack.core.linear_systems import Vector
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
+from noack.theory.margins.loss_margin import LossMargin
+from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
+from tests.helpers.approved import compare_lines, lines_of_error
+
+ROOT = Path(__file__).parents[4]
+PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'
+DWELL = '{policy="dwell", interval_s=0.11, rule={policy="absolute", delta=1}}'
+DEADLINE = f'{{policy="deadline", interval_s=0.3, rule={DWELL}}}'
+HOLDS = 'controller.timeout_input="hold"'
+DELAYED = 'network.impairments=[{kind="delay", delay_s=0.0333}]'
+
+
+def scenario(name: str, *settings: str) -> Scenario:
+    settings = (PERIODIC, "network.mansd=20", *settings)
+    return resolve(load(ROOT / "scenarios" / f"{name}.toml", settings))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("double_integrator", ()),
+        ("double_integrator", ("mode=zoh",)),
+        ("double_integrator", (DELAYED,)),
+        ("double_integrator", ("controller.rate_hz=10", DELAYED.replace("333", "99"))),
+        ("double_integrator", ("controller.rate_hz=40", "controller.phase=0.3")),
+        ("double_integrator", ("plant.measure_every=7", "controller.phase=0")),
+        ("lane_following", ("controller.phase=0", "controller.rate_hz=125", DELAYED)),
+        ("double_integrator", ("mode=zoh", "controller.update_timeout_s=0.1")),
+        ("double_integrator", ("controller.update_timeout_s=0.25", HOLDS)),
+        ("double_integrator", ("controller.update_timeout_s=0.21", HOLDS, DELAYED)),
+        ("lane_following", ("controller.update_timeout_s=0.11", "controller.rate_hz=125", DELAYED)),
+        (
+            "lane_following",
+            ("mode=zoh", "controller.update_timeout_s=0.133", "controller.rate_hz=40", DELAYED),
+        ),
+    ],
+)
+def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -> None:
+    resolved = scenario(name, "horizon_s=6", *settings)
+    margin, loop = LossMargin(resolved), loop_of(resolved)
+    delay_ns = margin.loop.times.delay_ns
+    fates = np.random.default_rng(1).random(1000) < 0.5
+    fates[0] = True
+    numbers = iter(range(1000))
+    run = simulate(resolved, lambda data, now_ns: delay_ns if fates[next(numbers)] else None)
+
+    steps, tested = run["plant_step"], run["sensor_measurement"]
+    sent_ns = tested["t_ns"][tested["event"] >= 0]
+    assert set(np.diff(sent_ns)) == {margin.longest_ns}
+    delivered = np.flatnonzero(fates[: len(sent_ns)])
+    assert len(delivered) > 15
+
+    def state(number: int, before: int) -> Vector:
+        step = steps[np.searchsorted(steps["t_ns"], sent_ns[number])]
+        if not delay_ns:
+            return np.concatenate([step["x"], step["u"]])
+        older = steps[np.searchsorted(steps["t_ns"], sent_ns[before])]
+        x_c = expm(loop.H * (sent_ns[number] - sent_ns[before]) * 1e-9) @ older["x"]
+        return np.concatenate([step["x"], x_c, step["u"]])[: margin.loop.dimension]
+
+    slots = margin.loop.times.slots
+    for before, one, following in zip(delivered[1:], delivered[2:], delivered[3:], strict=False):
+        usable_ns = margin.loop.times.usable_ns(int(one - before), delay_ns)
+        map_ = margin.loop.map(int(one % slots), usable_ns, int(following - one - 1)).middle
+        expected = state(following, one)
+        np.testing.assert_allclose(
+            map_ @ state(one, before), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
+        )
+
+
+def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
+    resolved = scenario("unstable_pendulum", "mode=zoh")
+    loop, margin, guarantee = loop_of(resolved), LossMargin(resolved), LossGuarantee((LongestBurst(3),))
+    expected = margin.stability(guarantee)
+    for unit in (2.0**40, 1e-12):
+        margin.loop = TimeTriggeredLoop(loop.A, loop.B * unit, loop.K / unit, loop.H, margin.loop.times)
+        margin.maps = margin.loop.map  # type: ignore[assignment]
+        found = margin.stability(guarantee)
+        assert found.pattern == expected.pattern
+        assert found.lower == pytest.approx(expected.lower, rel=1e-9)
+        assert found.upper == pytest.approx(expected.upper, rel=1e-3)
+
+
+def test_what_is_not_covered_is_refused_with_the_approved_line() -> None:
+    def margin(settings: str) -> object:
+        return LossMargin(scenario("double_integrator", *settings.split(" & "))).stability()
+
+    compare_lines(
+        Path(__file__).with_name("margin_refusals.txt"),
+        lambda settings: lines_of_error(lambda: margin(settings)),
+    )
