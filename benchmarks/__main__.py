@@ -21,7 +21,15 @@ from typing import NamedTuple
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from benchmarks import cases
-from benchmarks.report import BENCHMARKS, Benchmark, Load, MeasurementError, Row, print_table, write_json
+from benchmarks.report import (
+    BENCHMARKS,
+    Benchmark,
+    MachineLoad,
+    MeasurementError,
+    Row,
+    print_table,
+    write_json,
+)
 from noack.core.errors import NoackError
 
 GOALS = "goals"
@@ -112,7 +120,7 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
 def _measured(benchmark: Benchmark, options: argparse.Namespace) -> tuple[list[Row], bool]:
     """Run a benchmark and print its table; return its rows, and whether it failed."""
     print(f"{benchmark.name}:", file=sys.stderr)
-    load, begun_s, failed = Load(), time.monotonic(), False
+    load, begun_s, failed = MachineLoad(), time.monotonic(), False
     try:
         rows = [*benchmark.measure(options)]
     except (MeasurementError, NoackError, AssertionError) as error:  # assertions of the tests' helpers

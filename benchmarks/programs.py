@@ -64,7 +64,7 @@ def compiled(source: str, into: Path, *options: str) -> Path:
     return target
 
 
-class Line(NamedTuple):
+class OutputLine(NamedTuple):
     """A line of a program's standard error, and the time at which it was read."""
 
     at_s: float
@@ -75,7 +75,7 @@ class Finished(NamedTuple):
     """A program that has ended with exit status 0."""
 
     begun_s: float
-    lines: list[Line]
+    lines: list[OutputLine]
     stdout: str
 
 
@@ -92,7 +92,7 @@ def execute(command: Sequence[str]) -> Finished:
             env=os.environ | PLAIN_TERMINAL,
         ) as process:
             assert process.stderr is not None
-            lines = [Line(time.monotonic(), text.rstrip()) for text in process.stderr]
+            lines = [OutputLine(time.monotonic(), text.rstrip()) for text in process.stderr]
         stdout.seek(0)
         if process.returncode != 0:
             messages = [line.text for line in lines if not PROGRESS.match(line.text)]
@@ -129,7 +129,7 @@ def noack(*arguments: str) -> NoackRun:
     return NoackRun(json.loads(finished.stdout), first_step_s(finished.begun_s, finished.lines))
 
 
-def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:
+def first_step_s(begun_s: float, lines: Iterable[OutputLine]) -> float | None:
     """Return an upper bound of the time from ``begun_s`` to the first control step at speed 1.
 
     A progress line that shows simulated time t and is read at time s proves that the run's epoch

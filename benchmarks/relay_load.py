@@ -72,7 +72,7 @@ def new_soak() -> Any:
     return _FFI.new("struct soak *")
 
 
-class Ends:
+class PathEnds:
     """Both ends of a path through a relay: a sender connected to it, and the sink behind it.
 
     All datagrams are numbered consecutively from 0.
@@ -148,7 +148,7 @@ def _numbers(array: Nanoseconds) -> Any:
     return _FFI.from_buffer("int64_t[]", array)
 
 
-class Kind(NamedTuple):
+class RelayKind(NamedTuple):
     """A kind of relay."""
 
     name: str
@@ -161,23 +161,23 @@ class Kind(NamedTuple):
 _MODES = {"segment": "segments", "names": "senders' addresses", "paths": "a socket per client"}
 
 
-def c_relay(built: Built, *words: str) -> Kind:
+def c_relay(built: Built, *words: str) -> RelayKind:
     """Return ``relay.c`` in one of its modes, ``segment``, ``names`` and ``paths``."""
     name = ", ".join(["C relay", *(_MODES[word] for word in words)])
-    return Kind(name, lambda port, to: [str(built.relay), str(port), str(to), *words])
+    return RelayKind(name, lambda port, to: [str(built.relay), str(port), str(to), *words])
 
 
-def socat() -> Kind:
+def socat() -> RelayKind:
     """Return socat, forward only."""
 
     def command(port: int, to: int) -> list[str]:
         listen = f"UDP4-RECV:{port},rcvbuf={4 * 2**20}"
         return [program_path("socat", "socat"), "-u", "-b", "2048", listen, f"UDP4-SENDTO:{LOOPBACK}:{to}"]
 
-    return Kind("socat", command)
+    return RelayKind("socat", command)
 
 
-def our_relay(name: str, words: str, *flags: str, reverse: bool = False, lossy: bool = True) -> Kind:
+def our_relay(name: str, words: str, *flags: str, reverse: bool = False, lossy: bool = True) -> RelayKind:
     """Return ``python -m netem`` with impairments in tc's words, maybe with a reverse direction."""
     options = (*words.split(), *flags, *(() if reverse else ("--one-way",)), "--json")
 
@@ -185,13 +185,13 @@ def our_relay(name: str, words: str, *flags: str, reverse: bool = False, lossy: 
         ends = ("--listen", f"{LOOPBACK}:{port}", "--to", f"{LOOPBACK}:{to}")
         return [sys.executable, "-m", "netem", *ends, *options]
 
-    return Kind(name, command, lossy)
+    return RelayKind(name, command, lossy)
 
 
-class Relay:
+class LoadedRelay:
     """A running relay with its sender and sink."""
 
-    def __init__(self, kind: Kind, process: subprocess.Popen[str], ends: Ends) -> None:
+    def __init__(self, kind: RelayKind, process: subprocess.Popen[str], ends: PathEnds) -> None:
         self.name = kind.name
         self.ends = ends
         self.pid = process.pid
@@ -236,12 +236,12 @@ class Relay:
 
 
 @contextmanager
-def running(kind: Kind, built: Built) -> Iterator[Relay]:
+def running(kind: RelayKind, built: Built) -> Iterator[LoadedRelay]:
     """Run a relay on its core, between sender and sink."""
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         probe.bind((LOOPBACK, 0))
         port = int(probe.getsockname()[1])
-    with closing(Ends(built.load)) as ends, ExitStack() as stack:
+    with closing(PathEnds(built.load)) as ends, ExitStack() as stack:
         command = kind.command(port, ends.sink.getsockname()[1])
         with on_core(RELAY_CORE):
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -254,7 +254,7 @@ def running(kind: Kind, built: Built) -> Iterator[Relay]:
                 raise MeasurementError(f"{kind.name} does not listen: {process.communicate()[1].strip()}")
             time.sleep(0.01)
         ends.out.connect((LOOPBACK, port))
-        yield Relay(kind, process, ends)
+        yield LoadedRelay(kind, process, ends)
 
 
 def _is_bound(port: int) -> bool:
@@ -264,9 +264,9 @@ def _is_bound(port: int) -> bool:
 
 
 @contextmanager
-def started(kinds: Iterable[Kind], built: Built) -> Iterator[tuple[Rounds, list[Relay]]]:
+def started(kinds: Iterable[RelayKind], built: Built) -> Iterator[tuple[Rounds, list[LoadedRelay]]]:
     """Run relays within the context; the rounds say which ones did not start, and why."""
-    rounds, relays = Rounds(), list[Relay]()
+    rounds, relays = Rounds(), list[LoadedRelay]()
     with ExitStack() as stack:
         for kind in kinds:
             try:
@@ -277,8 +277,8 @@ def started(kinds: Iterable[Kind], built: Built) -> Iterator[tuple[Rounds, list[
 
 
 @contextmanager
-def direct_ends(built: Built) -> Iterator[Ends]:
+def direct_ends(built: Built) -> Iterator[PathEnds]:
     """Give a sender whose datagrams go directly to the sink."""
-    with closing(Ends(built.load)) as ends:
+    with closing(PathEnds(built.load)) as ends:
         ends.out.connect(ends.sink.getsockname())
         yield ends

@@ -153,7 +153,7 @@ def benchmark(name: str, title: str, options: Options | None = None) -> Callable
     return declare
 
 
-class Load:
+class MachineLoad:
     """The machine's load by other programs since the object's construction."""
 
     def __init__(self) -> None:

@@ -34,8 +34,7 @@ from scipy.stats import theilslopes
 from benchmarks.programs import LAUNCHER, Observed, Sample, observed_run
 from benchmarks.report import Goal, MeasurementError, Row, print_table
 from cosim.output.figures import palette
-from cosim.output.figures.figure_description import Axis, FigureDescription, Line, Panel, time_axis
-from cosim.output.figures.figure_description import Row as FigureRow
+from cosim.output.figures.figure_description import Axis, FigureDescription, Line, Panel, PanelRow, time_axis
 from cosim.output.figures.figure_files import save_figure
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import load_record
@@ -207,7 +206,7 @@ def memory_figure(run: Observed) -> FigureDescription:
         x = time_axis(at_s, numbers=i == len(ROLES) - 1, label="wall time [s]")
         title = "" if i else "private memory since the start"
         panel = Panel(title=title, items=[line], x=x, y=Axis(label=f"{role} [KiB]"))
-        rows.append(FigureRow(panels=[panel], height_in=0.95))
+        rows.append(PanelRow(panels=[panel], height_in=0.95))
     return FigureDescription(name="memory", rows=rows)
 
 

@@ -59,7 +59,7 @@ static inline void refuse(noack_decision *decision, int64_t fate) {
     if (decision->fate != NOACK_DELIVERED)
         return;
     if (decision->must_pass)
-        decision->spared = 1;
+        decision->loss_suppressed = 1;
     else
         decision->fate = fate;
 }

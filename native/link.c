@@ -74,12 +74,12 @@ static void repeat(const noack_recorded *recorded, noack_decision *decision) {
     decision->bit = within(recorded->bit, decision->size_bytes);
     decision->copy_bit = within(recorded->copy_bit, decision->size_bytes);
     decision->release_ns = NOACK_NEVER_NS;
-    decision->spared = fate == NOACK_FORCED;
+    decision->loss_suppressed = fate == NOACK_FORCED;
     int intact = decision->bit < 0 || (recorded->copy_delay_ns >= 0 && decision->copy_bit < 0);
     int delivers = fate == NOACK_DELIVERED || fate == NOACK_FORCED;
     if (decision->must_pass && !(delivers && intact)) {
         fate = NOACK_FORCED;
-        decision->spared = 1;
+        decision->loss_suppressed = 1;
         decision->bit = decision->copy_bit = -1;
     }
     decision->fate = fate;
@@ -139,7 +139,7 @@ void link_repeat(
         .arrival_ns = now_ns,
         .size_bytes = size_bytes,
         .must_pass = noack_must_pass(link, row),
-        .spared = 0,
+        .loss_suppressed = 0,
         .waits = 0,
         .key = 0,
         .after_ns = 0,
@@ -224,7 +224,7 @@ void noack_settle(noack_link *link, int64_t row, noack_decision *decision) {
     if (effective_ns != NOACK_NEVER_NS) {
         if (link->tracks)
             effective_ns = hold_back(link, row, decision, effective_ns);
-        if (decision->spared)
+        if (decision->loss_suppressed)
             decision->fate = NOACK_FORCED;
         if (flow->forced_first) {
             flow->forced_first = 0;

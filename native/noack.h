@@ -34,7 +34,7 @@ typedef struct { /* the decision for a packet; the stages modify it one after th
     int64_t arrival_ns;
     int64_t size_bytes; /* of the payload */
     int64_t must_pass;  /* 1: the guarantee requires its delivery */
-    int64_t spared;     /* 1: it must pass, and a stage would have lost it */
+    int64_t loss_suppressed;     /* 1: it must pass, and a stage would have lost it */
     int64_t waits;      /* 1: it waits in a queue that chooses when the link is free, so that its
                            departure is not known: release_ns is the earliest time */
     int64_t key;        /* what waits: the smallest key leaves first */

@@ -31,7 +31,7 @@ from netem.tc_words import (
 )
 from noack.core.errors import CallerError, shortened
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import expected_loss, read_files, with_kept_loss
+from noack.impairments.loss_prediction import expected_loss, read_files, with_target_loss
 from noack.impairments.words import OWN_TIME_S
 from noack.runtime.address import address_text, parse_address, parse_destination
 from noack.runtime.command_line import Parser
@@ -435,7 +435,7 @@ def _print_tc(console: Console, tc: TcCommand) -> None:
 
 def _uncapped(settings: LinkSettings) -> LinkSettings:
     """Return settings without the guarantee, which lose with the same probabilities."""
-    return with_kept_loss(settings).model_copy(update={"mansd": None, "constraints": ()})
+    return with_target_loss(settings).model_copy(update={"mansd": None, "constraints": ()})
 
 
 def _link_table(spec: LinkSpec) -> dict[str, object]:

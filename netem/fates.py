@@ -362,12 +362,12 @@ class _Link(BaseModel):
     reverse: _Direction
 
 
-class _Header(BaseModel):
+class _FormatHeader(BaseModel):
     format: int
     version: str
 
 
-class _Document(_Header):
+class _Document(_FormatHeader):
     """The part of a trace's metadata that a replay needs."""
 
     missing_events: Annotated[int, Field(ge=0)]
@@ -376,7 +376,7 @@ class _Document(_Header):
 
 def _document(path: Path, text: bytes | None) -> _Document:
     try:
-        header = _Header.model_validate_json(text or b"", strict=True)
+        header = _FormatHeader.model_validate_json(text or b"", strict=True)
         if header.format != FORMAT:
             raise CallerError(f"{path}: has the format of noack {header.version}; record it again")
         return _Document.model_validate_json(text or b"", strict=True)

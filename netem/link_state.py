@@ -16,7 +16,7 @@ from noack.core.random_streams import stream_key
 from noack.impairments.feature import Stage, StageTables
 from noack.impairments.link_settings import Counters, Decisions, LinkSettings
 from noack.impairments.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
-from noack.impairments.loss_prediction import with_kept_loss
+from noack.impairments.loss_prediction import with_target_loss
 
 Integers = NDArray[np.int64]
 _COUNTED = dtype_of("noack_counters").names or ()
@@ -148,7 +148,7 @@ class LinkState:
 
     def _new_link(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
         """Return a new ``noack_link`` of these settings, which shares the array of flows."""
-        settings = with_kept_loss(settings)
+        settings = with_target_loss(settings)
         tables = StageTables(
             scored=any(getattr(impairment, "loss_correlation", 0) != 0 for impairment in settings.impairments)
         )

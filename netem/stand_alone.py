@@ -162,7 +162,7 @@ def relay(
             running = nullcontext(lambda: False) if program is None else program.running(signals)
             has_ended = stack.enter_context(running)
         for setting, answer in stack.enter_context(realtime(options.realtime, _FIFO_PRIORITY)).items():
-            if answer.startswith("refused"):
+            if answer.startswith("not permitted"):
                 report_line(f"{setting} {answer}")
         takes_output = options.view or (options.stats is not None and options.stats_file is None)
         if program is None:

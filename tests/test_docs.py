@@ -20,7 +20,7 @@ import noack
 from cosim.cli import app
 from cosim.cli.command import durations
 from cosim.output.page_kit import glossary
-from cosim.studies.campaign.campaign_file import Axis, Campaign, Figure, Metrics, PairedComparison
+from cosim.studies.campaign.campaign_file import Campaign, CampaignAxis, Figure, Metrics, PairedComparison
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
@@ -112,7 +112,7 @@ def test_every_key_of_a_campaign_is_documented_and_no_other() -> None:
     assert documented_keys(page.partition("## The file")[0]) == shipped
     assert documented_keys(page.partition("## Metrics")[2].partition("##")[0]) == METRICS.keys()
     text = page.partition("## The file")[2].partition("## Draws")[0]
-    sections = {"axes": Axis, "metrics": Metrics, "compare": PairedComparison}
+    sections = {"axes": CampaignAxis, "metrics": Metrics, "compare": PairedComparison}
     keys = set(Campaign.model_fields) - {"metrics", "compare"} | {"figures.kind", "figures.where"}
     keys |= {f"{name}.{key}" for name, section in sections.items() for key in section.model_fields}
     figures = {table.model_fields["kind"].default: table for table in choices(Figure)}

@@ -169,6 +169,13 @@ def test_base_names_of_modules_are_unique() -> None:
     assert [name for name, count in names.items() if count > 1 and name not in EXEMPT] == []
 
 
+def test_names_of_classes_are_unique() -> None:
+    names = Counter(one.name for module in modules() for one in statements(module.tree)
+                    if isinstance(one, ast.ClassDef))  # fmt: skip
+    assert len(names) > 700
+    assert [name for name, count in names.items() if count > 1] == []
+
+
 def test_no_folder_grows_past_its_budget() -> None:
     folders = {path.parent for package in ("noack", "cosim") for path in ROOT.glob(f"{package}/*/*.py")}
     assert {str(folder.relative_to(ROOT)) for folder in folders} <= LINES.keys()

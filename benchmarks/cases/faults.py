@@ -212,7 +212,7 @@ _SEGMENTS, _SENDERS, _LONGEST_SLEEP_S = 64, 4, 0.01
 _UDP_SEGMENT = 103
 
 
-class Case(NamedTuple):
+class FloodCase(NamedTuple):
     """A flood."""
 
     name: str
@@ -224,10 +224,10 @@ class Case(NamedTuple):
 
 
 CASES = (
-    Case("5 x the loop's rate", LOOP_ROLES, 5 * LOOP_HZ * len(LOOP_ROLES)),
-    *(Case(f"limit, {role}", (role,), 0) for role in LOOP_ROLES),
-    Case("limit, all", LOOP_ROLES, 0),
-    Case("limit, all, no real-time", LOOP_ROLES, 0, asked=False),
+    FloodCase("5 x the loop's rate", LOOP_ROLES, 5 * LOOP_HZ * len(LOOP_ROLES)),
+    *(FloodCase(f"limit, {role}", (role,), 0) for role in LOOP_ROLES),
+    FloodCase("limit, all", LOOP_ROLES, 0),
+    FloodCase("limit, all, no real-time", LOOP_ROLES, 0, asked=False),
 )
 
 
@@ -254,7 +254,7 @@ def flood(ports: Sequence[int], rate_hz: float) -> int:
     return sent
 
 
-def flood_rows(case: Case) -> Iterator[Row]:
+def flood_rows(case: FloodCase) -> Iterator[Row]:
     """Yield the effects of a flood on a run.
 
     Measurements missed did not reach the sensor. Lost are all datagrams of the loop that were lost

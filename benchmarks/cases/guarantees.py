@@ -19,7 +19,7 @@ from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
 from noack.theory.certificates.scenario_certificates import certify
-from noack.theory.certificates.weight import choose_weight
+from noack.theory.certificates.trigger_weight import choose_weight
 from tests.oracles.loss_language import is_allowed, longest_burst, outcomes_of
 
 DECISIONS = 100_000_000

@@ -81,7 +81,7 @@ class BareClient:
         self.midpoint_ns = (there_ns - sent_ns + answered_ns - now_ns) // 2
 
 
-class Case(NamedTuple):
+class ClockCase(NamedTuple):
     """A setting of the client and of the reference, and the goal of the bound's error."""
 
     name: str
@@ -101,7 +101,7 @@ class Clock(NamedTuple):
     drift_ppb: int
 
 
-def answer(hosts: TwoHosts, case: Case, bare: bool, parent: Connection) -> None:
+def answer(hosts: TwoHosts, case: ClockCase, bare: bool, parent: Connection) -> None:
     """Send the port to the parent, and answer until it closes its end."""
     enter_namespace(hosts.names[0])
     listen = (hosts.addresses[0][0], 0)
@@ -117,7 +117,7 @@ def answer(hosts: TwoHosts, case: Case, bare: bool, parent: Connection) -> None:
                 end.answer_all()
 
 
-def ask(hosts: TwoHosts, case: Case, plain: bool, port: int, clock: Clock) -> Figures:
+def ask(hosts: TwoHosts, case: ClockCase, plain: bool, port: int, clock: Clock) -> Figures:
     """Check the bound against the true offset for a time; return the figures."""
     enter_namespace(hosts.names[1])
     clocks, address = DrivenClocks(*clock), (hosts.addresses[0][0], port)
@@ -157,7 +157,7 @@ def ask(hosts: TwoHosts, case: Case, plain: bool, port: int, clock: Clock) -> Fi
     return figures
 
 
-def measured(hosts: TwoHosts, clock: Clock, case: Case, *, bare: bool = False) -> Figures:
+def measured(hosts: TwoHosts, clock: Clock, case: ClockCase, *, bare: bool = False) -> Figures:
     """Run a reference and a client on two hosts; return the client's figures."""
     context = get_context("spawn")
     own, other = context.Pipe()
@@ -175,12 +175,12 @@ def measured(hosts: TwoHosts, clock: Clock, case: Case, *, bare: bool = False) -
 
 
 OURS, BARE = "noack", "plain NTP midpoint, no bound"
-MAIN = Case("20 ms, replies read at once", Goal("<=", 50))
+MAIN = ClockCase("20 ms, replies read at once", Goal("<=", 50))
 CASES = (
-    Case("50 ms, replies read at once", period_s=0.05),
-    Case("50 ms, replies read 50 ms later", period_s=0.05, late=True),
-    Case("50 ms, replies read 50 ms later, ρ = 201 ppm", Goal("<=", 50), 0.05, True, 201_000),
-    Case("20 ms, reference answers every 50 ms", answer_every_s=0.05),
+    ClockCase("50 ms, replies read at once", period_s=0.05),
+    ClockCase("50 ms, replies read 50 ms later", period_s=0.05, late=True),
+    ClockCase("50 ms, replies read 50 ms later, ρ = 201 ppm", Goal("<=", 50), 0.05, True, 201_000),
+    ClockCase("20 ms, reference answers every 50 ms", answer_every_s=0.05),
 )
 CLOCKS = [Clock(ahead_s * 10**9, drift) for ahead_s in (1, -1) for drift in (100_000, -100_000)]
 

@@ -23,7 +23,7 @@ _RARELY = ("--set", 'trigger={policy="periodic", period_s=0.5}')
 _LOSSLESS = ("--set", 'network.loss={model="lossless"}')
 
 
-class Case(NamedTuple):
+class LatencyCase(NamedTuple):
     """Runs whose events have a period, and their settings."""
 
     period_s: float
@@ -36,15 +36,15 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "every 2 ms, real-time settings": Case(0.002, 5.0, _OFTEN, True, Goal("<=", 1.4)),
-    "every 2 ms, no settings": Case(
+    "every 2 ms, real-time settings": LatencyCase(0.002, 5.0, _OFTEN, True, Goal("<=", 1.4)),
+    "every 2 ms, no settings": LatencyCase(
         0.002, 5.0, (*_OFTEN, "--set", "realtime.enabled=false"), False, Goal("<=", 1.3)
     ),
-    "every 0.5 s, real-time settings": Case(0.5, 30.0, _RARELY, True, Goal("<=", 1.3)),
+    "every 0.5 s, real-time settings": LatencyCase(0.5, 30.0, _RARELY, True, Goal("<=", 1.3)),
 }
 
 
-def ping(program: Callable[[], Path], case: Case, refused: set[str]) -> Figures:
+def ping(program: Callable[[], Path], case: LatencyCase, refused: set[str]) -> Figures:
     """Send datagrams through the bare relay; return one-way latencies, µs, and their count.
 
     Real-time settings that were not permitted are added to ``refused``.
@@ -61,7 +61,7 @@ def ping(program: Callable[[], Path], case: Case, refused: set[str]) -> Figures:
     return {**figures, "count": len(latencies_ns)}
 
 
-def updates(case: Case, refused: set[str]) -> Figures:
+def updates(case: LatencyCase, refused: set[str]) -> Figures:
     """Run the loop live; return the latencies of its updates, µs, and their count."""
     horizon = ("--set", f"horizon_s={case.round_s}")
     (loop,) = noack("run", "lane_following", *horizon, *_LOSSLESS, *case.arguments).summary["loops"]
@@ -131,7 +131,7 @@ def wake_ups() -> Figures:
     """Return the lateness of a round of a run's loop with real-time settings, µs."""
     numbers = map(str, (1000 * PERIOD_US, ROUND_S, PRIORITY, 0))
     lateness = json.loads(execute([sys.executable, "-m", "cosim.doctor.probe", "wake", *numbers]).stdout)
-    if (answer := lateness["granted"]["sched_fifo"]) != "applied":
+    if (answer := lateness["settings"]["sched_fifo"]) != "applied":
         raise MeasurementError(f"SCHED_FIFO {answer}")
     return quantiles_us(lateness["realtime"])
 

@@ -167,7 +167,7 @@ def _added(tools: relay_load.Built) -> Rounds:
     ours = relay_load.our_relay(PLAIN, "loss 5% mansd 0 seed 7", lossy=False)
     base_us = 0.0
 
-    def added(relay: relay_load.Relay) -> Figures:
+    def added(relay: relay_load.LoadedRelay) -> Figures:
         return quantiles_of(relay.name, relay.ends.ping(PINGS), base_us)
 
     def base() -> Figures:
@@ -193,7 +193,7 @@ def _late(tools: relay_load.Built) -> Rounds:
             raise MeasurementError(f"{_LATENCY} cannot be written")
         return cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE)
 
-    def late(relay: relay_load.Relay) -> Figures:
+    def late(relay: relay_load.LoadedRelay) -> Figures:
         with scheduled(FIFO_PRIORITY) as permitted:
             if not permitted:
                 rounds.add(KERNEL, "SCHED_FIFO is refused")
@@ -236,7 +236,7 @@ def steady_load(options: argparse.Namespace) -> Iterator[Row]:
             yield from _soak_rows(relay, options.soak_s, maximum_per_s)
 
 
-def _soak_rows(relay: relay_load.Relay, seconds: int, maximum_per_s: float) -> Iterator[Row]:
+def _soak_rows(relay: relay_load.LoadedRelay, seconds: int, maximum_per_s: float) -> Iterator[Row]:
     """Load a relay with half of its maximum rate, in groups of datagrams; yield the rows."""
     group = max(round(maximum_per_s / 2 * _GROUP_S), 1)
     period_ns = round(group / (maximum_per_s / 2) * 1e9)

@@ -60,7 +60,7 @@ _LIBRARIES = "import numpy, zenoh; print(); input()"
 _NOTHING = Goal("==", 0)
 
 
-class Load(NamedTuple):
+class LoopLoad(NamedTuple):
     """The loops of a run."""
 
     loops: int
@@ -91,7 +91,7 @@ class Load(NamedTuple):
         return [str(_SCENARIO), *(word for setting in settings for word in ("--set", setting))]
 
 
-def run(load: Load, folder: Path) -> Observed:
+def run(load: LoopLoad, folder: Path) -> Observed:
     """Run the loops as a user does."""
     observed = observed_run(load.arguments, folder, load.horizon_s, _POLL_S)
     if (ending := observed.summary["exit"])["status"]:
@@ -112,7 +112,7 @@ def cpu_s(command: Sequence[str]) -> float:
     return own_cpu_s(children=True) - before_s
 
 
-def bare_step_us(load: Load) -> float:
+def bare_step_us(load: LoopLoad) -> float:
     """Return the CPU time in µs that a step takes in C processes that only send and receive.
 
     A step is a measurement and an actuation. One process sends, and one receives, as many datagrams
@@ -128,7 +128,7 @@ def bare_step_us(load: Load) -> float:
         return 2e6 * cpu_s([str(program), *arguments]) / (count * burst)
 
 
-def figures(load: Load, run: Observed, bare_us: float) -> Iterator[Row]:
+def figures(load: LoopLoad, run: Observed, bare_us: float) -> Iterator[Row]:
     """Yield the figures of a run; ``bare_us`` is a step of the bare exchange."""
 
     def row(name: str, value: float, unit: str = "", **more: Any) -> Row:
@@ -155,7 +155,7 @@ def figures(load: Load, run: Observed, bare_us: float) -> Iterator[Row]:
     yield row("end of the run", end_s, "s", peer=peer, goal=_END_SHARE)
 
 
-def memory(load: Load, run: Observed) -> Iterator[Row]:
+def memory(load: LoopLoad, run: Observed) -> Iterator[Row]:
     """Yield the private memory of the processes of one loop: the median over its run."""
     used = {role: median(sample.uss_kib for sample in run.in_loops(role)) / _KIBI for role in LOOP_ROLES}
     name, total = f"{load}: private memory of {', '.join(used)}", sum(used.values())
@@ -198,16 +198,16 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
     loop, beside as many Pythons that import the libraries of each process.
     """
 
-    def measured(load: Load) -> Observed:
+    def measured(load: LoopLoad) -> Observed:
         say(str(load))
         with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
             return run(load, Path(folder))
 
     for loops, rate_hz in ((options.fleet_loops, 50.0), (20, 500.0)):
-        load = Load(loops, rate_hz, options.fleet_s)
+        load = LoopLoad(loops, rate_hz, options.fleet_s)
         before_us, observed, after_us = bare_step_us(load), measured(load), bare_step_us(load)
         yield from figures(load, observed, (before_us + after_us) / 2)
-    alone = Load(1, 500.0, min(options.fleet_s, _SINGLE_S))
+    alone = LoopLoad(1, 500.0, min(options.fleet_s, _SINGLE_S))
     yield from memory(alone, measured(alone))
 
 
@@ -215,7 +215,7 @@ ROUNDS = 1
 OURS, IMPORTS = "noack", "Python that imports the libraries"
 _CERTIFY = (*NOACK, "certify", "lane_following")
 _IMPORT_CONTROL = (sys.executable, "-c", "import control")
-_LOOPS = Load(20, 500.0, 5.0)
+_LOOPS = LoopLoad(20, 500.0, 5.0)
 
 
 def started() -> Figures:

@@ -1,1 +1,15 @@
-"""Analysis of runs: summary, claims, fidelity, replay; of scenarios: certificates, margin, adversary."""
+"""Analysis of scenarios, before a run: certificates, margin, mean cost, adversary; and of runs.
+
+Of a scenario:
+
+* ``certificates.py`` has all certificates, as one object and as a table.
+* ``margin_search.py`` finds the largest M for which the loop is stable, ``mean_cost.py`` its cost
+  under random losses. The mathematics of both is in ``noack/theory``.
+* ``adversary`` searches for the loss pattern that comes closest to a certificate's bound.
+
+Of a run, from its record:
+
+* ``summary`` has its numbers, ``claims`` compares them with the certificates.
+* ``fidelity.py`` splits the difference from the ideal loop by cause.
+* ``replay`` repeats every step from the recorded inputs, bit for bit.
+"""

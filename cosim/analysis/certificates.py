@@ -28,7 +28,7 @@ from noack.theory.certificates.conditions import (
 )
 from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import NetworkLimits, box, network_limits, own_plant
-from noack.theory.certificates.weight import choose_weight
+from noack.theory.certificates.trigger_weight import choose_weight
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
 from noack.theory.random_losses.moments import UnlimitedLosses, unlimited_losses
@@ -225,7 +225,7 @@ class Certificates:
         return [certificate for under, certificate in self if under == conditions]
 
     def _rows(self) -> Rows:
-        heads = [f"{under}, {plants_of(certificate)}" for under, certificate in self]
+        heads = [f"{under}, {covered_plants(certificate)}" for under, certificate in self]
         certificates = [certificate for _, certificate in self]
         rows = [[label, *values] for label, values, _ in constant_rows(certificates, None, 0.0)]
         return [[self.scenario.name, *heads], *rows]
@@ -353,7 +353,7 @@ _WEIGHTED = ("e_c", "e_s", "(x̂ − x)")
 """Rows of the bounds that are added under disturbances, noise or an observer."""
 
 
-def plants_of(certificate: ScenarioCertificate) -> str:
+def covered_plants(certificate: ScenarioCertificate) -> str:
     """Return which plants a certificate covers: "box", "region" or "plant"."""
     return {BOX: "box", REGION: "region"}.get(certificate.scope, "plant")
 

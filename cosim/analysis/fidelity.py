@@ -157,7 +157,7 @@ def _require_times(table: str, times_ns: NDArray[np.int64], horizon_ns: int) -> 
     _require(bool(possible), f"the record's {table} has times that no run has")
 
 
-class _Ticks(NamedTuple):
+class _InputOrigins(NamedTuple):
     """The origin of the controller's actuations (by sequence number) or of the plant's steps."""
 
     model_ns: NDArray[np.int64]
@@ -165,7 +165,7 @@ class _Ticks(NamedTuple):
     """Sequence number of the newest update that they use, −1 for none."""
 
 
-def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_Ticks, set[int]]:
+def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_InputOrigins, set[int]]:
     """Return the origin of each actuation, and the updates that the controller accepted."""
     inputs = np.sort(np.concatenate([ticks["input"], deliveries["input"]]))
     whole = np.array_equal(inputs, np.arange(len(inputs)))
@@ -173,15 +173,15 @@ def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_Ticks, set[int]]:
     _require(whole, "ticks or deliveries are missing from the controller's record")
     sequences = np.concatenate([[NO_SEQUENCE], deliveries["sequence"]])
     newest = sequences[np.searchsorted(deliveries["input"], ticks["input"])]
-    return _Ticks(ticks["model_t_ns"], newest), set(deliveries["sequence"].tolist())
+    return _InputOrigins(ticks["model_t_ns"], newest), set(deliveries["sequence"].tolist())
 
 
-def _latched(actuations: NDArray[np.int64], ticks: _Ticks) -> _Ticks:
+def _latched(actuations: NDArray[np.int64], ticks: _InputOrigins) -> _InputOrigins:
     """Return the origin of the input held from each step on; −1 before the first."""
     known = bool(actuations.max(initial=NO_SEQUENCE) < len(ticks.newest))
     _require(known, "the controller's record ends before the plant's")
-    by_sequence = _Ticks(np.append(ticks.model_ns, NO_ACTUATION), np.append(ticks.newest, NO_SEQUENCE))
-    return _Ticks(by_sequence.model_ns[actuations], by_sequence.newest[actuations])
+    by_sequence = _InputOrigins(np.append(ticks.model_ns, NO_ACTUATION), np.append(ticks.newest, NO_SEQUENCE))
+    return _InputOrigins(by_sequence.model_ns[actuations], by_sequence.newest[actuations])
 
 
 def _delays(accepted: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]) -> Callable[[int], int]:

@@ -105,7 +105,7 @@ def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None
     def attempt(guarantee: LossGuarantee) -> CostUnder | str:
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not known
-                return _under(resolved, periods, guarantee)
+                return _cost_under(resolved, periods, guarantee)
         except NotPredictableError as error:
             return f"not known: {error}"
 
@@ -121,7 +121,7 @@ def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None
     )
 
 
-def _under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarantee) -> CostUnder:
+def _cost_under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarantee) -> CostUnder:
     outcomes = loss_process(resolved.network.link).outcomes(guarantee)
     if resolved.network.initial_sync == "known_state":  # nothing is sent at t = 0
         outcomes = outcomes.after_pause()

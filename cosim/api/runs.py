@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.figure import Figure
 
-    from cosim.analysis.replay import Replay
+    from cosim.analysis.replay import ReplayResult
     from cosim.analysis.summary.summary_model import Claim, RunSummary
     from cosim.output.figures.figure_description import FigureDescription
 
@@ -256,7 +256,7 @@ class Run:
         run_archive.write_archive(self.directory, Path(path))
         return Path(path)
 
-    def replay(self) -> "Replay":
+    def replay(self) -> "ReplayResult":
         """Feed every machine its recorded inputs again and compare the outputs bit for bit.
 
         Returns:

@@ -19,9 +19,8 @@ from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.runs import Run
 from cosim.api.scenarios import Source, load, plain_table
 from cosim.lazy_modules import lazy_modules
-from cosim.measurement.measurement_outputs import write_network
-from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions
-from cosim.measurement.network_measurement import Measurement as NetworkMeasurement
+from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
+from cosim.measurement.network_section import write_network
 from cosim.measurement.trace_sources import read_source
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError

@@ -39,8 +39,8 @@ _REMEDIES = {
 }
 
 
-class FindingStatus(StrEnum):
-    """What a finding means for a run; ordered from good to bad."""
+class MachineVerdict(StrEnum):
+    """What a finding, or the worst one, means for a run; ordered from good to bad."""
 
     GOOD = "good"
     LIMITED = "limited"
@@ -53,14 +53,14 @@ class MachineFinding(NamedTuple):
     """One property of the machine."""
 
     what: str
-    verdict: FindingStatus
+    verdict: MachineVerdict
     found: str
     means: str = ""
     """Meaning for a run; may be empty."""
     remedy: str = ""
 
 
-GOOD, LIMITED, BAD = FindingStatus
+GOOD, LIMITED, BAD = MachineVerdict
 _VERDICTS = {
     GOOD: ("green", "ready"),
     LIMITED: ("yellow", "ready, with the limits above"),
@@ -69,7 +69,7 @@ _VERDICTS = {
 """Colour of a finding; verdict on the machine if this is the worst finding."""
 
 
-Outcome = tuple[FindingStatus, *tuple[str, ...]]
+Outcome = tuple[MachineVerdict, *tuple[str, ...]]
 """A finding without ``what``."""
 _checks: list[Callable[[MachineFacts, RunRequirements], Iterator[MachineFinding]]] = []
 
@@ -92,9 +92,9 @@ def judge(machine: MachineFacts, required: RunRequirements) -> list[MachineFindi
     return [finding for check in _checks for finding in check(machine, required)]
 
 
-def worst(findings: Sequence[MachineFinding]) -> FindingStatus:
+def worst(findings: Sequence[MachineFinding]) -> MachineVerdict:
     """Return the verdict on the whole machine."""
-    order = list(FindingStatus)
+    order = list(MachineVerdict)
     return max((finding.verdict for finding in findings), key=order.index)
 
 
@@ -121,11 +121,11 @@ def _cores(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
 
 @_check("real-time settings")
 def _settings(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
-    applied = [name for key, name in _SETTINGS.items() if machine.granted.get(key) == "applied"]
+    applied = [name for key, name in _SETTINGS.items() if machine.settings.get(key) == "applied"]
     if applied:
         yield GOOD, f"applied: {', '.join(applied)}"
     for key, name in _SETTINGS.items():
-        answer = machine.granted.get(key, "not known")
+        answer = machine.settings.get(key, "not known")
         if not answer.startswith("not permitted"):
             continue
         verdict, means = GOOD, f"{required.name} does not use it"
@@ -166,20 +166,20 @@ def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, in_force: 
         f"{required.rate_hz:g} Hz"
     )
     allowed = f"the {duration(required.allowance_ns * 1e-9)} that {required.name}'s certificates allow"
-    if not lateness.beyond:
+    if not lateness.too_late:
         near = lateness.max_us * 1e3 > required.allowance_ns / 2
         means = f"all within {allowed}" + (", some above half of it" if near else "")
         return GOOD, late, f"{means}; a longer run may exceed the maximum"
-    share = 100 * lateness.beyond / lateness.wakes
-    first_s = lateness.wakes / lateness.beyond / required.rate_hz
+    share = 100 * lateness.too_late / lateness.wakes
+    first_s = lateness.wakes / lateness.too_late / required.rate_hz
     means = (
-        f"{lateness.beyond:,} of them ({share:.2g} %) beyond {allowed}: about one every "
+        f"{lateness.too_late:,} of them ({share:.2g} %) beyond {allowed}: about one every "
         f"{first_s:.2g} s of a run of {required.duration_s:g} s; from the first on, the run needs a "
         "certificate for its actual lateness"
     )
     if not in_force:
         return GOOD, late, f"{means}. Runs use real-time settings"
-    remedy = "raise certificate.late_periods, lower speed or rates, or permit SCHED_FIFO"
+    remedy = "raise certificate.late_periods, or lower speed or rates"
     return LIMITED, late, means, remedy
 
 

@@ -50,10 +50,10 @@ EXTRAS = {
 """Extras of noack by name: one module that each installs, and what it is for."""
 _DATAGRAM = bytes(72)
 _ROUND_TRIPS = 1000
-_FLOOD = 20_000
+_FLOOD_DATAGRAMS = 20_000
 _WRITE_BYTES = 32 * 1024 * 1024
-_PATIENCE_S = 20.0
-_ANSWER_S = 2.0
+_PROBE_TIMEOUT_S = 20.0
+_QUERY_TIMEOUT_S = 2.0
 _PR_GET_TIMERSLACK = 30
 
 
@@ -103,7 +103,7 @@ class Lateness:
     p50_us: float
     p99_us: float
     max_us: float
-    beyond: int
+    too_late: int
     """Number of wake-ups that were later than the certificates allow."""
 
 
@@ -150,7 +150,7 @@ class MachineFacts:
     """Load average over the last minute."""
     governor: str | None
     """Frequency governor of the first core; None if unknown."""
-    granted: Mapping[str, str]
+    settings: Mapping[str, str]
     """For each real-time setting: applied or not permitted, as ``realtime`` reports it."""
     timer_resolution_ns: int
     timer_slack_ns: int | None
@@ -185,24 +185,24 @@ def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_
         runs: folder of the run directories; it need not exist.
         duration_s: length of each of the two measurements of wake-ups.
     """
-    plain, realtime, granted = _wake_ups(required, duration_s)
+    plain, realtime, settings = _measure_wake_ups(required, duration_s)
     recorded = environment("live")
     return MachineFacts(
         cores=recorded["cores"],
         cores_online=os.cpu_count() or 1,
         load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         governor=_read(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")),
-        granted=granted,
+        settings=settings,
         timer_resolution_ns=round(time.get_clock_info("monotonic").resolution * NS_PER_S),
         timer_slack_ns=_timer_slack_ns(),
         plain=plain,
         realtime=realtime,
-        round_trips=_or_why(_round_trips),
-        buffer=_or_why(_buffer),
-        ports_taken=list(_ports_taken(required)),
-        control=_or_why(_control),
-        disk=_or_why(lambda: _disk(runs, needed_bytes(resolved))),
-        runtime_folder=_runtime_folder(),
+        round_trips=_result_or_reason(_measure_round_trips),
+        buffer=_result_or_reason(_measure_buffer),
+        ports_taken=list(_list_taken_ports(required)),
+        control=_result_or_reason(_measure_query),
+        disk=_result_or_reason(lambda: _measure_disk(runs, needed_bytes(resolved))),
+        runtime_folder=_runtime_folder_problem(),
         display=has_display(),
         viewer=recorded["packages"].get("rerun-sdk") if is_installed() else None,
         extras={name: find_spec(module) is not None for name, (module, _) in EXTRAS.items()},
@@ -210,9 +210,9 @@ def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_
     )
 
 
-def _or_why(measuring: Callable[[], T]) -> T | str:
+def _result_or_reason(measure_it: Callable[[], T]) -> T | str:
     try:
-        return measuring()
+        return measure_it()
     except NoackError as error:
         return str(error)
     except zenoh.ZError as error:
@@ -221,7 +221,7 @@ def _or_why(measuring: Callable[[], T]) -> T | str:
         return why(error)
 
 
-def _probe(*arguments: object) -> list[str]:
+def _probe_command(*arguments: object) -> list[str]:
     return python_command("-m", "cosim.doctor.probe", *arguments)
 
 
@@ -230,16 +230,16 @@ class _WakeUps(TypedDict):
 
     plain: list[int]
     realtime: list[int]
-    granted: dict[str, str]
+    settings: dict[str, str]
 
 
-def _wake_ups(
+def _measure_wake_ups(
     required: RunRequirements, duration_s: float
 ) -> tuple[Lateness | str, Lateness | str, dict[str, str]]:
-    command = _probe("wake", required.period_ns, duration_s, required.fifo_priority, required.spin_us)
+    command = _probe_command("wake", required.period_ns, duration_s, required.fifo_priority, required.spin_us)
     try:
         probe = subprocess.run(
-            command, capture_output=True, text=True, check=True, timeout=_PATIENCE_S + 10 * duration_s
+            command, capture_output=True, text=True, check=True, timeout=_PROBE_TIMEOUT_S + 10 * duration_s
         )
     except (OSError, subprocess.SubprocessError) as error:
         reason = one_line(error)
@@ -248,7 +248,7 @@ def _wake_ups(
     plain, realtime = (
         lateness(late_ns, required.allowance_ns) for late_ns in (printed["plain"], printed["realtime"])
     )
-    return plain, realtime, printed["granted"]
+    return plain, realtime, printed["settings"]
 
 
 def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
@@ -257,27 +257,27 @@ def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
     if not len(late):
         return "no wake-up was measured"
     p50, p99 = np.quantile(late, [0.5, 0.99]) / 1e3
-    beyond = int((late > allowance_ns).sum())
-    return Lateness(len(late), float(p50), float(p99), float(late.max()) / 1e3, beyond)
+    too_late = int((late > allowance_ns).sum())
+    return Lateness(len(late), float(p50), float(p99), float(late.max()) / 1e3, too_late)
 
 
 def _round_trips_us(endpoint: socket.socket) -> list[float]:
     """Return the times of the datagrams that come back; raise MachineError if three do not."""
-    taken_us: list[float] = []
+    times_us: list[float] = []
     for number in range(_ROUND_TRIPS):
         begun_ns = time.perf_counter_ns()
         with suppress(TimeoutError):
             endpoint.send(_DATAGRAM)
             endpoint.recv(len(_DATAGRAM) + 1)
-            taken_us.append((time.perf_counter_ns() - begun_ns) * 1e-3)
-        if number - len(taken_us) >= 2:
+            times_us.append((time.perf_counter_ns() - begun_ns) * 1e-3)
+        if number - len(times_us) >= 2:
             raise MachineError("datagrams on the loopback are lost")
-    return taken_us
+    return times_us
 
 
-def _round_trips() -> RoundTrips:
+def _measure_round_trips() -> RoundTrips:
     with (
-        subprocess.Popen(_probe("echo"), stdout=subprocess.PIPE, text=True) as process,
+        subprocess.Popen(_probe_command("echo"), stdout=subprocess.PIPE, text=True) as process,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint,
     ):
         try:
@@ -287,23 +287,23 @@ def _round_trips() -> RoundTrips:
             if not port:
                 raise MachineError("a process that echoes datagrams did not start")
             endpoint.connect((LOOPBACK, port))
-            taken_us = _round_trips_us(endpoint)
+            times_us = _round_trips_us(endpoint)
             endpoint.send(b"")
         except BaseException:
             process.kill()
             raise
-    p50, p99 = np.quantile(taken_us, [0.5, 0.99])
-    return RoundTrips(_ROUND_TRIPS, _ROUND_TRIPS - len(taken_us), float(p50), float(p99))
+    p50, p99 = np.quantile(times_us, [0.5, 0.99])
+    return RoundTrips(_ROUND_TRIPS, _ROUND_TRIPS - len(times_us), float(p50), float(p99))
 
 
-def _buffer() -> Buffer:
+def _measure_buffer() -> Buffer:
     with closing(bind(0, "nothing")) as endpoint, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.connect(endpoint.getsockname())
-        for _ in range(_FLOOD):
+        for _ in range(_FLOOD_DATAGRAMS):
             sender.send(_DATAGRAM)
         received = 0
         with suppress(BlockingIOError):
-            while received < _FLOOD:
+            while received < _FLOOD_DATAGRAMS:
                 endpoint.recv(len(_DATAGRAM) + 1)
                 received += 1
         granted = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
@@ -311,7 +311,7 @@ def _buffer() -> Buffer:
     return Buffer(received, granted, int(limit) if limit else None)
 
 
-def _ports_taken(required: RunRequirements) -> Iterable[str]:
+def _list_taken_ports(required: RunRequirements) -> Iterable[str]:
     for name, port in required.ports.items():
         try:
             bind(port, f"ports.{name}").close()
@@ -319,7 +319,7 @@ def _ports_taken(required: RunRequirements) -> Iterable[str]:
             yield str(error)
 
 
-def _control() -> float:
+def _measure_query() -> float:
     """Return the time of a query in seconds, over zenoh sessions as in the control plane."""
     name, key = f"doctor-{os.getpid()}", "noack/doctor"
     with (
@@ -328,14 +328,14 @@ def _control() -> float:
         open_session(RUNS, name, listen=False) as client,
     ):
         begun_s = time.perf_counter()
-        answer = answer_to(client, key, "", _ANSWER_S)
+        answer = answer_to(client, key, "", _QUERY_TIMEOUT_S)
         taken_s = time.perf_counter() - begun_s
     if answer is None:
-        raise MachineError(f"no answer within {_ANSWER_S:g} s")
+        raise MachineError(f"no answer within {_QUERY_TIMEOUT_S:g} s")
     return taken_s
 
 
-def _disk(runs: Path, required_bytes: int) -> Disk:
+def _measure_disk(runs: Path, required_bytes: int) -> Disk:
     folder = next(path for path in (runs, *runs.absolute().parents) if path.is_dir())
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -351,7 +351,7 @@ def _disk(runs: Path, required_bytes: int) -> Disk:
     return Disk(str(folder), shutil.disk_usage(folder).free, required_bytes, _WRITE_BYTES / taken_s)
 
 
-def _runtime_folder() -> str | None:
+def _runtime_folder_problem() -> str | None:
     try:
         with open_private(create=True):
             pass

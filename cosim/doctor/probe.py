@@ -28,35 +28,35 @@ def wake(period_ns: int, duration_s: float, priority: int, spin_us: float) -> di
     """Wake up periodically, as a process of a run does, without and with real-time settings.
 
     Returns:
-        ``plain`` and ``realtime``: lateness in ns; ``granted``: the settings.
+        ``plain`` and ``realtime``: lateness in ns; ``settings``: which of them are applied.
     """
     measured: dict[str, object] = {}
     # Timer slack and locked memory cannot be undone in a process: measure without them first.
     for name, enabled in (("plain", False), ("realtime", True)):
-        with realtime(enabled, priority, place=0) as granted:
-            measured |= {name: idle_lateness_ns(period_ns, duration_s, spin_us), "granted": granted}
+        with realtime(enabled, priority, place=0) as settings:
+            measured |= {name: idle_lateness_ns(period_ns, duration_s, spin_us), "settings": settings}
     return measured
 
 
 def idle_lateness_ns(period_ns: int, duration_s: float, spin_us: float = 0.0) -> Sequence[int]:
     """Return the lateness of each wake-up of a run's loop that has nothing else to do, in ns."""
     end_ns = round(duration_s * NS_PER_S) + _WARM_UP * period_ns
-    resting = {
-        "name": "resting",
+    idle_loop = {
+        "name": "idle_loop",
         "horizon_s": end_ns / NS_PER_S,
         "model": {"name": "double_integrator"},
         "plant": {"initial_state": [0.0, 0.0], "rate_hz": NS_PER_S / period_ns},
         "trigger": {"beta": 1.0, "alpha_per_s": 1.0},
         "network": {"mansd": 0, "loss": {"model": "lossless"}},
     }
-    plant = plants_of((resolve(validate(resting, "the plant of a measurement")),))
+    plant = plants_of((resolve(validate(idle_loop, "the plant of a measurement")),))
     driver = LiveDriver(plant, Wire(0, bytes(KEY_BYTES)), spin_ns=round(spin_us * 1000))
-    ticks, clock = _Ticks(), RunClock(time.monotonic_ns())
+    ticks, clock = _TickRecord(), RunClock(time.monotonic_ns())
     run_loop(driver, ticks, clock, ticks, end_ns=end_ns, stop=lambda: False)
     return ticks.late_ns[_WARM_UP:]
 
 
-class _Ticks:
+class _TickRecord:
     """A record that keeps the lateness of each tick, and sockets that do nothing."""
 
     def __init__(self) -> None:

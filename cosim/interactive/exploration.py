@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.summary.run_summary import summarise
-from cosim.analysis.value_reduction import decimate_all
 from cosim.record.align import aligned_parts
+from cosim.record.decimation import decimate_all
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import ContinuousRun, LoopState, TooManyEventsError, run_continuous
 from cosim.simulation.exact_simulation import (

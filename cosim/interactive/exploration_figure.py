@@ -21,7 +21,7 @@ from cosim.output.figures.figure_description import (
     Line,
     Marks,
     Panel,
-    Row,
+    PanelRow,
     time_axis,
 )
 from cosim.output.figures.palette import CERTIFIED, CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD
@@ -54,7 +54,7 @@ def exploration_figure(shown: ExploredRun) -> FigureDescription:
 
     A name that several panels show is in the legend of the first.
     """
-    known, rows = {"‖x‖"}, list[Row]()
+    known, rows = {"‖x‖"}, list[PanelRow]()
     parts = [_state(shown), _errors(shown), _norm(shown), _events(shown)]
     horizon_s = np.array([0.0, shown.run.scenario.horizon_s])
     for (title, items, y), height_in in zip(parts, _HEIGHTS_IN, strict=True):
@@ -64,7 +64,7 @@ def exploration_figure(shown: ExploredRun) -> FigureDescription:
         known |= {*names}
         x = time_axis(horizon_s, numbers=len(rows) == len(parts) - 1)
         panel = Panel(title=title, items=drawn, x=x, y=y, legend=legend)
-        rows.append(Row(panels=[panel], height_in=height_in))
+        rows.append(PanelRow(panels=[panel], height_in=height_in))
     description = "; ".join(title for title, _, _ in parts)
     return FigureDescription(name="exploration", rows=rows, description=description)
 
@@ -92,7 +92,7 @@ def _state(shown: ExploredRun) -> _Part:
         band = Band(x=draws.t_s, low=low, high=high, label=BAND, colour=PLANT, opacity=0.22)
         items.insert(0, band)
     if other is not None and i < other.x.shape[1]:
-        items.insert(0, _kept(other, other.x[:, i]))
+        items.insert(0, _reference_line(other, other.x[:, i]))
         about = np.concatenate([about, other.x[:, i]])
     return f"{run.state_names[i]}: plant and both models", items, Axis(about=about)
 
@@ -115,7 +115,7 @@ def _errors(shown: ExploredRun) -> _Part:
     if draws is not None:
         items.append(_edge(draws, _positive(draws.e_c_norm.high, floor)))
     if other is not None:
-        items.insert(0, _kept(other, _known_error(other, floor)))
+        items.insert(0, _reference_line(other, _known_error(other, floor)))
     y = Axis(logarithmic=True, about=about, decades=_DECADES)
     return "errors of the models (logarithmic)", items, y
 
@@ -130,7 +130,7 @@ def _norm(shown: ExploredRun) -> _Part:
         edges = (draws.x_norm.low, draws.x_norm.high)
         items += [_edge(draws, _positive(edge, 0.0)) for edge in edges]
     if other is not None:
-        items.insert(0, _kept(other, _positive(other.x_norm, _SMALLEST * _largest(other.x_norm))))
+        items.insert(0, _reference_line(other, _positive(other.x_norm, _SMALLEST * _largest(other.x_norm))))
     return "‖x‖ (logarithmic)", items, Axis(logarithmic=True, about=norm, decades=_DECADES)
 
 
@@ -155,7 +155,7 @@ def _edge(ensemble: Ensemble, values: Vector) -> Line:
     return Line(x=ensemble.t_s, y=values, label=BAND, colour=PLANT, width=0.75, dash=DOTTED)
 
 
-def _kept(reference: Exploration, values: Vector) -> Line:
+def _reference_line(reference: Exploration, values: Vector) -> Line:
     return Line(x=reference.t_s, y=values, label=KEPT, colour=FORCED, width=0.9, dash=DASHED)
 
 

@@ -464,7 +464,7 @@ def figure_file(shown: ExploredRun, kind: FigureFormat) -> bytes:
     return file_content(exploration_figure(shown), kind, figure_width_in(kind, None))
 
 
-class Step(NamedTuple):
+class TutorialStep(NamedTuple):
     """A step of the tutorial: what to read, which settings it begins with, what to drag."""
 
     title: str
@@ -475,5 +475,6 @@ class Step(NamedTuple):
 
 
 STEPS = [
-    Step(**step) for step in tomllib.loads(_FOLDER.joinpath("tutorial.toml").read_text("utf-8"))["steps"]
+    TutorialStep(**step)
+    for step in tomllib.loads(_FOLDER.joinpath("tutorial.toml").read_text("utf-8"))["steps"]
 ]

@@ -98,7 +98,7 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
 
         for logger in ("engineio.server", "asyncio"):
             logging.getLogger(logger).addFilter(refused_message)
-        server = _Server(config, announced, reports.give_up)
+        server = _LabServer(config, announced, reports.give_up)
         with listener, suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
             asyncio.run(server.serve(sockets=[listener]))
 
@@ -124,7 +124,7 @@ _RECONNECT_S = 60.0
 """A page that is silent for less than 0.4 of this is not cut off: a busy machine may stall."""
 
 
-class _Server(uvicorn.Server):
+class _LabServer(uvicorn.Server):
     """A server that reports once it listens, and when it begins to end."""
 
     def __init__(

@@ -456,7 +456,7 @@ class ChangeRequests:
             settings=dict(change.settings),
             requested_ns=requested_ns,
             requested_at=requested_at,
-            kept_losses=found_probabilities(*(changed_scenario.network.link for changed_scenario in later)),
+            target_losses=found_probabilities(*(changed_scenario.network.link for changed_scenario in later)),
         )
         self.announced += (announcement,)
         return announcement

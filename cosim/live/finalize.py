@@ -50,7 +50,7 @@ from noack.core.file_access import write_whole
 from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.assumptions import Assumption, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
@@ -166,17 +166,20 @@ def _judged(
     loops, replayed = len(run.loops), None
     beside = ReplayBeside(helpers, ending.run_dir) if helpers.count and loops == 1 else None
 
-    def here(block: range) -> list[_Judged]:
+    def judge_here(block: range) -> list[_Judged]:
         return _judged_loops(run, ending, beside, block, helpers.expectations(block))
 
-    def there(block: range) -> list[_Judged]:
+    def judge_in_helper(block: range) -> list[_Judged]:
         own = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason)
         return helpers.call(_judged_stored, own, block, helpers.expectations(block))
 
-    with work_bar(f"claims of {loops} loops") as show, helpers.shared(_blocks(run), there, show) as judge:
+    with (
+        work_bar(f"claims of {loops} loops") as show,
+        helpers.shared(_blocks(run), judge_in_helper, show) as judge,
+    ):
         if run.kind == "live" and loops > 1:
             replayed = _replay(run.network)
-        judged_blocks = judge(here)
+        judged_blocks = judge(judge_here)
     judged = [loop for block in sorted(judged_blocks, key=min) for loop in judged_blocks[block]]
     summary = _summary(run, ending, [loop.summary for loop in judged])
     if replayed is not None:

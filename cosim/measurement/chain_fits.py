@@ -36,10 +36,8 @@ from numpy.typing import NDArray
 from scipy.special import expit, gammaln, logit, xlogy
 
 from cosim.lazy_modules import lazy_modules
-from cosim.measurement.loss_bursts import (
-    Flags,
+from cosim.measurement.interval_estimates import (
     IntervalEstimate,
-    LossBursts,
     Minimum,
     binomial_estimate,
     exponential_estimate,
@@ -47,6 +45,7 @@ from cosim.measurement.loss_bursts import (
     poisson_estimate,
     profile_interval,
 )
+from cosim.measurement.loss_bursts import Flags, LossBursts
 
 with lazy_modules():
     from scipy import stats

@@ -1,22 +1,19 @@
-"""All outputs of a measurement: tables, figures, page, JSON, and a ``[network]`` section.
+"""All outputs of a measurement: tables, figures (bursts, delays, correlation, (m, K)), page, JSON."""
 
-The section reproduces the measured network, as a trace or as a model. Tables, figures (bursts,
-delays, correlation and (m, K)) and the page with both are at the end.
-"""
-
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
 from cosim.live.monitoring.progress import error_console
-from cosim.measurement.chain_fits import ChainFit
-from cosim.measurement.loss_bursts import LEVEL, IntervalEstimate, histogram, most_losses
-from cosim.measurement.network_measurement import CertificateTime, Measurement
+from cosim.measurement.certificate_time import CertificateTime
+from cosim.measurement.interval_estimates import LEVEL, IntervalEstimate
+from cosim.measurement.loss_bursts import histogram, most_losses
+from cosim.measurement.network_measurement import NetworkMeasurement
+from cosim.measurement.network_section import Form, write_network
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     Axis,
@@ -33,20 +30,10 @@ from cosim.output.figures.figure_description import (
 )
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
-from noack.core.errors import CallerError, printable
+from noack.core.errors import CallerError
 from noack.core.file_access import require_suffix, write_whole
 from noack.core.number_format import NONE, duration, number, percent
-from noack.impairments.loss_prediction import read_files
-from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import toml_text
-from noack.scenario.sections import NetworkSection
-from noack.traces.packet_trace import LOST_NS, PacketTrace
-
-Form = Literal["trace", "model"]
-_SAMPLES = 101
-"""Number of delay quantiles of a model."""
-_MOST_CORRELATION = 0.99
 
 
 @dataclass(frozen=True)
@@ -71,7 +58,9 @@ class OutputRequest:
             require_suffix(self.network, "--write", ".toml")
 
 
-def report(measurement: Measurement, request: OutputRequest, console: Console | None) -> dict[str, object]:
+def report(
+    measurement: NetworkMeasurement, request: OutputRequest, console: Console | None
+) -> dict[str, object]:
     """Write what is requested, print the tables, and return the document of ``--json``.
 
     Raises:
@@ -96,109 +85,6 @@ def report(measurement: Measurement, request: OutputRequest, console: Console | 
     return document
 
 
-def write_network(measurement: Measurement, path: Path, form: Form) -> list[Path]:
-    """Write the section, and the trace that it names; return the written files.
-
-    Raises:
-        CallerError: the name does not end in .toml, or the emulator cannot reproduce the network.
-        MachineError: a file cannot be written.
-    """
-    require_suffix(path, "--write", ".toml")
-    written = [path]
-    if form == "trace":
-        trace_path = path.with_suffix(".csv")
-        write_whole(trace_path, trace_csv(measurement.trace))
-        section, written = _trace_section(measurement, trace_path.name), [trace_path, path]
-    else:
-        section = _model_section(measurement)
-    cap = {"mansd": measurement.longest_loss_burst, "enforce_mansd": False}
-    text = _comment(measurement, form) + toml_text({"network": {**cap, **section}})
-    source = f"--write {path}"
-    content = toml_file.parsed(text, source)["network"]
-    assert isinstance(content, dict)
-    loaded = toml_file.validated(NetworkSection, content, source)
-    read_files(loaded.link, path.parent, source)
-    write_whole(path, text)
-    return written
-
-
-def trace_csv(trace: PacketTrace) -> str:
-    """Return a trace as CSV in ns; :func:`noack.traces.packet_trace.read_trace` reads the same."""
-    columns = (trace.sequence.tolist(), trace.sent_ns.tolist(), trace.received_ns.tolist())
-    rows = (
-        f"{number},{sent},{'' if received == LOST_NS else received}\n"
-        for number, sent, received in zip(*columns, strict=True)
-    )
-    return "sequence,sent_ns,received_ns\n" + "".join(rows)
-
-
-def _comment(measurement: Measurement, form: Form) -> str:
-    deadline_s = measurement.options.deadline_s
-    late = "" if deadline_s is None else f", deadline {deadline_s:g} s"
-    lines = [f"Measured: {printable(measurement.name)}, {len(measurement.trace)} packets{late}."]
-    if form == "trace":
-        lines.append(
-            'Each update gets what was recorded at its time. With by = "packet", update k gets record k.'
-        )
-    else:
-        lines.append("A model, fitted per packet: it assumes updates at the trace's rate.")
-    lines.append("mansd is not enforced, so that the network behaves as measured.")
-    if measurement.is_outage.any():
-        lines.append("mansd does not cover the outages; no certificate does.")
-    return "".join(f"# {line}\n" for line in lines)
-
-
-def _trace_section(measurement: Measurement, name: str) -> Mapping[str, object]:
-    # The network would deliver the first packet.
-    known = {} if measurement.outcomes.effective[0] else {"initial_sync": "known_state"}
-    replay = {"kind": "replay", "file": name, "by": "time"}
-    return known | {"loss": {"model": "lossless"}, "impairments": [replay]}
-
-
-def _model_section(measurement: Measurement) -> Mapping[str, object]:
-    loss = _loss(measurement.chosen.fit) if measurement.models else {"model": "lossless"}
-    return {"loss": loss, "impairments": [*_outage_chain(measurement), *_delay(measurement)]}
-
-
-def _loss(fit: ChainFit) -> Mapping[str, object]:
-    if fit.model == "bernoulli":
-        return {"model": "bernoulli", "probability": fit.rates.loss_in_bad}
-    return {"model": "gilbert_elliott", **fit.rates._asdict()}
-
-
-def _outage_chain(measurement: Measurement) -> list[Mapping[str, object]]:
-    """Return the outages as a chain of their own, by packets."""
-    lengths = measurement.bursts.length[measurement.is_outage]
-    if not len(lengths):
-        return []
-    usual = len(measurement.trace) - int(lengths.sum())
-    chain = {
-        "model": "gilbert_elliott",
-        "good_to_bad": min(len(lengths) / max(usual, 1), 1.0),
-        "bad_to_good": 1 / float(lengths.mean()),
-    }
-    return [{"kind": "loss", "loss": chain}]
-
-
-def _delay(measurement: Measurement) -> list[Mapping[str, object]]:
-    """Return the delays of the effective packets; the others are lost in the model."""
-    delays_ns = measurement.trace.delay_ns[measurement.outcomes.effective]
-    if not len(delays_ns) or not delays_ns.any():
-        return []
-    if delays_ns.min() == delays_ns.max():
-        return [{"kind": "delay", "delay_s": int(delays_ns[0]) * 1e-9}]
-    samples_s = np.quantile(delays_ns, np.linspace(0, 1, _SAMPLES)) * 1e-9
-    correlation = measurement.delays.correlation[0] if measurement.delays.correlation else 0.0
-    return [
-        {
-            "kind": "delay",
-            "distribution": "empirical",
-            "samples_s": np.round(samples_s, 9).tolist(),
-            "correlation": round(min(max(correlation, 0.0), _MOST_CORRELATION), 4),
-        }
-    ]
-
-
 _MODELS = {"bernoulli": "independent losses", "gilbert": "Gilbert", "gilbert_elliott": "Gilbert–Elliott"}
 _PARAMETERS = {
     "probability": "loss probability",
@@ -213,7 +99,7 @@ _MOST_OUTAGES = 5
 
 
 def measurement_tables(
-    measurement: Measurement, void: CertificateTime | None = None
+    measurement: NetworkMeasurement, void: CertificateTime | None = None
 ) -> Iterator[ResultTable]:
     """Yield the tables of a measurement, and that of a scenario's certificate."""
     suffix = ", without the outages" if measurement.is_outage.any() else ""
@@ -252,7 +138,7 @@ def measurement_tables(
 
 
 def print_measurement(
-    console: Console, measurement: Measurement, void: CertificateTime | None = None
+    console: Console, measurement: NetworkMeasurement, void: CertificateTime | None = None
 ) -> None:
     """Print the tables and the remarks."""
     console.print(measurement.name, markup=False, highlight=False, soft_wrap=True)
@@ -263,7 +149,7 @@ def print_measurement(
         console.print(line, markup=False, highlight=False)
 
 
-def _numbers(measurement: Measurement, suffix: str) -> Iterator[tuple[str, str]]:
+def _numbers(measurement: NetworkMeasurement, suffix: str) -> Iterator[tuple[str, str]]:
     count, deadline_s = len(measurement.trace), measurement.options.deadline_s
     yield "packets", f"{count} in {measurement.observed_s:.1f} s"
     yield "lost", _share(int(measurement.outcomes.lost.sum()), count)
@@ -301,12 +187,12 @@ def _share(count: int, total: int) -> str:
     return f"{count} ({percent(count / total)})" if count else "0"
 
 
-def _burst(measurement: Measurement, index: int) -> str:
+def _burst(measurement: NetworkMeasurement, index: int) -> str:
     burst = measurement.burst_json(index)
     return f"{burst['losses']} packets, {burst['duration_s']:.3g} s, from {burst['begin_s']:.3f} s"
 
 
-def _model_rows(measurement: Measurement) -> Iterator[tuple[str, str, str]]:
+def _model_rows(measurement: NetworkMeasurement) -> Iterator[tuple[str, str, str]]:
     for name, model in measurement.models.items():
         chosen = " (preferred)" if name == measurement.chosen.fit.model else ""
         yield f"{_MODELS[name]}{chosen}", "", ""
@@ -322,7 +208,7 @@ def _estimate(estimate: IntervalEstimate | None) -> tuple[str, str]:
     return number(estimate.value), f"{number(estimate.low)} to {number(estimate.high)}"
 
 
-def _outage_rows(measurement: Measurement) -> Iterator[tuple[str, str, str]]:
+def _outage_rows(measurement: NetworkMeasurement) -> Iterator[tuple[str, str, str]]:
     fit = measurement.outage_fit
     per_hour = fit.rate_per_s and IntervalEstimate(*(3600 * value for value in fit.rate_per_s))
     yield "outages per hour", *_estimate(per_hour)
@@ -354,7 +240,7 @@ def void_remarks(void: CertificateTime | None) -> Iterator[str]:
 
 
 def write_page(
-    measurement: Measurement,
+    measurement: NetworkMeasurement,
     void: CertificateTime | None,
     path: Path,
     figure_files: FigureFiles | None = None,
@@ -387,7 +273,7 @@ _WINDOWS = 40
 _LONGEST_WINDOW = 1000
 
 
-def measurement_figures(measurement: Measurement) -> Iterator[FigureDescription]:
+def measurement_figures(measurement: NetworkMeasurement) -> Iterator[FigureDescription]:
     """Yield the figures of a measurement."""
     deadline_s = measurement.options.deadline_s
     limit = "" if deadline_s is None else f" Dashed: the deadline of {duration(deadline_s)}."
@@ -415,7 +301,7 @@ def measurement_figures(measurement: Measurement) -> Iterator[FigureDescription]
     )
 
 
-def _histogram(measurement: Measurement) -> Panel:
+def _histogram(measurement: NetworkMeasurement) -> Panel:
     outages = measurement.is_outage
     longest = measurement.bursts.longest
     # Bins of one length, or, if the lengths differ much, of a constant ratio.
@@ -439,7 +325,7 @@ def _histogram(measurement: Measurement) -> Panel:
     )
 
 
-def _delays(measurement: Measurement) -> Panel:
+def _delays(measurement: NetworkMeasurement) -> Panel:
     trace = measurement.trace
     sent_s, lost = np.asarray(trace.sent_ns * 1e-9), trace.lost
     values = np.asarray(np.where(lost, np.nan, np.maximum(trace.delay_ns, 1)) * 1e-9)
@@ -467,7 +353,7 @@ def _delays(measurement: Measurement) -> Panel:
     )
 
 
-def _correlation(measurement: Measurement) -> Panel:
+def _correlation(measurement: NetworkMeasurement) -> Panel:
     delays, (lags, losses) = measurement.delays, measurement.loss_correlation
     items = [
         _curve(x, y, label, colour)
@@ -486,7 +372,7 @@ def _correlation(measurement: Measurement) -> Panel:
     )
 
 
-def _windows(measurement: Measurement) -> Panel:
+def _windows(measurement: NetworkMeasurement) -> Panel:
     longest = max(min(_LONGEST_WINDOW, len(measurement.trace)), 1)
     windows = np.unique(np.geomspace(1, longest, _WINDOWS).round().astype(int)).tolist()
     in_all = most_losses(measurement.bursts, windows)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from rich.console import Console
 from rich.markup import escape
 
-from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, plants_of
+from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, covered_plants
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.output.result_tables import ResultTable, terminal_table
@@ -151,7 +151,7 @@ def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
     if not columns:
         return
     certificates = [certificate for _, certificate in columns]
-    headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in columns)]
+    headings = ["", *(f"{under},\n{covered_plants(certificate)}" for under, certificate in columns)]
     printed = results.theorem_2 is not None
     headings += ["paper's\nTheorem 2"] if printed else []
     rows = [

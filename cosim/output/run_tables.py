@@ -215,7 +215,7 @@ def _record(loop: LoopSummary) -> Iterator[tuple[str, str]]:
     if loop.conditions is not None and (error_s := loop.conditions.clock_error_s):
         yield "largest bound of a clock's error", duration(error_s)
     for restart in loop.restarts:
-        yield f"{restart.process} was restarted", away(restart)
+        yield f"{restart.process} was restarted", downtime_text(restart)
     yield from changes_in(loop.changes)
 
 
@@ -247,7 +247,7 @@ def interval_text(claim: Claim) -> str:
     return f"from {from_s:.3f} s " + ("on" if until_s is None else f"to {until_s:.3f} s")
 
 
-def away(restart: RestartPart) -> str:
+def downtime_text(restart: RestartPart) -> str:
     """Return the interval in which a process was down, and the reason."""
     since, until = seconds(restart.last_s), seconds(restart.first_s)
     why = (restart.what or "").partition(": ")[2]
@@ -399,7 +399,7 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
     if trips := [loop.watchdog.trips for loop in loops if loop.watchdog.trips]:
         rows.append(("watchdog acted", f"{sum(trips)} times, in {len(trips)} loops"))
     if deadlines := summary.deadlines:
-        rows.append(("deadlines missed", _missed(deadlines)))
+        rows.append(("deadlines missed", _missed_deadlines(deadlines)))
         worst = max(deadlines, key=lambda role: deadlines[role].max_us or 0.0)
         latest_s = 1e-6 * (deadlines[worst].max_us or 0.0)
         rows.append(("  largest lateness", f"{duration(latest_s)} ({worst})"))
@@ -415,7 +415,7 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
     return [*rows, *changes_in(summary.changes)]
 
 
-def _missed(deadlines: Mapping[str, DeadlinesPart]) -> str:
+def _missed_deadlines(deadlines: Mapping[str, DeadlinesPart]) -> str:
     late = [(role, part.late_steps, part.steps) for role, part in deadlines.items() if part.late_steps]
     missed = [f"{role} {late_steps} of {steps}" for role, late_steps, steps in late]
     return ", ".join(missed) or "none"

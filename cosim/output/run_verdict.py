@@ -31,9 +31,9 @@ from cosim.analysis.summary.summary_model import (
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
-    away,
     badness,
     changes_in,
+    downtime_text,
     loops_table,
     network_rows,
     run_title,
@@ -320,7 +320,7 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     for restart in loop.restarts:
         void = any(claim.verdict == "void" for claim in loop.claims)
         consequence = "; claims are void from then on" if void else ""
-        yield f"{restart.process} was restarted, {away(restart)}{consequence}"
+        yield f"{restart.process} was restarted, {downtime_text(restart)}{consequence}"
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"

@@ -355,8 +355,8 @@ def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
     few = few_of(names)
     if name is None:
         return CallerError(
-            f"the run has {len(names)} loops: take one with --loop NAME, in Python "
-            f"run.loops[NAME]; they are {few}"
+            f"the run has {len(names)} loops, and this is for one: use --loop NAME, RUN:NAME in noack compare, "
+            f"run.loops[NAME] in Python; they are {few}"
         )
     return CallerError(f"--loop {name}: the run has no such loop; it has {few}")
 

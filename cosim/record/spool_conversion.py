@@ -175,7 +175,7 @@ def finish_record(run_dir: Path, each: Each = map, early: Mapping[str, int] | No
                 (run_dir / SPOOL / EARLY / file).replace(run_dir / RECORD / file)
             [*each(partial(convert_table, run_dir), tables)]
     except OSError as error:
-        raise _kept(run_dir, error) from None
+        raise _write_error(run_dir, error) from None
     remove_spool(run_dir)
     return load_run(run_dir)
 
@@ -238,10 +238,10 @@ def remove_spool(run_dir: Path) -> None:
             remove_folder(done)  # of an earlier attempt that was interrupted
             remove_folder(spool.rename(done))
     except OSError as error:
-        raise _kept(run_dir, error) from None
+        raise _write_error(run_dir, error) from None
 
 
-def _kept(run_dir: Path, error: OSError) -> MachineError:
+def _write_error(run_dir: Path, error: OSError) -> MachineError:
     return MachineError(
         f"{run_dir / RECORD}: the record cannot be written: {why(error)}; what was recorded is "
         f"kept in {run_dir / SPOOL}, and `noack summary {run_dir}` finishes it"

@@ -35,7 +35,7 @@ class FederateOptions(NamedTuple):
     """The broker's address; by default the one of this host, at HELICS' own port."""
 
 
-class _Waiting(NamedTuple):
+class _QueuedMessage(NamedTuple):
     """A message in the channel."""
 
     data: bytes
@@ -51,7 +51,7 @@ class Route:
     sent: int = 0
     lost: int = 0
     longest_burst: int = 0
-    waiting: dict[int, _Waiting] = field(default_factory=dict)
+    waiting: dict[int, _QueuedMessage] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, object]:
         """Return the counts."""
@@ -159,17 +159,17 @@ class _Network:
                 self._take(time_ns, flow, message)
             self._leave(self._channel.release(round(granted_s * NS_PER_S)), granted_s)
 
-    def _received(self) -> Iterator[tuple[int, int, _Waiting]]:
+    def _received(self) -> Iterator[tuple[int, int, _QueuedMessage]]:
         """Yield the messages that have come: time in ns, number of the endpoint, content."""
         helics = self._helics
         for flow, endpoint in enumerate(self._endpoints):
             while helics.helicsEndpointHasMessage(endpoint):
                 message = helics.helicsEndpointGetMessage(endpoint)
-                content = _Waiting(helics.helicsMessageGetBytes(message), message.original_source, 0)
+                content = _QueuedMessage(helics.helicsMessageGetBytes(message), message.original_source, 0)
                 yield round(message.time * NS_PER_S), flow, content
         helics.helicsFederateClearMessages(self._federate)
 
-    def _take(self, now_ns: int, flow: int, message: _Waiting) -> None:
+    def _take(self, now_ns: int, flow: int, message: _QueuedMessage) -> None:
         """Let the channel decide about a message that was sent now."""
         route, channel = self.routes[flow], self._channel
         self._leave(channel.release(now_ns), now_ns / NS_PER_S)

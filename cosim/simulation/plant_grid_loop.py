@@ -107,7 +107,7 @@ class PlantGridLoop:
             within = [update for update in in_flight if update.acts_ns < until * period_ns]
             following = slice(step + 1, until + 1)
             if hold:
-                states[following] = self._held(x, newest, step, until)
+                states[following] = self._states_under_held_inputs(x, newest, step, until)
             else:
                 states[following] = self._continuous(x, [newest, *within], step, until)
             x_s_block = self._modelled(x_s, self._steps_s[1 : until - step + 1])
@@ -131,14 +131,14 @@ class PlantGridLoop:
         """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t)."""
         now_ns, newest = step * self._schedule.period_ns, updates[0]
         for update in updates[1:]:
-            x = self._followed(x, newest, now_ns, np.array([(update.acts_ns - now_ns) * 1e-9]))[0]
+            x = self._states_after(x, newest, now_ns, np.array([(update.acts_ns - now_ns) * 1e-9]))[0]
             newest, now_ns = max(newest, update, key=lambda candidate: candidate.number), update.acts_ns
         if len(updates) == 1:
-            return self._followed(x, newest, now_ns, self._steps_s[1 : until - step + 1])
+            return self._states_after(x, newest, now_ns, self._steps_s[1 : until - step + 1])
         end_ns = until * self._schedule.period_ns
-        return self._followed(x, newest, now_ns, np.array([(end_ns - now_ns) * 1e-9]))
+        return self._states_after(x, newest, now_ns, np.array([(end_ns - now_ns) * 1e-9]))
 
-    def _followed(self, x: Vector, newest: "_Update", now_ns: int, after_s: Vector) -> Matrix:
+    def _states_after(self, x: Vector, newest: "_Update", now_ns: int, after_s: Vector) -> Matrix:
         """Return x at ascending times after now, (k, n), while no other update acts."""
         x_c = self._modelled(newest.x, np.array([(now_ns - newest.event_ns) * 1e-9]))[0]
         start = np.array([x, np.zeros_like(x), x_c - x])  # e_s does not act on the plant
@@ -149,7 +149,7 @@ class PlantGridLoop:
         start = np.array([x, np.zeros_like(x), np.zeros_like(x)])
         return self._system.follow(np.zeros(1), start[None], age_s).x_c
 
-    def _held(self, x: Vector, newest: "_Update", step: int, until: int) -> Matrix:
+    def _states_under_held_inputs(self, x: Vector, newest: "_Update", step: int, until: int) -> Matrix:
         """Return x at the steps after ``step`` up to ``until``, under the inputs applied there."""
         model_ns = self._schedule.model_ns[step:until]
         age_ns = np.maximum(model_ns - newest.event_ns, 0)

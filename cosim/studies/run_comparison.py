@@ -20,7 +20,7 @@ from cosim.output.figures.figure_description import (
     Line,
     Marks,
     Panel,
-    Row,
+    PanelRow,
     plain,
     series_colour,
     time_axis,
@@ -216,7 +216,7 @@ def _claims(verdict: str) -> Callable[[LoopSummary], int]:
     return lambda loop: sum(claim.verdict == verdict for claim in loop.claims)
 
 
-def _missed(loop: LoopSummary) -> int | None:
+def _count_late_steps(loop: LoopSummary) -> int | None:
     late = loop.lateness_us
     return sum(role.late_steps for role in late.values()) if late else None
 
@@ -242,7 +242,7 @@ _NUMBERS: dict[str, Callable[[LoopSummary], float | None]] = {
     "largest ‖e_c‖": lambda s: s.sup_e_c_norm,
     "latency p50, µs": lambda s: None if s.latency_us is None else s.latency_us.p50,
     "latency p99, µs": lambda s: None if s.latency_us is None else s.latency_us.p99,
-    "deadlines missed": _missed,
+    "deadlines missed": _count_late_steps,
     "claims held": _claims("held"),
     "claims violated": _claims("violated"),
     "claims void": _claims("void"),
@@ -296,7 +296,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
         ])
         for i, name in enumerate(runs[0].record.loop.state_names[:_MOST_STATES])
     ]  # fmt: skip
-    rows = [Row(panels=[panel], height_in=_STATE_IN) for panel in panels]
+    rows = [PanelRow(panels=[panel], height_in=_STATE_IN) for panel in panels]
     for title, name in (
         (r"Sensor's error $\|e_s\|$ and threshold (dashed)", "e_s_norm"),
         (r"Controller's error $\|e_c\|$", "e_c_norm"),
@@ -313,12 +313,12 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
             ]
         norms = np.concatenate([getattr(samples, name) for samples in aligned])
         y = Axis(label="norm", logarithmic=True, about=norms, decades=_DECADES)
-        rows.append(Row(panels=[Panel(title=title, items=items, x=longest, y=y)], height_in=_NORM_IN))
+        rows.append(PanelRow(panels=[Panel(title=title, items=items, x=longest, y=y)], height_in=_NORM_IN))
     events = replace(_events(runs), x=replace(longest, label=TIME, numbers=True))
     return FigureDescription(
         name="runs",
         heading=f"{len(runs)} runs",
-        rows=[*rows, Row(panels=[events], height_in=_EVENTS_IN * (len(runs) + 1))],
+        rows=[*rows, PanelRow(panels=[events], height_in=_EVENTS_IN * (len(runs) + 1))],
         caption="One colour per run. Dashed: threshold. Bar: transmission delivered; cross: "
         "transmission lost.",
         description="States, error norms and transmissions of the runs over time, overlaid.",

@@ -12,7 +12,7 @@ void apply_corrupt(packet *packet, const noack_stage *stage, noack_stage_memory 
         return;
     if (decision->must_pass) {
         if (corrupts)
-            decision->spared = 1;
+            decision->loss_suppressed = 1;
         return;
     }
     if (corrupts)

@@ -24,7 +24,7 @@ from netem.relay_links import DIRECTIONS, Direction
 from netem.tc_words import settings_of, words_of
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import with_kept_loss
+from noack.impairments.loss_prediction import with_target_loss
 from noack.runtime import private_folder
 from noack.runtime.control_plane import cause_of, open_session
 from noack.runtime.private_folder import require_name
@@ -219,7 +219,7 @@ class ControlServer:
             settings = settings_of(change.words or [])
         _require_read(settings)
         try:
-            with_kept_loss(settings)
+            with_target_loss(settings)
         except ValueError as error:
             raise CallerError(str(error)) from None
         directions: Sequence[Direction] = DIRECTIONS if change.direction == "both" else (change.direction,)

@@ -135,7 +135,7 @@ def open_devices(spec: LinkSpec) -> DeviceLink:
         CallerError: the system does not permit it or lacks something, or there are too many shells.
     """
     try:
-        addresses = _range_here()
+        addresses = _namespace_range()
         number, outer = _first_free(addresses)
         own_namespace = _open_namespace()
         process.call("unshare", process.NEW_NETWORK)
@@ -164,7 +164,7 @@ def open_devices(spec: LinkSpec) -> DeviceLink:
     )
 
 
-def _range_here() -> IPv4Network:
+def _namespace_range() -> IPv4Network:
     """Return the addresses of which a shell in this namespace gets a part."""
     request = struct.pack("16s16x", _INSIDE.encode())
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:

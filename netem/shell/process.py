@@ -78,11 +78,11 @@ def children() -> set[int]:
     return ids
 
 
-def end_children(spared: Collection[int] = ()) -> None:
-    """End all children and adopted descendants but some, by SIGTERM and, if they go on, SIGKILL."""
+def end_children(kept: Collection[int] = ()) -> None:
+    """End all children and adopted descendants but those kept: by SIGTERM, then by SIGKILL."""
     late_s = time.monotonic() + _GRACE_S
     terminated: set[int] = set()
-    while remaining := children().difference(spared):
+    while remaining := children().difference(kept):
         late = time.monotonic() > late_s
         for child in remaining if late else remaining - terminated:
             os.kill(child, signal.SIGKILL if late else signal.SIGTERM)

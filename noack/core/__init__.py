@@ -1,1 +1,6 @@
-"""The library in C; clock, random streams, linear systems; errors, files, processes, numbers as text."""
+"""What all of noack is based on, without knowledge of loops.
+
+``core_library.py`` is the library in C, on which ``linear_systems.py`` and ``random_streams.py``
+rest; ``clock.py`` is a run's time. ``errors.py``, ``file_access.py``, ``process_limits.py``,
+``number_format.py`` and ``cached_method.py`` have no mathematics.
+"""

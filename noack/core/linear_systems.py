@@ -260,12 +260,12 @@ class ModelFlow:
             return self.propagate(x, to_ns - from_ns)
         index = bisect_right(self._since_ns, from_ns)
         while index < len(self._since_ns) and self._since_ns[index] < to_ns:
-            x = self._about(self._setpoints[index], x, self._since_ns[index] - from_ns)
+            x = self._propagate_about(self._setpoints[index], x, self._since_ns[index] - from_ns)
             from_ns = self._since_ns[index]
             index += 1
-        return self._about(self._setpoints[index], x, to_ns - from_ns)
+        return self._propagate_about(self._setpoints[index], x, to_ns - from_ns)
 
-    def _about(self, setpoint: Vector | None, x: Vector, dt_ns: int) -> Vector:
+    def _propagate_about(self, setpoint: Vector | None, x: Vector, dt_ns: int) -> Vector:
         if setpoint is None or dt_ns == 0:
             return self.propagate(x, dt_ns)
         moved: Vector = setpoint + self.propagate(x - setpoint, dt_ns)

@@ -17,7 +17,7 @@ of the packets' numbers; when the packets are sent does not matter, even if that
 losses.
 
 ``loss 30% keep`` asks for a loss rate under the guarantee and the other impairments (the target
-loss rate). :func:`with_kept_loss` finds the smallest probability for which the predicted rate of
+loss rate). :func:`with_target_loss` finds the smallest probability for which the predicted rate of
 the whole direction is the target. That may take seconds; a process that must not wait receives what
 another one computed (:func:`remember`).
 """
@@ -118,7 +118,7 @@ def joint_chain(settings: LinkSettings) -> tuple[Array, Array, Array]:
 def _constrained_rate(parts: Sequence[Chain | Pattern], guarantee: LossGuarantee) -> float:
     patterns = [part.lost for part in parts if isinstance(part, Pattern)]
     if len(patterns) == len(parts):
-        return pattern_rate(_together_lost(patterns), guarantee)
+        return pattern_rate(_lost_by_any(patterns), guarantee)
     return constrained_rate(*_joint_chain(parts), guarantee)
 
 
@@ -138,7 +138,7 @@ def _capped_rate(parts: Sequence[Chain | Pattern], mansd: int | None) -> float:
 
 def _pattern_rate(patterns: Sequence[NDArray[np.bool_]], mansd: int | None) -> float:
     """Return the loss rate of several patterns combined, counted over their common period."""
-    lost = _together_lost(patterns)
+    lost = _lost_by_any(patterns)
     period = len(lost)
     if mansd is None:
         return float(lost.mean())
@@ -149,7 +149,7 @@ def _pattern_rate(patterns: Sequence[NDArray[np.bool_]], mansd: int | None) -> f
     return float((bursts - bursts // (mansd + 1)).sum() / period)
 
 
-def _together_lost(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+def _lost_by_any(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     period = math.lcm(*map(len, patterns))
     if period > LONGEST_PATTERN:
         raise NotPredictableError(f"the loss patterns repeat together only after {period} packets")
@@ -386,44 +386,44 @@ def expected_loss(settings: LinkSettings) -> LossPrediction:
     Raises:
         ValueError: a loss rate cannot be kept.
     """
-    return predict(with_kept_loss(settings))
+    return predict(with_target_loss(settings))
 
 
-class _Kept(NamedTuple):
-    """A loss whose rate is kept."""
+class _TargetLoss(NamedTuple):
+    """A loss of which the rate is given, not the probability."""
 
     number: int
     impairment: LossOf
     loss: BernoulliLoss
 
 
-def with_kept_loss(settings: LinkSettings) -> LinkSettings:
+def with_target_loss(settings: LinkSettings) -> LinkSettings:
     """Return settings with the probability that gives the asked loss rate.
 
     Raises:
         ValueError: there is none; one line.
     """
-    kept_losses = [
-        _Kept(number, impairment, impairment.loss)
+    target_losses = [
+        _TargetLoss(number, impairment, impairment.loss)
         for number, impairment in enumerate(settings.impairments)
         if isinstance(impairment, LossOf)
         and isinstance(impairment.loss, BernoulliLoss)
         and impairment.loss.keep
     ]
-    if not kept_losses:
+    if not target_losses:
         return settings
-    kept_loss = kept_losses[0]
-    if len(kept_losses) > 1:
-        raise ValueError(f"{kept_loss.impairment.text()}: only one loss of a direction can be kept")
+    target_loss = target_losses[0]
+    if len(target_losses) > 1:
+        raise ValueError(f"{target_loss.impairment.text()}: only one loss of a direction can be kept")
     key = _key(settings)
     if key not in _found:
-        remember({key: _probability(settings, kept_loss)})
-    return _with_probability(settings, kept_loss, _found[key])
+        remember({key: _probability(settings, target_loss)})
+    return _with_probability(settings, target_loss, _found[key])
 
 
 def found_probabilities(*links: LinkSettings) -> dict[str, float]:
     """Return the probabilities of valid settings, for :func:`remember`; none where none is kept."""
-    keys = [_key(link) for link in links if with_kept_loss(link) is not link]
+    keys = [_key(link) for link in links if with_target_loss(link) is not link]
     return {key: _found[key] for key in keys}
 
 
@@ -448,20 +448,20 @@ def _matters(impairment: Impairment) -> bool:
         return True
 
 
-def _with_probability(settings: LinkSettings, kept_loss: _Kept, probability: float) -> LinkSettings:
-    loss = kept_loss.loss.model_copy(update={"probability": probability, "keep": False})
+def _with_probability(settings: LinkSettings, target_loss: _TargetLoss, probability: float) -> LinkSettings:
+    loss = target_loss.loss.model_copy(update={"probability": probability, "keep": False})
     impairments: list[Impairment] = list(settings.impairments)
-    impairments[kept_loss.number] = kept_loss.impairment.model_copy(update={"loss": loss})
+    impairments[target_loss.number] = target_loss.impairment.model_copy(update={"loss": loss})
     return settings.model_copy(update={"impairments": tuple(impairments)})
 
 
-def _probability(settings: LinkSettings, kept_loss: _Kept) -> float:
+def _probability(settings: LinkSettings, target_loss: _TargetLoss) -> float:
     from scipy.optimize import brentq  # slow to import
 
-    text, target = kept_loss.impairment.text(), kept_loss.loss.probability
+    text, target = target_loss.impairment.text(), target_loss.loss.probability
 
     def rate_at(probability: float, link_settings: LinkSettings = settings) -> float:
-        rate, note = predict(_with_probability(link_settings, kept_loss, float(probability)))
+        rate, note = predict(_with_probability(link_settings, target_loss, float(probability)))
         if rate is None:
             raise ValueError(f"{text}: the loss rate cannot be predicted: {note}")
         return rate
@@ -504,7 +504,7 @@ def read_files(settings: LinkSettings, folder: Path, place: str = "") -> LinkSet
     )
     read = settings.model_copy(update={"impairments": impairments})
     try:
-        with_kept_loss(read)
+        with_target_loss(read)
     except ValueError as error:
         raise CallerError(f"{place}: {error}" if place else str(error)) from None
     return read

@@ -137,9 +137,9 @@ def pattern_rate(lost: NDArray[np.bool_], guarantee: LossGuarantee) -> float:
             first, earlier_losses = visits[int(state[0])]
             return (losses - earlier_losses) / ((period - first) * len(lost))
         visits[int(state[0])] = period, losses
-        for wish in lost.tolist():
-            after_loss = automaton.after_loss(state) if wish else state
-            if wish and after_loss[0] >= 0:
+        for is_lost in lost.tolist():
+            after_loss = automaton.after_loss(state) if is_lost else state
+            if is_lost and after_loss[0] >= 0:
                 state, losses = after_loss, losses + 1
             else:
                 state = automaton.after_delivery(state)

@@ -124,7 +124,7 @@ class FmuSystem:
         weakref.finalize(self, end.close)  # when the object is deleted, or the process ends
         try:
             description = _described(path)
-            self.about = _about(description)
+            self.about = _description_text(description)
             self._instance = self._load(_unpacked(path, settings, description, end), end, description)
             self._start(settings, x0, description)
         except CallerError:
@@ -216,14 +216,14 @@ class FmuSystem:
             )
 
 
-class _Kept(NamedTuple):
+class _UnpackedFmus(NamedTuple):
     """Folders of unpacked FMUs by path and SHA-256, and when they are removed."""
 
     folders: dict[tuple[Path, str | None], Path]
     end: ExitStack
 
 
-_KEPT = ContextVar[_Kept | None]("kept", default=None)
+_KEPT = ContextVar[_UnpackedFmus | None]("kept", default=None)
 
 
 @contextmanager
@@ -233,7 +233,7 @@ def unpacked_once() -> Iterator[None]:
     The instances share the FMU's library: they should follow one another.
     """
     with ExitStack() as end:
-        end.callback(_KEPT.reset, _KEPT.set(_Kept({}, end)))
+        end.callback(_KEPT.reset, _KEPT.set(_UnpackedFmus({}, end)))
         yield
 
 
@@ -241,7 +241,7 @@ def _unpacked(path: Path, settings: FmuSettings, description: "ModelDescription"
     """Return a folder with the content of an FMU; without a context for it, it is removed at the end."""
     kept, key = _KEPT.get(), (path, settings.sha256)
     if kept is None or description.coSimulation.canBeInstantiatedOnlyOncePerProcess:
-        kept = _Kept({}, end)
+        kept = _UnpackedFmus({}, end)
     if key not in kept.folders:
         folder = kept.end.enter_context(temporary_folder())
         _fmpy().extract(str(path), str(folder))
@@ -424,7 +424,7 @@ def _not_initial(variable: "ScalarVariable") -> str | None:
     return reason and f"{reason}; name variables whose initial is exact or approx, or none: []"
 
 
-def _about(description: "ModelDescription") -> str:
+def _description_text(description: "ModelDescription") -> str:
     tool = description.generationTool or "a tool that it does not name"
     needs = "; it needs that tool to run" if description.coSimulation.needsExecutionTool else ""
     return f"FMU {description.modelName}, FMI {description.fmiVersion}, by {tool}{needs}"

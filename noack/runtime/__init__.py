@@ -1,1 +1,11 @@
-"""A process in a run: its UDP sockets, real-time loop, control plane (zenoh) and telemetry."""
+"""A process in a run: its UDP sockets, real-time loop, control plane (zenoh) and telemetry.
+
+Read ``run_process.py`` first, from top to bottom. It uses, in this order:
+
+* ``command_line.py`` and ``join_ticket.py``, with which a process starts,
+* ``control_plane.py``, its messages (``control_messages.py``) and the life cycle that they change
+  (``life_cycle.py``); on another host ``connections`` and ``host_clocks``, too,
+* ``udp_sockets.py`` with ``address.py``,
+* ``real_time_loop.py``, whose driver is ``live_driver.py`` or ``node_driver.py``,
+* ``telemetry.py`` and ``spool.py`` for the rows; ``private_folder.py`` for files of the user.
+"""

@@ -75,7 +75,7 @@ class ChangeAnnouncement(ControlMessage):
     settings: Table  # values by scenario key
     requested_ns: Nanoseconds  # simulated time of the request
     requested_at: str  # date and time of the request; or that the scenario contains the change
-    kept_losses: dict[str, FiniteFloat] = {}
+    target_losses: dict[str, FiniteFloat] = {}
     """Probabilities for :func:`noack.impairments.loss_prediction.remember`."""
 
     @property

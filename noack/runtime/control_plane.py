@@ -404,7 +404,7 @@ class ParameterUpdates:
         updates: list[ChangeAnnouncement] = []
         while self._waiting and (at_most is None or len(updates) < at_most):
             announced = self._waiting.pop(0)
-            remember(announced.kept_losses)
+            remember(announced.target_losses)
             if announced.number >= self._next_number:  # a late process receives some twice
                 self._next_number = announced.number + 1
                 updates.append(announced)

@@ -65,7 +65,7 @@ class Ticket(ScenarioSection):
     """The coordinator's monotonic clock, of which the run's epoch is a reading."""
     time_reference: SocketAddress | None = None
     """Where processes with another clock compare it with the coordinator's, under the run's key."""
-    kept_losses: Annotated[dict[str, FiniteFloat], AfterValidator(remember)] = Field({})
+    target_losses: Annotated[dict[str, FiniteFloat], AfterValidator(remember)] = Field({})
     """Probabilities that the check of the scenario needs."""
     scenario: Scenario  # resolved
 
@@ -79,7 +79,7 @@ def new_ticket(scenario: Scenario, run_dir: Path, *, launched: bool) -> Ticket:
         launched=launched,
         admission_pass=new_admission_pass(),
         clock=clock_identity(),
-        kept_losses=found_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
+        target_losses=found_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
         scenario=scenario,
     )
 

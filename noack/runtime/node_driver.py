@@ -163,7 +163,7 @@ class NodeDriver(LiveDriver):
                 socket.send_fds(self._own, [first[:1]], [endpoint.fileno() for endpoint in self._sockets])
             self._to_send += first[1:] + data
         elif now != self._sent_clock:
-            self._put(core.NOACK_NODE_CLOCK, now)
+            self._queue_message(core.NOACK_NODE_CLOCK, now)
         self._sent_clock = now
 
     def _settings(self) -> bytes:
@@ -205,7 +205,7 @@ class NodeDriver(LiveDriver):
         from_peer = source[:2] == self._source
         if not from_peer:
             self.core.foreign += 1
-        self._put(core.NOACK_NODE_DATAGRAM, struct.pack("<q", from_peer) + data)
+        self._queue_message(core.NOACK_NODE_DATAGRAM, struct.pack("<q", from_peer) + data)
 
     def finish(self, sink: RecordSink) -> None:
         """Let the program end; take all that it has done.
@@ -233,7 +233,7 @@ class NodeDriver(LiveDriver):
                 "it must send the row of each tick"
             )
 
-    def _put(self, kind: int, content: bytes) -> None:
+    def _queue_message(self, kind: int, content: bytes) -> None:
         self._to_send += _HEAD.pack(kind, len(content)) + content
 
     def _exchange(self, wait_s: float, wake: int = 0) -> bool:

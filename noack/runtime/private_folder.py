@@ -162,7 +162,7 @@ def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[P
                 lock(descriptor, wait=True)
                 with open(descriptor, "w", closefd=False) as file:
                     json.dump(content, file)
-                _put(folder, scratch, name)
+                _replace_file(folder, scratch, name)
             finally:
                 folder.remove(scratch)
         except FileExistsError:
@@ -190,7 +190,7 @@ def _inside(kind: str) -> tuple[str, ...]:
     return (kind,) if kind else ()
 
 
-def _put(folder: PrivateFolder, scratch: str, name: str) -> None:
+def _replace_file(folder: PrivateFolder, scratch: str, name: str) -> None:
     for attempt in range(2):
         try:
             with _locked(folder):

@@ -1,1 +1,11 @@
-"""The scenario file: its tables and their checks, files that it names, names and draws as numbers."""
+"""The scenario: from a file to the numbers of a run.
+
+1. ``sections.py`` and ``run_sections.py``: the tables of a scenario. ``scenario_tables.py``: all of
+   them, and what follows from them. ``scenario.py``: with the N loops.
+2. ``toml_file.py`` and ``scenario_file.py`` read a file, with one line per mistake;
+   ``matrix_files.py`` and ``mat_file.py`` the matrices that it names.
+3. ``scenario_checks.py``: tables that depend on each other; ``link_load.py`` and
+   ``response_times.py``: whether a shared link can carry its loops.
+4. ``resolution.py``: names and random draws become numbers. Machines are made of the result.
+5. ``runtime_parameters.py`` and ``parameter_changes.py``: changes during a run.
+"""

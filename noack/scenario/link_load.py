@@ -52,7 +52,7 @@ class Demand(NamedTuple):
     largest_s: float  # Largest time between two transmissions; infinite if there is none
 
 
-class _Stage(NamedTuple):
+class _RunPart(NamedTuple):
     """A part of the run, between two changes of settings."""
 
     begin: str  # Where it begins, in words; empty: at the start of the run
@@ -117,7 +117,7 @@ def link_loads(scenario: Scenario) -> list[LinkLoad]:
     Raises:
         CallerError: a loop cannot be resolved, or its trigger excludes its model.
     """
-    updates, actuations = _stages(scenario)
+    updates, actuations = _run_parts(scenario)
     names = loop_names(scenario)
     update_loads = _link_loads(updates, Flow.UPDATE, "network", names)
     return update_loads + _link_loads(actuations, Flow.ACTUATION, "network.actuation", names)
@@ -129,7 +129,7 @@ def update_delay(scenario: Scenario) -> DelayBound:
     Raises:
         CallerError: as :func:`link_loads`.
     """
-    delays, loops_s = _largest_delays(_stages(scenario)[0])
+    delays, loops_s = _largest_delays(_run_parts(scenario)[0])
     bounds_s = {f"network.impairments.{index}": max(delays_s) for index, delays_s in enumerate(delays)}
     impairments_s = {key: bound_s for key, bound_s in bounds_s.items() if bound_s > 0}
     longest_s = scenario.network.link.longest_delay_s
@@ -150,44 +150,44 @@ def proven_delays(scenario: Scenario) -> list[ProvenDelay | None]:
     count = sum(section.count for section in loop_sections(scenario))
     if scenario.certificate.network_delay_s is not None or scenario.network.link.delay_is_bounded:
         return [None] * count
-    _, loops_s = _largest_delays(_stages(scenario)[0])
+    _, loops_s = _largest_delays(_run_parts(scenario)[0])
     return [ProvenDelay(delay_s, count) for delay_s in loops_s]
 
 
-def _stages(scenario: Scenario) -> tuple[list[_Stage], list[_Stage]]:
+def _run_parts(scenario: Scenario) -> tuple[list[_RunPart], list[_RunPart]]:
     """Return the parts of the run between changes of settings: updates, actuations."""
     sections = loop_sections(scenario)
     loops = [loop_scenario(scenario, section) for section in sections]
     counts = [section.count for section in sections]
-    updates, actuations = list[_Stage](), list[_Stage]()
+    updates, actuations = list[_RunPart](), list[_RunPart]()
     for number in range(len(scenario.changes) + 1):
         begin = f"from changes.{number - 1} on, " if number else ""
         if number:
             loops = [with_settings(loop, scenario.changes[number - 1].set) for loop in loops]
         network = loops[0].network
-        updates.append(_Stage(begin, network, [*map(_demand, loops, counts)]))
+        updates.append(_RunPart(begin, network, [*map(_demand, loops, counts)]))
         if network.actuation is not None:
             demands = [*map(_actuations, loops, counts)]
-            actuations.append(_Stage(begin, network.actuation, demands))
+            actuations.append(_RunPart(begin, network.actuation, demands))
     return updates, actuations
 
 
-def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str, names: Sequence[str]) -> list[LinkLoad]:
+def _link_loads(run_parts: Sequence[_RunPart], flow: Flow, path: str, names: Sequence[str]) -> list[LinkLoad]:
     loads: list[LinkLoad] = []
-    if not stages:
+    if not run_parts:
         return loads
-    delays, _ = _largest_delays(stages)
-    for index, impairment in enumerate(stages[0].direction.impairments):
+    delays, _ = _largest_delays(run_parts)
+    for index, impairment in enumerate(run_parts[0].direction.impairments):
         key = f"{path}.impairments.{index}"
         if isinstance(impairment, Schedule):
             delays_of = [*zip(names, delays[index], strict=True)]
-            loads += _slot_loads(impairment, stages, (key, flow), delays_of)
+            loads += _slot_loads(impairment, run_parts, (key, flow), delays_of)
         if not isinstance(impairment, Rate | Opportunities):
             continue
         previous: LinkLoad | None = None
         delay_s = _largest_bound(delays[index])
         by_loops = tuple(_by_loops(names, delays[index])) if len(delays[index]) > 1 else ()
-        for begin, direction, loops in stages:
+        for begin, direction, loops in run_parts:
             window = _window(direction)
             bits = [int(impairment.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
             needed_bps = (
@@ -222,7 +222,7 @@ def _largest_bound(delays_s: Sequence[float]) -> float | None:
 
 def _slot_loads(
     schedule: Schedule,
-    stages: Sequence[_Stage],
+    run_parts: Sequence[_RunPart],
     path: tuple[str, Flow],
     delays_of: Sequence[tuple[str, float]],
 ) -> Iterator[LinkLoad]:
@@ -231,13 +231,13 @@ def _slot_loads(
     ``delays_of`` has the name of each loop of the run and the bound of its delay.
     """
     key, flow = path
-    first, slots = 0, _slots(schedule, stages)
+    first, slots = 0, _slots(schedule, run_parts)
     round_s = len(schedule.order) * schedule.slot_ns / NS_PER_S
-    for entry, loops in enumerate(stages[0].loops):
+    for entry, loops in enumerate(run_parts[0].loops):
         number = min(range(first, first + loops.loops), key=lambda loop: len(slots[loop]))
         first += loops.loops
         name, delay_s = delays_of[number]
-        for begin, direction, demands in stages:
+        for begin, direction, demands in run_parts:
             loop, window = demands[entry], _window(direction)
             bits = 8 * loop.payload_bytes
             must_pass = bits * _share(window)
@@ -253,9 +253,9 @@ def _slot_loads(
             )
 
 
-def _slots(schedule: Schedule, stages: Sequence[_Stage]) -> list[list[int]]:
+def _slots(schedule: Schedule, run_parts: Sequence[_RunPart]) -> list[list[int]]:
     """Return the slots of each loop of the run."""
-    loops = sum(demand.loops for demand in stages[0].loops)
+    loops = sum(demand.loops for demand in run_parts[0].loops)
     return [*schedule.slots, *([] for _ in range(loops))][:loops]
 
 
@@ -269,23 +269,23 @@ def _share(window: LossWindow) -> float:
     return (window.packets - window.losses) / window.packets
 
 
-def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], list[float]]:
+def _largest_delays(run_parts: Sequence[_RunPart]) -> tuple[list[list[float]], list[float]]:
     """Return the bounds of the delay in each impairment, and of each loop in all, in seconds.
 
     A schedule, and a rate that chooses what it sends, have a bound for each loop; another
     impairment has one for all; infinite: there is none.
     """
-    least_s, largest_s = 0.0, [0.0] * sum(demand.loops for demand in stages[0].loops)
+    least_s, largest_s = 0.0, [0.0] * sum(demand.loops for demand in run_parts[0].loops)
     delays_s, copied = list[list[float]](), False
-    for impairment in stages[0].direction.impairments:  # they cannot change
+    for impairment in run_parts[0].direction.impairments:  # they cannot change
         spread_s = max(largest_s) - least_s
         if isinstance(impairment, Schedule | Rate):
             if isinstance(impairment, Schedule):
-                delays_s.append(_slot_delays_s(impairment, stages, spread_s, copied=copied))
+                delays_s.append(_slot_delays_s(impairment, run_parts, spread_s, copied=copied))
             elif impairment.scheduler is not None:
-                delays_s.append(_chosen_delays_s(impairment, impairment.scheduler, stages))
+                delays_s.append(_chosen_delays_s(impairment, impairment.scheduler, run_parts))
             else:
-                delays_s.append([_queue_delay_s(impairment, stages, spread_s, copied=copied)])
+                delays_s.append([_queue_delay_s(impairment, run_parts, spread_s, copied=copied)])
             largest_s = [
                 before_s + added_s for before_s, added_s in zip(largest_s, cycle(delays_s[-1]), strict=False)
             ]
@@ -299,19 +299,19 @@ def _largest_delays(stages: Sequence[_Stage]) -> tuple[list[list[float]], list[f
 
 
 def _slot_delays_s(
-    schedule: Schedule, stages: Sequence[_Stage], spread_s: float, *, copied: bool
+    schedule: Schedule, run_parts: Sequence[_RunPart], spread_s: float, *, copied: bool
 ) -> list[float]:
     """Return the bounds for the slots of each loop; see :func:`_queue_delay_s`."""
     least_s = [
-        min(stage.loops[entry].least_s for stage in stages)
-        for entry, demand in enumerate(stages[0].loops)
+        min(stage.loops[entry].least_s for stage in run_parts)
+        for entry, demand in enumerate(run_parts[0].loops)
         for _ in range(demand.loops)
     ]
-    share = max(_share(_window(stage.direction)) for stage in stages)
-    if any(stage.direction.constraints for stage in stages):
+    share = max(_share(_window(stage.direction)) for stage in run_parts)
+    if any(stage.direction.constraints for stage in run_parts):
         share = math.inf
     delays_s = []
-    for slots, loop_least_s in zip(_slots(schedule, stages), least_s, strict=True):
+    for slots, loop_least_s in zip(_slots(schedule, run_parts), least_s, strict=True):
         least_ns, count = round(loop_least_s * NS_PER_S), len(slots)
         round_ns, copies = len(schedule.order) * schedule.slot_ns, 2 if copied else 1
         bounds = [math.inf]
@@ -327,16 +327,16 @@ def _slot_delays_s(
     return delays_s
 
 
-def _chosen_delays_s(rate: Rate, scheduler: Scheduler, stages: Sequence[_Stage]) -> list[float]:
+def _chosen_delays_s(rate: Rate, scheduler: Scheduler, run_parts: Sequence[_RunPart]) -> list[float]:
     """Return the bounds for each loop of a rate that chooses what it sends.
 
     A change of the direction's settings makes the order of what waits final, so that any may go first.
     """
-    demands = stages[0].loops
-    changes = any(stage.direction.link != stages[0].direction.link for stage in stages)
+    demands = run_parts[0].loops
+    changes = any(stage.direction.link != run_parts[0].direction.link for stage in run_parts)
     senders_ns = [
         (
-            round(min(stage.loops[entry].least_s for stage in stages) * NS_PER_S),
+            round(min(stage.loops[entry].least_s for stage in run_parts) * NS_PER_S),
             max(-(-int(rate.line_bits(demand.payload_bytes)) * NS_PER_S // rate.rate_bps), 1),
         )
         for entry, demand in enumerate(demands)
@@ -356,30 +356,30 @@ def _chosen_delays_s(rate: Rate, scheduler: Scheduler, stages: Sequence[_Stage])
     return [bounds_s[kind] for kind in kinds]
 
 
-def _queue_delay_s(rate: Rate, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> float:
+def _queue_delay_s(rate: Rate, run_parts: Sequence[_RunPart], spread_s: float, *, copied: bool) -> float:
     """Return the bound for the least M and the shortest times between transmissions of the run.
 
     What waits in the queue at a change was sent before it, so no stage has a bound of its own.
 
     Args:
         rate: the bottleneck.
-        stages: the parts of the run.
+        run_parts: the parts of the run.
         spread_s: by how much the delays before the queue can differ.
         copied: datagrams may have been sent twice before the queue.
     """
     if not isinstance(rate.discipline, TailDrop) or math.isinf(spread_s):
         return math.inf
-    bits = [int(rate.line_bits(loop.payload_bytes)) for loop in stages[0].loops]
-    counts = [loop.loops for loop in stages[0].loops]
-    by_loops = zip(*(stage.loops for stage in stages), strict=True)
+    bits = [int(rate.line_bits(loop.payload_bytes)) for loop in run_parts[0].loops]
+    counts = [loop.loops for loop in run_parts[0].loops]
+    by_loops = zip(*(stage.loops for stage in run_parts), strict=True)
     least_s: list[float] = [min(demand.least_s for demand in demands) for demands in by_loops]
     every_bps: float = sum(b * k / d for b, k, d in zip(bits, counts, least_s, strict=True))
     together = sum(b * k for b, k in zip(bits, counts, strict=True))
     copies = 2 if copied else 1
     if copies * every_bps <= rate.rate_bps:
         return copies * (together + every_bps * spread_s) / rate.rate_bps
-    needed_bps = every_bps * max(_share(_window(stage.direction)) for stage in stages)
-    if needed_bps < rate.rate_bps and not any(stage.direction.constraints for stage in stages):
+    needed_bps = every_bps * max(_share(_window(stage.direction)) for stage in run_parts)
+    if needed_bps < rate.rate_bps and not any(stage.direction.constraints for stage in run_parts):
         waiting = rate.queue * max(bits) + together + needed_bps * spread_s
         return waiting / (rate.rate_bps - needed_bps)
     return math.inf

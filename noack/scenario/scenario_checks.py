@@ -21,7 +21,7 @@ from noack.impairments.constraints import require_consistent
 from noack.impairments.link_settings import Constraints, Mansd, require_scores
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
-from noack.impairments.loss_prediction import with_kept_loss
+from noack.impairments.loss_prediction import with_target_loss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtime_parameters
 from noack.scenario.scenario_tables import ScenarioTables
@@ -66,10 +66,10 @@ def check_sections(scenario: ScenarioTables) -> None:
     _check_observer(scenario)
     _check_watchdog(scenario)
     check_trigger(scenario)
-    check_kept_loss(scenario)
+    check_target_loss(scenario)
 
 
-def check_kept_loss(scenario: ScenarioTables) -> None:
+def check_target_loss(scenario: ScenarioTables) -> None:
     """Raise ValueError if a loss rate cannot be kept; with a trace, as soon as it has been read."""
     network = scenario.network
     for key, section in network.directions.items():
@@ -77,7 +77,7 @@ def check_kept_loss(scenario: ScenarioTables) -> None:
         if any(isinstance(loss, TraceLoss) for loss in losses):
             continue
         try:
-            with_kept_loss(section.link)
+            with_target_loss(section.link)
         except ValueError as error:
             raise ValueError(f"{key}.loss: {error}") from None
 
@@ -292,5 +292,5 @@ def with_settings(scenario: S, settings: ReadTable) -> S:
     changed = scenario.model_copy(update={**update, "changes": ()})
     check_trigger(changed)
     check_setpoint(changed)
-    check_kept_loss(changed)
+    check_target_loss(changed)
     return changed

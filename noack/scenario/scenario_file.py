@@ -21,7 +21,7 @@ from noack.scenario import toml_file
 from noack.scenario.matrix_files import with_matrices
 from noack.scenario.runtime_parameters import SHORT, full_key
 from noack.scenario.scenario import LOOP_NEEDS, PARTS, Scenario, parts_model, with_loop_tables
-from noack.scenario.scenario_checks import check_kept_loss
+from noack.scenario.scenario_checks import check_target_loss
 from noack.scenario.sections import DirectionSection
 from noack.scenario.toml_file import keys as known_keys
 from noack.scenario.toml_file import nearest_key
@@ -86,7 +86,7 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
         update |= {key: section.model_copy(update=read)} if key else read
     scenario = scenario.model_copy(update={"network": network.model_copy(update=update)})
     try:
-        check_kept_loss(scenario)
+        check_target_loss(scenario)
     except ValueError as error:
         raise CallerError(f"{source}: {error}") from None
 

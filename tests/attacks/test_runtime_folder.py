@@ -14,7 +14,7 @@ import pytest
 import rerun.blueprint as rrb
 
 import noack
-from cosim.doctor.machine_measures import _runtime_folder
+from cosim.doctor.machine_measures import _runtime_folder_problem
 from cosim.measurement.live_measurement import ProbeRows
 from cosim.output.viewer.recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
@@ -101,7 +101,7 @@ def test_a_symbolic_link_instead_of_a_folder_is_refused(
     with pytest.raises(CallerError, match="closed to others"):
         USES[use](ticket)
     if not place:
-        assert "closed to others" in str(_runtime_folder())  # the doctor reports it
+        assert "closed to others" in str(_runtime_folder_problem())  # the doctor reports it
     assert [file.name for file in own.rglob("*") if file.is_file()] == ["default.json"]
 
 

@@ -55,9 +55,9 @@ from cosim.simulation.sampled_loop import SampledLoop
 from noack.core.linear_systems import Vector
 from noack.core.random_streams import stream
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.enclosure import NotDecayingError, response
 from noack.theory.bounds.gains import ErrorGains, Output
-from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify

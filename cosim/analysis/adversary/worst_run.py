@@ -31,7 +31,7 @@ from noack.core.number_format import at_least, at_most, number
 from noack.disturbances.uniform import UniformDisturbance
 from noack.impairments.loss_guarantee import outcome_letters
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import Constants
+from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _MOST_RESPONSES = 2000

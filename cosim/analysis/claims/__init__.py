@@ -1,1 +1,8 @@
-"""Claims checked against a run: held, violated or void, with time and reason."""
+"""Claims checked against a run: held, violated or void, with time and reason.
+
+1. ``observed_conditions.py``: the conditions under which a run took place, and which assumptions
+   they violate. ``condition_reader.py`` reads them from the rows of the record.
+2. ``run_evidence.py``: signals, conditions and certificates, against which claims are checked.
+3. ``claim_definition.py``: the form of a claim; ``catalogue`` has the claims.
+4. ``claim_evaluation.py``: checks all of them, for each part of a run.
+"""

@@ -8,7 +8,7 @@ import numpy as np
 
 from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
-from noack.theory.bounds.terms import Constants
+from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 

@@ -30,7 +30,7 @@ from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, ClaimD
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, RunPart, Samples, late_certificates
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
-from cosim.analysis.value_reduction import decimate
+from cosim.record.decimation import decimate
 from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
@@ -51,8 +51,8 @@ from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.runtime_parameters import text_of
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.disturbances import bound_forcing
-from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, about_setpoint, allowed_conditions, void_at_setpoint
 from noack.theory.certificates.scenario_certificates import outside_box
@@ -157,7 +157,7 @@ def _end_s(part: RunPart) -> float | None:
     return round(part.from_s + part.until_s, 9) if math.isfinite(part.until_s) else None
 
 
-class _Instance(NamedTuple):
+class _ClaimInstance(NamedTuple):
     """A claim about a run, by a certificate or without one."""
 
     find: Callable[[RunEvidence, Samples], Findings]
@@ -207,7 +207,7 @@ class ClaimEvaluation(RunEvidence):
         return claims
 
     @cached_property
-    def _checked(self) -> list[_Instance]:
+    def _checked(self) -> list[_ClaimInstance]:
         """All claims, checked in one pass over the run."""
         instances = list(self._instances())
         for samples in self.samples():
@@ -215,7 +215,7 @@ class ClaimEvaluation(RunEvidence):
                 instance.take(self, samples)
         return instances
 
-    def _instances(self) -> Iterator[_Instance]:
+    def _instances(self) -> Iterator[_ClaimInstance]:
         """Yield the claims of each certificate, and those that need none."""
         scenario = self.record.scenario
         for certificate in self.certificates:
@@ -225,10 +225,10 @@ class ClaimEvaluation(RunEvidence):
             for claim in definitions(CertifiedClaim):
                 check = ClaimCheck(claim.statement, certificate.source, self.part)
                 find = partial(claim.find, certificate=certificate, constants=constants)
-                yield _Instance(find, check, [], certificate, outside)
+                yield _ClaimInstance(find, check, [], certificate, outside)
         for claim in definitions(ClaimDefinition):
             unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
-            yield _Instance(claim.find, ClaimCheck(claim.statement, claim.source, self.part, unmet), [])
+            yield _ClaimInstance(claim.find, ClaimCheck(claim.statement, claim.source, self.part, unmet), [])
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds; those of a long run are thinned."""
@@ -295,7 +295,7 @@ class RunClaims:
         parts: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
-            parts.append(self._after(made, until_ns))
+            parts.append(self._claims_after(made, until_ns))
         return parts
 
     @property
@@ -349,10 +349,12 @@ class RunClaims:
         for evaluation in self.parts:
             # Other bounds hold for deviations from another set-point, or start later.
             if not isinstance(evaluation, Claim) and evaluation.part.from_s == 0 and self._setpoint is None:
-                envelopes += [_until(curve, evaluation.part.until_s) for curve in evaluation.envelopes()]
+                envelopes += [
+                    _envelope_until(curve, evaluation.part.until_s) for curve in evaluation.envelopes()
+                ]
         return envelopes
 
-    def _after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
+    def _claims_after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
         """The claims about the part of the run that follows a change."""
         record = self._judged
         known = record.events()["event"]
@@ -364,10 +366,10 @@ class RunClaims:
         )
         after = after[np.isin(after["sequence"], known)]
         if made.everywhere_ns == NEVER_NS:
-            return _nothing_after(made, until_ns, "not every process received the change")
+            return _void_after(made, until_ns, "not every process received the change")
         if not len(after) or after["t_ns"][0] >= until_ns:
             up_to = "" if until_ns == NEVER_NS else f", up to {until_ns / NS_PER_S:.3f} s"
-            return _nothing_after(made, until_ns, f"no update was delivered after it{up_to}")
+            return _void_after(made, until_ns, f"no update was delivered after it{up_to}")
         origin_ns, sequence = int(after["t_ns"][0]), int(after["sequence"][0])
         own = _part_of(record, made.scenario, origin_ns, sequence)
         part = RunPart(
@@ -400,7 +402,7 @@ def claims_of(record: RunRecord) -> "RunClaims":
     return RunClaims(record)
 
 
-def _nothing_after(made: RecordedChange, until_ns: int, why: str) -> Claim:
+def _void_after(made: RecordedChange, until_ns: int, why: str) -> Claim:
     """Return a void claim for the part after a change, with the reason for having no claims."""
     at_s, text = made.first_ns / NS_PER_S, text_of(made.change.settings)
     until_s = None if until_ns == NEVER_NS else until_ns / NS_PER_S
@@ -413,7 +415,7 @@ def _until_s(until_ns: int, origin_ns: int) -> float:
     return math.inf if until_ns == NEVER_NS else (until_ns - origin_ns) * 1e-9
 
 
-def _until(envelope: Envelope, until_s: float) -> Envelope:
+def _envelope_until(envelope: Envelope, until_s: float) -> Envelope:
     if envelope.quantity == "inter_event":  # two ends of a line
         return envelope._replace(t_s=np.minimum(envelope.t_s, until_s))
     return envelope._replace(values=np.where(envelope.t_s < until_s, envelope.values, np.nan))

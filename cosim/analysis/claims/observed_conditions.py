@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from noack.impairments.loss_guarantee import LongestBurst, LossRule
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.conditions import ideal_conditions
 
 _TOLERANCE_S = 1e-9
@@ -150,7 +150,7 @@ class AssumptionViolation(NamedTuple):
 
 
 class ObservedConditions(NamedTuple):
-    """The conditions of :class:`noack.theory.bounds.terms.NetworkConditions`, as observed."""
+    """The conditions of :class:`noack.theory.bounds.certificate_terms.NetworkConditions`, as observed."""
 
     losses: PacketLosses
     """Updates that the controller never received, or received too late."""

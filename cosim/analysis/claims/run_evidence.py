@@ -35,7 +35,7 @@ from noack.core.linear_systems import Matrix, Propagator, all_entries, spectral_
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import (
     KnownStateBounds,
     ScenarioCertificate,

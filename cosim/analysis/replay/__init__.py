@@ -11,7 +11,7 @@ No output depends on the exact value of ``now_ns``. So it is only checked that `
 before the deadlines and does not decrease.
 """
 
-from cosim.analysis.replay.replay_result import Replay
+from cosim.analysis.replay.replay_result import ReplayResult
 from cosim.analysis.replay.run_replay import replay, replay_run
 
-__all__ = ["Replay", "replay", "replay_run"]
+__all__ = ["ReplayResult", "replay", "replay_run"]

@@ -26,7 +26,7 @@ def difference(
     replayed: object = None,
 ) -> ReplayDifference:
     """Return a difference with its values formatted."""
-    (first, first_hex), (second, second_hex) = _shown(recorded), _shown(replayed)
+    (first, first_hex), (second, second_hex) = _displayed_value(recorded), _displayed_value(replayed)
     return ReplayDifference(
         table=table,
         row=row,
@@ -61,7 +61,7 @@ def first_entry(recorded: ArrayLike, replayed: ArrayLike) -> tuple[int, object, 
     return None
 
 
-def _shown(value: object) -> tuple[Value, str | None]:
+def _displayed_value(value: object) -> tuple[Value, str | None]:
     if isinstance(value, float):
         if math.isnan(value):  # NaNs may differ in their bits
             return None, f"nan, bits {struct.pack('>d', value).hex()}"
@@ -115,7 +115,7 @@ class MessagesReplay(SummaryPart):
     difference: ReplayDifference | None
 
 
-class Replay(SummaryPart):
+class ReplayResult(SummaryPart):
     """The result of a replay."""
 
     processes: tuple[ProcessReplay, ...]
@@ -158,7 +158,7 @@ class Replay(SummaryPart):
         return verdict | {"gaps": self.gaps} | self.model_dump()
 
 
-def print_replay(console: Console, replay: Replay, changed: Sequence[str]) -> None:
+def print_replay(console: Console, replay: ReplayResult, changed: Sequence[str]) -> None:
     """Print the result of a replay, and what ``changed`` since the run on its computer."""
     table = Table(title="replay, compared bit for bit")
     for heading in ("process or link", "recorded", "compared", "verdict"):

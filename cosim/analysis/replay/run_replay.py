@@ -21,7 +21,13 @@ from cosim.analysis.replay.machine_replay import (
     SharedMachines,
     received_words,
 )
-from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, Replay, difference, first_entry
+from cosim.analysis.replay.replay_result import (
+    MessagesReplay,
+    ProcessReplay,
+    ReplayResult,
+    difference,
+    first_entry,
+)
 from cosim.analysis.summary.summary_model import ReplayPart
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
@@ -327,7 +333,7 @@ class _Hop:
 Result = TypeVar("Result", ProcessReplay, MessagesReplay)
 
 
-def replay(record: RunRecord, shared: SharedMachines | None = None) -> Replay:
+def replay(record: RunRecord, shared: SharedMachines | None = None) -> ReplayResult:
     """Replay a run and compare it with its record; a process is replayed up to its first gap.
 
     ``shared`` has the machines of several loops, if they are replayed in turn.
@@ -346,10 +352,10 @@ def replay(record: RunRecord, shared: SharedMachines | None = None) -> Replay:
             if messages is not None:
                 messages.take(part)
     results = tuple(result for machine in machines.values() for result in machine.results)
-    return Replay(processes=results, messages=() if messages is None else messages.results())
+    return ReplayResult(processes=results, messages=() if messages is None else messages.results())
 
 
-def replay_run(run: RecordedRun, loop: str | None = None) -> Replay:
+def replay_run(run: RecordedRun, loop: str | None = None) -> ReplayResult:
     """Replay a run, or one of its loops; each process's and link's results are added up.
 
     Raises:
@@ -362,7 +368,7 @@ def replay_run(run: RecordedRun, loop: str | None = None) -> Replay:
     processes = _by_name((result.process, result) for replayed in replays for result in replayed.processes)
     messages = _by_name((result.leg, result) for replayed in replays for result in replayed.messages)
     in_order = sorted(processes, key=lambda name: LOOP_ROLES.index(name.split()[0]))
-    return Replay(
+    return ReplayResult(
         processes=tuple(_added(processes[name]) for name in in_order),
         messages=tuple(map(_added, messages.values())),
     )

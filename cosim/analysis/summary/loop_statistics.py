@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import DROPOUTS, AssumptionViolation
+from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.analysis.summary.summary_model import (
     DisturbancePart,
     EstimationPart,
@@ -26,7 +27,6 @@ from cosim.analysis.summary.summary_model import (
     ViolationPart,
     WatchdogPart,
 )
-from cosim.analysis.value_reduction import QuantileSketch
 from cosim.record.align import (
     AlignedPart,
     AlignedRun,
@@ -184,7 +184,7 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
     legs = {
         "measurement": measured,
         "update to netem": _Unmatched().take(events, outcomes.sequence),
-        "update to controller": _Unmatched().take(_left_until(outcomes, last_ns), received),
+        "update to controller": _Unmatched().take(_forwarded_until(outcomes, last_ns), received),
         "actuation": actuated,
     }
     for flow in record.scenario.network.flows[1:]:
@@ -192,7 +192,9 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
         sent, arrived = (record.columns(table, "sequence")["sequence"] for table in _SENT_RECEIVED[flow])
         legs.pop(name, None)
         legs[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
-        legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(_left_until(answers, last_ns), arrived)
+        legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
+            _forwarded_until(answers, last_ns), arrived
+        )
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
     counts = {leg: unmatched.count(complete=complete) for leg, unmatched in legs.items()}
     return {leg: max(count - _not_finite(record, leg), 0) for leg, count in counts.items()}
@@ -205,7 +207,7 @@ def _not_finite(record: RunRecord, leg: str) -> int:
     return int((channel.get("rejected") or {}).get(Rejection.NOT_FINITE, 0))
 
 
-def _left_until(outcomes: PacketOutcome, last_ns: float) -> NDArray[np.int64]:
+def _forwarded_until(outcomes: PacketOutcome, last_ns: float) -> NDArray[np.int64]:
     """Return the numbers of the datagrams that were forwarded, and were due until then."""
     return outcomes.sequence[outcomes.forwarded & (outcomes.due_ns <= last_ns)]
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.analysis.summary.quantiles import quantiles_in
 from cosim.analysis.summary.run_summary import change_parts
 from cosim.analysis.summary.summary_model import (
     Claim,
@@ -18,7 +19,6 @@ from cosim.analysis.summary.summary_model import (
     NetworkPart,
     RunSummary,
 )
-from cosim.analysis.value_reduction import quantiles_in
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from noack.core.clock import NS_PER_S

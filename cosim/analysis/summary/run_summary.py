@@ -332,7 +332,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
     poles = np.linalg.eigvals(A + B @ loop.K)
     in_box: bool | None = None
     if plant.uncertainty_A is not None or plant.uncertainty_B is not None:
-        in_box = _within(off_A, plant.uncertainty_A) and _within(off_B, plant.uncertainty_B)
+        in_box = _is_within(off_A, plant.uncertainty_A) and _is_within(off_B, plant.uncertainty_B)
     return LinearisationPart(
         A=A.tolist(),
         B=B.tolist(),
@@ -343,7 +343,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
     )
 
 
-def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
+def _is_within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
     allowed = np.zeros_like(off) if halfwidth is None else np.array(halfwidth)
     return bool((np.abs(off) <= np.maximum(allowed, _EXACT)).all())
 

@@ -194,7 +194,7 @@ def measure(
         last = "the listener reports what has arrived"
         cli.print_lines(json, {"notes": result.notes}, *result.notes, last)
         return ExitStatus.OK
-    measurement = network_measurement.Measurement(result.trace, options, name, result.notes)
+    measurement = network_measurement.NetworkMeasurement(result.trace, options, name, result.notes)
     document = measurement_outputs.report(measurement, request, None if json else cli.console())
     if json:
         cli.print_json(document)

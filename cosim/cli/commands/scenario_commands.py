@@ -87,7 +87,7 @@ def doctor(
         required,
         results,
     )
-    is_bad = findings.worst(results) is findings.FindingStatus.BAD
+    is_bad = findings.worst(results) is findings.MachineVerdict.BAD
     return ExitStatus.FAILED if is_bad else ExitStatus.OK
 
 

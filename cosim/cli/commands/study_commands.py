@@ -240,15 +240,15 @@ class NetworkOptions:
             if getattr(self, option) is not None:
                 raise CallerError(f"--{option}: is for --for network and --for transmissions only")
 
-    def wish(
+    def request(
         self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]", bounds: "design_search.Bounds"
-    ) -> "network_search.Wish":
+    ) -> "network_search.DesignRequest":
         """Return what is asked for; raise CallerError if an option is wrong."""
         if self.period is not None and not 1e-6 <= self.period <= 1e7:
             raise CallerError(f"--period: from 1e-6 to 1e7 seconds, not {self.period:g}")
         if not 0 < self.share < math.inf:
             raise CallerError(f"--share: must be positive, not {self.share:g}")
-        return network_search.Wish(
+        return network_search.DesignRequest(
             goal="transmissions" if self.aim is DesignAim.TRANSMISSIONS else "network",
             window=self.window,
             most=self.most,
@@ -357,19 +357,19 @@ def design(
         if requirements.settling is not None or feedback.gain != "given":
             raise CallerError(f"--settling, --gain: are not for --for {network.aim.value}")
         page = files.page_of(f"{loaded.name}-network")
-        wish = network.wish(feedback.matrices(loaded), requirements.bounds())
+        request = network.request(feedback.matrices(loaded), requirements.bounds())
         with progress.work_bar("trying gains", lines=True) as bar:
-            outcome = event_design.design_for_network(loaded, wish, seed, bar)
+            outcome = event_design.design_for_network(loaded, request, seed, bar)
         written = design_page.write_outcome(outcome, page, figure_files)
         written += files.write(outcome.written()) if outcome.is_certified else []
-        cli.show_with_files(json, outcome.to_json(), written, design_page.print_design, outcome)
+        cli.show_with_files(json, outcome.to_json(), written, design_page.print_loop_design, outcome)
         return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
     network.refuse()
     page = files.page_of(loaded.name)
     result = _trigger_of(loaded, requirements.limits(), weights, feedback, draws, seed)
     written = design_page.write_page(result, page, figure_files)
     written += files.write(scenario_file.dumps(result.scenario)) if result.feasible else []
-    cli.show_with_files(json, result.document(), written, design_page.print_found, result)
+    cli.show_with_files(json, result.document(), written, design_page.print_trigger_design, result)
     if not result.confirmed:
         print_to_stderr(f"noack: {result.verdict()}")
     return ExitStatus.OK if result.confirmed else ExitStatus.FAILED
@@ -477,7 +477,7 @@ class StudyOptions(opt.ScenarioOptions):
             depth = depth._replace(amplitude=self.disturbance)
         return depth
 
-    def _policies(self, kinds: "Sequence[capacity_plan.Kind]") -> dict[str, dict[str, Any]]:
+    def _policies(self, kinds: "Sequence[capacity_plan.LoopKind]") -> dict[str, dict[str, Any]]:
         """Return the settings of the policies that are compared, too, by name."""
         known = {capacity_plan.PERIODIC, capacity_plan.ZOH, capacity_plan.MODEL}
         by_name: dict[str, dict[str, Any]] = {}

@@ -95,7 +95,7 @@ class ClaimMonitor:
             while self._due and (first or time.thread_time() - began_s < _TURN_S):
                 self._check(self._due.pop(0), AssumptionMonitor.advance)
                 first = False
-        return self._take_found()
+        return self._take_findings()
 
     def end(self) -> list[Finding]:
         """Return the findings from the rows that were still waiting; no more rows follow."""
@@ -103,7 +103,7 @@ class ClaimMonitor:
             self._hand_out()
             for loop in range(len(self._monitors)):
                 self._check(loop, AssumptionMonitor.end)
-        return self._take_found()
+        return self._take_findings()
 
     def _hand_out(self) -> None:
         """Begin a round: give each loop its rows."""
@@ -149,6 +149,6 @@ class ClaimMonitor:
     def _of_run_s(self, loop: int, t_ns: int) -> float:
         return (t_ns + self._phases_ns[loop]) / NS_PER_S
 
-    def _take_found(self) -> list[Finding]:
+    def _take_findings(self) -> list[Finding]:
         findings, self._found = self._found, []
         return findings

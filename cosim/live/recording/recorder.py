@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.analysis.value_reduction import is_long
 from cosim.lazy_modules import lazy_modules
 from cosim.live.recording.telemetry_store import TelemetryStore
+from cosim.record.decimation import is_long
 from cosim.record.processes import report_of, write_reports
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from cosim.record.run_events import updates_in

@@ -207,7 +207,7 @@ class Panel:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Row:
+class PanelRow:
     """Panels side by side; if the figure is too narrow for them, in several rows."""
 
     panels: Sequence[Panel]
@@ -242,7 +242,7 @@ class FigureDescription:
     """A figure of a page, a file or a notebook."""
 
     name: str
-    rows: Sequence[Row]
+    rows: Sequence[PanelRow]
     caption: str = ""
     description: str = ""
     """Text alternative of the figure; its caption by default."""
@@ -257,7 +257,7 @@ class FigureDescription:
 
 def one_panel(name: str, panel: Panel, height_in: float) -> FigureDescription:
     """Describe a figure of one panel."""
-    return FigureDescription(name=name, rows=[Row(panels=[panel], height_in=height_in)])
+    return FigureDescription(name=name, rows=[PanelRow(panels=[panel], height_in=height_in)])
 
 
 def time_axis(t_s: Reals, *, numbers: bool = True, label: str = TIME) -> Axis:

@@ -21,7 +21,6 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter, MaxNLocator, ScalarFormatter
 
-from cosim.analysis.value_reduction import decimate
 from cosim.output.figures.figure_description import (
     LARGEST,
     Axis,
@@ -55,6 +54,7 @@ from cosim.output.figures.figure_layout import (
     turned_in,
 )
 from cosim.record.align import Reals
+from cosim.record.decimation import decimate
 
 LegendItem = tuple[Artist, str]
 """A drawn object and its label in the legend."""

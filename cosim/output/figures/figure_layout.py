@@ -22,7 +22,7 @@ from typing import NamedTuple
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from cosim.output.figures.figure_description import Axis, FigureDescription, Panel, Row
+from cosim.output.figures.figure_description import Axis, FigureDescription, Panel, PanelRow
 from cosim.output.figures.figure_format import SCREEN_IN
 from cosim.output.figures.palette import Colour
 
@@ -217,13 +217,13 @@ def place_panels(described: FigureDescription) -> tuple[list[Place], tuple[float
     return places, (space.width_in, top_in)
 
 
-def _columns(row: Row, room_in: float) -> int:
+def _columns(row: PanelRow, room_in: float) -> int:
     columns = min(row.columns or len(row.panels), len(row.panels))
     return max(min(columns, int(room_in / row.narrowest_in)), 1) if row.narrowest_in else columns
 
 
 def _place_line(
-    row: Row, first: int, columns: int, top_in: float, right_in: float, *, has_heading: bool
+    row: PanelRow, first: int, columns: int, top_in: float, right_in: float, *, has_heading: bool
 ) -> list[Place]:
     """Place the panels of a row that are side by side, from number ``first`` on."""
     space, panels = layout(), row.panels[first : first + columns]

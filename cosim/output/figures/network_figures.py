@@ -19,7 +19,7 @@ from cosim.output.figures.figure_description import (
     Item,
     Line,
     Panel,
-    Row,
+    PanelRow,
     Steps,
     plain,
     time_axis,
@@ -104,7 +104,7 @@ def network_figures(
     ]
 
 
-def _link_rows(over_time: LoopsOverTime, names: Sequence[str], in_flight: InFlightPart) -> list[Row]:
+def _link_rows(over_time: LoopsOverTime, names: Sequence[str], in_flight: InFlightPart) -> list[PanelRow]:
     """Describe the number of datagrams in the network, and the share of each loop of the bytes."""
     most = np.asarray(in_flight.max_by_interval, np.float64)
     mean = np.asarray(in_flight.mean_by_interval, np.float64)
@@ -140,10 +140,10 @@ def norms_figure(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) 
     return FigureDescription(name="loops", rows=_rows(over_time, *panels))
 
 
-def _rows(over_time: LoopsOverTime, *panels: tuple[str, Sequence[Item], Axis]) -> list[Row]:
+def _rows(over_time: LoopsOverTime, *panels: tuple[str, Sequence[Item], Axis]) -> list[PanelRow]:
     """Return panels, one above the other, with the time axis of the run."""
     return [
-        Row(height_in=_PANEL_IN, panels=[
+        PanelRow(height_in=_PANEL_IN, panels=[
             Panel(title=title, items=items, y=y,
                   x=time_axis(over_time.edges_s, numbers=i == len(panels) - 1))
         ])
@@ -210,7 +210,7 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> 
         ),
     )
     height_in = min(max(count * _ROW_IN, _LOWEST_IN), _HIGHEST_IN)
-    rows = [Row(panels=[panel], height_in=height_in)]
+    rows = [PanelRow(panels=[panel], height_in=height_in)]
     return FigureDescription(name="map", rows=rows, scale=scale)
 
 

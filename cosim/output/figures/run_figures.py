@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.analysis.fidelity import Fidelity
-from cosim.analysis.value_reduction import decimate_all
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     DASHES,
@@ -28,7 +27,7 @@ from cosim.output.figures.figure_description import (
     Line,
     Marks,
     Panel,
-    Row,
+    PanelRow,
     Rule,
     bound_lines,
     finite,
@@ -47,6 +46,7 @@ from cosim.output.figures.timing_figures import (
     times_figure,
 )
 from cosim.record.align import AlignedRun, Reals, aligned_parts
+from cosim.record.decimation import decimate_all
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
@@ -252,7 +252,7 @@ def states_figure(
     ]
     head = "MB-ET" if mode == "model" else "ZOH-ET"
     note = f" ({drawn} of {n} states)" if drawn < n else ""
-    of_states = Row(
+    of_states = PanelRow(
         panels=panels,
         height_in=1.45 if drawn <= 2 * columns else 1.15,
         columns=columns,
@@ -262,7 +262,7 @@ def states_figure(
     return FigureDescription(
         name="states",
         heading=": ".join(filter(None, (head, plain(title, _LONGEST_TITLE)))) + note,
-        rows=[of_states, *(Row(panels=[panel], height_in=1.2) for panel in intervals)],
+        rows=[of_states, *(PanelRow(panels=[panel], height_in=1.2) for panel in intervals)],
     )
 
 
@@ -302,7 +302,7 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
         "States, and the times between transmissions and between deliveries: each stem is the time "
         "since the one before, so the first packet has none. "
         + scenario.protocol.states_caption.format(known=known)
-        + _known(scenario)
+        + _estimate_text(scenario)
         + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",
         f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. "
         f"Below, stems for {len(events)} transmissions, of which {int(sent.lost.sum())} were "
@@ -311,7 +311,7 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
     )
 
 
-def _known(scenario: Scenario) -> str:
+def _estimate_text(scenario: Scenario) -> str:
     """Explain x̂, if the sensor does not measure x exactly."""
     if scenario.coverage.knows_state:
         return ""
@@ -455,7 +455,7 @@ def _losses(record: RunRecord) -> FigureDescription:
         panels.append(_loss_panel("Of actuations", label, "bursts", lost, limit))
         both = " Last panel: the same of actuations."
     narrowest_in, widest_in = _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN
-    row = Row(panels=panels, height_in=1.9, narrowest_in=narrowest_in, widest_in=widest_in)
+    row = PanelRow(panels=panels, height_in=1.9, narrowest_in=narrowest_in, widest_in=widest_in)
     kept = "the guarantee" if network.enforce_mansd else "the assumption (not enforced)"
     return FigureDescription(name="losses", rows=[row]).captioned(
         "Effective losses of updates: dropped, corrupted, or delivered out of order. "

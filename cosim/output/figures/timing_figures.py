@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.summary.loop_statistics import latency_us, lateness_parts
-from cosim.analysis.value_reduction import QuantileSketch
+from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     DASHES,

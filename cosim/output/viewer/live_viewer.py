@@ -96,7 +96,7 @@ class RecordingServer:
         if not follow:
             self.finished.set()
         try:
-            self._http = _Server((HOST, 0), _Handler)
+            self._http = _PageServer((HOST, 0), _Handler)
         except OSError as error:
             raise MachineError(f"cannot serve {path}: {error}") from None
         self._http.recording = self
@@ -179,14 +179,14 @@ def _same(secret: str, wanted: str) -> bool:
     return secrets.compare_digest(secret.encode(), wanted.encode())
 
 
-class _Server(socketserver.ThreadingTCPServer):
+class _PageServer(socketserver.ThreadingTCPServer):
     daemon_threads = True
     block_on_close = False
     recording: RecordingServer
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: _Server
+    server: _PageServer
 
     def do_GET(self) -> None:
         """Answer with the page, one of its files, or the recording."""

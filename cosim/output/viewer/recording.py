@@ -131,7 +131,7 @@ class RecordingFile:
         self.close()
 
 
-def about(scenario: Scenario, kind: Kind = "live") -> str:
+def run_text(scenario: Scenario, kind: Kind = "live") -> str:
     """Return the viewer's text about a run, in Markdown."""
     network = scenario.network
     late = {

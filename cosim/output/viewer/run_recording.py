@@ -43,14 +43,14 @@ from cosim.analysis.summary.network_summary import (
     worst_loop,
 )
 from cosim.analysis.summary.summary_model import RunSummary
-from cosim.analysis.value_reduction import Reals, is_long
 from cosim.output.figures.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.network_diagram import NetworkDiagram
 from cosim.output.viewer.pictures.picture import picture_of
-from cosim.output.viewer.recording import LoopView, Nanoseconds, RecordingFile, ViewError, about
+from cosim.output.viewer.recording import LoopView, Nanoseconds, RecordingFile, ViewError, run_text
 from cosim.output.viewer.table_feed import ViewFeed, log_level
+from cosim.record.decimation import Reals, is_long
 from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
 from noack.core.clock import NS_PER_S
@@ -204,7 +204,7 @@ def _shown_loop(
     """Describe what is shown of a loop; lateness only if the processes have no other loop."""
     loop, is_timed = loop_of(scenario), kind == "live" and not folder
     return bp.ShownLoop(
-        about(scenario, kind),
+        run_text(scenario, kind),
         loop.state_names,
         loop.input_names,
         processes=LOOP_ROLES if is_timed else (),

@@ -7,7 +7,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.value_reduction import decimate_all
 from cosim.output.viewer.pictures.picture import Frames
 from cosim.output.viewer.recording import LoopView
 from cosim.record.align import (
@@ -20,6 +19,7 @@ from cosim.record.align import (
     initial_track,
     true_states,
 )
+from cosim.record.decimation import decimate_all
 from cosim.record.record_source import concatenate_rows
 from cosim.record.run_events import claimed_until_s, model_flow, updates_in
 from cosim.record.run_record import Rows
@@ -164,7 +164,7 @@ class ViewFeed:
     def _clock_errors(self, table: str, rows: Rows) -> None:
         if len(rows):
             error_us = np.where(rows["error_ns"] == LOST_NS, np.nan, rows["error_ns"] * 1e-3)
-            keep = self._kept(rows["now_ns"], error_us)
+            keep = self._rows_to_show(rows["now_ns"], error_us)
             self._view.clock_errors(OWNER[table], rows["now_ns"][keep], error_us[keep])
 
     def _take(self, table: str, until_ns: int | None) -> Rows:
@@ -194,7 +194,7 @@ class ViewFeed:
         if not self._scenario.protocol.acknowledges:
             bounds[~in_common(self._scenario, aligned)] = np.nan
         curves = [aligned.x, aligned.x_s, aligned.x_c, aligned.e_s_norm, aligned.e_c_norm, bounds]
-        kept = self._kept(aligned.t_ns, np.column_stack(curves))
+        kept = self._rows_to_show(aligned.t_ns, np.column_stack(curves))
         thin = AlignedRun._make(values[kept] for values in aligned)
         of_state = np.column_stack([self._certified(t_s, "state"), self._from_event(rows, aligned)])
         self._view.samples(thin, bounds[kept], of_state[kept])
@@ -204,7 +204,7 @@ class ViewFeed:
         event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
         if len(event_ns):
             passed_s = _intervals_s(event_ns, self._last_event_ns)
-            kept = self._kept(event_ns, passed_s)
+            kept = self._rows_to_show(event_ns, passed_s)
             self._view.broadcasts(event_ns[kept], passed_s[kept])
             self._last_event_ns = int(event_ns[-1])
         self._lateness("sensor", rows)
@@ -251,7 +251,7 @@ class ViewFeed:
         e_s = rows["x_s"] - rows["x"]
         return self._monitor.take(rows["t_ns"], e_s, rows["event"], aligned.received).identity
 
-    def _kept(self, t_ns: Times, values: Reals) -> NDArray[np.intp]:
+    def _rows_to_show(self, t_ns: Times, values: Reals) -> NDArray[np.intp]:
         """Return the rows to show of curves, (k,) or (k, n)."""
         if self._columns is None:
             return np.arange(len(t_ns))
@@ -278,7 +278,7 @@ class ViewFeed:
         self._forced = {sequence for sequence in self._forced if sequence > newest}
         event_ns = rows["t_ns"]
         passed_s = _intervals_s(event_ns, self._last_delivery_ns)
-        keep = self._kept(event_ns, passed_s)
+        keep = self._rows_to_show(event_ns, passed_s)
         self._view.receptions(event_ns[keep], passed_s[keep], forced[keep])
         self._last_delivery_ns = int(event_ns[-1])
 
@@ -294,12 +294,12 @@ class ViewFeed:
         dropped = ~effective(rows["fate"])
         if dropped.any():
             lost_ns = event_ns[dropped]
-            self._view.drops(lost_ns[self._kept(lost_ns, np.zeros(len(lost_ns)))])
+            self._view.drops(lost_ns[self._rows_to_show(lost_ns, np.zeros(len(lost_ns)))])
         self._lateness("netem", rows)
 
     def _inputs(self, steps: Rows) -> None:
         if len(steps):
-            keep = self._kept(steps["t_ns"], steps["u"])
+            keep = self._rows_to_show(steps["t_ns"], steps["u"])
             self._view.inputs(steps["t_ns"][keep], steps["u"][keep])
             self._lateness("controller", steps)
 
@@ -307,7 +307,7 @@ class ViewFeed:
         if len(rows):
             t_ns, late_ns = rows["t_ns"], rows["now_ns"] - rows["t_ns"]
             late_us = np.asarray(late_ns / (1e3 * self._scenario.speed), dtype=np.float64)
-            keep = self._kept(t_ns, late_us)
+            keep = self._rows_to_show(t_ns, late_us)
             self._view.lateness(process, t_ns[keep], late_us[keep])
 
 

@@ -20,7 +20,7 @@ from cosim.output.figures.figure_description import (
     Line,
     Marks,
     Panel,
-    Row,
+    PanelRow,
     one_panel,
     plain,
     series_colour,
@@ -150,7 +150,7 @@ def heat_map_figure(
         )
         for title, values in maps.items()
     ]
-    row = Row(
+    row = PanelRow(
         panels=panels,
         height_in=_MAP_HEIGHT_IN,
         columns=_MAPS_IN_A_ROW,

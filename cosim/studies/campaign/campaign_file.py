@@ -79,7 +79,7 @@ _UNITS = {"_per_s": "1/s", "_s": "s", "_ms": "ms", "_us": "µs", "_ns": "ns", "_
 """Units by the ends of keys, the longer ends first."""
 
 
-class Axis(ScenarioSection):
+class CampaignAxis(ScenarioSection):
     """An axis of the grid: a key of the scenario with its values, or variants of several keys."""
 
     name: Identifier
@@ -267,7 +267,7 @@ class Term(NamedTuple):
             raise ValueError(f"holds: {text.strip()}: expected a number or one of {names}") from None
 
 
-class Claim(ScenarioSection):
+class CampaignClaim(ScenarioSection):
     """A statement about the runs; the draws give its verdict."""
 
     says: Annotated[str, Field(min_length=1)]
@@ -327,13 +327,13 @@ class Campaign(ScenarioSection):
     """Seed of the draws. Draw i has the same plant, x(0) and losses at every grid point."""
     chunk: Annotated[int, Field(ge=1, le=1_000_000)] = 2000
     """Draws per file of the results. A worker computes one file at a time."""
-    axes: Annotated[tuple[Axis, ...], Field(min_length=1)]
+    axes: Annotated[tuple[CampaignAxis, ...], Field(min_length=1)]
     """The axes; the grid has all combinations of their values."""
     metrics: Metrics = Metrics()
     compare: PairedComparison | None = None
     figures: tuple[Figure, ...] = ()
     """The figures of the page."""
-    claims: tuple[Claim, ...] = ()
+    claims: tuple[CampaignClaim, ...] = ()
     """Statements that are checked. A claim is confirmed if it holds in at least 95 % of the draws
     at each grid point, or group of them, that it is about. It is partly confirmed if it holds in
     at least half of the draws at the first of them."""
@@ -341,7 +341,7 @@ class Campaign(ScenarioSection):
     """Values of axes at which claims are judged that do not name them; by default all."""
 
     @cached_property
-    def by_name(self) -> Mapping[str, Axis]:
+    def by_name(self) -> Mapping[str, CampaignAxis]:
         """The axes by name."""
         return {axis.name: axis for axis in self.axes}
 

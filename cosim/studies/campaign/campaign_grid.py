@@ -16,9 +16,9 @@ from cosim.shipped_files import find_shipped
 from cosim.simulation.exact_simulation import ROW, Setting, run_batch, setting_of, timeless
 from cosim.studies.campaign.campaign_file import LOOPS, Campaign, Value, scales_loops
 from cosim.studies.campaign.campaign_workers import Work
+from cosim.studies.campaign.drawn_runs import SampledWork, SharedNetworkWork, in_virtual_time
 from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
-from cosim.studies.campaign.sampled_draws import SampledWork, SharedNetworkWork, in_virtual_time
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario import toml_file

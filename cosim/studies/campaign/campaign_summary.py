@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
-from cosim.studies.campaign.campaign_file import Campaign, Claim, Term, label_of
+from cosim.studies.campaign.campaign_file import Campaign, CampaignClaim, Term, label_of
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.metrics import (
@@ -92,7 +92,7 @@ def judge_claims(campaign: Campaign, points: Sequence[Point], values: Values) ->
         yield _judged(claim, groups, lambda point: cached(point.number))
 
 
-def _judged(claim: Claim, groups: dict[str, list[Point]], values: Values) -> JudgedClaim:
+def _judged(claim: CampaignClaim, groups: dict[str, list[Point]], values: Values) -> JudgedClaim:
     shares, medians = dict[str, float](), ""
     for name, group in groups.items():
         holds, texts = [], []
@@ -114,7 +114,7 @@ def _judged(claim: Claim, groups: dict[str, list[Point]], values: Values) -> Jud
     return JudgedClaim(claim.says, claim.source, first, shares[least_at], least_at, medians)
 
 
-def _side(term: Term, claim: Claim, group: Sequence[Point], values: Values) -> Vector:
+def _side(term: Term, claim: CampaignClaim, group: Sequence[Point], values: Values) -> Vector:
     if term.metric is None:
         return np.array([term.number])
     (point,) = (p for p in group if term.label is None or p.labels[claim.axis or ""] == term.label)

@@ -76,7 +76,7 @@ def _code() -> str:
             name = path.relative_to(root)
             if package != "cosim" or name.parts[0] not in _NO_CODE_OF_RUNS:
                 digest.update(path.read_bytes())
-    for module in ("random_draws.py", "sampled_draws.py"):
+    for module in ("random_draws.py", "drawn_runs.py"):
         digest.update(Path(__file__).with_name(module).read_bytes())
     return digest.hexdigest()
 

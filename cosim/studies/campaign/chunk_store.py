@@ -71,7 +71,7 @@ class Store:
     def missing(self) -> Iterator[Chunk]:
         """Return the chunks without a file, ordered by draw and then by point."""
         for chunks in zip(*(self.chunks(point.number) for point in self.points), strict=True):
-            yield from (chunk for chunk in chunks if not self._is_there(chunk))
+            yield from (chunk for chunk in chunks if not self._is_complete(chunk))
 
     def write(self, chunk: Chunk, rows: NDArray[np.void]) -> None:
         """Write a chunk completely or not at all.
@@ -110,7 +110,7 @@ class Store:
                 parts[name].append(table[name].to_numpy()[: len(chunk.draws)])
         return {name: np.concatenate(part) for name, part in parts.items()}
 
-    def _is_there(self, chunk: Chunk) -> bool:
+    def _is_complete(self, chunk: Chunk) -> bool:
         """Whether the chunk's file is valid; it may have more rows, if draws was larger before."""
         try:
             table = pq.read_metadata(self._path(chunk))

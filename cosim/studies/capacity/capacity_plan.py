@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import JsonValue
 
-from cosim.studies.campaign.campaign_file import Axis, Campaign, Metrics
-from cosim.studies.campaign.sampled_draws import cost_of
+from cosim.studies.campaign.campaign_file import Campaign, CampaignAxis, Metrics
+from cosim.studies.campaign.drawn_runs import cost_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.rate import Rate
@@ -41,7 +41,7 @@ _PERIOD_PER_TIME_CONSTANT = 0.3
 Entry = dict[str, JsonValue]
 
 
-class Kind(NamedTuple):
+class LoopKind(NamedTuple):
     """A kind of loop."""
 
     name: str
@@ -75,7 +75,7 @@ class Kind(NamedTuple):
         return disturbances
 
 
-def kinds_of(scenario: Scenario, period_s: float | None) -> tuple[Kind, ...]:
+def kinds_of(scenario: Scenario, period_s: float | None) -> tuple[LoopKind, ...]:
     """Return the kinds of loops of a scenario.
 
     Args:
@@ -93,7 +93,7 @@ def kinds_of(scenario: Scenario, period_s: float | None) -> tuple[Kind, ...]:
         else:
             own_s = sampling_period_s(loop) if period_s is None else period_s
         entry = section.model_dump(mode="json", exclude_none=True, exclude={"seeds"})
-        kinds.append(Kind(section.name, section.count, loop, entry, require_multiple(own_s, loop)))
+        kinds.append(LoopKind(section.name, section.count, loop, entry, require_multiple(own_s, loop)))
     if all(kind.is_periodic for kind in kinds):
         raise CallerError(
             'trigger.policy = "periodic": the event-triggered loops need an event-triggered '
@@ -102,13 +102,13 @@ def kinds_of(scenario: Scenario, period_s: float | None) -> tuple[Kind, ...]:
     return tuple(kinds)
 
 
-def smallest_mixture(kinds: Sequence[Kind]) -> int:
+def smallest_mixture(kinds: Sequence[LoopKind]) -> int:
     """Return the number of loops of the smallest mixture with the proportions of the scenario."""
     counts = [kind.loops for kind in kinds]
     return sum(counts) // math.gcd(*counts)
 
 
-def policies_of(kinds: Sequence[Kind]) -> dict[str, Entry]:
+def policies_of(kinds: Sequence[LoopKind]) -> dict[str, Entry]:
     """Return the settings of the policies that are always compared."""
 
     def settings(mode: str, *, periodic: bool = False) -> Entry:
@@ -186,7 +186,7 @@ class CapacityPlan:
 
     scenario: Scenario
     """The loops and the network; not resolved."""
-    kinds: tuple[Kind, ...]
+    kinds: tuple[LoopKind, ...]
     """The kinds of loops."""
     file: Path
     settings: Mapping[str, JsonValue]
@@ -256,7 +256,9 @@ class CapacityPlan:
     def campaign(self) -> Campaign:
         """Return the campaign of all runs."""
         axes = [
-            Axis(name=POLICY, variants={name: dict(settings) for name, settings in self.policies.items()}),
+            CampaignAxis(
+                name=POLICY, variants={name: dict(settings) for name, settings in self.policies.items()}
+            ),
             self._numbers(),
         ]
         if self.amplitude:
@@ -269,7 +271,7 @@ class CapacityPlan:
                 }
                 for name, amplitude in ((OWN, 0.0), (COMMON, self.amplitude))
             }
-            axes.append(Axis.model_validate({"name": DISTURBANCE, "variants": variants}))
+            axes.append(CampaignAxis.model_validate({"name": DISTURBANCE, "variants": variants}))
         return Campaign(
             name=self.scenario.name,
             description=f"How many loops does a link of {self.link} carry?",
@@ -294,15 +296,15 @@ class CapacityPlan:
             ),
         )
 
-    def _numbers(self) -> Axis:
+    def _numbers(self) -> CampaignAxis:
         """Return the axis of the numbers of loops."""
         title = "number of loops"
         if self.is_one_kind and isinstance(bottleneck(self.scenario), Rate):
-            return Axis(name=LOOPS, title=title, key="loops", values=self.counts)
+            return CampaignAxis(name=LOOPS, title=title, key="loops", values=self.counts)
         variants = {str(count): self._network(count, 1) for count in self.counts}
         if not self.is_one_kind:
             variants |= {unshared(count): self._network(count, count) for count in self.counts}
-        return Axis(name=LOOPS, title=title, variants=variants)
+        return CampaignAxis(name=LOOPS, title=title, variants=variants)
 
     def _network(self, loops: int, factor: int) -> Entry:
         """Return the settings of loops on bottlenecks so many times as fast, with longer queues."""
@@ -340,7 +342,7 @@ def bottleneck(scenario: Scenario) -> Rate | Schedule:
     return min(rates, key=lambda rate: rate.rate_bps) if rates else schedules[0]
 
 
-def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
+def periodic_loops(scenario: Scenario, kinds: Sequence[LoopKind]) -> float:
     """Return how many periodic loops, in the kinds' proportions, a bottleneck of R bit/s carries.
 
     A loop needs b / h bits per second, so it is R / (mean of b / h); of one kind, R h / b. In slots
@@ -357,7 +359,7 @@ def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
     return queue.rate_bps * loops / needed_bps
 
 
-def require_in_time(scenario: Scenario, kinds: Sequence[Kind], deadline_s: float) -> None:
+def require_in_time(scenario: Scenario, kinds: Sequence[LoopKind], deadline_s: float) -> None:
     """Raise CallerError if a rate needs longer than the deadline for one update alone."""
     if not isinstance(queue := bottleneck(scenario), Rate):
         return

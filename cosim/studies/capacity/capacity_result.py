@@ -39,9 +39,9 @@ from cosim.record.run_record import load_run
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
 from cosim.studies.campaign.chunk_store import Store
+from cosim.studies.campaign.drawn_runs import SharedNetworkWork
 from cosim.studies.campaign.metrics import Estimate, Metric, measured, quantile_interval, quartiles
 from cosim.studies.campaign.random_draws import seeds_of
-from cosim.studies.campaign.sampled_draws import SharedNetworkWork
 from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan, unshared
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError

@@ -1,1 +1,8 @@
-"""Minimises transmissions by the choice of a trigger, subject to limits; see docs/design.md."""
+"""Designs of a loop; see docs/design.md.
+
+``design_search.py`` minimises transmissions by the choice of a trigger, subject to limits, among
+the candidates of ``design_space.py``. ``event_design.py`` searches for the gain and threshold that
+are certified for the largest M. ``network_search.py`` does so for time-triggered loops, with
+``hold_strategies.py`` between updates; ``loop_growth.py`` excludes candidates quickly.
+``design_page.py`` shows the results of all three.
+"""

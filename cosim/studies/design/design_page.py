@@ -143,7 +143,7 @@ def rows(result: DesignResult) -> list[tuple[str, ...]]:
     ]
 
 
-def print_found(console: Console, result: DesignResult) -> None:
+def print_trigger_design(console: Console, result: DesignResult) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
     title = f"{result.name}: trade-off of transmissions and settling time"
     all_rows = rows(result)
@@ -281,7 +281,7 @@ def write_outcome(outcome: DesignOutcome, path: Path, figure_files: FigureFiles 
     )
 
 
-def print_design(console: Console, outcome: DesignOutcome) -> None:
+def print_loop_design(console: Console, outcome: DesignOutcome) -> None:
     """Print the comparison, the verdict, and the lines for the scenario."""
     title = f"{outcome.name}: loops under the worst losses"
     table = ResultTable("design", title, _LOOP_HEADINGS, outcome.rows)

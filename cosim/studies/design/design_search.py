@@ -17,7 +17,7 @@ from cosim.simulation.exact_simulation import Population, run_batch, setting_of
 from cosim.studies.campaign.campaign_figures import undominated
 from cosim.studies.campaign.metrics import estimate, interval_ranks, quantile_interval
 from cosim.studies.campaign.random_draws import Box, box_of
-from cosim.studies.design.design_space import Candidate, DesignSpace, space_of
+from cosim.studies.design.design_space import DesignSpace, TriggerCandidate, space_of
 from noack.core.errors import CallerError
 from noack.core.number_format import at_most, plus_minus
 from noack.scenario.resolution import loop_of, resolve
@@ -96,7 +96,7 @@ class CandidateMeasures(NamedTuple):
 class Trial:
     """A candidate with its measures and bounds."""
 
-    candidate: Candidate
+    candidate: TriggerCandidate
     measured: CandidateMeasures
     full: bool = False
     """Whether it was measured with all draws."""
@@ -176,7 +176,7 @@ class Search:
         self._few = box.population(seed, range(max(draws // _SCREENING, 1)))
         self._all = box.population(seed, range(draws))
         self._fresh = box.population(seed, range(draws, 2 * draws))
-        self._trials: dict[Candidate, Trial] = {}
+        self._trials: dict[TriggerCandidate, Trial] = {}
 
     @property
     def trials(self) -> list[Trial]:
@@ -235,13 +235,13 @@ class Search:
 
         share, rounds, best = 0.5, 0, best_of_family()
         while share > _SMALLEST_STEP and rounds < _MOST_ROUNDS:
-            self._try(self.space.around(best.candidate, share))
+            self._try(self.space.neighbours(best.candidate, share))
             previous, best = best, best_of_family()
             if best is previous:
                 share /= 2
             rounds += 1
 
-    def _try(self, candidates: Iterable[Candidate]) -> None:
+    def _try(self, candidates: Iterable[TriggerCandidate]) -> None:
         for candidate in candidates:
             if candidate not in self._trials:
                 scenario = self.space.families[candidate.family].with_trigger(candidate)
@@ -253,7 +253,7 @@ class Search:
             self._measure_more(best)
         return best
 
-    def _rank(self, trial: Trial) -> tuple[float, float, float, Candidate]:
+    def _rank(self, trial: Trial) -> tuple[float, float, float, TriggerCandidate]:
         excess, measured = trial.excess(self.limits), trial.measured
         unsettled = 1.0 - measured.settled if excess > 0 else 0.0
         return excess, unsettled, measured.transmissions, trial.candidate

@@ -16,9 +16,9 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.certificates.weight import choose_weight
+from noack.theory.certificates.trigger_weight import choose_weight
 
 RATE_STEP, RATE_STEPS, MOST_RATE = 1.5, 6, 0.95
 """α of the grid: MOST_RATE of the decay rate, divided by powers of RATE_STEP; RATE_STEPS values."""
@@ -29,7 +29,7 @@ _WIDEST = 3.0
 """Factor by which the search may exceed the grid's range of β."""
 
 
-class Candidate(NamedTuple):
+class TriggerCandidate(NamedTuple):
     """A trigger of a family."""
 
     family: int
@@ -53,7 +53,7 @@ class Family:
         """The names of norm and gain."""
         return self.weight if self.gain == "given" else f"{self.weight}, {self.gain}"
 
-    def with_trigger(self, candidate: Candidate) -> Scenario:
+    def with_trigger(self, candidate: TriggerCandidate) -> Scenario:
         """Return the scenario of a candidate."""
         trigger = self.scenario.decaying.model_copy(
             update={"alpha_per_s": candidate.alpha_per_s, "beta": candidate.beta}
@@ -73,24 +73,24 @@ class DesignSpace:
     floor: float
     """Floor of the trigger; β must be above it."""
 
-    def grid(self) -> Iterator[Candidate]:
+    def grid(self) -> Iterator[TriggerCandidate]:
         """Return the first candidates of the search."""
         for family, decay_per_s in enumerate(self.decay_per_s):
             for step, level in itertools.product(range(RATE_STEPS), LEVELS):
                 alpha_per_s = MOST_RATE * decay_per_s / RATE_STEP**step
-                candidate = Candidate(family, alpha_per_s, float(level) * self.initial_norm)
+                candidate = TriggerCandidate(family, alpha_per_s, float(level) * self.initial_norm)
                 if self.contains(candidate):
                     yield candidate
 
-    def around(self, centre: Candidate, share: float) -> Iterator[Candidate]:
+    def neighbours(self, centre: TriggerCandidate, share: float) -> Iterator[TriggerCandidate]:
         """Return a candidate's neighbours, at a distance of this share of the grid's steps."""
         family, alpha_per_s, beta = centre
         for i, j in itertools.product((-share, 0, share), repeat=2):
-            candidate = Candidate(family, alpha_per_s * RATE_STEP**i, beta * LEVEL_STEP**j)
+            candidate = TriggerCandidate(family, alpha_per_s * RATE_STEP**i, beta * LEVEL_STEP**j)
             if (i or j) and self.contains(candidate):
                 yield candidate
 
-    def contains(self, candidate: Candidate) -> bool:
+    def contains(self, candidate: TriggerCandidate) -> bool:
         """Whether a candidate is within the ranges."""
         low = max(LEVELS[0] * self.initial_norm / _WIDEST, self.floor)
         high = LEVELS[-1] * self.initial_norm * _WIDEST

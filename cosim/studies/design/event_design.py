@@ -25,9 +25,9 @@ from cosim.studies.design.design_search import WORDS, bounds_of
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.network_search import (
     COSTS_OF_INPUT,
+    DesignRequest,
     NetworkSearch,
     Progress,
-    Wish,
     examined_m,
     nelder_mead,
     periodic_outcome,
@@ -80,24 +80,24 @@ class Certified(NamedTuple):
 class EventSearch:
     """All that is known about the loops of a scenario with other gains and thresholds."""
 
-    def __init__(self, scenario: Scenario, wish: Wish, seed: int, draws: int = DRAWS) -> None:
+    def __init__(self, scenario: Scenario, request: DesignRequest, seed: int, draws: int = DRAWS) -> None:
         trigger = scenario.decaying
         scenario.coverage.require_exact()
         scenario.coverage.require_unchanging()
-        if not wish.cost > 0:
-            raise CallerError(f"--cost: must be positive, not {wish.cost:g}")
-        if wish.holds is not None:
+        if not request.cost > 0:
+            raise CallerError(f"--cost: must be positive, not {request.cost:g}")
+        if request.holds is not None:
             raise CallerError("--holds: is for periodic updates; give their --period, too")
-        if wish.window is not None:
+        if request.window is not None:
             raise CallerError("--window: is for periodic updates; give their --period, too")
         resolved = resolve(scenario)
-        self.scenario, self.wish, self.plant = scenario, wish, loop_of(resolved)
+        self.scenario, self.request, self.plant = scenario, request, loop_of(resolved)
         n, m = self.plant.n, self.plant.m
-        self.weights = wish.weights or (np.eye(n), np.eye(m))
+        self.weights = request.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
         self.original = EventLoop(rows_of(self.plant.K), trigger.alpha_per_s, trigger.beta)
         self.tried = self.judged = self._likely = 0
-        self.most = examined_m(scenario, wish.most or _MOST_M)
+        self.most = examined_m(scenario, request.most or _MOST_M)
         box = box_of(scenario)
         self._draws = box.population(seed, range(draws))
         self._fresh = box.population(seed, range(draws, 2 * draws))
@@ -110,7 +110,7 @@ class EventSearch:
             raise CallerError(
                 "the given loop costs 0, so that --cost limits nothing; give another plant.initial_state"
             )
-        self.limits = Measured(wish.cost * base.cost, wish.transmissions * base.transmissions)
+        self.limits = Measured(request.cost * base.cost, request.transmissions * base.transmissions)
 
     def scenario_of(self, loop: EventLoop, m: int | None = None) -> Scenario:
         """Return the scenario of a loop; with M, or with its own."""
@@ -141,7 +141,7 @@ class EventSearch:
         if certificate is None:
             return math.inf
         bounds = bounds_of(certificate, self.scenario)
-        within = all(bounds[name] <= limit for name, limit in self.wish.bounds.items())
+        within = all(bounds[name] <= limit for name, limit in self.request.bounds.items())
         return bounds["state"] if within else math.inf
 
     def measured(self, loop: EventLoop, population: Population) -> Measured:
@@ -185,7 +185,7 @@ class EventSearch:
         self.tried += 1
         measured, least = self.measured(loop, self._draws), self.scenario.network.mansd + 1
         over = _log_over(measured.cost, self.limits.cost)
-        if self.wish.goal == "transmissions":
+        if self.request.goal == "transmissions":
             bound = 0.0 if math.isfinite(self.state_bound(loop, least)) else 1.0
             if over or bound:
                 return min(1.0 + over + bound, _FORBIDDEN)
@@ -218,7 +218,7 @@ class EventSearch:
             def improving(share: float, number: int = number) -> None:
                 progress(0.3 + 0.6 * (number + share) / len(order))
 
-            most = self.wish.effort // (10 * _STARTS)
+            most = self.request.effort // (10 * _STARTS)
             improved, reached = self._improve(starts[index], most, improving)
             if reached < value:
                 best, value = improved, reached
@@ -268,7 +268,7 @@ def _rounded(entries: Vector, template: EventLoop, alpha_per_s: float, beta: flo
 
 def event_outcome(search: EventSearch, original: Certified, best: Certified) -> DesignOutcome:
     """Return what is shown of a search."""
-    of_network = search.wish.goal == "network"
+    of_network = search.request.goal == "network"
     return DesignOutcome(
         search.scenario.name,
         "certified " + ("for the whole box" if search.of_box else "for the scenario's own plant"),
@@ -279,7 +279,7 @@ def event_outcome(search: EventSearch, original: Certified, best: Certified) -> 
         best.m > 0,
         best.loop != original.loop,
         {
-            "goal": search.wish.goal,
+            "goal": search.request.goal,
             "of_box": search.of_box,
             "limits": search.limits._asdict(),
             "tried": search.tried,
@@ -293,9 +293,9 @@ def _notes(search: EventSearch, original: Certified, best: Certified) -> Iterato
     """Yield what the reader should know of a search."""
     limits, before, after = search.limits, original.loop.alpha_per_s, best.loop.alpha_per_s
     limit = f"a mean cost of at most {limits.cost:.4g}"
-    if search.wish.goal == "network":
+    if search.request.goal == "network":
         limit += f", at most {limits.transmissions:.4g} transmissions"
-    for name, most in search.wish.bounds.items():
+    for name, most in search.request.bounds.items():
         limit += f", {WORDS[name]} ≤ {most:g} certified"
     proven = "its certificate is proven, that it is the best is not" if best.m else "it has no certificate"
     yield f"the best of {search.tried:,} loops tried with {limit}; {proven}"
@@ -339,15 +339,15 @@ def _figure(search: EventSearch, original: Certified, best: Certified) -> Figure
 
 
 def design_for_network(
-    scenario: Scenario, wish: Wish, seed: int = 0, progress: Progress = lambda share: None
+    scenario: Scenario, request: DesignRequest, seed: int = 0, progress: Progress = lambda share: None
 ) -> DesignOutcome:
     """Search for a loop; with a period it is time-triggered. The result is deterministic.
 
     Raises:
-        CallerError: the scenario does not permit it, or a wish is out of range.
+        CallerError: the scenario does not permit it, or a request is out of range.
     """
-    if wish.period_s is None and isinstance(scenario.trigger, DecayingSettings):
-        events = EventSearch(scenario, wish, seed)
+    if request.period_s is None and isinstance(scenario.trigger, DecayingSettings):
+        events = EventSearch(scenario, request, seed)
         return event_outcome(events, *events.run(progress))
-    search = NetworkSearch(scenario, wish)
+    search = NetworkSearch(scenario, request)
     return periodic_outcome(search, *search.run(progress))

@@ -66,7 +66,7 @@ _STARTS = 4
 _UNSTABLE = 1e3
 
 
-class Candidate(NamedTuple):
+class GainCandidate(NamedTuple):
     """A gain and what the controller does between updates."""
 
     hold: Hold
@@ -86,7 +86,7 @@ class Rung(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Wish:
+class DesignRequest:
     """What a design is asked for."""
 
     goal: Goal = "network"
@@ -110,10 +110,10 @@ class Wish:
     """Number of loops that the search without gradients may try."""
 
 
-class Reached(NamedTuple):
+class ReachedRung(NamedTuple):
     """A loop with the highest rung that it is proven to reach."""
 
-    candidate: Candidate
+    candidate: GainCandidate
     rung: int
     """Its number in the ladder; −1: none."""
     stability: Stability | None
@@ -148,25 +148,25 @@ def examined_m(scenario: Scenario, most: int) -> int:
     return most if burst is None else min(most, burst + 1)
 
 
-def ladder_of(scenario: Scenario, wish: Wish, margin: LossMargin) -> list[Rung]:
+def ladder_of(scenario: Scenario, request: DesignRequest, margin: LossMargin) -> list[Rung]:
     """Return what a loop must tolerate, from easy to hard."""
     network, period_ns = scenario.network, margin.longest_ns
-    if wish.goal == "transmissions":
+    if request.goal == "transmissions":
         return list(_periods(scenario, margin))
-    if wish.window is not None:
-        if not 2 <= wish.window <= 64:
-            raise CallerError(f"--window: from 2 to 64 updates, not {wish.window}")
+    if request.window is not None:
+        if not 2 <= request.window <= 64:
+            raise CallerError(f"--window: from 2 to 64 updates, not {request.window}")
         rungs = []
-        for m in range(wish.window):
-            rules = (AtMost(losses=m, window=wish.window),) if m else ()
+        for m in range(request.window):
+            rules = (AtMost(losses=m, window=request.window),) if m else ()
             guarantee = LossGuarantee((LongestBurst(m), *(rule.rule for rule in rules)))
             settings: dict[str, object] = {"mansd": m, "constraints": rules}
-            name = f"m = {m} of {wish.window}"
+            name = f"m = {m} of {request.window}"
             rungs.append(Rung(name, m, guarantee, period_ns, settings))
         return rungs
     return [
         Rung(f"M = {m}", m, capped(network.guarantee, m - 1), period_ns, {"mansd": m - 1})
-        for m in range(1, examined_m(scenario, wish.most or _MOST_M) + 1)
+        for m in range(1, examined_m(scenario, request.most or _MOST_M) + 1)
     ]
 
 
@@ -185,7 +185,7 @@ def _periods(scenario: Scenario, margin: LossMargin) -> Iterator[Rung]:
 class NetworkSearch:
     """All that is known about the loops of a scenario with other gains."""
 
-    def __init__(self, scenario: Scenario, wish: Wish) -> None:
+    def __init__(self, scenario: Scenario, request: DesignRequest) -> None:
         if not scenario.coverage.is_linear:
             raise CallerError(
                 f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear; '
@@ -193,13 +193,13 @@ class NetworkSearch:
             )
         without_timeout(scenario).coverage.require_exact()
         scenario.coverage.require_unchanging()
-        if wish.bounds:
+        if request.bounds:
             raise CallerError("--bound: is for a loop with events, not for periodic updates")
-        if wish.most is not None and (wish.goal == "transmissions" or wish.window is not None):
+        if request.most is not None and (request.goal == "transmissions" or request.window is not None):
             raise CallerError("--most: is for --for network without --window")
-        if not wish.cost >= 1:
-            raise CallerError(f"--cost: 1 or more times that of the given loop, not {wish.cost:g}")
-        self.wish, self.scenario = wish, time_triggered(scenario, wish.period_s)
+        if not request.cost >= 1:
+            raise CallerError(f"--cost: 1 or more times that of the given loop, not {request.cost:g}")
+        self.request, self.scenario = request, time_triggered(scenario, request.period_s)
         resolved = resolve(self.scenario)
         self.plant, margin = loop_of(resolved), LossMargin(resolved)
         self._times, self._resolved = margin.loop.times, resolved
@@ -209,21 +209,23 @@ class NetworkSearch:
                 f'trigger.policy = "{scenario.trigger.policy}": the search is for periodic '
                 "updates; give their --period"
             )
-        self.ladder = ladder_of(self.scenario, wish, margin)
+        self.ladder = ladder_of(self.scenario, request, margin)
         n, m = self.plant.n, self.plant.m
-        self.weights = wish.weights or (np.eye(n), np.eye(m))
+        self.weights = request.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
-        self.holds = tuple(itertools.chain(*HOLDS.values())) if wish.holds is None else tuple(wish.holds)
-        self.original = Candidate(given_hold(self.scenario), rows_of(self.plant.K))
+        self.holds = (
+            tuple(itertools.chain(*HOLDS.values())) if request.holds is None else tuple(request.holds)
+        )
+        self.original = GainCandidate(given_hold(self.scenario), rows_of(self.plant.K))
         base = self.quick_loop(self.original, margin.longest_ns).cost(self.plant.x0)
-        self.limit = wish.cost * base
+        self.limit = request.cost * base
         """Largest cost; infinite if the given loop is unstable without losses."""
         self.tried = self.judged = 0
         self.highest: dict[Hold, int] = {}
         """By hold strategy: the highest rung on which a loop was tried and is not excluded."""
         self._graphs: dict[tuple[LossGuarantee, int, Hold, int], PatternGraph] = {}
 
-    def quick_loop(self, candidate: Candidate, period_ns: int) -> QuickLoop:
+    def quick_loop(self, candidate: GainCandidate, period_ns: int) -> QuickLoop:
         """Return the loop of a candidate in double precision."""
         plant, K = self.plant, np.array(candidate.K)
         H = plant.A_model + plant.B_model @ K
@@ -244,7 +246,7 @@ class NetworkSearch:
             self._graphs[key] = PatternGraph(list_bursts(rung.guarantee, times))
         return self._graphs[key]
 
-    def growth(self, candidate: Candidate, rung: int) -> float:
+    def growth(self, candidate: GainCandidate, rung: int) -> float:
         """Return a lower bound of the logarithm of the growth per period."""
         self.tried += 1
         setting = self.ladder[rung]
@@ -252,11 +254,11 @@ class NetworkSearch:
         graph = self.graph(setting, candidate.hold)
         return graph.growth(loop.maps(graph.bursts))
 
-    def cost(self, candidate: Candidate, rung: int) -> float:
+    def cost(self, candidate: GainCandidate, rung: int) -> float:
         """Return the cost without losses."""
         return self.quick_loop(candidate, self.ladder[max(rung, 0)].period_ns).cost(self.plant.x0)
 
-    def excess(self, candidate: Candidate, rung: int) -> float:
+    def excess(self, candidate: GainCandidate, rung: int) -> float:
         """Return what is minimised: the growth, and by how much the cost exceeds its limit."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             plant = self.plant
@@ -273,7 +275,7 @@ class NetworkSearch:
             return growth
         return max(growth, -_SLACK) + _SLACK + math.log(cost / self.limit)
 
-    def climb(self, candidate: Candidate, rung: int) -> tuple[int, float]:
+    def climb(self, candidate: GainCandidate, rung: int) -> tuple[int, float]:
         """Return the highest rung that is not excluded, from one on, and the excess at the next."""
         while rung < len(self.ladder):
             if (excess := self.excess(candidate, rung)) >= -_SLACK:
@@ -281,7 +283,7 @@ class NetworkSearch:
             rung += 1
         return rung - 1, -math.inf
 
-    def scenario_of(self, candidate: Candidate, rung: int) -> Scenario:
+    def scenario_of(self, candidate: GainCandidate, rung: int) -> Scenario:
         """Return the scenario of a loop on a rung, not resolved."""
         setting, scenario = self.ladder[max(rung, 0)], self.scenario
         trigger = scenario.trigger.model_copy(update={"period_s": setting.period_ns / NS_PER_S})
@@ -294,24 +296,24 @@ class NetworkSearch:
             }
         )
 
-    def judge(self, candidate: Candidate, rung: int) -> Stability:
+    def judge(self, candidate: GainCandidate, rung: int) -> Stability:
         """Return the certified bounds of a loop on a rung."""
         self.judged += 1
         margin = LossMargin(resolve(self.scenario_of(candidate, rung)))
         stability = margin.first_bounds()
         return margin.coarse_bounds() if stability.verdict == "undecided" else stability
 
-    def reach(self, candidate: Candidate, most: int, least: int = -1) -> tuple[int, Stability | None]:
+    def reach(self, candidate: GainCandidate, most: int, least: int = -1) -> tuple[int, Stability | None]:
         """Return the highest certified rung from ``most`` down to above ``least``."""
         for rung in range(most, least, -1):
             if (stability := self.judge(candidate, rung)).verdict == "stable":
                 return rung, stability
         return least, None
 
-    def first(self) -> Reached:
+    def first(self) -> ReachedRung:
         """Return what the given loop reaches; its bounds are refined until they decide."""
         start = 0
-        if self.wish.goal == "transmissions":
+        if self.request.goal == "transmissions":
             period_ns = self._times.period_ns
             start = max(i for i, rung in enumerate(self.ladder) if rung.period_ns <= period_ns)
         top, _ = self.climb(self.original, start)
@@ -319,7 +321,7 @@ class NetworkSearch:
             top = next((i for i in range(start, -1, -1) if self.climb(self.original, i)[0] >= i), -1)
         return self.completed(self.original, top)
 
-    def completed(self, candidate: Candidate, most: int) -> Reached:
+    def completed(self, candidate: GainCandidate, most: int) -> ReachedRung:
         """Return a loop with refined bounds on its rung and on the next one.
 
         A designed loop stays on a rung beyond which its cost would exceed the limit.
@@ -334,9 +336,9 @@ class NetworkSearch:
             if following.verdict != "stable":
                 break
             rung, stability, following = rung + 1, following, None
-        return Reached(candidate, rung, stability, following, self.cost(candidate, rung))
+        return ReachedRung(candidate, rung, stability, following, self.cost(candidate, rung))
 
-    def regulators(self) -> list[Candidate]:
+    def regulators(self) -> list[GainCandidate]:
         """Return LQR gains of the model with all hold strategies."""
         plant, (Q, R) = self.plant, self.weights
         gains = [lqr_gain(plant.A_model, plant.B_model, Q, c * R) for c in COSTS_OF_INPUT]
@@ -349,16 +351,16 @@ class NetworkSearch:
         def behaviour(hold: Hold) -> tuple[str, LoopTimes]:
             return hold.mode, self.times(hold, self.period_ns)
 
-        return self.wish.holds is None or behaviour(self.original.hold) in map(behaviour, self.holds)
+        return self.request.holds is None or behaviour(self.original.hold) in map(behaviour, self.holds)
 
-    def run(self, progress: Progress = lambda share: None) -> tuple[Reached, Reached]:
+    def run(self, progress: Progress = lambda share: None) -> tuple[ReachedRung, ReachedRung]:
         """Return what the given loop reaches, and the best loop found."""
         original = self.first()
         self.tried, best, rung = 0, original.candidate, -1
         if self.keeps_given_hold:
             rung = original.rung
         progress(0.1)
-        starts = [Candidate(hold, original.candidate.K) for hold in self.holds]
+        starts = [GainCandidate(hold, original.candidate.K) for hold in self.holds]
         starts += self.regulators()
         ranked = sorted(
             ((*self.climb(start, max(rung, 0)), start) for start in starts),
@@ -377,7 +379,7 @@ class NetworkSearch:
         pool = [best] if rung >= 0 else []
         pool += [candidate for _, _, candidate in ranked[:_STARTS]]
         pool = list(dict.fromkeys([*pool, *first_of_each.values()]))
-        share = max(self.wish.effort // len(pool), 1)
+        share = max(self.request.effort // len(pool), 1)
         for number, start in enumerate(pool):
             candidate = start
             tries_left = share
@@ -402,7 +404,7 @@ class NetworkSearch:
             rung = self.highest.get(hold, -1)
             yield hold.text, self.ladder[rung].name if rung >= 0 else "nothing"
 
-    def _improve(self, start: Candidate, rung: int, most: int) -> Candidate | None:
+    def _improve(self, start: GainCandidate, rung: int, most: int) -> GainCandidate | None:
         """Return a loop near ``start`` whose lower bound is below 1 on a rung; None: none found."""
         K = np.array(start.K)
         scale = scaled_steps(K)
@@ -449,20 +451,20 @@ def scaled_steps(K: Matrix) -> Vector:
     return np.ravel(np.maximum(np.abs(K), 0.1 * np.abs(K).max(axis=1, keepdims=True)))
 
 
-def _rounded(hold: Hold, K: Matrix) -> Candidate:
+def _rounded(hold: Hold, K: Matrix) -> GainCandidate:
     """Return a candidate with six digits: what is judged is what is printed."""
-    return Candidate(hold, tuple(tuple(float(f"{entry:.6g}") for entry in row) for row in K))
+    return GainCandidate(hold, tuple(tuple(float(f"{entry:.6g}") for entry in row) for row in K))
 
 
 class _FoundError(Exception):
     """Ends a minimisation."""
 
-    def __init__(self, candidate: Candidate) -> None:
+    def __init__(self, candidate: GainCandidate) -> None:
         super().__init__()
         self.candidate = candidate
 
 
-def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) -> DesignOutcome:
+def periodic_outcome(search: NetworkSearch, original: ReachedRung, best: ReachedRung) -> DesignOutcome:
     """Return what is shown of a search."""
     return DesignOutcome(
         search.scenario.name,
@@ -474,8 +476,8 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
         best.rung >= 0,
         best.candidate != original.candidate,
         {
-            "goal": search.wish.goal,
-            "window": search.wish.window,
+            "goal": search.request.goal,
+            "window": search.request.window,
             "cost_limit": search.limit,
             "tried": search.tried,
             "judged": search.judged,
@@ -486,7 +488,7 @@ def periodic_outcome(search: NetworkSearch, original: Reached, best: Reached) ->
     )
 
 
-def _loop_result(search: NetworkSearch, reached: Reached, *, is_excluded: bool = False) -> LoopResult:
+def _loop_result(search: NetworkSearch, reached: ReachedRung, *, is_excluded: bool = False) -> LoopResult:
     ladder, (hold, K), proven = search.ladder, reached.candidate, reached.stability
     rung = ladder[max(reached.rung, 0)]
     sent = search.scenario.timing.measurement_period_ns / rung.period_ns
@@ -499,7 +501,7 @@ def _loop_result(search: NetworkSearch, reached: Reached, *, is_excluded: bool =
     cells = {
         "proven stable for": reach,
         "growth per period there": growth,
-        "the next one": _beyond(ladder, reached),
+        "the next one": _next_rung_text(ladder, reached),
         "cost without losses": f"{reached.cost:.4g}",
         "share of measurements sent": f"{100 * sent:.3g} %",
         "between updates": hold.text + " (not in --holds)" * is_excluded,
@@ -513,7 +515,7 @@ def _loop_result(search: NetworkSearch, reached: Reached, *, is_excluded: bool =
     return LoopResult(reach, cells, document)
 
 
-def _notes(search: NetworkSearch, original: Reached, best: Reached) -> Iterator[str]:
+def _notes(search: NetworkSearch, original: ReachedRung, best: ReachedRung) -> Iterator[str]:
     """Yield what the reader should know of a search."""
     limit = f"{search.limit:.4g}" if math.isfinite(search.limit) else "any size"
     yield (
@@ -524,11 +526,11 @@ def _notes(search: NetworkSearch, original: Reached, best: Reached) -> Iterator[
         hold = original.candidate.hold.text
         yield f"the given loop tolerates more than the designed one; --holds excludes its strategy, {hold}"
     period_s = search.period_ns / NS_PER_S
-    if search.wish.period_s is not None and round(search.wish.period_s * NS_PER_S) != search.period_ns:
-        yield f"--period {search.wish.period_s:g}: updates are sent at measurements, every {period_s:g} s"
+    if search.request.period_s is not None and round(search.request.period_s * NS_PER_S) != search.period_ns:
+        yield f"--period {search.request.period_s:g}: updates are sent at measurements, every {period_s:g} s"
 
 
-def _beyond(ladder: Sequence[Rung], reached: Reached) -> str:
+def _next_rung_text(ladder: Sequence[Rung], reached: ReachedRung) -> str:
     if reached.rung + 1 == len(ladder):
         return "not examined"
     if reached.beyond is None:
@@ -538,9 +540,9 @@ def _beyond(ladder: Sequence[Rung], reached: Reached) -> str:
     return f"{ladder[reached.rung + 1].name}: {result}"
 
 
-def _figure(search: NetworkSearch, original: Reached, best: Reached) -> FigureDescription:
+def _figure(search: NetworkSearch, original: ReachedRung, best: ReachedRung) -> FigureDescription:
     """Describe the growth of both loops over the ladder."""
-    ladder, wish = search.ladder, search.wish
+    ladder, request = search.ladder, search.request
     top = min(max(best.rung, original.rung) + 4, len(ladder))
     rungs = np.unique(np.linspace(0, top - 1, min(top, _MOST_POINTS)).astype(int))
     numbers = np.array([rung.number for rung in ladder])
@@ -552,9 +554,9 @@ def _figure(search: NetworkSearch, original: Reached, best: Reached) -> FigureDe
             x, y = numbers[[reached.rung]], np.array([reached.stability.upper])
             mark_label = f"{label}: proven"
             items.append(Marks(x=x, y=y, colour=colour, marker="*", size=12, label=mark_label))
-    x_label = "M" if wish.window is None else f"losses in {wish.window} updates"
-    if wish.goal == "transmissions":
+    x_label = "M" if request.window is None else f"losses in {request.window} updates"
+    if request.goal == "transmissions":
         x_label = "time between updates [s]"
-    x_axis = Axis(label=x_label, whole=wish.goal == "network")
+    x_axis = Axis(label=x_label, whole=request.goal == "network")
     panel = Panel(items=items, x=x_axis, y=Axis(label="growth per period"))
     return figure_of("growth", panel, _CAPTION)

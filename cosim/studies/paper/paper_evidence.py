@@ -28,7 +28,7 @@ from noack.plants.linear import lane_following
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import Constants
+from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.paper import Interval, longest_interval_s, theorem_1, theorem_2

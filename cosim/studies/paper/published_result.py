@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _STYLES = {"reproduced": "green", "agrees": "green", "differs": "red"}
 
 
-class Row(NamedTuple):
+class ComparedValue(NamedTuple):
     """A published value and the computed one."""
 
     quantity: str
@@ -58,7 +58,7 @@ class PublishedResult(NamedTuple):
     about: str
     """What is reproduced, in one line."""
     reference: str
-    rows: Callable[[], Sequence[Row]]
+    rows: Callable[[], Sequence[ComparedValue]]
     """Computes the rows."""
     notes: tuple[str, ...] = ()
     """What the publication, as far as it was available, does not give."""
@@ -69,7 +69,7 @@ class Reproduction(NamedTuple):
 
     name: str
     result: PublishedResult
-    rows: Sequence[Row]
+    rows: Sequence[ComparedValue]
 
     @property
     def as_expected(self) -> bool:
@@ -109,11 +109,11 @@ def print_rows(console: "Console", reproduction: Reproduction) -> None:
 
 def value_row(
     quantity: str, place: str, published: float, computed: float, method: str, *, digits: int
-) -> Row:
+) -> ComparedValue:
     """Return the row of a number that is published with so many digits after the point."""
     agrees = abs(computed - published) <= 0.5000001 * 10.0**-digits
     texts = f"{published:.{digits}f}", f"{computed:.{digits + 1}f}"
-    return Row(quantity, place, "=", *texts, method, agrees)
+    return ComparedValue(quantity, place, "=", *texts, method, agrees)
 
 
 def stored_matrices(name: str) -> dict[str, dict[str, Matrix]]:

@@ -41,7 +41,7 @@ _LONGEST_S = 1e9
 _AT_REST = 1e-9
 """The plant rests if |f(0, 0)| is at most this share of the largest entry of A and B in its row."""
 _UNDECIDED = "its equations distinguish cases, and the region contains more than one of them"
-NOT_INSTALLED = "its equations cannot be enclosed: pip install 'noack[regions]'"
+NOT_INSTALLED = "its equations cannot be enclosed without python-flint: pip install 'noack[regions]'"
 
 
 class NotEnclosedError(NoackError):

@@ -124,7 +124,9 @@ def _rounded(values: Matrix) -> Matrix:
     return np.array([float(f"{value:.{_DIGITS}g}") for value in values.ravel()]).reshape(values.shape)
 
 
-def _followed(system_at: SystemAt, x0: Vector, u: Vector, settling: int, ahead: int, step_ns: int) -> Matrix:
+def _trajectory_points(
+    system_at: SystemAt, x0: Vector, u: Vector, settling: int, ahead: int, step_ns: int
+) -> Matrix:
     """Return x after the settling, a step later, and at the end, (3, n)."""
     system, states = system_at(x0), []
     for step in range(settling + ahead):
@@ -137,7 +139,7 @@ def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, s
     """Return the linear model of a system that is only moved."""
     n, m, settling = len(x0), len(u0), round(settling_s * 1e9 / step_ns)
     ahead = _AHEAD if settling else 1
-    resting = _followed(system_at, x0, u0, settling, ahead, step_ns)
+    resting = _trajectory_points(system_at, x0, u0, settling, ahead, step_ns)
     drift = (resting[1] - resting[0]) / (step_ns * 1e-9)
 
     def without(reason: str) -> LinearMotion:
@@ -148,13 +150,13 @@ def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, s
         off = np.zeros(n + m)
         off[i] = _OFF * max(1.0, abs(value))
         plus, minus = (
-            _followed(system_at, x0 + sign * off[:n], u0 + sign * off[n:], settling, ahead, step_ns)
+            _trajectory_points(system_at, x0 + sign * off[:n], u0 + sign * off[n:], settling, ahead, step_ns)
             for sign in (1.0, -1.0)
         )
         start_offs[:n, i], step_offs[:n, i], ahead_offs[:n, i] = (plus - minus) / (2 * off[i])
     if not (np.isfinite(start_offs).all() and np.isfinite(ahead_offs).all()):
         return without(NOT_FINITE)
-    if not np.array_equal(resting, _followed(system_at, x0, u0, settling, ahead, step_ns)):
+    if not np.array_equal(resting, _trajectory_points(system_at, x0, u0, settling, ahead, step_ns)):
         return without(NOT_REPEATED)
     if np.linalg.svd(start_offs, compute_uv=False)[-1] < _SINGULAR:
         return without(NO_STATE)
@@ -210,7 +212,7 @@ def largest_errors(
     def change(x: Vector, u: Vector) -> tuple[Vector, Vector]:
         if rates is not None:
             return x, np.asarray(rates(x, u))
-        begin, end, _ = _followed(system_at, x, u, settling, 1, step_ns)
+        begin, end, _ = _trajectory_points(system_at, x, u, settling, 1, step_ns)
         return begin, end - begin
 
     linear = np.hstack([motion.A, motion.B])

@@ -111,7 +111,7 @@ class TaskLimit:
 
 
 @dataclass(slots=True, eq=False)
-class _Waiting:
+class _PartialConnection:
     """A connection whose first bytes are not complete."""
 
     connection: socket.socket
@@ -135,7 +135,7 @@ class _Gate:
         self._loop, self._listening, self._begin, self._first = loop, listening, begin, first
         self._linger_s = linger_s
         self._descriptor = listening.fileno()
-        self._waiting: dict[int, _Waiting] = {}
+        self._waiting: dict[int, _PartialConnection] = {}
         """By descriptor, the oldest first."""
         self._unserved: Counter[str] = Counter()
         self._ending = False
@@ -177,7 +177,7 @@ class _Gate:
             if self._first is None:
                 self._serve(connection, b"", host)
                 continue
-            waiting = _Waiting(connection, source, host, self._loop.time() + self._first.within_s)
+            waiting = _PartialConnection(connection, source, host, self._loop.time() + self._first.within_s)
             self._waiting[connection.fileno()] = waiting
             if not self._advance(waiting, self._first):
                 self._loop.add_reader(connection.fileno(), self._advance, waiting, self._first)
@@ -188,7 +188,7 @@ class _Gate:
         if not self._ending:
             self._loop.add_reader(self._descriptor, self._accept)
 
-    def _advance(self, waiting: _Waiting, first: FirstBytes) -> bool:
+    def _advance(self, waiting: _PartialConnection, first: FirstBytes) -> bool:
         """Read what has arrived; return whether the connection waits no longer."""
         try:
             data = waiting.connection.recv(first.most - len(waiting.data), socket.MSG_DONTWAIT)
@@ -213,7 +213,7 @@ class _Gate:
     def _make_room(self) -> None:
         """End the oldest connections without progress, of the hosts that have the most."""
         newer: Counter[str] = Counter()
-        order: list[tuple[int, int, _Waiting]] = []
+        order: list[tuple[int, int, _PartialConnection]] = []
         for age, waiting in enumerate(reversed(self._waiting.values())):
             order.append((newer[waiting.host], age, waiting))
             newer[waiting.host] += 1
@@ -234,7 +234,7 @@ class _Gate:
         self._first.unserved(count)
         self._loop.call_later(_CHECK_S, self._check)
 
-    def _end(self, waiting: _Waiting, answer: bytes = b"") -> None:
+    def _end(self, waiting: _PartialConnection, answer: bytes = b"") -> None:
         """Close a connection that is not served."""
         self._unserved[waiting.host] += 1
         self._forget(waiting)
@@ -242,7 +242,7 @@ class _Gate:
             waiting.connection.send(answer, socket.MSG_DONTWAIT)
         waiting.connection.close()
 
-    def _forget(self, waiting: _Waiting) -> None:
+    def _forget(self, waiting: _PartialConnection) -> None:
         self._loop.remove_reader(waiting.connection.fileno())
         del self._waiting[waiting.connection.fileno()]
 

@@ -8,8 +8,9 @@ an interval, for G = H + αI (the models) and G = A + BK + αI (the plant's loop
    from a Lyapunov equation or from eigenvectors; ν is computed from the final L, so nothing depends
    on how L was found.
 2. ``enclosure.py``: the suprema and integrals. Between two nodes the distance of a response from
-   its chord is bounded by its second derivative; beyond the last node ν bounds the response. Why
-   samples are not sufficient: docs/theory.md, "Why the suprema are enclosed, not sampled".
+   its chord (``sag`` in names) is bounded by its second derivative (``bend``); beyond the last node
+   ν bounds the response. Why samples are not sufficient: docs/theory.md, "Why the suprema are
+   enclosed, not sampled".
 3. ``gains.py``: the names of these numbers. With K = U R the input error p = u − Kx acts through B
    U (docs/theory.md, "The loop", eq:miet_errdyn in the form of the three equations there):
 
@@ -20,8 +21,8 @@ an interval, for G = H + αI (the models) and G = A + BK + αI (the plant's loop
    disturbances in ``free``.
 4. ``box.py``: the same gains for every plant of an uncertainty box; the model error is one more
    input, bounded by a small-gain argument over its entries.
-5. ``terms.py``: the data of a certificate: its assumptions on the network, the bound of ‖e_s‖ that
-   a trigger guarantees, and the certified bounds.
+5. ``certificate_terms.py``: the data of a certificate: its assumptions on the network, the bound of
+   ‖e_s‖ that a trigger guarantees, and the certified bounds.
 6. ``trigger_bounds.py``: the bound of ‖e_s‖ after each test, for every trigger rule; and the growth
    of e_s from this bound until the next test, or from 0 after an event until the rule can transmit
    again (Volterra's inequality, iterated).

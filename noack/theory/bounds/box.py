@@ -72,12 +72,12 @@ class BoxGains(PlantGains):
         """
         if start_s == 0:
             return np.zeros(()), dict.fromkeys(self.outputs, np.zeros(()))
-        error, impulse, w = self._started_late(start_s)
+        error, impulse, w = self._start_bounds(start_s)
         states = {output: impulse * peaks.impulse + w @ peaks.from_w for output, peaks in self._peaks.items()}
         states[Output.MISMATCH] += np.linalg.norm(self._scales * w, axis=-1)
         return error, states
 
-    def _started_late(self, start_s: float) -> tuple[Vector, Vector, Vector]:
+    def _start_bounds(self, start_s: float) -> tuple[Vector, Vector, Vector]:
         """Return sup‖p‖ over the start, ∫‖p‖, and the bound of |w| that follows."""
         R, box = self.error.split_K[1], spectral_norm(self.halfwidth_A)
         # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
@@ -101,7 +101,7 @@ class BoxGains(PlantGains):
         total = np.stack([bound for name, bound in from_start if name not in self.outputs], axis=-1)
         w, impulse = self._free_model_error + self._forced_model_error * input_error, np.zeros(())
         if start_s > 0:
-            _, impulse, late = self._started_late(start_s)
+            _, impulse, late = self._start_bounds(start_s)
             w = w + late
         for index, peaks in enumerate(self._coordinates):
             total[index] += peaks.forced * input_error + peaks.impulse * impulse + peaks.from_w @ w
@@ -153,13 +153,13 @@ class BoxGains(PlantGains):
         return Outputs(self._signals)
 
     @cached_property
-    def _pushed(self) -> list[ResponseBounds]:
+    def _responses_to_errors(self) -> list[ResponseBounds]:
         """Responses of the model's closed loop to each w_i."""
         return [response(self.closed_loop, column[:, None]) for column in self._directions.T]
 
     def _peaks_at(self, C: Matrix) -> "_PeakGains":
         forced = self._forced.through(C)
-        from_w = [float(w.through(C).integral()) for w in self._pushed]
+        from_w = [float(w.through(C).integral()) for w in self._responses_to_errors]
         return _PeakGains(float(forced.integral()), float(forced.sup()), np.array(from_w))
 
     @cached_property

@@ -28,10 +28,10 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, discretise
 from noack.scenario.resolution import assumed_model, loop_of
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import EstimationBound
 from noack.theory.bounds.contraction import largest_gains, spectral_norm, times
 from noack.theory.bounds.enclosure import NotDecayingError, factors
 from noack.theory.bounds.gains import Forcing, NormalForcing
-from noack.theory.bounds.terms import EstimationBound
 
 MISMATCH = "Â − A"
 """Name of the output by which the plant's steps differ from the model's."""

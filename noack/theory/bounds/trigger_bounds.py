@@ -22,9 +22,9 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.gains import Columns, Growth, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.trigger.trigger_rule import QuadraticForm, TriggerRule
 
 _ROUNDING = 1.0 + 1e-9
@@ -203,7 +203,7 @@ class TriggerBounds:
         """
         due_s, forced_s, apart_s = self._between_events(conditions)
         h_s = conditions.sampling_s
-        idle_s = self._after(self.rule.idle_ns, conditions)
+        idle_s = self._longest_until_test(self.rule.idle_ns, conditions)
         untested_s = max(idle_s - h_s, 0.0) if math.isfinite(idle_s) else 0.0
         bounds: list[TriggerBound] = []
         if self.comparison is not None:
@@ -302,7 +302,7 @@ class TriggerBounds:
             The longest; the shortest after which an event is due; the shortest.
         """
         rule = self.rule
-        due_s = self._after(rule.longest_ns, conditions)
+        due_s = self._longest_until_test(rule.longest_ns, conditions)
         earliest_ns = max(rule.idle_ns, 0.0)
         if not len(rule.form.up):  # nothing is compared
             earliest_ns = rule.longest_ns if rule.forecast is None else rule.shortest_ns
@@ -311,7 +311,7 @@ class TriggerBounds:
         forced_s = _rounded_up(rule.longest_ns / NS_PER_S, step_s)
         return due_s, forced_s, apart_s
 
-    def _after(self, time_ns: float, conditions: NetworkConditions) -> float:
+    def _longest_until_test(self, time_ns: float, conditions: NetworkConditions) -> float:
         """Return the longest time from an event to the first test a time after it."""
         time_s, step_s = time_ns / NS_PER_S, conditions.spacing_s
         if not math.isfinite(time_s):

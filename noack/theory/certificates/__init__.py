@@ -13,7 +13,7 @@ loop"):
    threshold under these bounds (eq:miet_errdyn; the paper's is eq:tau). N and D_C depend on δ, so
    the largest consistent δ is used. For one known plant ``deliveries/`` sharpens the bounds by what
    holds from one delivery to the next.
-3. ``disturbed.py``. With persistent disturbances, noise, an observer or a constant threshold, each
+3. ``persistent_bounds.py``. With persistent disturbances, noise, an observer or a constant threshold, each
    bound has a decaying part and a persistent part. All inequalities are linear in functions of
    time, so the bounds of the two parts are added.
 4. ``scenario_certificates.py``. Which of these a scenario gets, for its own plant and for the box;
@@ -32,5 +32,5 @@ What a certificate assumes: ``conditions.py`` derives h, d, σ and the losses fr
 moves a set-point to 0; ``assumptions.py`` lists every assumption of the paper and of the
 certificate, with a verdict. A run that violates a condition voids the claims from that time on.
 
-``weight.py`` chooses W of the trigger's norm such that a certificate is tight.
+``trigger_weight.py`` chooses W of the trigger's norm such that a certificate is tight.
 """

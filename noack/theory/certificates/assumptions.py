@@ -16,8 +16,8 @@ from noack.core.number_format import at_least
 from noack.scenario.resolution import LoopMatrices, SteadyState, loop_of, policy_of, steady_state
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
+from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.bounds.disturbances import normal_bounds
-from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.conditions import network_delay_texts
 
 _NOT_COVERED = "not covered by the theorems and the certificates"

@@ -29,10 +29,10 @@ from noack.core.number_format import at_least, at_most
 from noack.plants.systems.jacobian_enclosure import Inclusion
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.enclosure import KernelBounds, response
 from noack.theory.bounds.gains import Output, PlantGains, error_gains
-from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import Assumption
 from noack.theory.certificates.conditions import BOX, OWN_PLANT
 
@@ -317,11 +317,11 @@ class KnownStateBounds:
     def _disturbed(self, age_s: Vector) -> Vector:
         if not self.disturbances.size:
             return np.zeros(len(age_s))
-        edges_s, sums = self._pushed
+        edges_s, sums = self._disturbance_sums
         return np.asarray(sums[np.searchsorted(edges_s, age_s, side="left")])
 
     @cached_property
-    def _pushed(self) -> tuple[Vector, Vector]:
+    def _disturbance_sums(self) -> tuple[Vector, Vector]:
         """Nodes, and Σ_i ∫‖e^{Ms} D_i‖ds up to each node and over all times."""
         plant, total = self.parts[-1].plant, 0.0
         unscaled = plant.closed_loop - plant.alpha_per_s * np.eye(len(plant.A))

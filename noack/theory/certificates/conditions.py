@@ -19,7 +19,7 @@ from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.certificate_terms import NetworkConditions
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"

@@ -36,8 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.certificate_terms import CertificatePart, Constants, NetworkConditions
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
-from noack.theory.bounds.terms import Constants, NetworkConditions, Part
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 
 _SIGNALS = 6
@@ -121,7 +121,7 @@ class BoundMethod(Enum):
 
 
 class LoopConstants(NamedTuple):
-    """The constants of several loops but δ, (loops,) each: see ``Constants`` in ``terms``."""
+    """The constants of several loops but δ, (loops,) each: see ``Constants`` in ``certificate_terms``."""
 
     missing_events: Counts
     delta: Vector
@@ -153,12 +153,12 @@ class ErrorInequalities:
     trigger and conditions; spacings and solutions are those of each loop.
     """
 
-    def __init__(self, part: Part, conditions: NetworkConditions, earlier_error: float) -> None:
+    def __init__(self, part: CertificatePart, conditions: NetworkConditions, earlier_error: float) -> None:
         self._error, self._plant, self._bound, self._estimation = error, plant, bound, _ = part
         self._conditions = conditions
         self.age_gains = error.age_gains(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
-        self._beyond = np.maximum(self._start_error, earlier_error)
+        self._first_input_error = np.maximum(self._start_error, earlier_error)
         self._states = {
             output: Coefficients(free + start[output], gain) for output, (free, gain) in plant.states.items()
         }
@@ -189,7 +189,7 @@ class ErrorInequalities:
         by_bound = []
         for signals, _, bound in solved:  # each b is another one
             bound = np.where(np.arange(_SIGNALS) == 1, bound, smallest)
-            by_bound.append(self._found(signals, events, gain, bound, is_counted))
+            by_bound.append(self._implied_bounds(signals, events, gain, bound, is_counted))
         exists = np.any([constants.exists for constants in by_bound], axis=0)
         return LoopConstants(*map(np.fmin.reduce, zip(*by_bound, strict=True)))._replace(exists=exists)
 
@@ -206,7 +206,7 @@ class ErrorInequalities:
             solved.append((signals, gain, np.max([solution.bound for solution in solutions], axis=0)))
         return solved
 
-    def _found(
+    def _implied_bounds(
         self,
         signals: "_Signals",
         events: Counts,
@@ -249,7 +249,7 @@ class ErrorInequalities:
         """
         sensor = np.eye(_SIGNALS)[1]
         if own_growth is not None:
-            sensor = self._begun(
+            sensor = self._with_start(
                 _columns(0.0, own_growth.stretch, 0.0, *own_growth.driven), own_growth.highest
             )
         counted = events
@@ -315,21 +315,23 @@ class ErrorInequalities:
                 followed = own_growth.mean_s * sum_of_sups(kernel, events, spacing_s)
                 driven[index] = np.minimum(driven[index], followed)
         highest = self._plant.driven[output][0].sup() if self._error.decays else 0.0
-        row = self._begun(present + _columns(0.0, gain, gain, *driven), highest)
+        row = self._with_start(present + _columns(0.0, gain, gain, *driven), highest)
         if stages is not None and own_growth is not None:
             row[..., 3] = present[..., 3]
-            row += stages.entered(*self._entered(output, len(stages.inputs), spacing_s, own_growth), events)
+            row += stages.entered(
+                *self._input_effects(output, len(stages.inputs), spacing_s, own_growth), events
+            )
         return row
 
-    def _begun(self, row: Matrix, highest: Vector | float) -> Matrix:
+    def _with_start(self, row: Matrix, highest: Vector | float) -> Matrix:
         """Add what enters before the first input, where ‖p‖ is not bounded by π.
 
         ``highest`` bounds what a p of 1 adds in a unit of time.
         """
         begun = np.fmin(row[..., 3], self._begin_s * highest)
-        return np.asarray(row + (self._beyond * begun)[..., None] * _ONE)
+        return np.asarray(row + (self._first_input_error * begun)[..., None] * _ONE)
 
-    def _entered(
+    def _input_effects(
         self, output: Output, count: int, spacing_s: Vector, own_growth: ErrorGrowth
     ) -> tuple[Matrix, Matrix]:
         """Bound how inputs before missing events move C e_c, from the newest event on.
@@ -360,7 +362,7 @@ class ErrorInequalities:
             or not spacing_s.all()
         ):
             return None
-        sizes, sups = self._entered(Output.GAIN, count, spacing_s, own_growth)
+        sizes, sups = self._input_effects(Output.GAIN, count, spacing_s, own_growth)
         shape = len(spacing_s), _SIGNALS
         late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own_growth.longest_s)
         highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
@@ -378,7 +380,7 @@ class ErrorInequalities:
 
     def _solved(self, signals: "_Signals", growing: ErrorGrowth, own_growth: ErrorGrowth | None) -> Solution:
         """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
-        errors, beyond, held = signals.errors, self._beyond, self.age_gains
+        errors, beyond, held = signals.errors, self._first_input_error, self.age_gains
         estimated, input_error = np.eye(_SIGNALS)[2], signals.input_error
 
         through, free = self._through(signals, {str(C): gain for C, gain in held.items()})
@@ -394,7 +396,7 @@ class ErrorInequalities:
         through, free = self._through(signals, growing.shares)
         of_test = (through + growing.estimation * estimated, growing.fixed + free)
         if own_growth is None:
-            driven = self._begun(_columns(0.0, 0.0, 0.0, *growing.driven), growing.highest)
+            driven = self._with_start(_columns(0.0, 0.0, 0.0, *growing.driven), growing.highest)
             of_test = growing.stretch * of_test[0] + driven, growing.stretch * of_test[1]
         other_rows = ((input_error, 0.0), of_mismatch, (0.0 * input_error, 1.0))
         all_rows = (of_age, of_test, of_estimate, *other_rows)
@@ -428,7 +430,7 @@ class ErrorInequalities:
                     self._plant,
                     np.where(searched, bound.reached - estimation, 0.0),
                     np.where(searched, constants.mismatch, 0.0),
-                    np.where(searched, np.maximum(other_input_error, self._beyond), 0.0),
+                    np.where(searched, np.maximum(other_input_error, self._first_input_error), 0.0),
                     error_gain,
                     estimation,
                 ),
@@ -456,7 +458,7 @@ class _Stages(NamedTuple):
     def entered(self, sizes: Matrix, sups: Matrix, events: Counts) -> Matrix:
         """Bound what has entered e_c before up to so many missing events, (loops, 6).
 
-        ``sizes`` and ``sups`` are those of :meth:`ErrorInequalities._entered`.
+        ``sizes`` and ``sups`` are those of :meth:`ErrorInequalities._input_effects`.
         """
         largest = np.zeros(self.inputs.shape[1:])
         for count in range(1, len(self.inputs) + 1):

@@ -18,15 +18,20 @@ from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows
 from noack.theory.bounds.box import BoxGains
+from noack.theory.bounds.certificate_terms import (
+    CertificatePart,
+    Constants,
+    NetworkConditions,
+    NoCertificateError,
+)
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
-from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate
+from noack.theory.certificates.persistent_bounds import DisturbedCertificate, PlantAt, choose_rate
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 MOST_S = 10.0
@@ -56,11 +61,9 @@ def trigger_bounds(resolved: Scenario) -> TriggerBounds:
     return TriggerBounds(rule_of(resolved), weight, fastest)
 
 
-def certify(
-    resolved: Scenario, conditions: NetworkConditions, start_error: float = 0.0
-) -> ScenarioCertificate:
+def certify(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCertificate:
     """The certificate of a scenario's own plant; see :class:`CertificateScope`."""
-    return own_plant(resolved, start_error).certificate(conditions)
+    return own_plant(resolved).certificate(conditions)
 
 
 def certify_box(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCertificate | None:
@@ -387,7 +390,7 @@ class CertificateScope:
         plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
-        part = Part(plant.error, plant, self._trigger.bound(conditions, level, reached))
+        part = CertificatePart(plant.error, plant, self._trigger.bound(conditions, level, reached))
         return (
             yield from sharpened(
                 Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)

@@ -4,7 +4,7 @@ The bounds are the solution of the inequalities of :mod:`noack.theory.certificat
 The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
 assumed δ gives a time of at least δ, it holds by induction over the events; the largest such δ is
 used. The constants are sharpened by the flow between two updates
-(:mod:`noack.theory.certificates.deliveries.scheduled_flow`).
+(:mod:`noack.theory.certificates.deliveries.sharpened_constants`).
 """
 
 import contextlib
@@ -19,19 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Vector
-from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.bounds.terms import (
-    MEASURED,
+from noack.theory.bounds.certificate_terms import (
+    CertificatePart,
     Constants,
-    EstimationBound,
     NetworkConditions,
     NoCertificateError,
-    Part,
     TriggerBound,
 )
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.trigger_bounds import LONGEST_S
-from noack.theory.certificates.deliveries.scheduled_flow import is_scheduled_flow, scheduled_constants
+from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 
 _SETTLED = 1e-3
@@ -47,7 +45,7 @@ class Problem(NamedTuple):
     least the sum of the parts' ``reached``, so the next event needs one part that reaches its own.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[CertificatePart, ...]
     conditions: NetworkConditions
     earlier_error: float = 0.0
     """Bound of sup‖p‖ of the first part while the plant still applies inputs of an earlier run."""
@@ -137,11 +135,8 @@ def solve(
     plant: PlantGains,
     conditions: NetworkConditions,
     bound: TriggerBound,
-    earlier_error: float = 0.0,
     *,
-    estimation: EstimationBound = MEASURED,
     structured: bool = True,
-    longest: bool = True,
 ) -> Constants:
     """Return the constants of one part that are certified for all times; see :class:`Problem`.
 
@@ -149,8 +144,8 @@ def solve(
         NoCertificateError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
-    part = Part(error, plant, bound, estimation)
-    return completed_alone(sharpened(Problem((part,), conditions, earlier_error, structured, longest)))
+    problem = Problem((CertificatePart(error, plant, bound),), conditions, structured=structured)
+    return completed_alone(sharpened(problem))
 
 
 def sharpened(problem: Problem) -> Search[Constants]:
@@ -161,7 +156,7 @@ def sharpened(problem: Problem) -> Search[Constants]:
     (constants,) = yield problem
     (part,), conditions, *_ = problem
     is_plain = problem.structured and problem.earlier_error == 0.0
-    if problem.longest and is_plain and is_scheduled_flow(part):
+    if problem.longest and is_plain and can_be_sharpened(part):
         key = id(part.plant), constants, repr((part.bound, conditions))
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
             return sharpened_once(_Sharpening(key, constants, part, conditions))
@@ -170,18 +165,18 @@ def sharpened(problem: Problem) -> Search[Constants]:
 
 @dataclass(frozen=True)
 class _Sharpening:
-    """What :func:`scheduled_constants` needs. The key has the plant's id: the part keeps the plant."""
+    """What :func:`sharpened_constants` needs. The key has the plant's id: the part keeps the plant."""
 
     key: Hashable
     constants: Constants = field(compare=False)
-    part: Part = field(compare=False)
+    part: CertificatePart = field(compare=False)
     conditions: NetworkConditions = field(compare=False)
 
 
 @lru_cache(maxsize=32)
 def sharpened_once(known: _Sharpening) -> Constants:
     """Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
-    return scheduled_constants(known.constants, known.part, known.conditions)
+    return sharpened_constants(known.constants, known.part, known.conditions)
 
 
 def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:

@@ -132,7 +132,7 @@ class _Centers(NamedTuple):
         weight = count * longest
         for _ in range(_STAGES):
             for _ in range(_NEWTON_STEPS):
-                moved = self._moved(P, level, weight)
+                moved = self._newton_step(P, level, weight)
                 if moved is None:
                     break
                 P, level, decrement = moved
@@ -144,7 +144,7 @@ class _Centers(NamedTuple):
             weight *= _HEAVIER
         return P
 
-    def _moved(self, P: Stack, level: float, weight: float) -> tuple[Stack, float, float] | None:
+    def _newton_step(self, P: Stack, level: float, weight: float) -> tuple[Stack, float, float] | None:
         """Return P and log γ after a step of Newton's method, and twice what it promised.
 
         None: no step along its direction makes the value smaller.

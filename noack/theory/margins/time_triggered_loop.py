@@ -182,7 +182,9 @@ class TimeTriggeredLoop:
             usable_ns: how long the update before it is used after its transmission, up to d.
             losses: number of lost updates between the two.
         """
-        return self._after(slot, usable_ns, losses).rows(self._kept).interval().scaled(self._given_units)
+        return (
+            self._state_after(slot, usable_ns, losses).rows(self._kept).interval().scaled(self._given_units)
+        )
 
     def period(self, slot: int, is_delivered: bool) -> IntervalMatrix:
         """Return the map of (x, x_c, u, w), in units of its own, from one transmission to the next.
@@ -201,7 +203,7 @@ class TimeTriggeredLoop:
             return self._updated(self._start, from_ns, NEVER_NS, NEVER_NS).interval()
         return self._between(from_ns, from_ns + self.times.period_ns).interval()
 
-    def _after(self, slot: int, usable_ns: int, losses: int) -> FixedPointMatrix:
+    def _state_after(self, slot: int, usable_ns: int, losses: int) -> FixedPointMatrix:
         period_ns = self.times.period_ns
         timeout_ns = slot * period_ns + self.times.timeout_ns
         states = self._states.setdefault((slot, usable_ns), [])

@@ -32,10 +32,10 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from noack.core.linear_systems import Vector, exponential
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.certificates.inequalities import solve_inequalities
 from noack.theory.random_losses.quadratic_moments import (
     Known,
@@ -95,7 +95,7 @@ def mean_squares(
         NotDecayingError: α is not below the decay rate of the models, or of A + BK.
     """
     try:
-        inequalities = _Inequalities(error, plant, conditions, beta, largest_probability)
+        inequalities = _MomentInequalities(error, plant, conditions, beta, largest_probability)
         bounds, loop_gain = inequalities.solve()
     except (np.linalg.LinAlgError, OverflowError):
         raise NoCertificateError("numbers overflow: an input is too old for the fastest mode") from None
@@ -124,7 +124,7 @@ class _Bounds(NamedTuple):
         return np.array([self.sensor_error, self.input_error, 1.0])
 
 
-class _Inequalities:
+class _MomentInequalities:
     """The inequalities; every signal is bounded by a row: multiples of a and π, and a constant."""
 
     def __init__(
@@ -176,7 +176,10 @@ class _Inequalities:
 
     def refine(self, bounds: _Bounds) -> _Bounds:
         """Make bounds smaller; each one that is used holds already."""
-        known, loop = self._known(bounds), (self._error, self._plant, self._conditions, self._probability)
+        known, loop = (
+            self._known_parts(bounds),
+            (self._error, self._plant, self._conditions, self._probability),
+        )
         functions = quadratic_functions(LossyFlow(*loop), known)
         if not functions and self._conditions.hold_s > 0:
             functions = quadratic_functions(LossyFlow(*loop, counts_age=False), known)
@@ -186,7 +189,7 @@ class _Inequalities:
                 break
         return bounds
 
-    def _known(self, bounds: _Bounds) -> Known:
+    def _known_parts(self, bounds: _Bounds) -> Known:
         """What is known of the parts of v; errors[C] bounds both ‖C e_c‖ and ‖C(e_c − ê_c)‖ with a delay."""
         states, errors, conditions = bounds.states, bounds.errors, self._conditions
         gains = dict(self._ages)
@@ -211,7 +214,7 @@ class _Inequalities:
 
     def _improved(self, bounds: _Bounds, functions: Sequence[QuadraticFunction]) -> _Bounds:
         """Bound every signal by what is known of the others."""
-        known, delay_s = self._known(bounds), self._conditions.delay_s
+        known, delay_s = self._known_parts(bounds), self._conditions.delay_s
         signals, values = self._driving(bounds), bounds.values
         propagated = exponential(self._error.scaled_H * delay_s)
         errors: dict[str, float] = {}
@@ -246,7 +249,7 @@ class _Inequalities:
         if sampling_s > 0:
             growth = self._plant.growth(sampling_s, _CELLS)
             areas = growth.mismatch.integral_on_grid(), growth.input_error.integral_on_grid()
-            a = a + _driven(areas, signals)
+            a = a + _input_row(areas, signals)
         return np.asarray(a)
 
     def _state(self, output: str) -> Vector:
@@ -260,9 +263,9 @@ class _Inequalities:
         ages_s = delay_s + conditions.spacing_s * np.arange(float(_MOST_LOST))
         return _Missing(
             (error.kernels[output].sup(delay_s) if delay_s > 0 else error.now(output)) * _A,
-            _driven((recent.through(C).integral_on_grid() for recent in self._recent), signals),
-            _driven((kernel.integral() for kernel in kernels), signals),
-            conditions.sampling_s * _driven((kernel.sup(delay_s) for kernel in kernels), signals),
+            _input_row((recent.through(C).integral_on_grid() for recent in self._recent), signals),
+            _input_row((kernel.integral() for kernel in kernels), signals),
+            conditions.sampling_s * _input_row((kernel.sup(delay_s) for kernel in kernels), signals),
             self._beta * error.kernels[output].sups(ages_s),
         )
 
@@ -281,7 +284,7 @@ class _Inequalities:
         return np.asarray(missing.present + missing.recent + best)
 
 
-def _driven(gains: Iterable[Stack], signals: _Signals) -> Vector:
+def _input_row(gains: Iterable[Stack], signals: _Signals) -> Vector:
     """Return the row of what E x and B p do with these gains."""
     return sum((gain * row for gain, row in zip(gains, signals, strict=False)), np.zeros(3))
 

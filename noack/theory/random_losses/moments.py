@@ -25,9 +25,9 @@ from noack.impairments.loss_prediction import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.certificates.assumptions import below
 from noack.theory.certificates.conditions import most_events
 from noack.theory.certificates.scenario_certificates import CertificateScope

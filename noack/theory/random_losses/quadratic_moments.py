@@ -31,8 +31,8 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.random_losses.mean_square_growth import from_triangles, triangles
 
 _OF_STATE, _OF_ERROR = (0.1, 0.35), (0.35, 0.75)
@@ -215,7 +215,9 @@ class _Search:
         """The function for the smallest bound that was found; None if it cannot be confirmed."""
         try:
             first = self._first()
-            found = None if first is None else _Inequalities(self._blocks, len(first)).maximise_last(first)
+            found = (
+                None if first is None else _MatrixInequalities(self._blocks, len(first)).maximise_last(first)
+            )
         except np.linalg.LinAlgError:  # a matrix is singular to rounding
             return None
         if found is None:
@@ -335,7 +337,7 @@ class _Search:
         return np.asarray(-(M.T @ form + form @ M) - 2 * self._rate * form)
 
 
-class _Inequalities:
+class _MatrixInequalities:
     """Numbers and matrices that are affine in a vector, and are to be positive."""
 
     def __init__(self, blocks: Callable[[Vector], Blocks], size: int) -> None:
@@ -370,7 +372,7 @@ class _Inequalities:
         while True:
             for _ in range(_NEWTON_STEPS):
                 step, decrement = self._newton_step(values, weight)
-                moved = self._moved(values, step, weight, decrement) if decrement > _CENTERED else None
+                moved = self._step_along(values, step, weight, decrement) if decrement > _CENTERED else None
                 if moved is None:
                     break
                 values = moved
@@ -402,7 +404,7 @@ class _Inequalities:
         step = scales * np.linalg.solve(R, np.linalg.solve(R.T, scales * gradient))
         return step, float(gradient @ step)
 
-    def _moved(self, values: Vector, step: Vector, weight: float, decrement: float) -> Vector | None:
+    def _step_along(self, values: Vector, step: Vector, weight: float, decrement: float) -> Vector | None:
         """Return the values after a step along which the objective grows, shortened if need be."""
         length, now = 1.0, self._objective(values, weight)
         while length > _SHORTEST:

@@ -184,8 +184,8 @@ class _Tilts:
         chances = np.array([chain.delivered, chain.lost])
         X, Y, radius, before = self._forward, self._backward, 0.0, -1.0
         for _ in range(_POWERS):
-            X, radius = _scaled(_after(self._maps, chances, X))
-            Y, _ = _scaled(_after(self._maps.transpose(0, 2, 1), chances.transpose(0, 2, 1), Y))
+            X, radius = _scaled(_mapped_moments(self._maps, chances, X))
+            Y, _ = _scaled(_mapped_moments(self._maps.transpose(0, 2, 1), chances.transpose(0, 2, 1), Y))
             if abs(radius - before) <= _PRECISION * radius:
                 break
             before = radius
@@ -199,7 +199,7 @@ class _Tilts:
         return value, self._shares - weights / max(float(weights.sum()), 1e-300)
 
 
-def _after(maps: Stack, chances: Array, X: Stack) -> Stack:
+def _mapped_moments(maps: Stack, chances: Array, X: Stack) -> Stack:
     before = np.einsum("oij,iab->ojab", chances, X)
     return np.asarray((maps[:, None] @ before @ maps.transpose(0, 2, 1)[:, None]).sum(axis=0))
 

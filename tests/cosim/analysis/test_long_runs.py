@@ -10,10 +10,11 @@ from hypothesis.extra.numpy import arrays
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
 from cosim.analysis.replay import replay
+from cosim.analysis.summary.quantiles import EXACT, RESOLUTION, QuantileSketch
 from cosim.analysis.summary.run_summary import summarise
-from cosim.analysis.value_reduction import EXACT, RESOLUTION, QuantileSketch, decimate
 from cosim.record import run_record
 from cosim.record.align import align_tables
+from cosim.record.decimation import decimate
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import PLANT_STEP

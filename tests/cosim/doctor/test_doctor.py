@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from typer.testing import Result
 
-from cosim.doctor.findings import FindingStatus, MachineFinding, judge, worst
+from cosim.doctor.findings import MachineFinding, MachineVerdict, judge, worst
 from cosim.doctor.machine_measures import (
     Buffer,
     Disk,
@@ -30,7 +30,7 @@ PROMPT = Lateness(1000, 30.0, 100.0, 300.0, 0)
 ALL = ("sched_fifo", "memory_lock", "timer_slack", "affinity", "cpu_dma_latency")
 IDEAL = MachineFacts(
     cores=4, cores_online=4, load=0.1, governor="performance",
-    granted=dict.fromkeys(ALL, "applied"),
+    settings=dict.fromkeys(ALL, "applied"),
     timer_resolution_ns=1, timer_slack_ns=50_000, plain=PROMPT, realtime=PROMPT,
     round_trips=RoundTrips(1000, 0, 20.0, 60.0), buffer=Buffer(10_000, 8_388_608, 4_194_304),
     ports_taken=(), control=1e-3, disk=Disk("runs", 10**10, 10**7, 5e8), runtime_folder=None,
@@ -43,44 +43,44 @@ def about(title: str, required: RunRequirements = WANTED, **changed: Any) -> Mac
     """The first finding of a kind that is not good, or the first one if all are good."""
     findings = judge(replace(IDEAL, **changed), required)
     of_kind = [finding for finding in findings if finding.what.startswith(title)]
-    return next((finding for finding in of_kind if finding.verdict is not FindingStatus.GOOD), of_kind[0])
+    return next((finding for finding in of_kind if finding.verdict is not MachineVerdict.GOOD), of_kind[0])
 
 
 def test_a_machine_without_limits_is_good() -> None:
     findings = judge(IDEAL, WANTED)
-    assert worst(findings) is FindingStatus.GOOD
+    assert worst(findings) is MachineVerdict.GOOD
     assert not [finding for finding in findings if finding.remedy]
 
 
 @pytest.mark.parametrize(("what", "changed", "verdict"), [
-    ("cores", {"cores": 1}, FindingStatus.LIMITED),
-    ("cores", {"load": 7.0}, FindingStatus.LIMITED),
-    ("cores", {"governor": "powersave"}, FindingStatus.LIMITED),
-    ("cores", {"load": None, "governor": None}, FindingStatus.GOOD),
-    ("real-time", {"granted": {"sched_fifo": "not permitted: no"}}, FindingStatus.LIMITED),
-    ("timers", {"timer_resolution_ns": 4_000_000}, FindingStatus.LIMITED),
-    ("wake-ups with the", {"realtime": "it timed out"}, FindingStatus.LIMITED),
-    ("UDP", {"round_trips": "datagrams on the loopback are lost"}, FindingStatus.BAD),
-    ("UDP", {"round_trips": RoundTrips(1000, 1, 20.0, 60.0)}, FindingStatus.LIMITED),
-    ("receive buffer", {"buffer": Buffer(256, 212_992, 212_992)}, FindingStatus.LIMITED),
-    ("receive buffer", {"buffer": "nothing"}, FindingStatus.BAD),
-    ("ports", {"ports_taken": ["plant: UDP port 47001 is taken"]}, FindingStatus.BAD),
-    ("control plane", {"control": "no answer within 2 s"}, FindingStatus.BAD),
-    ("disk", {"disk": "runs: cannot be written: no space left"}, FindingStatus.BAD),
-    ("disk", {"disk": Disk("runs", 10**6, 10**7, 5e8)}, FindingStatus.BAD),
-    ("disk", {"disk": Disk("runs", 10**10, 10**7, 1e6)}, FindingStatus.LIMITED),
-    ("runtime folder", {"runtime_folder": "/run/x: must be yours"}, FindingStatus.LIMITED),
-    ("viewer", {"display": False}, FindingStatus.LIMITED),
-    ("viewer", {"viewer": None}, FindingStatus.LIMITED),
-    ("extra: fmi", {"extras": {"fmi": False}}, FindingStatus.LIMITED),
-    ("versions", {"versions": {"python": "3.12.1", "noack": None}}, FindingStatus.LIMITED),
+    ("cores", {"cores": 1}, MachineVerdict.LIMITED),
+    ("cores", {"load": 7.0}, MachineVerdict.LIMITED),
+    ("cores", {"governor": "powersave"}, MachineVerdict.LIMITED),
+    ("cores", {"load": None, "governor": None}, MachineVerdict.GOOD),
+    ("real-time", {"settings": {"sched_fifo": "not permitted: no"}}, MachineVerdict.LIMITED),
+    ("timers", {"timer_resolution_ns": 4_000_000}, MachineVerdict.LIMITED),
+    ("wake-ups with the", {"realtime": "it timed out"}, MachineVerdict.LIMITED),
+    ("UDP", {"round_trips": "datagrams on the loopback are lost"}, MachineVerdict.BAD),
+    ("UDP", {"round_trips": RoundTrips(1000, 1, 20.0, 60.0)}, MachineVerdict.LIMITED),
+    ("receive buffer", {"buffer": Buffer(256, 212_992, 212_992)}, MachineVerdict.LIMITED),
+    ("receive buffer", {"buffer": "nothing"}, MachineVerdict.BAD),
+    ("ports", {"ports_taken": ["plant: UDP port 47001 is taken"]}, MachineVerdict.BAD),
+    ("control plane", {"control": "no answer within 2 s"}, MachineVerdict.BAD),
+    ("disk", {"disk": "runs: cannot be written: no space left"}, MachineVerdict.BAD),
+    ("disk", {"disk": Disk("runs", 10**6, 10**7, 5e8)}, MachineVerdict.BAD),
+    ("disk", {"disk": Disk("runs", 10**10, 10**7, 1e6)}, MachineVerdict.LIMITED),
+    ("runtime folder", {"runtime_folder": "/run/x: must be yours"}, MachineVerdict.LIMITED),
+    ("viewer", {"display": False}, MachineVerdict.LIMITED),
+    ("viewer", {"viewer": None}, MachineVerdict.LIMITED),
+    ("extra: fmi", {"extras": {"fmi": False}}, MachineVerdict.LIMITED),
+    ("versions", {"versions": {"python": "3.12.1", "noack": None}}, MachineVerdict.LIMITED),
 ])  # fmt: skip
 def test_each_finding_has_a_verdict_and_a_remedy(
-    what: str, changed: dict[str, Any], verdict: FindingStatus
+    what: str, changed: dict[str, Any], verdict: MachineVerdict
 ) -> None:
     finding = about(what, **changed)
     assert finding.verdict is verdict
-    if verdict is not FindingStatus.GOOD:
+    if verdict is not MachineVerdict.GOOD:
         assert finding.means
         assert finding.remedy or isinstance(next(iter(changed.values())), str)
         assert worst(judge(replace(IDEAL, **changed), WANTED)) is verdict
@@ -89,12 +89,12 @@ def test_each_finding_has_a_verdict_and_a_remedy(
 def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
     late = Lateness(1000, 50.0, 3000.0, 9000.0, 4)
     finding = about("wake-ups with the real-time settings applied", realtime=late)
-    assert finding.verdict is FindingStatus.LIMITED
+    assert finding.verdict is MachineVerdict.LIMITED
     not_realtime = replace(WANTED, realtime=False)  # what is not used does not matter
-    assert about("wake-ups", plain=late).verdict is FindingStatus.GOOD
-    assert about("wake-ups", not_realtime, plain=late).verdict is FindingStatus.LIMITED
+    assert about("wake-ups", plain=late).verdict is MachineVerdict.GOOD
+    assert about("wake-ups", not_realtime, plain=late).verdict is MachineVerdict.LIMITED
     refused = {"sched_fifo": "not permitted: Operation not permitted"}
-    assert about("real-time", not_realtime, granted=refused).verdict is FindingStatus.GOOD
+    assert about("real-time", not_realtime, settings=refused).verdict is MachineVerdict.GOOD
     # 4 of 1000 at 500 Hz: one every 250 steps of 2 ms
     assert "4 of them (0.4 %) beyond the 4 ms that loop's certificates allow" in finding.means
     assert "one every 0.5 s of a run of 20 s" in finding.means
@@ -142,6 +142,6 @@ def test_every_check_gives_a_finding_and_a_taken_port_makes_a_run_impossible(
     assert measured["buffer"]["datagrams"] > 100
     assert measured["control"] > 0
     assert measured["disk"]["write_bytes_per_s"] > 0
-    assert set(measured["granted"]) >= {"sched_fifo", "memory_lock"}
+    assert set(measured["settings"]) >= {"sched_fifo", "memory_lock"}
     assert {entry["verdict"] for entry in document["findings"]} <= {"good", "limited", "bad"}
     assert not list(tmp_path.iterdir())

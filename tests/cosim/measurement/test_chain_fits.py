@@ -11,17 +11,9 @@ from hypothesis import strategies as st
 
 from cosim.measurement import chain_fits as rule
 from cosim.measurement.chain_fits import ChainFits, ChainRates, LossLikelihood, find_outages, fit_outages
-from cosim.measurement.loss_bursts import (
-    binomial_estimate,
-    exponential_estimate,
-    histogram,
-    loss_bursts,
-    most_losses,
-    outcomes,
-    poisson_estimate,
-    quantile_m,
-)
-from cosim.measurement.network_measurement import Measurement, MeasurementOptions
+from cosim.measurement.interval_estimates import binomial_estimate, exponential_estimate, poisson_estimate
+from cosim.measurement.loss_bursts import histogram, loss_bursts, most_losses, outcomes, quantile_m
+from cosim.measurement.network_measurement import MeasurementOptions, NetworkMeasurement
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.traces.packet_trace import packet_trace, read_trace
 from tests.cosim.measurement.chains import chain_losses
@@ -147,12 +139,12 @@ TRACES = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
 
 def test_the_rural_run_has_one_outage_of_ten_seconds_and_an_m_without_it() -> None:
     trace = read_trace(TRACES / "rural_n8_10kmh.csv")
-    measurement = Measurement(trace, MeasurementOptions(deadline_s=0.1))
+    measurement = NetworkMeasurement(trace, MeasurementOptions(deadline_s=0.1))
     (outage,) = measurement.to_json()["outages"]
     assert outage["losses"] == 175
     assert 10 < outage["duration_s"] < 11.5
     assert measurement.longest_loss_burst + 1 == measurement.quantiles[-1].bursts == 49
-    by_hand = Measurement(trace, MeasurementOptions(deadline_s=0.1, outage_s=2.0))
+    by_hand = NetworkMeasurement(trace, MeasurementOptions(deadline_s=0.1, outage_s=2.0))
     durations_s = by_hand.bursts.times_s(trace)[1]
     assert by_hand.is_outage.tolist() == (durations_s >= 2.0).tolist()
     assert by_hand.is_outage.sum() == 2

@@ -13,17 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import noack
+from cosim.measurement.certificate_time import DELAY, certificate_time
 from cosim.measurement.chain_fits import ChainRates
 from cosim.measurement.loss_bursts import histogram
-from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables, trace_csv
+from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables
 from cosim.measurement.network_measurement import (
-    DELAY,
-    Measurement,
     MeasurementOptions,
+    NetworkMeasurement,
     autocorrelation,
-    certificate_time,
     normal_scores,
 )
+from cosim.measurement.network_section import trace_csv
 from cosim.measurement.trace_sources import SourceOptions, read_source, updates_trace
 from cosim.record.run_events import packet_outcomes
 from cosim.simulation.virtual_time import simulate
@@ -117,7 +117,7 @@ def test_correlation_is_that_of_an_autoregressive_delay() -> None:
     assert scores[1] == scores[2] < scores[0] < scores[3]
     sent = 10**8 * np.arange(len(z))
     trace = packet_trace(sent, sent + delay_ns, ~known)
-    delays = Measurement(trace).delays
+    delays = NetworkMeasurement(trace).delays
     assert delays.quantiles_s[0.5] == pytest.approx(np.median(delay_ns[known]) * 1e-9)
     assert delays.received == known.sum()
 
@@ -136,7 +136,7 @@ def test_any_trace_is_measured(records: list[tuple[int, int | None]], deadline_s
     lost = np.array([delay is None for _, delay in records])
     received = sent + np.array([delay or 0 for _, delay in records])
     trace = packet_trace(sent, received, lost)
-    measurement = Measurement(trace, MeasurementOptions(deadline_s=deadline_s))
+    measurement = NetworkMeasurement(trace, MeasurementOptions(deadline_s=deadline_s))
     with np.errstate(all="raise", under="ignore"):
         document = measurement.to_json()
     assert document["effective_losses"] >= int(lost.sum())

@@ -19,7 +19,7 @@ from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.core.number_format import at_most
 from noack.scenario.resolution import loop_of
-from noack.theory.bounds.terms import Constants
+from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import most_events
 from noack.theory.certificates.scenario_certificates import outside_box

@@ -14,7 +14,7 @@ from matplotlib.legend import Legend
 from matplotlib.text import Text
 
 import noack
-from cosim.analysis.value_reduction import QuantileSketch
+from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     Axis,

@@ -3,14 +3,17 @@
 import json
 import re
 import shlex
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from netem import stand_alone
 from netem.__main__ import main
 from netem.emulator_options import command_line_parser as parser
 from netem.emulator_options import parsed, specs_of
+from netem.relay import Relay
 from netem.relay_links import LinkSpec
 from netem.tc_words import EXAMPLES, KEYWORDS, load_links, parse, settings_of
 from noack.impairments.kinds.loss import LOSS_WORDS
@@ -160,3 +163,15 @@ def test_a_command_of_tc_is_complete_in_a_terminal_of_any_width(explain: Explain
         "tc qdisc add dev DEVICE root netem limit 16384 delay 10ms 2ms distribution normal "
         "loss gemodel 1% 99% 100% 0%"
     }
+
+
+def test_settings_that_are_not_permitted_are_reported(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = {"sched_fifo": "not permitted: why", "memory_lock": "applied"}
+    monkeypatch.setattr(stand_alone, "realtime", lambda *_: nullcontext(answers))
+    monkeypatch.setattr(Relay, "run", lambda *_: None)
+    assert main(["--listen", ":0", "--to", ":9001", "--realtime", "--json"]) == 0
+    reported = capsys.readouterr().err
+    assert "noack netem: sched_fifo not permitted: why\n" in reported
+    assert "memory_lock" not in reported

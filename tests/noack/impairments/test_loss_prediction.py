@@ -26,7 +26,7 @@ from noack.impairments.loss_prediction import (
     predict,
     read_files,
     remember,
-    with_kept_loss,
+    with_target_loss,
 )
 from noack.impairments.markov_chain import NotPredictableError
 from noack.protocol.record_tables import Fate
@@ -166,7 +166,7 @@ def makes_stale(settings: LinkSettings) -> bool:
 )
 def test_a_kept_loss_is_predicted_as_it_was_asked(words: str, asked: float) -> None:
     asking = settings_of(words)
-    assert predict(with_kept_loss(asking)).rate == pytest.approx(asked, abs=1e-9)
+    assert predict(with_target_loss(asking)).rate == pytest.approx(asked, abs=1e-9)
     assert expected_loss(asking).rate == pytest.approx(asked, abs=1e-9)
 
 
@@ -174,14 +174,14 @@ def test_a_probability_that_another_process_found_is_not_computed_again(monkeypa
     """Not even by the loops of a run; but other settings have another probability."""
     settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
     found = found_probabilities(settings, settings_of("delay 1ms"))
-    assert list(found.values()) == [with_kept_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
+    assert list(found.values()) == [with_target_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
     monkeypatch.setattr(loss_prediction, "_found", {})
     monkeypatch.setattr(loss_prediction, "predict", None)
     remember(json.loads(json.dumps(found)))
     assert found_probabilities(settings_of("loss 10% keep loss 5% delay 9ms mansd 1")) == found
     for other in ("loss 10% keep loss 5% mansd 2", "loss 10% keep mansd 1"):
         with pytest.raises(TypeError):
-            with_kept_loss(settings_of(other))
+            with_target_loss(settings_of(other))
 
 
 P = 0.3

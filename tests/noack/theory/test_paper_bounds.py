@@ -11,8 +11,8 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.scenario.resolution import LoopMatrices, loop_of
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.enclosure import response
-from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.paper import (
     ErrorMonitor,
     Interval,

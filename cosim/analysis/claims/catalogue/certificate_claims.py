@@ -19,7 +19,7 @@ from cosim.analysis.claims.claim_definition import (
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from noack.core.linear_systems import row_norms
 from noack.core.number_format import at_most
-from noack.theory.bounds.terms import Constants
+from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 
 

@@ -172,10 +172,10 @@ def trail_style(who: str, width: float) -> rr.LineStrips2D:
     return style(WHO[who], width, order=_ORDERS[who] - 2)
 
 
-def label(text: str, at: tuple[float, float], colour: Colour, *, order: float = _FRONT) -> rr.Points2D:
+def label(text: str, at: tuple[float, float], colour: Colour) -> rr.Points2D:
     """Return a text below a point."""
     return rr.Points2D(
-        upright([at]), radii=0.0, colors=colour, labels=text, show_labels=True, draw_order=order
+        upright([at]), radii=0.0, colors=colour, labels=text, show_labels=True, draw_order=_FRONT
     )
 
 

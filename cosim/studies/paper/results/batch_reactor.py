@@ -6,8 +6,8 @@ from scipy.linalg import expm
 
 from cosim.simulation.continuous import ContinuousLoop
 from cosim.studies.paper.published_result import (
+    ComparedValue,
     PublishedResult,
-    Row,
     run_from_each,
     shipped_loop,
     stored_matrices,
@@ -46,7 +46,7 @@ def _slowest_state(loop: ContinuousLoop, periods: int) -> tuple[float, Matrix]:
     return float(values[0]), vectors[:, 0]
 
 
-def _rows() -> list[Row]:
+def _rows() -> list[ComparedValue]:
     loop = shipped_loop("reactor_petc")
     states = np.vstack([unit_states(2000, 4), *(_slowest_state(loop, k)[1] for k in range(1, 5))])
     periods = _periods(loop, states)
@@ -59,9 +59,9 @@ def _rows() -> list[Row]:
     counts, agree = (f"{inside.sum()}", f"{has_two.sum()}"), bool((inside == has_two).all())
     are_listed, after_one = following <= _AFTER_ONE, (_listed(_AFTER_ONE), _listed(following))
     return [
-        Row("intervals, periods", _WHERE, "=", _listed(_REGIONS), _listed(proven), _HOW, complete),
-        Row("intervals after one of 1 period", _WHERE, "among", *after_one, _HOW, are_listed),
-        Row("states whose interval is 2 periods", _WHERE, "=", *counts, _HOW, agree),
+        ComparedValue("intervals, periods", _WHERE, "=", _listed(_REGIONS), _listed(proven), _HOW, complete),
+        ComparedValue("intervals after one of 1 period", _WHERE, "among", *after_one, _HOW, are_listed),
+        ComparedValue("states whose interval is 2 periods", _WHERE, "=", *counts, _HOW, agree),
     ]
 
 

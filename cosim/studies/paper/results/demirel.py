@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from cosim.studies.paper.published_result import PublishedResult, Row, stored_matrices, value_row
+from cosim.studies.paper.published_result import ComparedValue, PublishedResult, stored_matrices, value_row
 from noack.core.linear_systems import Matrix
 
 _WHERE = "authors' README.md"
@@ -66,16 +66,16 @@ class ScheduledLoop(NamedTuple):
         return total / len(steps)
 
 
-def drawn_loops(seed: int = 20, n: int = 2, count: int = 3) -> list[ScheduledLoop]:
-    """Return the plants that the authors' program draws, each with an unstable A, and n states."""
-    random = np.random.RandomState(seed)  # as the authors' program
+def drawn_loops(seed: int = 20) -> list[ScheduledLoop]:
+    """Return the three plants that the authors' program draws, each with an unstable A, and two states."""
+    random, n = np.random.RandomState(seed), 2  # as the authors' program
 
     def positive(size: int) -> Matrix:
         drawn = random.rand(size, size)
         return np.asarray((drawn + drawn.T) / 2 + size * np.eye(size))
 
     loops: list[ScheduledLoop] = []
-    while len(loops) < count:
+    while len(loops) < 3:
         A = random.rand(n, n)
         while np.linalg.eigvals(A).real.max() < 1:
             A = random.rand(n, n)
@@ -84,7 +84,7 @@ def drawn_loops(seed: int = 20, n: int = 2, count: int = 3) -> list[ScheduledLoo
     return loops
 
 
-def _rows() -> list[Row]:
+def _rows() -> list[ComparedValue]:
     drawn, rows = list(zip("123", drawn_loops(), strict=True)), []
     for schedule, published in stored_matrices("demirel")["losses"].items():
         turns = schedule.split(",")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cosim.studies.paper.published_result import PublishedResult, Row, value_row
+from cosim.studies.paper.published_result import ComparedValue, PublishedResult, value_row
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.joint_spectral_radius import joint_spectral_radius
 from noack.theory.margins.switched_system import Edge
@@ -27,7 +27,7 @@ def edges() -> list[Edge]:
     return edges
 
 
-def _rows() -> list[Row]:
+def _rows() -> list[ComparedValue]:
     radius = joint_spectral_radius(edges(), accuracy=1e-11)
     modes = [_EDGES[number] % 10 for number in radius.cycle]
     rotated = [tuple(modes[i:] + modes[:i]) for i in range(len(modes))]
@@ -36,7 +36,7 @@ def _rows() -> list[Row]:
     return [
         value_row("growth, lower bound", _WHERE, _RADIUS, radius.lower, _HOW, digits=12),
         value_row("growth, upper bound", _WHERE, _RADIUS, radius.upper, _HOW, digits=10),
-        Row("its modes", _WHERE, "=", published, computed, _HOW, _CYCLE in rotated),
+        ComparedValue("its modes", _WHERE, "=", published, computed, _HOW, _CYCLE in rotated),
     ]
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from cosim.simulation.continuous import ContinuousLoop
 from cosim.studies.paper.published_result import (
+    ComparedValue,
     PublishedResult,
-    Row,
     run_from_each,
     shipped_loop,
     stored_matrices,
@@ -122,23 +122,23 @@ INEQUALITIES = {
 """By statement: the inequalities, h in seconds, ε, whether the sensor waits."""
 
 
-def _rows() -> list[Row]:
+def _rows() -> list[ComparedValue]:
     rows, solved = [], stored_matrices("selivanov_fridman")
     for statement, (inequalities, h, epsilon, waits) in INEQUALITIES.items():
         parts = inequalities(solved[statement], h, epsilon, waits=waits)
         margin = min(map(smallest_eigenvalue, parts))
         quantity = f"{statement}, h = {h}, ε = {epsilon}"
-        rows.append(Row(quantity, _WHERE, ">", "0", f"{margin:.1e}", _LMI, margin > _MARGIN))
+        rows.append(ComparedValue(quantity, _WHERE, ">", "0", f"{margin:.1e}", _LMI, margin > _MARGIN))
     loops = (("switching", "Theorem 1", _switching()), ("periodic", "Remark 1", _periodic()))
     means = []
     for name, statement, loop in loops:
         grown, mean = _run(loop, solved[statement]["P"], unit_states(100, 2))
         means.append(mean)
         quantity, place = f"growth of V, {name}", f"follows from {statement}"
-        rows.append(Row(quantity, place, "≤", "1", f"{grown:.3f}", _RUN, grown <= 1))
+        rows.append(ComparedValue(quantity, place, "≤", "1", f"{grown:.3f}", _RUN, grown <= 1))
     share = means[0] / means[1]
     quantity, method = "transmissions, switching / periodic", _SENT.format(*means)
-    return [*rows, Row(quantity, "abstract", "<", "1", f"{share:.3f}", method, share < 1)]
+    return [*rows, ComparedValue(quantity, "abstract", "<", "1", f"{share:.3f}", method, share < 1)]
 
 
 def _switching() -> ContinuousLoop:

@@ -5,8 +5,8 @@ from scipy.integrate import quad
 
 from cosim.simulation.continuous import ContinuousLoop
 from cosim.studies.paper.published_result import (
+    ComparedValue,
     PublishedResult,
-    Row,
     run_from_each,
     shipped_loop,
     unit_states,
@@ -27,7 +27,7 @@ def bound_s(loop: ContinuousLoop, sigma: float) -> float:
     return float(bound)
 
 
-def _rows() -> list[Row]:
+def _rows() -> list[ComparedValue]:
     rows = []
     for sigma in _SIGMAS:
         trigger = f'trigger={{policy="relative", sigma={sigma}}}'
@@ -37,7 +37,7 @@ def _rows() -> list[Row]:
         least_s = bound_s(loop, sigma)
         agrees = least_s <= shortest_s <= _CLOSE * least_s
         texts = f"{1e3 * least_s:.3f} ms", f"{1e3 * shortest_s:.3f} ms"
-        rows.append(Row(f"shortest interval, σ = {sigma:g}", _WHERE, "≥", *texts, _HOW, agrees))
+        rows.append(ComparedValue(f"shortest interval, σ = {sigma:g}", _WHERE, "≥", *texts, _HOW, agrees))
     return rows
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag, solve_discrete_are, solve_triangular
 from scipy.optimize import linprog, nnls
 
-from cosim.studies.paper.published_result import PublishedResult, Row
+from cosim.studies.paper.published_result import ComparedValue, PublishedResult
 from noack.core.linear_systems import Matrix, Vector, discretise
 
 LOSSES = tuple(share / 10 for share in range(10))
@@ -32,7 +32,7 @@ _SHRINK = 0.99999
 _SOLVED = 1e-9
 
 
-class Plant(NamedTuple):
+class ConstrainedPlant(NamedTuple):
     """x⁺ = Ax + Bu + w within |x| ≤ most_x, |u| ≤ most_u, |w| ≤ most_w, with the costs Q, R."""
 
     A: Matrix
@@ -58,7 +58,7 @@ class Plant(NamedTuple):
         return reached
 
 
-def cart_pole() -> Plant:
+def cart_pole() -> ConstrainedPlant:
     """Return the linear cart-pole of the authors' program, in periods of 20 ms."""
     M, m, inertia, g, length = 1.0, 0.1, 0.001, 9.8, 0.5
     p = inertia * (M + m) + M * m * length**2
@@ -67,7 +67,7 @@ def cart_pole() -> Plant:
     A[1, 2], A[3, 2] = -((m * length) ** 2) * g / p, m * g * length * (M + m) / p
     costs = np.diag([100.0, 10.0, 100.0, 10.0]), np.array([[0.1]])
     limits, disturbances = np.array([5.0, 5.0, 0.3, 2.0]), np.array([1e-4, 2.7e-3, 3e-4, 4.3e-2])
-    return Plant(*discretise(A, B, 20_000_000), *costs, limits, 10.0, disturbances)
+    return ConstrainedPlant(*discretise(A, B, 20_000_000), *costs, limits, 10.0, disturbances)
 
 
 class Optimisation:
@@ -77,7 +77,7 @@ class Optimisation:
     needs; (z_N, s) is in the largest set that the best feedback never leaves.
     """
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(self, plant: ConstrainedPlant) -> None:
         self.plant, n = plant, len(plant.A)
         self.P, self.K = plant.terminal()
         self._limits = np.array(
@@ -103,7 +103,7 @@ class Optimisation:
         self._by_start = np.vstack([self._free[n:-n], end[:, :n] @ self._free[-n:], np.zeros((N, n))])
         self._most = np.concatenate([np.tile(self._limits, N - 1), most_end, np.full(N, most_u)])
 
-    def _terminal_set(self, plant: Plant, most_u: float) -> tuple[Matrix, Vector]:
+    def _terminal_set(self, plant: ConstrainedPlant, most_u: float) -> tuple[Matrix, Vector]:
         """Return rows and limits of the largest set of (z, s) in which the feedback to s stays."""
         n = len(plant.A)
         closed, unit = plant.A - plant.B @ self.K, np.eye(n)[:, :1]
@@ -148,7 +148,7 @@ def _reaches(row: Vector, rows: Matrix, limits: Vector) -> float:
     return float(row @ farthest)
 
 
-class Message(NamedTuple):
+class ControllerMessage(NamedTuple):
     """What the controller sends in one period."""
 
     inputs: Vector
@@ -188,7 +188,7 @@ def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vect
     reach = np.array([plant.tube(optimisation.K, unit) for unit in np.eye(n)])
     arriving = np.random.default_rng(round(100 * lost)).random((STEPS, 2)) >= lost
     arriving[0] = True
-    sent, x, z, assumed = list[Message](), np.zeros(n), np.zeros(n), np.zeros(n)
+    sent, x, z, assumed = list[ControllerMessage](), np.zeros(n), np.zeros(n), np.zeros(n)
     acknowledged = used = unbroken = unsolved = 0
     shares = np.zeros(3)
     for k, ((arrives, answered), w) in enumerate(zip(arriving, disturbances, strict=True)):
@@ -197,7 +197,7 @@ def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vect
             sent.append(sent[-1])
         else:
             inputs, position_m = solution
-            sent.append(Message(inputs, K[0] * position_m, acknowledged))
+            sent.append(ControllerMessage(inputs, K[0] * position_m, acknowledged))
         unbroken = unbroken + 1 if arrives else 0
         if arrives and unbroken >= k - acknowledged:
             used = k
@@ -227,7 +227,7 @@ def make_disturbances(optimisation: Optimisation) -> tuple[Matrix, Matrix]:
     return drawn, np.roll(np.sign(turned)[::-1], -1, axis=0) * plant.most_w
 
 
-def _rows() -> list[Row]:
+def _rows() -> list[ComparedValue]:
     optimisation = Optimisation(cart_pole())
     outcomes = [
         run(optimisation, lost, disturbances, optimisation.K[0])
@@ -241,12 +241,14 @@ def _rows() -> list[Row]:
         ("share of its limit that u reaches", _ABSTRACT, most_input),
     )
     return [
-        Row("optimisations without a solution", _ABSTRACT, "=", "0", f"{unsolved}", _HOW, unsolved == 0),
+        ComparedValue(
+            "optimisations without a solution", _ABSTRACT, "=", "0", f"{unsolved}", _HOW, unsolved == 0
+        ),
         *(
-            Row(quantity, where, "≤", "1", f"{share:.3f}", _HOW, share <= 1 + _SOLVED)
+            ComparedValue(quantity, where, "≤", "1", f"{share:.3f}", _HOW, share <= 1 + _SOLVED)
             for quantity, where, share in largest
         ),
-        Row(
+        ComparedValue(
             "distance of the nominal position from the target after 5 s", _ABSTRACT, "<",
             f"{1000 * _NEAR_M:.0f} mm, then 0", f"{1000 * distance_m:.1f} mm", _HOW,
             distance_m < _NEAR_M,

@@ -13,7 +13,7 @@ An ellipsoid that x never leaves sharpens the constants of the inequalities:
 3. ``invariant_ellipsoids.py``. The search for such an ellipsoid that is small.
 4. ``lost_events.py``. Bounds of e_c after 0, 1, … lost events, and the time until the next event.
 5. ``inserted_bounds.py``. The inequalities, into which any bound that holds is inserted.
-6. ``scheduled_flow.py``. All of these in turns, until the bounds have settled. Tests may be
+6. ``sharpened_constants.py``. All of these in turns, until the bounds have settled. Tests may be
    sampled, updates delayed, and inputs held.
 
 If events are due at finitely many times, x is followed from one delivery to the next by balls:

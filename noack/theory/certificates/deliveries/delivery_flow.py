@@ -37,22 +37,22 @@ ROUNDING = 1 + 1e-5
 class InputEffects(NamedTuple):
     """How much inputs that are held and late change the flow from the moment an update acts."""
 
-    held: float = 0.0
+    age_input: float = 0.0
     """Bound of ‖q‖, p = K e_c + q."""
-    late: float = 0.0
+    first_error: float = 0.0
     """Bound of ‖e_c‖_W when an update acts."""
-    late_s: float = 0.0
+    acts_within_s: float = 0.0
     """The largest time from an event until its update acts."""
 
     @property
     def is_none(self) -> bool:
         """Whether they change nothing."""
-        return self.held == 0 and self.late == 0
+        return self.age_input == 0 and self.first_error == 0
 
     def sizes(self, unit_effects: tuple[Vector, Vector]) -> Vector:
         """Return by how much an output can differ, over each cell, (k,)."""
-        late, pushed = unit_effects
-        return self.late * late + self.held * pushed
+        by_error, by_input = unit_effects
+        return self.first_error * by_error + self.age_input * by_input
 
 
 NO_EFFECTS = InputEffects()
@@ -86,17 +86,17 @@ class DeliveryFlow:
         fastest = max(float(np.abs(np.linalg.eigvals(self.generator)).max()), 1e-9)
         slowest, unstable = -spectral_abscissa(self.H), spectral_abscissa(self.generator)
         step_s, t_s, state = _FIRST_STEP / fastest, 0.0, np.eye(2 * self.n)
-        leap = exponential(self.generator * step_s)
+        propagator = exponential(self.generator * step_s)
         edges, states = [t_s], [state]
         for cell in range(1, _MOST_CELLS):
-            t_s, state = t_s + step_s, leap @ state
+            t_s, state = t_s + step_s, propagator @ state
             edges.append(t_s)
             states.append(state)
-            grown = np.linalg.norm(state[:, : self.n])
-            if grown > _MOST_GROWTH or math.exp(-slowest * t_s) < _SETTLED:
+            size = np.linalg.norm(state[:, : self.n])
+            if size > _MOST_GROWTH or math.exp(-slowest * t_s) < _SETTLED:
                 break
             if cell % _CELLS_PER_STEP == 0 and 2 * step_s * unstable < _MOST_STEP:
-                step_s, leap = 2 * step_s, leap @ leap
+                step_s, propagator = 2 * step_s, propagator @ propagator
         return np.array(edges), np.array(states)
 
     @cached_property
@@ -132,17 +132,17 @@ class DeliveryFlow:
         return max(int(self.edges_s[1:-1].searchsorted(time_s)), 0)
 
     @cached_property
-    def _entered(self) -> tuple[Stack, Stack, Vector]:
+    def _unit_responses(self) -> tuple[Stack, Stack, Vector]:
         """e^{Fτ} (0, I) and e^{Fτ} (BU, −BU) at the nodes, and step²/8 · ‖F‖² e^{‖F‖ step}."""
-        pushed = self._propagators @ np.vstack([self.input_error, -self.input_error])
+        by_input = self._propagators @ np.vstack([self.input_error, -self.input_error])
         turns = np.diff(self.edges_s) * float(np.linalg.norm(self.generator, 2))
-        return self._propagators[:, :, self.n :], pushed, turns**2 / 8 * np.exp(turns)
+        return self._propagators[:, :, self.n :], by_input, turns**2 / 8 * np.exp(turns)
 
     def unit_effects(self, C: Matrix) -> tuple[Vector, Vector]:
         """Bound sup ‖C e^{Fτ} (0, I)‖ over each cell, and ∫₀^τ ‖C e^{Fs} (BU, −BU)‖ ds, (k,)."""
-        late, pushed, bends = self._entered
+        by_error, by_input, bends = self._unit_responses
         size, sizes = float(np.linalg.norm(C, 2)), []
-        for stack in (late, pushed):
+        for stack in (by_error, by_input):
             ends = spectral_norms(C @ stack)
             sags = bends * size * np.linalg.norm(stack[:-1], axis=(1, 2))
             sizes.append((np.maximum(ends[1:], ends[:-1]) + sags) * ROUNDING)
@@ -179,7 +179,7 @@ def bend_rows(flow: DeliveryFlow) -> Matrix:
     return np.asarray((F @ F)[n:] - np.hstack([np.zeros((n, n)), H @ H]))
 
 
-def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
+def error_since_event(flow: DeliveryFlow, time_s: float) -> Matrix:
     """Return C_r: e_s a time after an event is C_r z."""
     rows = np.asarray(exponential(flow.generator * time_s)[flow.n :])
     rows[:, flow.n :] -= exponential(flow.H * time_s)

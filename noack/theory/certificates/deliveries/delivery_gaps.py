@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import Outputs, response_until
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
 
 ROUNDING = 1 + 1e-9
 _MOST_GAPS, _MOST_CELLS = 256, 640
@@ -82,13 +82,13 @@ class GapNorm(NamedTuple):
     """γ_g, with the age of the input."""
     aged: Matrix
     """∫‖ΛΨ‖ over each cell."""
-    late: Vector
+    removal: Vector
     """J of the next event, with the age of the input."""
-    late_aged: Matrix
+    removal_aged: Matrix
     """The part of J of the next event that a w of 1 in each cell causes."""
     pulse: Vector
     """‖Λξ‖ after a gap, J of the next event, and what is left of S, for S = 1."""
-    late_pulse: Vector
+    removal_pulse: Vector
     remaining: Vector
     weighted_sum: Vector
     """‖Λξ‖/θ + S after a gap for S = 1."""
@@ -157,7 +157,7 @@ class GapLoop:
         return np.array(powers)
 
     @cached_property
-    def late(self) -> tuple[Matrix, float]:
+    def removal(self) -> tuple[Matrix, float]:
         """C and b with J ≤ max_i ‖C_i e⁻‖ + b ‖e⁻‖_W, C of shape (nodes, q, n).
 
         C_i = e^{αd} R e^{Hu} at nodes of u from −σ to d + σ.
@@ -173,24 +173,24 @@ class GapLoop:
         nodes = [grown * self.R @ exponential(H * u_s) for u_s in nodes_s.tolist()]
         return np.array(nodes), bend * ROUNDING
 
-    def late_sizes(self, errors: Matrix) -> Vector:
+    def removal_sizes(self, errors: Matrix) -> Vector:
         """Bound J for errors e⁻, (k, n)."""
-        nodes, bend = self.late
+        nodes, bend = self.removal
         sizes = np.linalg.norm(np.einsum("iqn,kn->kiq", nodes, errors), axis=-1).max(axis=-1)
         weighted = np.linalg.norm(errors @ self.plant.error.weight.T, axis=-1)
         return np.asarray((sizes + bend * weighted) * ROUNDING)
 
     @cached_property
-    def late_outputs(self) -> dict[str, Matrix]:
+    def removal_outputs(self) -> dict[str, Matrix]:
         """C of the outputs whose largest one bounds J."""
-        nodes, bend = self.late
+        nodes, bend = self.removal
         rows = [*nodes, bend * self.plant.error.weight]
         return {f"{number}": np.hstack([0 * C, C]) for number, C in enumerate(rows)}
 
     @cached_property
-    def late_areas(self) -> Vector:
+    def removal_areas(self) -> Vector:
         """Bound ∫J over each cell, for J as what z = e^{Fr} (B; −B) U causes."""
-        kernels = self._response.through_each(Outputs(self.late_outputs))
+        kernels = self._response.through_each(Outputs(self.removal_outputs))
         *nodes, weighted = (kernel.area for kernel in kernels.values())
         return np.asarray(np.max(nodes, axis=0) + weighted)
 
@@ -205,7 +205,7 @@ class GapLoop:
         return np.where(self.windows > 0, sums[..., self.windows - 1], 0.0)
 
     @cached_property
-    def driven(self) -> Stack:
+    def input_responses(self) -> Stack:
         """∫‖C e^{F(s−r)} (B; −B) U‖ over r in each cell, for s in each, (outputs, s, r)."""
         distances = np.subtract.outer(np.arange(self.cells), np.arange(self.cells))
         areas = []
@@ -224,26 +224,26 @@ class GapLoop:
         ages = ages * ROUNDING
         # J of the next event: the error that its update removes, from ξ and from w.
         lost = self.flows[self.ends, self.n :] @ inverse
-        nodes, bend = self.late
-        late = _norms(nodes @ lost[:, None]).max(axis=1)
-        late = late + bend * _norms(self.plant.error.weight @ lost)
-        late_aged = self.at_ends(self.late_areas)
-        late = late * ROUNDING + late_aged @ ages
+        nodes, bend = self.removal
+        removal = _norms(nodes @ lost[:, None]).max(axis=1)
+        removal = removal + bend * _norms(self.plant.error.weight @ lost)
+        removal_aged = self.at_ends(self.removal_areas)
+        removal = removal * ROUNDING + removal_aged @ ages
         # ‖Λξ‖ after the gap.
         aged = self.at_ends(self._response.through(np.hstack([shape, 0 * shape])).area)
         stretch = self._stretch(shape, inverse) + aged @ curved
         # The same for S = 1: what the updates in flight add, and what of S remains.
-        pulses, late_pulses = (self.within_windows(areas) / self.shares for areas in (aged, late_aged))
+        pulses, removal_pulses = (self.within_windows(areas) / self.shares for areas in (aged, removal_aged))
         remaining = (self.windows - self.ends[:, None]).clip(min=0) / (self.late_cells or 1) / self.shares
         # The θ that lets ‖Λξ‖ + θS grow least.
-        least = pulses / (1 - late_pulses - remaining).clip(min=1e-9)
+        least = pulses / (1 - removal_pulses - remaining).clip(min=1e-9)
         thetas = (float(least.max()) * ROUNDING or _LEAST) * _THETAS[:, None]
-        weighted_sum = (pulses / thetas[..., None] + late_pulses + remaining).max(axis=-1)
-        gains = np.maximum(stretch + thetas * late, weighted_sum).max(axis=1)
+        weighted_sum = (pulses / thetas[..., None] + removal_pulses + remaining).max(axis=-1)
+        gains = np.maximum(stretch + thetas * removal, weighted_sum).max(axis=1)
         best = int(gains.argmin())
         return GapNorm(
-            shape, bends, ages, stretch, aged, late, late_aged,
-            pulses.max(axis=1), late_pulses.max(axis=1), remaining.max(axis=1), weighted_sum[best],
+            shape, bends, ages, stretch, aged, removal, removal_aged,
+            pulses.max(axis=1), removal_pulses.max(axis=1), remaining.max(axis=1), weighted_sum[best],
             float(thetas[best, 0]), float(gains[best]),
         )  # fmt: skip
 

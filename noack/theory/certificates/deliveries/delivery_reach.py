@@ -74,7 +74,7 @@ _CONDITION = 1e-10
 
 
 @dataclass(frozen=True)
-class Starts:
+class DeliveryEllipsoid:
     """The states ξ at a delivery with ‖Λ W ξ‖ ≤ 1."""
 
     flow: DeliveryFlow
@@ -124,25 +124,25 @@ class Starts:
         """
         flow = self.flow
         S = self.shape @ flow.closed_loop @ self.inverse
-        pushed = self.shape @ flow.input_error
-        squares, largest = pushed @ pushed.T / 2, 0.0
-        size = float(np.linalg.norm(pushed, 2))
+        by_input = self.shape @ flow.input_error
+        squares, largest = by_input @ by_input.T / 2, 0.0
+        size = float(np.linalg.norm(by_input, 2))
         for gamma in size * np.exp(np.linspace(-4.0, 0.0, 17)) if size else ():
             low, high = 0.0, -2 * float(logarithmic_norm(S)) / gamma
             for _ in range(_HALVINGS if high > 0 else 0):
                 middle = (low + high) / 2
-                grown = float(logarithmic_norm(S + middle / gamma * squares)) + middle * gamma / 2
-                low, high = (middle, high) if grown < 0 else (low, middle)
+                growth = float(logarithmic_norm(S + middle / gamma * squares)) + middle * gamma / 2
+                low, high = (middle, high) if growth < 0 else (low, middle)
             largest = max(largest, low)
         bounds = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
-        return largest, bounds.loose(np.ones(1), np.array([_ALONE]))[:, 0], bounds
+        return largest, bounds.frobenius_bounds(np.ones(1), np.array([_ALONE]))[:, 0], bounds
 
 
 @dataclass(frozen=True)
 class Reach:
     """What z can be at some time after a delivery: ‖ΛWξ‖ ≤ c at the delivery, ‖e_c‖_W ≤ D since."""
 
-    starts: Starts
+    ellipsoid: DeliveryEllipsoid
     size: float
     """c."""
     limit: float
@@ -155,64 +155,64 @@ class Reach:
 
     def sup(self, C: Matrix) -> float:
         """Bound ‖C z‖ at all times, for C of shape (q, 2n)."""
-        return max(self._sup(_CellBounds(self.starts, C), 0), self._from_start(C))
+        return max(self._sup(_CellBounds(self.ellipsoid, C), 0), self._from_start(C))
 
     def sup_state(self, C: Matrix) -> float:
         """Bound ‖C W x‖ at all times, for C of shape (q, n)."""
-        size = self.size * float(spectral_norm(C @ self.starts.inverse)) * ROUNDING
+        size = self.size * float(spectral_norm(C @ self.ellipsoid.inverse)) * ROUNDING
         return max(size, self._from_start(np.hstack([C, np.zeros_like(C)])))
 
     def _from_start(self, C: Matrix) -> float:
-        return self.starts.flow.from_start(C, self.limit) if self.first_cell else 0.0
+        return self.ellipsoid.flow.from_start(C, self.limit) if self.first_cell else 0.0
 
-    def largest(self, since_s: float = 0.0) -> float:
+    def largest_state(self, since_s: float = 0.0) -> float:
         """Bound ‖ΛWx‖ from a time after the start on."""
         if not self.first_cell:
             return self.size
-        flow, C = self.starts.flow, self.starts.state_bounds.C
+        flow, C = self.ellipsoid.flow, self.ellipsoid.state_bounds.C
         return max(self.size, flow.from_start(C, self.limit, flow.cell_at(since_s)))
 
     def is_invariant(self) -> bool:
         """Return whether ‖Λx‖ ≤ c at a delivery implies the same at all times until the next.
 
-        It cannot be left while ‖K e_c + q‖ is below :attr:`Starts.drive_limit`.
+        It cannot be left while ‖K e_c + q‖ is below :attr:`DeliveryEllipsoid.drive_limit`.
         """
-        largest, driven, bounds = self.starts.drive_limit
-        driven = driven + (self._changes(bounds) + self.effects.held) / self.size
-        first_cell = int(np.argmax(np.append(driven, np.inf) * ROUNDING >= largest))
-        return self._sup(self.starts.state_bounds, first_cell) <= self.size
+        largest, input_errors, bounds = self.ellipsoid.drive_limit
+        input_errors = input_errors + (self._changes(bounds) + self.effects.age_input) / self.size
+        first_cell = int(np.argmax(np.append(input_errors, np.inf) * ROUNDING >= largest))
+        return self._sup(self.ellipsoid.state_bounds, first_cell) <= self.size
 
     def _changes(self, bounds: "_CellBounds") -> Vector:
         """Bound what delay and hold change of C z over the cells, (k,)."""
         return self.effects.sizes(bounds.unit_effects)
 
     @cached_property
-    def _errors(self) -> Vector:
+    def _error_changes(self) -> Vector:
         """The same of e_c."""
-        return self.effects.sizes(self.starts.flow.error_effects)
+        return self.effects.sizes(self.ellipsoid.flow.error_effects)
 
     @cached_property
-    def _levels(self) -> Vector:
+    def _state_levels(self) -> Vector:
         """Bounds of ‖ΛWx‖ over the cells, for c = 1."""
-        return 1 + self._changes(self.starts.state_bounds) / self.size
+        return 1 + self._changes(self.ellipsoid.state_bounds) / self.size
 
     @cached_property
-    def _cells(self) -> int:
+    def _followed_cells(self) -> int:
         """The cells that are followed."""
-        return int(np.argmax(np.append(self._errors, np.inf) > self.followed_share * self.limit))
+        return int(np.argmax(np.append(self._error_changes, np.inf) > self.followed_share * self.limit))
 
     def _sup(self, bounds: "_CellBounds", first_cell: int) -> float:
         # All is in proportion to c, for D/c.
-        limits, changes = self.limit + self._errors, self._changes(bounds)
-        cells = slice(first_cell, self._cells)
-        after = self._afterwards(bounds)
-        followed = bounds.sup(limits / self.size, self._levels, changes / self.size, cells, after)
+        limits, changes = self.limit + self._error_changes, self._changes(bounds)
+        cells = slice(first_cell, self._followed_cells)
+        after = self._sup_after_last_node(bounds)
+        followed = bounds.sup(limits / self.size, self._state_levels, changes / self.size, cells, after)
         return float(self.size * max(followed, after))
 
-    def _afterwards(self, bounds: "_CellBounds") -> float:
+    def _sup_after_last_node(self, bounds: "_CellBounds") -> float:
         """Bound ‖C z‖ after the last node that is followed, for c = 1."""
-        changes = self.effects.held * bounds.unit_effects[1]
-        cells, moved, forms, roots = self._windows
+        changes = self.effects.age_input * bounds.unit_effects[1]
+        cells, moved, forms, roots = self._last_windows
         Y = bounds.C @ moved
         images = Y[:, None] @ roots
         sizes = spectral_norms(images.reshape(-1, *images.shape[2:])).reshape(images.shape[:2])
@@ -223,29 +223,29 @@ class Reach:
         return float(by_window.min())
 
     @cached_property
-    def _windows(self) -> tuple[NDArray[np.int64], Stack, Stack, Stack]:
+    def _last_windows(self) -> tuple[NDArray[np.int64], Stack, Stack, Stack]:
         """What holds of z a time T' ago, after the last node that is followed, for each T'.
 
         T' as a cell, the flow in it, forms that are at most 1, all for c = 1 and in (x_c, e_c):
         ‖x_c‖ ≤ h, and ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1 at several times; semi-axes for some of their sums.
         """
-        flow, n, shape, windows = self.starts.flow, self.starts.flow.n, self.starts.shape, []
-        last_s, limit, identity = float(flow.edges_s[self._cells]), self.limit / self.size, np.eye(n)
+        flow, n, shape, windows = self.ellipsoid.flow, self.ellipsoid.flow.n, self.ellipsoid.shape, []
+        last_s, limit, identity = float(flow.edges_s[self._followed_cells]), self.limit / self.size, np.eye(n)
         # By how much held inputs change ‖e_c‖, and the bound of ‖Λx‖, over each cell.
-        held = self.effects.held / self.size
-        errors = held * flow.error_effects[1]
-        levels = held * self.starts.state_bounds.unit_effects[1]
+        age_input = self.effects.age_input / self.size
+        errors = age_input * flow.error_effects[1]
+        levels = age_input * self.ellipsoid.state_bounds.unit_effects[1]
         for share in _WINDOWS:
             # h bounds x_c = x + e_c, which follows the model, at the node T' ago.
             node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
             since_s = last_s - float(flow.edges_s[node])
             x_c = flow.states[node, :n] + flow.states[node, n:]
-            h = float(np.linalg.norm(x_c @ self.starts.inverse, 2))
-            h = h + float(np.linalg.norm(x_c, 2)) * self.effects.late / self.size
+            h = float(np.linalg.norm(x_c @ self.ellipsoid.inverse, 2))
+            h = h + float(np.linalg.norm(x_c, 2)) * self.effects.first_error / self.size
             if self.first_cell:
                 h = max(h, float(np.linalg.norm(x_c @ flow.start)) / self.size)
             # The conditions at times from T' ago until now, as rows for (x_c, e_c) T' ago.
-            level = 1.0 if node >= self.first_cell else self.largest() / self.size
+            level = 1.0 if node >= self.first_cell else self.largest_state() / self.size
             rows = [np.hstack([identity, np.zeros((n, n))]) / (flow.stretch * h)]
             moved = np.block([[identity, -identity], [np.zeros((n, n)), identity]])
             step = exponential(flow.generator * (since_s / _EARLIER))
@@ -271,11 +271,16 @@ class Reach:
 class _CellBounds:
     """Bounds of ‖C z‖ over each cell, for ‖Λξ‖ ≤ 1."""
 
-    def __init__(self, starts: Starts, C: Matrix) -> None:
-        self.C, self._singular, self._flow, self._starts = C, starts.axes[0], starts.flow, starts
+    def __init__(self, ellipsoid: DeliveryEllipsoid, C: Matrix) -> None:
+        self.C, self._singular, self._flow, self._shape = (
+            C,
+            ellipsoid.axes[0],
+            ellipsoid.flow,
+            ellipsoid.shape,
+        )
         self.cells, n = self._singular.shape
         cells = self.cells
-        ends, terms, remainder = starts.cell_terms
+        ends, terms, remainder = ellipsoid.cell_terms
         self._ends = (C @ ends).reshape(len(C), 2, cells, n)
         bends = (C @ terms).reshape(len(C), -1, cells, n)
         self._squares = np.concatenate(
@@ -287,7 +292,7 @@ class _CellBounds:
             axis=2,
         )
         """(k, n, 7): of both ends, and of the terms that bound ‖C F² e^{Fτ}‖, for each axis."""
-        self._sags_s2 = np.diff(starts.flow.edges_s) ** 2 / 8
+        self._sags_s2 = np.diff(ellipsoid.flow.edges_s) ** 2 / 8
 
     @cached_property
     def unit_effects(self) -> tuple[Vector, Vector]:
@@ -301,10 +306,10 @@ class _CellBounds:
 
         A bound below ``enough`` is not improved.
         """
-        loose = self.loose(limits, _LOGITS)
-        if not np.isfinite(loose).all():
+        bounds = self.frobenius_bounds(limits, _LOGITS)
+        if not np.isfinite(bounds).all():
             return math.inf
-        highest, logits = loose.min(axis=1) + added, _LOGITS[loose.argmin(axis=1)]
+        highest, logits = bounds.min(axis=1) + added, _LOGITS[bounds.argmin(axis=1)]
         highest[: followed_cells.start] = 0.0
         highest[followed_cells.stop :] = 0.0
         rounds, joint = np.zeros(len(highest), dtype=np.int64), 0
@@ -315,25 +320,25 @@ class _CellBounds:
                 return float(highest[cells[-1]]) * ROUNDING
             settled = cells[rounds[cells] == len(_WIDTHS)]
             if len(settled):
-                values = self._joint(limits, levels, settled, logits[settled, None])
+                values = self._joint_bounds(limits, levels, settled, logits[settled, None])
                 highest[settled] = np.minimum(highest[settled], values + added[settled])
                 rounds[settled], joint = rounds[settled] + 1, joint + 1
                 continue
             cells = cells[rounds[cells] < len(_WIDTHS)]
             candidates = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
-            values = self._tight(limits, cells, candidates)
+            values = self._spectral_bounds(limits, cells, candidates)
             index = values.argmin(axis=1)
             logits[cells] = candidates[np.arange(len(cells)), index]
             highest[cells] = np.minimum(highest[cells], values.min(axis=1) + added[cells])
             rounds[cells] += 1
 
-    def loose(self, limits: Vector, logits: Vector) -> Stack:
+    def frobenius_bounds(self, limits: Vector, logits: Vector) -> Stack:
         """Return bounds in the Frobenius norm, for every λ, (k, j)."""
         singular = self._singular / limits[:, None]
         sizes = np.sqrt(_semi_axes(singular, logits) ** 2 @ self._squares)
         return np.asarray(sizes[..., :2].max(axis=2) + self._sags_s2[:, None] * sizes[..., 2:].sum(axis=2))
 
-    def _tight(self, limits: Vector, cells: NDArray[np.int64], logits: Stack) -> Stack:
+    def _spectral_bounds(self, limits: Vector, cells: NDArray[np.int64], logits: Stack) -> Stack:
         """Return bounds in the spectral norm for some cells, each with its own λ, (k, j)."""
         ends = self._ends[:, :, cells]
         d = _semi_axes(self._singular[cells] / limits[cells, None], logits)
@@ -344,12 +349,14 @@ class _CellBounds:
         ends = np.sqrt(sizes.reshape(scaled.shape[:-2])).max(axis=2)
         return np.asarray(ends + self._sags_s2[cells, None] * bends)
 
-    def _joint(self, limits: Vector, levels: Vector, cells: NDArray[np.int64], logits: Stack) -> Vector:
+    def _joint_bounds(
+        self, limits: Vector, levels: Vector, cells: NDArray[np.int64], logits: Stack
+    ) -> Vector:
         """Return bounds by all conditions at several earlier nodes, (k,); the bends are as above."""
         flow, n = self._flow, self._flow.n
         times_s = flow.edges_s[cells, None] * (np.arange(1, _EARLIER + 1) / _EARLIER)
         nodes = np.minimum(flow.edges_s.searchsorted(times_s, side="right") - 1, cells[:, None])
-        states, shape = flow.states[nodes], self._starts.shape
+        states, shape = flow.states[nodes], self._shape
         rows = np.concatenate(
             [
                 np.broadcast_to(shape, (len(cells), 1, n, n)),

@@ -21,10 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
+from noack.theory.bounds.certificate_terms import (
+    Constants,
+    NetworkConditions,
+    NoCertificateError,
+    TriggerBound,
+)
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, Outputs, response_until
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.bounds.trigger_bounds import ErrorGrowth
 from noack.theory.certificates.deliveries.delivery_gaps import ERROR, INPUT, ROUNDING, GapLoop, Gaps, of_cells
 
@@ -64,13 +69,13 @@ class Deliveries:
         at_rest = np.vstack([np.linalg.inv(self._norm.shape), np.zeros((n, n))])
         responses = response_until(loop.F, at_rest, loop.until_s, loop.cells)
         C = loop.outputs
-        self._of_ball = _highest(responses.through_each(Outputs(C)))
+        self._ball_outputs = _highest(responses.through_each(Outputs(C)))
         """‖C e^{Fr} (Λ⁻¹; 0)‖ over each cell, (outputs, cells)."""
         curved = {name: output @ loop.F @ loop.F for name, output in C.items()}
         sags = _highest(responses.through_each(Outputs(curved)))
         self._sags = loop.cell_s**2 / 8 * sags
-        self._of_late = (loop.within_windows(loop.driven) / loop.shares).max(axis=-1)
-        self._ages_seen = np.zeros_like(self._of_ball)
+        self._removal_effects = (loop.within_windows(loop.input_responses) / loop.shares).max(axis=-1)
+        self._ages_seen = np.zeros_like(self._ball_outputs)
         self._ages_seen[[*C].index(INPUT)] = 1.0
 
     @property
@@ -83,8 +88,8 @@ class Deliveries:
         plant, conditions, bound = self._loop.plant, self._loop.conditions, self._bound
         size = dict(zip(self._loop.outputs, self._sizes().tolist(), strict=True))
         start_error = float(plant.start_up(conditions.start_s)[0])
-        pushed, moved, _ = ErrorGrowth(plant, bound.due_s, TriggerBound(0.0, None)).driven
-        sensor = pushed * max(size[INPUT], start_error) + moved * size[Output.MISMATCH]
+        by_input, by_mismatch, _ = ErrorGrowth(plant, bound.due_s, TriggerBound(0.0, None)).driven
+        sensor = by_input * max(size[INPUT], start_error) + by_mismatch * size[Output.MISMATCH]
         apart_s = max(bound.apart_s, conditions.spacing_s)
         return Constants(
             rate_per_s=plant.alpha_per_s,
@@ -106,7 +111,7 @@ class Deliveries:
         counts, slots = self._loop.gaps.counts, int(self._loop.gaps.counts[-1]) + 1
         # Before, what the start causes is not among the balls yet.
         settled = max(slots, math.ceil(self._loop.conditions.start_s / self._loop.gaps.step_s))
-        highest, start_balls = self._start()
+        highest, start_balls = self._start_bounds_and_balls()
         # What follows from the balls of the last times, by their time modulo the longest gap + 1.
         following = [np.zeros((slots, *array.shape)) for array in start_balls]
         has_balls, gaps = np.zeros(slots, dtype=bool), np.arange(len(counts))
@@ -152,14 +157,14 @@ class Deliveries:
     def _after_gaps(self, balls: Sequence["_Ball"]) -> "_Balls":
         """Return what follows from balls after each gap, (k, gaps)."""
         loop, norm, n = self._loop, self._norm, self._loop.n
-        points, ages = np.array([ball.c for ball in balls]), self._driving(balls)
+        points, ages = np.array([ball.c for ball in balls]), self._inputs(balls)
         moved = np.einsum("gan,kn->kga", loop.flows[loop.ends], points)
-        late = loop.late_sizes(moved[..., n:].reshape(-1, n)).reshape(moved.shape[:2])
-        late, aged = (late + ages @ norm.late_aged.T)[..., None], (ages @ norm.aged.T)[..., None]
+        late = loop.removal_sizes(moved[..., n:].reshape(-1, n)).reshape(moved.shape[:2])
+        late, aged = (late + ages @ norm.removal_aged.T)[..., None], (ages @ norm.aged.T)[..., None]
         corners = np.array([ball.corners for ball in balls])  # (k, 2, corners)
         rho, J = corners[:, None, 0], corners[:, None, 1]
         stretch, late_of_rho, carried = (
-            factor[:, None] for factor in (norm.stretch, norm.late, norm.late_pulse + norm.remaining)
+            factor[:, None] for factor in (norm.stretch, norm.removal, norm.removal_pulse + norm.remaining)
         )
         late_sum = late_of_rho * rho + norm.weighted_sum[:, None] * J + late
         weighted_sum = stretch * rho + aged + norm.theta * late_sum
@@ -170,24 +175,24 @@ class Deliveries:
         """Bound all outputs from now on, given the balls within a longest gap."""
         norm, loop = self._norm, self._loop
         size = max(float(np.linalg.norm(norm.shape @ ball.c)) + ball.weighted_sum for ball in balls)
-        remaining = 1 - float((norm.late_pulse + norm.remaining).max())
-        J = float(norm.late.max()) * size / remaining if remaining > 0 else math.inf
+        remaining = 1 - float((norm.removal_pulse + norm.remaining).max())
+        J = float(norm.removal.max()) * size / remaining if remaining > 0 else math.inf
         J = min(max(J, *(ball.J for ball in balls)), size / norm.theta)
-        of_ball = self._of_ball + self._ages_seen * norm.ages + loop.driven @ norm.ages
-        return np.asarray((of_ball * size + self._of_late * J).max(axis=1))
+        of_ball = self._ball_outputs + self._ages_seen * norm.ages + loop.input_responses @ norm.ages
+        return np.asarray((of_ball * size + self._removal_effects * J).max(axis=1))
 
-    def _ages_of(self, points: Matrix) -> Matrix:
+    def _age_inputs(self, points: Matrix) -> Matrix:
         """Bound ‖w‖ over each cell, as far as it comes from the input's age, for ξ (k, n)."""
         nodes = np.einsum("rtqn,kn->krtq", self._loop.aged, points)
         sizes = of_cells(np.linalg.norm(nodes, axis=-1).max(axis=-1))
         weighted = np.linalg.norm(points @ self._norm.shape.T, axis=-1)
         return np.asarray((sizes + self._norm.age_bends * weighted[:, None]) * ROUNDING)
 
-    def _driving(self, balls: Sequence["_Ball"]) -> Matrix:
+    def _inputs(self, balls: Sequence["_Ball"]) -> Matrix:
         """Bound ‖w‖ over each cell for ξ = c of each ball, without J, (k, cells)."""
         loop, times = self._loop, np.array([ball.time for ball in balls])[:, None]
         cells_s = times * loop.gaps.step_s + loop.cell_s * np.arange(loop.cells)
-        ages = self._ages_of(np.array([ball.c for ball in balls]))
+        ages = self._age_inputs(np.array([ball.c for ball in balls]))
         return np.asarray(ages + self._started * (cells_s < loop.conditions.start_s))
 
     def _until_next_delivery(self, balls: "list[_Ball]") -> Vector:
@@ -196,19 +201,19 @@ class Deliveries:
         points = np.array([ball.c for ball in balls])
         corners = np.array([ball.corners for ball in balls])[..., None]
         nodes = np.einsum("ran,kn->kra", loop.flows, points)
-        ages, driving = self._ages_of(points), self._driving(balls)
+        ages, driving = self._age_inputs(points), self._inputs(balls)
         sizes = np.linalg.norm(points @ norm.shape.T, axis=-1)
         highest = []
         for number, C in enumerate(loop.outputs.values()):
-            ages_seen, pushed = self._ages_seen[number], loop.driven[number]
-            of_ball = self._of_ball[number] + ages_seen * norm.ages + pushed @ norm.ages
-            corner = (of_ball * corners[:, 0] + self._of_late[number] * corners[:, 1]).max(axis=1)
+            ages_seen, by_input = self._ages_seen[number], loop.input_responses[number]
+            of_ball = self._ball_outputs[number] + ages_seen * norm.ages + by_input @ norm.ages
+            corner = (of_ball * corners[:, 0] + self._removal_effects[number] * corners[:, 1]).max(axis=1)
             cells = of_cells(np.linalg.norm(nodes @ C.T, axis=-1))
             cells = cells + self._sags[number] * sizes[:, None] + corner
-            highest.append((cells + driving @ pushed.T + ages_seen * ages).max())
+            highest.append((cells + driving @ by_input.T + ages_seen * ages).max())
         return np.array(highest)
 
-    def _start(self) -> tuple[Vector, "_Balls"]:
+    def _start_bounds_and_balls(self) -> tuple[Vector, "_Balls"]:
         """Bound all outputs until the next delivery after t = 0, and return what follows.
 
         Until some time of at most T the input is 0: w = −K e^{Hr} x(0). What it adds to z, as a
@@ -225,40 +230,42 @@ class Deliveries:
             exponential(generator * T) @ x0 for generator in (loop.plant.A + alpha * np.eye(n), loop.scaled_H)
         )
         first_cell = math.ceil(T / loop.cell_s - 1e-9)
-        pushed = np.append(free, models - free) - exponential(loop.F * T)[:, :n] @ x0
+        added_at_T = np.append(free, models - free) - exponential(loop.F * T)[:, :n] @ x0
         step = exponential(loop.F * loop.cell_s)
-        added = [exponential(loop.F * max(first_cell * loop.cell_s - T, 0.0)) @ pushed]
+        added = [exponential(loop.F * max(first_cell * loop.cell_s - T, 0.0)) @ added_at_T]
         for _ in range(loop.cells - first_cell):
             added.append(step @ added[-1])
         # The outputs until the next delivery.
         F, BK = loop.F, loop.BK
         turn = F @ BK - BK @ loop.scaled_H
-        ages = self._ages_of(x0[None])[0]
+        ages = self._age_inputs(x0[None])[0]
         nodes, highest = loop.flows @ x0, []
         with_start = nodes[first_cell:] + np.array(added)
         for number, C in enumerate(loop.outputs.values()):
             cells = of_cells(np.linalg.norm(nodes @ C.T, axis=-1))
             later = np.linalg.norm(with_start @ C.T, axis=-1)
             cells[first_cell:] = np.maximum(cells[first_cell:], of_cells(later))
-            cells[first_cell:] += T**2 / 8 * self._carried(C, turn, loop.cells)
-            cells[first_cell:] += loop.cell_s**2 / 8 * T * self._carried(C @ F @ F, BK, loop.cells)
-            cells[:first_cell] += T * self._carried(C, BK, max(first_cell, 1))
+            cells[first_cell:] += T**2 / 8 * self._start_response(C, turn, loop.cells)
+            cells[first_cell:] += loop.cell_s**2 / 8 * T * self._start_response(C @ F @ F, BK, loop.cells)
+            cells[:first_cell] += T * self._start_response(C, BK, max(first_cell, 1))
             cells += self._sags[number] * np.linalg.norm(norm.shape @ x0)
-            cells += loop.driven[number] @ ages
+            cells += loop.input_responses[number] @ ages
             highest.append((cells + self._ages_seen[number] * ages).max())
         # The balls after each gap, with the middle between both ends of the line as their centres.
         ends = np.array(added)[loop.ends - first_cell]
         moved = nodes[loop.ends]
-        bent = T**2 / 8 * self._carried(np.hstack([norm.shape, 0 * norm.shape]), turn, loop.cells)
+        bent = T**2 / 8 * self._start_response(np.hstack([norm.shape, 0 * norm.shape]), turn, loop.cells)
         half = np.linalg.norm(ends[:, :n] @ norm.shape.T, axis=-1) / 2
-        *late, weighted = (T**2 / 8 * self._carried(C, turn, loop.cells) for C in loop.late_outputs.values())
-        J = np.maximum(loop.late_sizes(moved[:, n:]), loop.late_sizes((moved + ends)[:, n:]))
-        J = J + max(late) + weighted + norm.late_aged @ ages
+        *late, weighted = (
+            T**2 / 8 * self._start_response(C, turn, loop.cells) for C in loop.removal_outputs.values()
+        )
+        J = np.maximum(loop.removal_sizes(moved[:, n:]), loop.removal_sizes((moved + ends)[:, n:]))
+        J = J + max(late) + weighted + norm.removal_aged @ ages
         rho = half * ROUNDING + bent + norm.aged @ ages
         weighted_sum = rho + norm.theta * J
         return np.array(highest), _Balls(moved[:, :n] + ends[:, :n] / 2, rho, J, weighted_sum)
 
-    def _carried(self, C: Matrix, Y: Matrix, cells: int) -> float:
+    def _start_response(self, C: Matrix, Y: Matrix, cells: int) -> float:
         """Bound ‖C e^{Fr} Y e^{Hs} x(0)‖ over cells of r, and s up to T."""
         loop, T = self._loop, self._loop.conditions.start_s
         if T == 0:

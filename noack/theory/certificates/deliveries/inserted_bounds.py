@@ -16,10 +16,10 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.gains import Growth, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 
@@ -67,7 +67,7 @@ class _SumOfErrors:
                 followed = plant.growths(until_s, COARSE_CELLS)
                 means = [followed[C].means(growth.ages_s + later_s)[:2] for C in error.outputs]
                 driven[:, :, index] = np.array(means).T
-        self._entered, self._mismatched = (
+        self._by_input, self._by_mismatch = (
             np.dstack([driven[k], np.minimum(missing * grown[:, k, None], means_s * sups[k])]) for k in (0, 1)
         )
         self._gains = np.dstack([present, np.broadcast_to(missing, (*present.shape, count))])
@@ -83,7 +83,7 @@ class _SumOfErrors:
         Given are bounds of ‖e_s‖_W after a test for each growth, of π and sup‖R_E x‖.
         """
         parts = self._parts(b, mismatch, np.array([input_error]))[..., 0]
-        return parts, self._entered_at_start(self._begin_s) * max(start_error - input_error, 0.0)
+        return parts, self._start_effects(self._begin_s) * max(start_error - input_error, 0.0)
 
     def after_losses(self, b: Vector, inputs: Vector, mismatch: float, late_s: float, late: float) -> Matrix:
         """Bound ‖C e_c‖ after 0, 1, … lost events, which are at least ``late_s`` apart, (o, j).
@@ -92,16 +92,16 @@ class _SumOfErrors:
         """
         parts, lost = self._parts(b, mismatch, inputs), np.arange(len(inputs))
         sums = [parts[:, 0, j] + parts[:, lost[1 : j + 1], lost[:j][::-1]].sum(axis=1) for j in lost.tolist()]
-        return np.array(sums).T + self._entered_at_start(late_s)[:, lost] * max(late - float(inputs[0]), 0.0)
+        return np.array(sums).T + self._start_effects(late_s)[:, lost] * max(late - float(inputs[0]), 0.0)
 
     def _parts(self, b: Vector, mismatch: float, inputs: Vector) -> Stack:
         """Bound each error's part of ‖C e_c‖ for each bound of ‖p‖, (o, i, j)."""
-        known = self._gains * b[:, None] + self._mismatched * mismatch
-        return _smallest(known[..., None] + self._entered[..., None] * inputs, self._growths)
+        known = self._gains * b[:, None] + self._by_mismatch * mismatch
+        return _smallest(known[..., None] + self._by_input[..., None] * inputs, self._growths)
 
-    def _entered_at_start(self, late_s: float) -> Matrix:
+    def _start_effects(self, late_s: float) -> Matrix:
         """Bound what enters within a time at first, into the first i errors together, by a p of 1, (o, i)."""
-        return np.asarray(np.fmin(late_s * self._highest, self._entered.max(axis=1).cumsum(axis=1)))
+        return np.asarray(np.fmin(late_s * self._highest, self._by_input.max(axis=1).cumsum(axis=1)))
 
 
 class _OpenLoopErrors:
@@ -133,8 +133,8 @@ class _OpenLoopErrors:
                 entered = pairs.through_groups(error.stacked)
                 rows = []
                 for C in error.outputs:
-                    by_input, mismatched = entered[C]
-                    growth_sizes = Growth(mismatched, by_input, np.zeros(COARSE_CELLS))
+                    by_input, by_mismatch = entered[C]
+                    growth_sizes = Growth(by_mismatch, by_input, np.zeros(COARSE_CELLS))
                     means = growth_sizes.means(ages_s if until_s else any_age)
                     rows.append((kept_by_output[C].sup_on_grid(), *means[:2], *growth_sizes.totals[:2]))
                 gains_by_growth.append(rows)
@@ -158,17 +158,17 @@ class _OpenLoopErrors:
         """
         late = float(self._late[0] * input_error + self._late[1] * mismatch)
 
-        def followed(gains: Stack, lost: float) -> Vector:
-            kept, remaining, by_input, mismatched, *totals = gains
-            tested = kept * b + remaining * lost + by_input * held + mismatched * mismatch
+        def open_loop_errors(gains: Stack, lost: float) -> Vector:
+            kept, remaining, by_input, by_mismatch, *totals = gains
+            tested = kept * b + remaining * lost + by_input * held + by_mismatch * mismatch
             values = np.maximum(tested, kept * late + totals[0] * held + totals[1] * mismatch)
             return _smallest(values, self._growths)
 
         lost = [0.0]
         for _ in range(self._lost):
-            lost.append(max(float(followed(self._step, lost[-1])[0]), lost[-1]))
-        between = np.array([followed(self._between, error)[0] for error in lost])
-        return between, np.array([followed(self._whole, error) for error in (0.0, lost[-1])]).T
+            lost.append(max(float(open_loop_errors(self._step, lost[-1])[0]), lost[-1]))
+        between = np.array([open_loop_errors(self._between, error)[0] for error in lost])
+        return between, np.array([open_loop_errors(self._whole, error) for error in (0.0, lost[-1])]).T
 
 
 @dataclass
@@ -181,19 +181,19 @@ class KnownBounds:
     """Of sup‖C x‖."""
     errors: dict[Output, float]
     """Of sup‖C e_c‖."""
-    sensor: float = math.inf
+    sensor_error: float = math.inf
     """Of β̃ = sup‖e_s‖_W."""
-    earlier: float = math.inf
+    earlier_input_error: float = math.inf
     """Of the part of ‖u − Kx‖ that does not come from the present e_s."""
-    received: float = math.inf
+    received_input_error: float = math.inf
     """Of ‖u − Kx‖ while no event is missing."""
-    lost: Vector = field(default_factory=lambda: np.array(math.inf))
+    after_losses: Vector = field(default_factory=lambda: np.array(math.inf))
     """Of ‖e_c‖_W after at most 0, 1, … lost events, from when an update acts until the next event."""
-    present: Vector = field(default_factory=lambda: np.array(math.inf))
+    sensor_after_losses: Vector = field(default_factory=lambda: np.array(math.inf))
     """Of ‖e_s‖_W meanwhile, if the update acts before the first lost event."""
-    inputs: Vector = field(default_factory=lambda: np.array(math.inf))
+    inputs_after_losses: Vector = field(default_factory=lambda: np.array(math.inf))
     """Of ‖p‖ likewise."""
-    tested: float = math.inf
+    tested_sensor_error: float = math.inf
     """Of ‖e_s‖_W after a test."""
 
     def reduce_errors(self, sizes: Vector) -> None:
@@ -210,7 +210,7 @@ class KnownBounds:
 class InsertedInequalities(ErrorInequalities):
     """The inequalities of one loop without disturbances, into which bounds are inserted."""
 
-    def known(self, spacing_s: float) -> KnownBounds:
+    def solved_bounds(self, spacing_s: float) -> KnownBounds:
         """Return the bounds of one loop; infinite without a certificate."""
         spacing, events = np.array([spacing_s]), np.array([self._missing_events(spacing_s)])
         solved = [
@@ -229,9 +229,9 @@ class InsertedInequalities(ErrorInequalities):
         growths = [growth for row in self._growths for growth in row]
         b = np.array([growth.after_test(states) for growth in growths])
         is_last = [growth.longest_s == self._conditions.sampling_s for growth in growths]
-        known.tested = min([known.tested, *b[is_last].tolist()])
+        known.tested_sensor_error = min([known.tested_sensor_error, *b[is_last].tolist()])
         self._insert_errors(known, b, spacing_s)
-        if spacing_s >= self.late_s:
+        if spacing_s >= self.acts_within_s:
             self._insert_lost(known, b, spacing_s)
         self._insert_sensor(known, b)
         age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
@@ -242,34 +242,42 @@ class InsertedInequalities(ErrorInequalities):
         """Insert bounds of e_c, given those of e_s after a test: as a sum, and in open loop."""
         age_input, input_error, mismatch = known.signals[[0, 3, 4]].tolist()
         weighted, gain = self._rows
-        for method, sums in self._sums(spacing_s).items():
+        for method, sums in self._error_sums(spacing_s).items():
             parts, at_start = sums.bound(b, input_error, mismatch, self.start_error)
             whole = parts.cumsum(axis=1) + at_start
             if method is BoundMethod.MISSING:
-                known.earlier = min(known.earlier, float(whole[gain, -1] - parts[gain, 0]) + age_input)
-                known.received = min(known.received, float(whole[gain, 0]) + age_input)
-                known.lost = np.minimum(known.lost, whole[weighted, : self._conditions.dropouts + 1])
+                known.earlier_input_error = min(
+                    known.earlier_input_error, float(whole[gain, -1] - parts[gain, 0]) + age_input
+                )
+                known.received_input_error = min(
+                    known.received_input_error, float(whole[gain, 0]) + age_input
+                )
+                known.after_losses = np.minimum(
+                    known.after_losses, whole[weighted, : self._conditions.dropouts + 1]
+                )
             known.reduce_errors(whole[:, -1])
         start_error = max(input_error, self.start_error)
-        between_events, whole = self._followed(spacing_s).bound(b, age_input, start_error, mismatch)
+        between_events, whole = self._open_loop_errors(spacing_s).bound(b, age_input, start_error, mismatch)
         known.reduce_errors(whole[:, -1])
-        known.received = min(known.received, float(whole[gain, 0]) + age_input)
-        known.lost = np.minimum(known.lost, between_events)
+        known.received_input_error = min(known.received_input_error, float(whole[gain, 0]) + age_input)
+        known.after_losses = np.minimum(known.after_losses, between_events)
 
     def _insert_lost(self, known: KnownBounds, b: Vector, spacing_s: float) -> None:
         """Insert bounds of e_c after 0, 1, … lost events, if an update acts before the next event."""
         age_input, input_error, mismatch = known.signals[[0, 3, 4]].tolist()
         weighted, gain = self._rows
-        inputs = np.minimum(known.inputs, self._error.now(Output.GAIN) * known.lost + age_input)
-        inputs[0] = min(inputs[0], known.received)
+        inputs = np.minimum(
+            known.inputs_after_losses, self._error.now(Output.GAIN) * known.after_losses + age_input
+        )
+        inputs[0] = min(inputs[0], known.received_input_error)
         # While one more event is in flight, π bounds the input that drives the present error.
         stages = np.append(inputs, input_error)[: self._missing_events(spacing_s) + 1]
         start_error = max(input_error, self.start_error)
-        sums = self._sums(spacing_s)[BoundMethod.MISSING]
-        summed = sums.after_losses(b, stages, mismatch, self.late_s, start_error)
+        sums = self._error_sums(spacing_s)[BoundMethod.MISSING]
+        summed = sums.after_losses(b, stages, mismatch, self.acts_within_s, start_error)
         known.reduce_errors(summed[:, -1])
-        known.lost = np.minimum(known.lost, summed[weighted, : len(inputs)])
-        known.inputs = np.minimum(inputs, summed[gain, : len(inputs)] + age_input)
+        known.after_losses = np.minimum(known.after_losses, summed[weighted, : len(inputs)])
+        known.inputs_after_losses = np.minimum(inputs, summed[gain, : len(inputs)] + age_input)
 
     @property
     def _rows(self) -> tuple[int, int]:
@@ -280,31 +288,35 @@ class InsertedInequalities(ErrorInequalities):
     def _insert_sensor(self, known: KnownBounds, b: Vector) -> None:
         """Insert bounds of e_s, given those after a test."""
         input_error, mismatch = known.signals[3:5].tolist()
-        inputs = np.minimum(known.inputs + np.zeros_like(known.lost), input_error)
-        received = inputs[0] = min(float(inputs[0]), known.received)
+        inputs = np.minimum(known.inputs_after_losses + np.zeros_like(known.after_losses), input_error)
+        received = inputs[0] = min(float(inputs[0]), known.received_input_error)
         inputs = np.append(input_error, inputs)
-        late = self.entered(self.late_s, max(input_error, self.start_error), mismatch)
+        late = self.entered(self.acts_within_s, max(input_error, self.start_error), mismatch)
         ends, by_bound = iter(b.tolist()), []
         for row in self._growths:
-            sizes = np.max([self._grown(growth, next(ends), inputs, mismatch) for growth in row], axis=0)
+            sizes = np.max(
+                [self._largest_errors(growth, next(ends), inputs, mismatch) for growth in row], axis=0
+            )
             until_s = max(growth.longest_s for growth in row)
             # In this time after an update acts, e_s is what was there and what has entered since.
             after_update = self._error.stretch(until_s) * late + self.entered(until_s, received, mismatch)
             by_bound.append([sizes[0], max(float(sizes[1]), after_update), *sizes[2:]])
         smallest = np.min(by_bound, axis=0)
-        known.sensor = min(known.sensor, float(smallest[0]))
-        known.present = np.minimum(known.present, np.minimum(smallest[1:], known.sensor))
-        known.lost[0] = min(known.lost[0], known.present[0])
+        known.sensor_error = min(known.sensor_error, float(smallest[0]))
+        known.sensor_after_losses = np.minimum(
+            known.sensor_after_losses, np.minimum(smallest[1:], known.sensor_error)
+        )
+        known.after_losses[0] = min(known.after_losses[0], known.sensor_after_losses[0])
 
     def entered(self, until_s: float, input_error: float, mismatch: float) -> float:
         """Bound the e_s that enters within some time."""
         if until_s == 0:
             return 0.0
-        by_input, mismatched, _ = self._plant.growth(until_s, COARSE_CELLS).totals
-        return float(by_input * input_error + mismatched * mismatch)
+        by_input, by_mismatch, _ = self._plant.growth(until_s, COARSE_CELLS).totals
+        return float(by_input * input_error + by_mismatch * mismatch)
 
     @property
-    def late_s(self) -> float:
+    def acts_within_s(self) -> float:
         """An update acts at most so long after its event, the first one after the start."""
         return max(self._conditions.delay_s, self._conditions.start_s)
 
@@ -320,16 +332,16 @@ class InsertedInequalities(ErrorInequalities):
             for (name, free), forced in zip(plant.free.items(), plant.forced.values(), strict=True)
         }
 
-    def _grown(self, growth: ErrorGrowth, b: float, inputs: Vector, mismatch: float) -> Vector:
+    def _largest_errors(self, growth: ErrorGrowth, b: float, inputs: Vector, mismatch: float) -> Vector:
         """Return how large e_s may become under one bound, given those of ‖p‖; the start is in the first."""
-        by_input, mismatched, _ = growth.driven
+        by_input, by_mismatch, _ = growth.driven
         at_start = np.fmin(by_input, self._begin_s * growth.highest)
-        sizes = growth.stretch * b + by_input * inputs + mismatched * mismatch
+        sizes = growth.stretch * b + by_input * inputs + by_mismatch * mismatch
         sizes[0] += at_start * max(self.start_error - float(inputs[0]), 0.0)
         return np.asarray(sizes)
 
     @cached_method
-    def _sums(self, spacing_s: float) -> Mapping[BoundMethod, _SumOfErrors]:
+    def _error_sums(self, spacing_s: float) -> Mapping[BoundMethod, _SumOfErrors]:
         conditions = self._conditions
         numbers = {
             BoundMethod.DRIFTING: (conditions.dropouts, conditions.delay_s),
@@ -341,7 +353,7 @@ class InsertedInequalities(ErrorInequalities):
         }
 
     @cached_method
-    def _followed(self, spacing_s: float) -> _OpenLoopErrors:
+    def _open_loop_errors(self, spacing_s: float) -> _OpenLoopErrors:
         return _OpenLoopErrors(self._plant, self._growths, self._conditions, spacing_s)
 
     def _missing_events(self, spacing_s: float) -> int:
@@ -353,7 +365,7 @@ class InsertedInequalities(ErrorInequalities):
     @property
     def start_error(self) -> float:
         """sup‖u − Kx‖ of one loop before the first input."""
-        return float(self._beyond)
+        return float(self._first_input_error)
 
     def next_event_s(self, known: KnownBounds) -> float:
         """Return the time between two events that follows from bounds; 0 if there is none."""
@@ -361,7 +373,7 @@ class InsertedInequalities(ErrorInequalities):
             return 0.0
         zero, never = np.zeros(1), np.zeros(1, dtype=bool)
         events = np.zeros(1, dtype=np.int64)
-        mismatch, earlier = known.signals[4:5], zero + known.earlier
+        mismatch, earlier = known.signals[4:5], zero + known.earlier_input_error
         before, after = (zero,) * 6, (zero,) * 3
         constants = LoopConstants(events, *before, mismatch, *after, earlier, ~never)
         return float(self.inter_event_s(constants, never, ~never)[0])

@@ -25,7 +25,7 @@ from noack.theory.certificates.deliveries.delivery_flow import (
     DeliveryFlow,
     InputEffects,
 )
-from noack.theory.certificates.deliveries.delivery_reach import Reach, Starts
+from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoid, Reach
 
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 _WIDE_MARGINS = (1.0, 1.15, 1.4, 1.8, 2.5, 3.5)
@@ -55,10 +55,10 @@ class InvariantEllipsoids:
     """‖e_s‖_W at an event, at least, if no input is held or late. Up to the first event x is that
     of the start, which need not be in the ellipsoid then."""
 
-    def within(
+    def reach_within(
         self,
         limit: float,
-        effects_of: Callable[[Starts, float], InputEffects] | None = None,
+        effects_of: Callable[[DeliveryEllipsoid, float], InputEffects] | None = None,
         start_s: float = 0.0,
     ) -> Reach | None:
         """Return the flow from an ellipsoid for these bounds; None if none is found.
@@ -68,23 +68,23 @@ class InvariantEllipsoids:
             effects_of: returns how much delay and hold change the flow as long as ‖ΛWx‖ ≤ c.
             start_s: until then the input is 0.
         """
-        starts = self._starts
-        if starts is None or np.linalg.cond(starts.shape) > _ILL_CONDITIONED:
+        ellipsoid = self._best_ellipsoid
+        if ellipsoid is None or np.linalg.cond(ellipsoid.shape) > _ILL_CONDITIONED:
             return None
-        (size,) = self._sizes(starts.inverse[None], limit)
+        (size,) = self._invariant_sizes(ellipsoid.inverse[None], limit)
         if start_s > 0:
             drift = self.plant.A + self.plant.alpha_per_s * np.eye(self.flow.n)
             responses = response_until(drift, self.plant.start, start_s)
-            size = max(size, float(responses.through(starts.shape @ self.flow.weight).sup_on_grid()))
-        if self._first:  # the first delivery
-            Y = np.hstack([starts.shape, np.zeros_like(starts.shape)])
-            size = max(size, self.flow.from_start(Y, limit, self._first))
+            size = max(size, float(responses.through(ellipsoid.shape @ self.flow.weight).sup_on_grid()))
+        if self._first_event_cell:  # the first delivery
+            Y = np.hstack([ellipsoid.shape, np.zeros_like(ellipsoid.shape)])
+            size = max(size, self.flow.from_start(Y, limit, self._first_event_cell))
         if not 0 < size < math.inf:
             return None
         for margin in _MARGINS if effects_of is None else _WIDE_MARGINS:
-            effects = NO_EFFECTS if effects_of is None else effects_of(starts, float(size * margin))
+            effects = NO_EFFECTS if effects_of is None else effects_of(ellipsoid, float(size * margin))
             for share in (1.0,) if effects_of is None else _FOLLOWED:
-                reach = Reach(starts, float(size * margin), limit, effects, share, self._first)
+                reach = Reach(ellipsoid, float(size * margin), limit, effects, share, self._first_event_cell)
                 if reach.is_invariant():
                     return reach
         return None
@@ -95,12 +95,12 @@ class InvariantEllipsoids:
         return DeliveryFlow(self.plant)
 
     @cached_property
-    def _first(self) -> int:
+    def _first_event_cell(self) -> int:
         """The cell of the first event after the start."""
         return self.flow.first_event(self.level) if self.level else 0
 
     @cached_property
-    def _starts(self) -> Starts | None:
+    def _best_ellipsoid(self) -> DeliveryEllipsoid | None:
         """Λ for a small bound of ‖x‖: a pattern search over its three parameters."""
         with np.errstate(all="ignore"):
             candidates = np.array(_STARTS)
@@ -112,7 +112,7 @@ class InvariantEllipsoids:
                 if merits.min() < merit:
                     best, merit = candidates[merits.argmin()], merits.min()
             (factor,) = self._factors(best[None])
-        return Starts(self.flow, np.linalg.inv(factor)) if math.isfinite(merit) else None
+        return DeliveryEllipsoid(self.flow, np.linalg.inv(factor)) if math.isfinite(merit) else None
 
     def _merits(self, parameters: Matrix) -> Vector:
         """Return the bounds of ‖x‖ that some parameters give, (c,)."""
@@ -121,12 +121,12 @@ class InvariantEllipsoids:
         merits = np.full(len(parameters), np.inf)
         if usable.any():
             factors = factors[usable]
-            sizes = self._sizes(factors, self.largest)
-            sizes = sizes + self._pushed(factors, sizes)
+            sizes = self._invariant_sizes(factors, self.largest)
+            sizes = sizes + self._sizes_by_age_input(factors, sizes)
             merits[usable] = sizes * np.linalg.norm(self.flow.inverse @ factors, 2, axis=(1, 2))
         return merits
 
-    def _pushed(self, factors: Stack, sizes: Vector) -> Vector:
+    def _sizes_by_age_input(self, factors: Stack, sizes: Vector) -> Vector:
         """Return about the ‖Λx‖ to which q drives x, (c,)."""
         if not any(self.age_gains.values()):
             return np.zeros(len(sizes))
@@ -148,14 +148,14 @@ class InvariantEllipsoids:
         """
         factors = np.full((len(parameters), self.flow.n, self.flow.n), np.nan)
         for index, (logit, all_x, x0) in enumerate(parameters.clip(-15.0, 15.0)):
-            by_input, by_all, by_start = self._grown(float(logit))
+            by_input, by_all, by_start = self._lyapunov_solutions(float(logit))
             X = by_input + math.exp(all_x) * by_all + math.exp(x0) * by_start
             with contextlib.suppress(np.linalg.LinAlgError):
                 factors[index] = np.linalg.cholesky(X)
         return factors
 
     @cached_method
-    def _grown(self, logit: float) -> list[Matrix]:
+    def _lyapunov_solutions(self, logit: float) -> list[Matrix]:
         """Return X for each of the three parts of Q, for ν that follows from ``logit``."""
         flow, n = self.flow, self.flow.n
         share = 0.1 + 0.85 / (1 + math.exp(-logit))
@@ -179,7 +179,7 @@ class InvariantEllipsoids:
         even = np.linspace(1, count, _NODES).astype(int)
         return np.asarray(states[sorted({*late.clip(1, count), *even})])
 
-    def _sizes(self, factors: Stack, limit: float) -> Vector:
+    def _invariant_sizes(self, factors: Stack, limit: float) -> Vector:
         """Return about the smallest c for which ‖Λx‖ ≤ c is invariant and contains x(0), (c,).
 
         At a node it does not exceed c if c² ≥ μ/(1 − λ) for some μ, λ the largest eigenvalue of
@@ -194,7 +194,9 @@ class InvariantEllipsoids:
             )
         )
         first_state = (
-            self.flow.start[:, 0] if not self._first else self.flow.start_response[0][self._first, :n]
+            self.flow.start[:, 0]
+            if not self._first_event_cell
+            else self.flow.start_response[0][self._first_event_cell, :n]
         )
         largest = np.linalg.norm(shapes @ first_state, axis=1) ** 2 * ROUNDING
         candidates, nodes = np.nonzero(np.linalg.eigvalsh(image)[..., -1] >= 1)

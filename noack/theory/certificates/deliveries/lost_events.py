@@ -80,7 +80,7 @@ def errors_after_losses(
     Returns:
         The bounds, and a time between events that is at least ``spacing_s``.
     """
-    flow, errors = reach.starts.flow, without_flow.copy()
+    flow, errors = reach.ellipsoid.flow, without_flow.copy()
     most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
     if spacing_s >= most_s or len(without_flow) == 1:
         return errors, spacing_s
@@ -89,33 +89,33 @@ def errors_after_losses(
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
     tested = np.where(r_s * ROUNDING >= sensor.begin_s, sensor.tested, math.inf)
     first_s = float(flow.edges_s[reach.first_cell]) if reach.first_cell else math.inf
-    since_s, apart_s, size_of_x = -reach.effects.late_s, math.inf, reach.size
+    since_s, apart_s, size_of_x = -reach.effects.acts_within_s, math.inf, reach.size
     for lost, size in enumerate(sensor.sizes.tolist()):
-        earlier = float(errors[lost - 1]) if lost else max(_NOTHING * size, reach.effects.late)
+        earlier = float(errors[lost - 1]) if lost else max(_NOTHING * size, reach.effects.first_error)
         window_s = min(max(since_s, 0.0), most_s)
-        stage = _Stage(reach, window_s, earlier, size_of_x, outputs, r_s, flows)
+        event = _LostEvent(reach, window_s, earlier, size_of_x, outputs, r_s, flows)
         # e_c until the next delivery, if at most so many events are lost.
         if lost:
             added = size + kernel.sups(r_s) * earlier
-            largest = stage.largest_error(np.minimum(tested, size), added)
+            largest = event.largest_error(np.minimum(tested, size), added)
             errors[lost] = min(without_flow[lost], max(largest, float(added[-1]), earlier))
             if lost > 1 and errors[lost] > _NEARLY_PLAIN * float(added[0]):
                 return errors, spacing_s  # later stages gain nothing, either
         # The time until the next event. After a delivery e_s is at most ‖e^{(H+αI)r}‖ · late larger
         # than C_r z.
-        late_part = 0.0 if lost else flow.stretch * reach.effects.late
-        later_s = stage.next_event_s(sensor, late_part, bend, min(_LATEST * spacing_s, sensor.forced_s))
+        first_part = 0.0 if lost else flow.stretch * reach.effects.first_error
+        later_s = event.next_event_s(sensor, first_part, bend, min(_LATEST * spacing_s, sensor.forced_s))
         since_s += max(spacing_s, later_s)
         if not lost:  # x(0) itself may be outside the ellipsoid
             since_s, later_s = min(since_s, first_s), min(later_s, first_s)
-            size_of_x = reach.largest(first_s - since_s)
+            size_of_x = reach.largest_state(first_s - since_s)
         apart_s = min(apart_s, max(spacing_s, later_s))
     return errors, apart_s
 
 
 def bend_of_error(reach: Reach, level: float) -> float:
     """Bound the second derivative of e_s while ‖e_s‖_W is below a level."""
-    flow = reach.starts.flow
+    flow = reach.ellipsoid.flow
     return reach.sup(bend_rows(flow)) + float(np.linalg.norm(flow.H @ flow.H, 2)) * level
 
 
@@ -128,7 +128,7 @@ def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float, grid_s: floa
     return grid_s * np.unique(np.rint(r_s / grid_s)) if grid_s else r_s
 
 
-class _Stage:
+class _LostEvent:
     """What follows an event, a time w or more after the delivery, for times r since it.
 
     z is e^{Fw} ζ at the event. What q has changed since some time before is bounded with e^{−Fs} (BU, −BU).
@@ -144,14 +144,14 @@ class _Stage:
         r_s: Vector,
         flows: Stack,
     ) -> None:
-        self._flow, self._r_s, self._earlier = reach.starts.flow, r_s, earlier
-        self._held, self._late_s = reach.effects.held, reach.effects.late_s
-        n, shape, identity = self._flow.n, reach.starts.shape, np.eye(2 * self._flow.n)
+        self._flow, self._r_s, self._error_before = reach.ellipsoid.flow, r_s, earlier
+        self._age_input, self._acts_within_s = reach.effects.age_input, reach.effects.acts_within_s
+        n, shape, identity = self._flow.n, reach.ellipsoid.shape, np.eye(2 * self._flow.n)
         event = exponential(self._flow.generator * window_s)
-        pushed = self._flow.error_effects[1][[self._flow.cell_at(time_s) for time_s in r_s.tolist()]]
-        self._later = self._held * pushed if self._held else np.zeros(len(r_s))
+        by_input = self._flow.error_effects[1][[self._flow.cell_at(time_s) for time_s in r_s.tolist()]]
+        self._input_changes = self._age_input * by_input if self._age_input else np.zeros(len(r_s))
         error_change, state_change = (
-            self._held * self._pushed_back(C, window_s) for C in (identity[n:, n:], shape)
+            self._age_input * self._input_response_before(C, window_s) for C in (identity[n:, n:], shape)
         )
         rows = [
             identity[n:] / (earlier + error_change),
@@ -167,9 +167,9 @@ class _Stage:
         models = flows[:, :n, :n] + flows[:, n:, :n]
         self._e_s = self._z[:, n:] - models @ event[n:]
 
-    def _pushed_back(self, C: Matrix, ago_s: float) -> float:
+    def _input_response_before(self, C: Matrix, ago_s: float) -> float:
         """Bound ∫ ‖C e^{−As} BU‖ ds over some time; (I, 0) e^{−Fs} (BU, −BU) = e^{−As} BU."""
-        if not (self._held and ago_s):
+        if not (self._age_input and ago_s):
             return 0.0
         flow = self._flow
         responses = response_until(flow.BK - flow.closed_loop, flow.input_error, ago_s)
@@ -177,13 +177,13 @@ class _Stage:
 
     def largest_error(self, sizes: Vector, added: Vector) -> float:
         """Bound ‖e_c‖_W up to the last r, given those of e_s, and bounds without the flow."""
-        n, sizes = self._flow.n, (sizes + self._later)[:-1, None, None] ** 2
+        n, sizes = self._flow.n, (sizes + self._input_changes)[:-1, None, None] ** 2
         events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1] / sizes
         forms = np.concatenate([self._forms[:-1], events[:, None]], axis=1)
-        cap = added[:-1] - self._later[1:]
+        cap = added[:-1] - self._input_changes[1:]
         ends, weights = largest_outputs(forms, self._z[1:, n:], float(added[-1]), cap=cap)
-        cells = np.maximum(ends, np.append(self._earlier, ends[:-1])) + self._sags(forms, weights)
-        return float(np.minimum(cells + self._later[1:], added[:-1]).max())
+        cells = np.maximum(ends, np.append(self._error_before, ends[:-1])) + self._sags(forms, weights)
+        return float(np.minimum(cells + self._input_changes[1:], added[:-1]).max())
 
     def _sags(self, forms: Stack, weights: Stack) -> Vector:
         """Bound how much e_c differs from its chord in each cell of r."""
@@ -196,22 +196,22 @@ class _Stage:
             bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", rows, inverse, rows)))
         return np.asarray(steps_s**2 / 8 * bends * ROUNDING)
 
-    def next_event_s(self, sensor: SensorErrors, late_part: float, bend: float, most_s: float) -> float:
-        """Return a time before which there is no event; e_s may be larger than C_r z by ``late_part``."""
+    def next_event_s(self, sensor: SensorErrors, first_part: float, bend: float, most_s: float) -> float:
+        """Return a time before which there is no event; e_s may be larger than C_r z by ``first_part``."""
         is_near, flow, level = self._r_s <= most_s, self._flow, sensor.level
-        level -= late_part * self._late_s if sensor.integrates else late_part
+        level -= first_part * self._acts_within_s if sensor.integrates else first_part
         if level <= 0:
             return 0.0
-        if self._held:  # what is followed differs from e_s
-            pushed = flow.unit_effects(bend_rows(flow))[1][flow.cell_at(most_s)]
-            difference = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._later.max())
-            bend = bend + self._held * float(pushed) + difference
+        if self._age_input:  # what is followed differs from e_s
+            by_input = flow.unit_effects(bend_rows(flow))[1][flow.cell_at(most_s)]
+            difference = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._input_changes.max())
+            bend = bend + self._age_input * float(by_input) + difference
         enough = 0.0 if sensor.integrates else 0.9 * level
         ends, _ = largest_outputs(self._forms[is_near], self._e_s[is_near], enough, improve_all=True)
         steps_s = np.diff(self._r_s[is_near])
-        cells = np.maximum(ends[1:], ends[:-1]) + steps_s**2 / 8 * bend + self._later[1:][is_near[1:]]
+        cells = np.maximum(ends[1:], ends[:-1]) + steps_s**2 / 8 * bend + self._input_changes[1:][is_near[1:]]
         if sensor.integrates:
-            cells = np.cumsum(steps_s * (np.maximum.accumulate(cells) + late_part))
+            cells = np.cumsum(steps_s * (np.maximum.accumulate(cells) + first_part))
         found_s = float(self._r_s[np.append(cells >= level, True).argmax()])
         # Tests may lie beside the nodes if times are not those since an event.
-        return max(found_s - sensor.grid_s, 0.0) if late_part and sensor.integrates else found_s
+        return max(found_s - sensor.grid_s, 0.0) if first_part and sensor.integrates else found_s

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cosim.analysis import value_reduction
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.recording import ViewError
 from cosim.output.viewer.run_recording import write_loop_view
-from cosim.record import run_record
+from cosim.record import decimation, run_record
 from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environment, write_scenario
 from cosim.record.run_record import RunRecord, write_run
 from cosim.simulation.virtual_time import simulate
@@ -66,7 +65,7 @@ def test_each_envelope_holds_all_samples_of_its_bin(tmp_path: Path, monkeypatch:
     write_environment(tmp_path, "live")
     write_run(alone(record), tmp_path)
     steps = record.count(PLANT_STEP)
-    monkeypatch.setattr(value_reduction, "_MOST_STEPS", steps // 2)
+    monkeypatch.setattr(decimation, "_MOST_STEPS", steps // 2)
     monkeypatch.setattr(run_record, "BATCH_ROWS", PART_STEPS)
     monkeypatch.setattr(RunRecord, "slice_columns", COLUMNS)
     finalize(RunEnding(tmp_path, 7, ExitStatus.OK, "horizon"), report=False)

@@ -16,8 +16,8 @@ from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.campaign_grid import row_type
+from cosim.studies.campaign.drawn_runs import LOOPS_ROW, SampledWork, SharedNetworkWork, in_virtual_time
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario, seeds_of
-from cosim.studies.campaign.sampled_draws import LOOPS_ROW, SampledWork, SharedNetworkWork, in_virtual_time
 from noack.core.errors import CallerError, ExitStatus
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss

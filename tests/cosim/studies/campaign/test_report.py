@@ -25,7 +25,7 @@ from cosim.studies.campaign.campaign_figures import (
     pareto_figure,
     undominated,
 )
-from cosim.studies.campaign.campaign_file import Axis, load
+from cosim.studies.campaign.campaign_file import CampaignAxis, load
 from cosim.studies.campaign.campaign_grid import Point, base_of
 from cosim.studies.campaign.campaign_report import without_constants, write_report, written
 from cosim.studies.campaign.campaign_summary import JudgedClaim, judge_claims, summarise
@@ -208,7 +208,7 @@ def test_figures_and_texts_accept_infinite_single_and_many_values() -> None:
 def test_an_axis_has_the_unit_of_its_key_and_is_logarithmic_if_its_values_grow_by_factors(
     key: str, values: tuple[float, ...], label: str, logarithmic: bool
 ) -> None:
-    axis = Axis(name="rate", key=key, values=values)
+    axis = CampaignAxis(name="rate", key=key, values=values)
     series = {"a": [estimate(np.ones(3)) for _ in values]}
     drawn = curve_figure(np.array(values, np.float64), axis.labels, series, axis.heading, "cost")
     assert (drawn.rows[0].panels[0].x.label, drawn.rows[0].panels[0].x.logarithmic) == (label, logarithmic)

@@ -13,7 +13,7 @@ from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Store, run_campaign
-from cosim.studies.campaign.sampled_draws import used_up
+from cosim.studies.campaign.drawn_runs import used_up
 from cosim.studies.capacity import capacity_plan as plans
 from cosim.studies.capacity.capacity_page import CapacityResult
 from cosim.studies.capacity.capacity_plan import kinds_of, policies_of

@@ -18,7 +18,7 @@ from cosim.studies.design.design_page import DesignOutcome
 from cosim.studies.design.event_design import Certified, EventSearch, design_for_network, event_outcome
 from cosim.studies.design.hold_strategies import read_holds
 from cosim.studies.design.loop_growth import PatternGraph
-from cosim.studies.design.network_search import NetworkSearch, Reached, Wish, periodic_outcome
+from cosim.studies.design.network_search import DesignRequest, NetworkSearch, ReachedRung, periodic_outcome
 from noack.impairments.loss_guarantee import LossesInWindow
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -40,8 +40,8 @@ class Found(NamedTuple):
     """A search with its loops and what is shown of them."""
 
     search: NetworkSearch
-    given: Reached
-    best: Reached
+    given: ReachedRung
+    best: ReachedRung
     shown: DesignOutcome
 
 
@@ -54,14 +54,14 @@ class FoundEvents(NamedTuple):
     shown: DesignOutcome
 
 
-def searched(given: Scenario, wish: Wish) -> Found:
-    search = NetworkSearch(given, wish)
+def searched(given: Scenario, request: DesignRequest) -> Found:
+    search = NetworkSearch(given, request)
     loops = search.run()
     return Found(search, *loops, periodic_outcome(search, *loops))
 
 
-def searched_events(given: Scenario, wish: Wish, seed: int) -> FoundEvents:
-    search = EventSearch(given, wish, seed)
+def searched_events(given: Scenario, request: DesignRequest, seed: int) -> FoundEvents:
+    search = EventSearch(given, request, seed)
     loops = search.run()
     return FoundEvents(search, *loops, event_outcome(search, *loops))
 
@@ -77,8 +77,8 @@ def final_size(scenario: Scenario, pattern: Sequence[bool]) -> float:
 @pytest.fixture(scope="module")
 def pole() -> Found:
     """The pole on a cart, by regulators alone."""
-    wish = Wish(period_s=PERIOD_S, effort=0)
-    return searched(shipped("cart_pole", LINEAR), wish)
+    request = DesignRequest(period_s=PERIOD_S, effort=0)
+    return searched(shipped("cart_pole", LINEAR), request)
 
 
 def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
@@ -96,20 +96,24 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
 
 
 @pytest.mark.parametrize(
-    ("name", "settings", "wish"),
+    ("name", "settings", "request"),
     [
-        ("lane_periodic", (), Wish(effort=0, most=8)),
-        ("lane_periodic", (), Wish(effort=0, window=8)),
-        ("unstable_pendulum", (), Wish(effort=80, period_s=PERIOD_S, holds=read_holds("model"))),
-        ("unstable_pendulum", ("mode=zoh",), Wish(effort=30, period_s=PERIOD_S, holds=read_holds("zoh"))),
-        ("unstable_pendulum", ZERO, Wish(effort=60, period_s=PERIOD_S, holds=read_holds("zero"))),
-        ("double_integrator", ("network.mansd=2",), Wish("transmissions", period_s=1, effort=30)),
+        ("lane_periodic", (), DesignRequest(effort=0, most=8)),
+        ("lane_periodic", (), DesignRequest(effort=0, window=8)),
+        ("unstable_pendulum", (), DesignRequest(effort=80, period_s=PERIOD_S, holds=read_holds("model"))),
+        (
+            "unstable_pendulum",
+            ("mode=zoh",),
+            DesignRequest(effort=30, period_s=PERIOD_S, holds=read_holds("zoh")),
+        ),
+        ("unstable_pendulum", ZERO, DesignRequest(effort=60, period_s=PERIOD_S, holds=read_holds("zero"))),
+        ("double_integrator", ("network.mansd=2",), DesignRequest("transmissions", period_s=1, effort=30)),
     ],
 )
 def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
-    name: str, settings: tuple[str, ...], wish: Wish
+    name: str, settings: tuple[str, ...], request: DesignRequest
 ) -> None:
-    found = searched(shipped(name, *settings), wish)
+    found = searched(shipped(name, *settings), request)
     given, best = found.given, found.best
     assert best.rung >= given.rung
     assert best.cost <= found.search.limit or best == given
@@ -118,23 +122,23 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
         assert LossMargin(resolve(found.shown.scenario)).coarse_bounds().upper < 1
     if name != "double_integrator":
         assert best.rung > given.rung
-    if wish.window:
+    if request.window:
         assert isinstance(found.shown.scenario.network.guarantee.rules[-1], LossesInWindow)
 
 
 def test_each_hold_strategy_has_the_most_that_its_best_loop_reached() -> None:
-    found = searched(shipped("lane_periodic"), Wish(effort=0, most=8, holds=read_holds("zoh,model")))
+    found = searched(shipped("lane_periodic"), DesignRequest(effort=0, most=8, holds=read_holds("zoh,model")))
     (hold, of_hold), (model, of_model) = found.shown.by_hold
     assert (hold, model, of_model) == ("hold", "the model's input", "M = 8")
-    alone = searched(shipped("lane_periodic"), Wish(effort=0, most=8, holds=read_holds("zoh")))
+    alone = searched(shipped("lane_periodic"), DesignRequest(effort=0, most=8, holds=read_holds("zoh")))
     assert of_hold == f"M = {alone.best.rung + 1}"
     assert alone.best.rung < found.best.rung
     assert found.shown.to_json()["highest_by_hold"] == {hold: of_hold, model: of_model}
 
 
 def test_the_search_is_deterministic() -> None:
-    wish = Wish(period_s=PERIOD_S, effort=20)
-    first, second = (design_for_network(shipped("cart_pole", LINEAR), wish).to_json() for _ in range(2))
+    request = DesignRequest(period_s=PERIOD_S, effort=20)
+    first, second = (design_for_network(shipped("cart_pole", LINEAR), request).to_json() for _ in range(2))
     assert first == second
 
 
@@ -147,7 +151,7 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
     ]
     for more in ((), settings, (*settings, "mode=zoh"), *timeouts):
         given = shipped("double_integrator", *more)
-        search = NetworkSearch(given, Wish(period_s=0.31, most=5))
+        search = NetworkSearch(given, DesignRequest(period_s=0.31, most=5))
         exact = LossMargin(resolve(search.scenario))
         bursts = exact.bursts(search.ladder[4].guarantee)
         quick = search.quick_loop(search.original, exact.longest_ns).maps(bursts)
@@ -194,7 +198,7 @@ def test_each_hold_strategy_is_written_decided_and_run_as_claimed(
 ) -> None:
     """Repeated patterns of the M that is proven vanish in a run, one of the next M grows."""
     scenario = shipped("unstable_pendulum", "mode=zoh", "controller.safe_input=[0.1]")
-    found = searched(scenario, Wish(period_s=PERIOD_S, effort=0, holds=read_holds(word), cost=50))
+    found = searched(scenario, DesignRequest(period_s=PERIOD_S, effort=0, holds=read_holds(word), cost=50))
     best, written = found.best, validate(tomllib.loads(found.shown.written()), "written")
     assert best.candidate.hold in read_holds(word)
     assert (written.mode, written.controller.update_timeout_s) == (mode, timeout_s)
@@ -208,19 +212,19 @@ def test_each_hold_strategy_is_written_decided_and_run_as_claimed(
 
 def test_the_holds_that_are_named_decide_also_about_the_given_timeout() -> None:
     given = ("controller.update_timeout_s=0.752", "mode=model")
-    wish = Wish(period_s=PERIOD_S, effort=0, holds=read_holds("zero"), cost=50)
-    found = searched(shipped("unstable_pendulum", *given), wish)
+    request = DesignRequest(period_s=PERIOD_S, effort=0, holds=read_holds("zero"), cost=50)
+    found = searched(shipped("unstable_pendulum", *given), request)
     assert found.best.candidate.hold in read_holds("zero")
     assert found.best.rung < found.given.rung
     assert any("--holds excludes its strategy" in note for note in found.shown.notes)
     assert found.shown.given.cells["between updates"].endswith(" (not in --holds)")
-    same = searched(shipped("unstable_pendulum", *ZERO), wish)
+    same = searched(shipped("unstable_pendulum", *ZERO), request)
     assert same.search.keeps_given_hold
     assert same.best.rung >= same.given.rung
 
 
 def test_a_period_between_two_measurements_is_said_to_be_longer() -> None:
-    found = searched(shipped("unstable_pendulum"), Wish(period_s=0.2503, effort=0))
+    found = searched(shipped("unstable_pendulum"), DesignRequest(period_s=0.2503, effort=0))
     assert "--period 0.2503: updates are sent at measurements, every 0.252 s" in found.shown.notes
 
 
@@ -235,8 +239,8 @@ def test_a_file_that_is_no_scenario_is_kept(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def events() -> FoundEvents:
     """The pendulum's own trigger and gain, and better ones, with a certified bound of ‖x‖."""
-    wish = Wish(most=40, bounds={"state": 1.6}, effort=50)
-    return searched_events(shipped("unstable_pendulum"), wish, seed=5)
+    request = DesignRequest(most=40, bounds={"state": 1.6}, effort=50)
+    return searched_events(shipped("unstable_pendulum"), request, seed=5)
 
 
 def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
@@ -261,7 +265,7 @@ def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
 
 def test_fewer_transmissions_of_events_for_the_same_network() -> None:
     given = shipped("double_integrator")
-    found = searched_events(given, Wish("transmissions", effort=50), seed=1)
+    found = searched_events(given, DesignRequest("transmissions", effort=50), seed=1)
     assert found.shown.scenario.network == given.network
     assert found.best.measured.transmissions < 0.9 * found.given.measured.transmissions
     assert found.search.certificate(found.best.loop, given.network.mansd + 1) is not None
@@ -273,20 +277,20 @@ def test_fewer_transmissions_of_events_for_the_same_network() -> None:
 def test_no_m_is_examined_beyond_what_a_constraint_allows(losses: int, period_s: float | None) -> None:
     constraint = f'network.constraints=[{{kind="at_most", losses={losses}, window=10}}]'
     scenario = shipped("double_integrator", constraint)
-    shown = design_for_network(scenario, Wish(period_s=period_s, effort=0, most=9))
+    shown = design_for_network(scenario, DesignRequest(period_s=period_s, effort=0, most=9))
     assert shown.given.document["certified"] == shown.best.document["certified"] == losses + 1
 
 
 def test_a_plant_outside_its_box_is_certified_itself() -> None:
     box = "plant.uncertainty_B=[[0.0], [0.1]]"
     outside = 'plant.draw="given"', "plant.A=[[0.0, 1.0], [0.0, 0.0]]", "plant.B=[[0.0], [1.2]]"
-    assert EventSearch(shipped("double_integrator", box), Wish(), 0, draws=20).of_box
-    assert not EventSearch(shipped("double_integrator", box, *outside), Wish(), 0, draws=20).of_box
+    assert EventSearch(shipped("double_integrator", box), DesignRequest(), 0, draws=20).of_box
+    assert not EventSearch(shipped("double_integrator", box, *outside), DesignRequest(), 0, draws=20).of_box
 
 
 def test_a_given_loop_that_diverges_sets_no_limit() -> None:
     unstable = "model.gain=[[5.0, 5.0]]", "model.allow_unstable=true"
-    search = EventSearch(shipped("double_integrator", *unstable), Wish(most=1), 0, draws=20)
+    search = EventSearch(shipped("double_integrator", *unstable), DesignRequest(most=1), 0, draws=20)
     assert search.excess(search.original._replace(K=((-1.0, -1.4),))) < 0
 
 

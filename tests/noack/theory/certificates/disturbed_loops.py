@@ -1,6 +1,7 @@
 """Random loops with bounded disturbances and noise, and with an observer; their worst signals."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import Any
@@ -12,16 +13,17 @@ from noack.core.linear_systems import spectral_abscissa
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
+from noack.theory.bounds.certificate_terms import CertificatePart, Constants, EstimationBound, TriggerBound
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains
-from noack.theory.bounds.terms import Constants, EstimationBound, Part, TriggerBound
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.disturbed import solve_two_parts
+from noack.theory.certificates.persistent_bounds import solve_two_parts
 from noack.theory.certificates.scenario_certificates import own_plant
 from noack.theory.certificates.solution import completed_alone
 from tests.oracles.lossy_loops import (
     DRIFTING,
     RUNS,
     STEPS,
+    EventRule,
     Matrix,
     Reals,
     System,
@@ -65,8 +67,8 @@ class DisturbedLoop:
         models = pushed.error
         estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ self.noise)))
         first, rest = completed_alone(solve_two_parts(
-            Part(decaying.error, decaying, TriggerBound(system.beta, None)),
-            Part(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
+            CertificatePart(decaying.error, decaying, TriggerBound(system.beta, None)),
+            CertificatePart(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
             system.conditions,
         ))  # fmt: skip
         return Sum(self.system, first, rest)
@@ -181,6 +183,9 @@ class ObservedLoop:
     push: float
     noise: float
     floor: float
+    settings: dict[str, Any] | None = None
+    """Of another trigger than the decaying threshold, which has ``floor``."""
+    rule: EventRule | None = None
 
     @property
     def scenario(self) -> Scenario:
@@ -194,6 +199,10 @@ class ObservedLoop:
         else:
             observer["gain"] = self.gain.tolist()
         rate_hz = 1 / system.step_s
+        threshold = {
+            "beta": system.beta, "alpha_per_s": system.alpha, "floor": self.floor,
+            "weight": system.weight.tolist(),
+        }  # fmt: skip
         return validate(
             {
                 "name": "observed", "horizon_s": STEPS * system.step_s,
@@ -211,10 +220,7 @@ class ObservedLoop:
                     ],
                 },
                 "observer": observer,
-                "trigger": {
-                    "beta": system.beta, "alpha_per_s": system.alpha, "floor": self.floor,
-                    "weight": system.weight.tolist(),
-                },
+                "trigger": self.settings or threshold,
                 "network": {
                     "mansd": 5, "loss": {"model": "lossless"},
                     "initial_sync": "known_state" if system.known_start else "first_packet",
@@ -301,7 +307,7 @@ def worst_shares(
     estimate = Filter(loop, np.concatenate([noise, noise], axis=2)[:, :, :p])
     trace: Trace = simulate(
         system, *networks(int(rng.integers(2**32)), system), floor=loop.floor, pushes=pushes,
-        estimate=estimate,
+        estimate=estimate, rule=deepcopy(loop.rule),
     )  # fmt: skip
     t_s = times_s(system)
     shares = {

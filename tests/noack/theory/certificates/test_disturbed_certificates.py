@@ -9,12 +9,18 @@ import pytest
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from noack.theory.bounds.box import BoxGains
+from noack.theory.bounds.certificate_terms import (
+    CertificatePart,
+    Constants,
+    NetworkConditions,
+    NoCertificateError,
+    TriggerBound,
+)
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, NormalForcing, PlantGains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part, TriggerBound
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions
-from noack.theory.certificates.disturbed import solve_two_parts
+from noack.theory.certificates.persistent_bounds import solve_two_parts
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.certificates.solution import completed_alone, solve
 from tests.noack.theory.certificates.disturbed_loops import Sum, random_disturbed_loop, signals
@@ -34,8 +40,8 @@ def box_certificate(system: System, columns: np.ndarray, half: float, floor: flo
     first = plant(system.alpha, system.x0[:, None], None)
     rest = plant(0.0, np.zeros((len(system.A), 1)), forcing)
     return Sum(system, *completed_alone(solve_two_parts(
-        Part(first.error, first, TriggerBound(system.beta, None)),
-        Part(rest.error, rest, TriggerBound(floor, None, unit=1.0)),
+        CertificatePart(first.error, first, TriggerBound(system.beta, None)),
+        CertificatePart(rest.error, rest, TriggerBound(floor, None, unit=1.0)),
         system.conditions,
     )))  # fmt: skip
 

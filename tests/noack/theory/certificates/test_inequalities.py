@@ -6,8 +6,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.gains import PlantGains
-from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.bounds.trigger_bounds import first_passage_s
 from noack.theory.certificates.inequalities import solve_inequalities
 from tests.oracles.lossy_loops import System

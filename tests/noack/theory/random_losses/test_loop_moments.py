@@ -9,7 +9,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import noack
 from cosim.analysis.mean_cost import CostUnder, find_mean_cost
-from cosim.studies.campaign.sampled_draws import SampledWork
+from cosim.studies.campaign.drawn_runs import SampledWork
 from noack.core.linear_systems import Matrix
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.loss_prediction import loss_process

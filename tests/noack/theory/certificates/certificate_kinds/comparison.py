@@ -16,6 +16,7 @@ from tests.noack.theory.certificates.certificate_kinds import Broken, Kind, Tall
 from tests.noack.theory.certificates.certificate_kinds.continuous import CONTINUOUS, SCHEDULED
 from tests.noack.theory.certificates.certificate_kinds.decaying import DECAYING
 from tests.noack.theory.certificates.certificate_kinds.designs import DESIGNS
+from tests.noack.theory.certificates.certificate_kinds.disturbed_policies import DISTURBED_POLICIES
 from tests.noack.theory.certificates.certificate_kinds.margins import MARGINS
 from tests.noack.theory.certificates.certificate_kinds.policies import POLICIES
 from tests.noack.theory.certificates.certificate_kinds.random_losses import MOMENT, RANDOM_LOSSES
@@ -26,7 +27,7 @@ KINDS: Mapping[str, Kind] = {
     kind.name: kind
     for kind in (
         DECAYING, CONTINUOUS, SCHEDULED, DISTURBED, OBSERVED, RANDOM_LOSSES, MOMENT, KNOWN_STATE,
-        *POLICIES, MARGINS, REGIONS, DESIGNS,
+        *POLICIES, *DISTURBED_POLICIES, MARGINS, REGIONS, DESIGNS,
     )
 }  # fmt: skip
 

@@ -14,15 +14,15 @@ from unittest.mock import patch
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.certificate_terms import Constants, NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError
 from noack.theory.bounds.gains import PlantGains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
-from noack.theory.certificates.deliveries import scheduled_flow
+from noack.theory.certificates.deliveries import sharpened_constants
 from noack.theory.certificates.deliveries.delivery_flow import NO_EFFECTS, DeliveryFlow
 from noack.theory.certificates.deliveries.delivery_reach import Reach
 from noack.theory.certificates.deliveries.inserted_bounds import _OpenLoopErrors
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
-from noack.theory.certificates.deliveries.scheduled_flow import _ScheduledFlow
+from noack.theory.certificates.deliveries.sharpened_constants import _SharpenedBounds
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.decaying import (
     bounds_of,
@@ -37,22 +37,22 @@ from tests.oracles.lossy_loops import DRIFTING, System, random_system
 def only_the_start() -> AbstractContextManager[Any]:
     """The ellipsoid need not contain what errors drive x to."""
 
-    def within(
+    def reach_within(
         ellipsoids: InvariantEllipsoids, limit: float, effects_of: Any = None, _: float = 0.0
     ) -> Reach | None:
-        starts = ellipsoids._starts
-        if starts is None:
+        ellipsoid = ellipsoids._best_ellipsoid
+        if ellipsoid is None:
             return None
-        size = float(np.linalg.norm(starts.shape @ ellipsoids.flow.start))
-        effects = NO_EFFECTS if effects_of is None else effects_of(starts, size)
-        return Reach(starts, size, limit, effects)
+        size = float(np.linalg.norm(ellipsoid.shape @ ellipsoids.flow.start))
+        effects = NO_EFFECTS if effects_of is None else effects_of(ellipsoid, size)
+        return Reach(ellipsoid, size, limit, effects)
 
-    return patch.object(InvariantEllipsoids, "within", within)
+    return patch.object(InvariantEllipsoids, "reach_within", reach_within)
 
 
 def no_lost_updates() -> AbstractContextManager[Any]:
     """At an event e_c is 0."""
-    return patch.object(scheduled_flow, "errors_at_events", np.zeros_like)
+    return patch.object(sharpened_constants, "errors_at_events", np.zeros_like)
 
 
 def no_mismatch(*, at_nodes: bool) -> AbstractContextManager[Any]:
@@ -68,7 +68,7 @@ def no_mismatch(*, at_nodes: bool) -> AbstractContextManager[Any]:
 
 def no_age_of_inputs() -> AbstractContextManager[Any]:
     """Inputs that are held and late do not change the flow."""
-    return patch.object(_ScheduledFlow, "_input_effects", lambda *_: NO_EFFECTS)
+    return patch.object(_SharpenedBounds, "_input_effects", lambda *_: NO_EFFECTS)
 
 
 def no_lost_errors() -> AbstractContextManager[Any]:

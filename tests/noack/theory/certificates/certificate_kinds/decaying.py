@@ -14,9 +14,9 @@ from unittest.mock import patch
 
 import numpy as np
 
+from noack.theory.bounds.certificate_terms import Constants, NoCertificateError
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, constant_kernel
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
-from noack.theory.bounds.terms import Constants, NoCertificateError
 from noack.theory.certificates.inequalities import ErrorInequalities
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.oracles.lossy_loops import (

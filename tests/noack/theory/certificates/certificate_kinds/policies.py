@@ -19,7 +19,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.bounds import trigger_bounds as bounds_of_triggers
-from noack.theory.bounds.terms import NetworkConditions, TriggerBound
+from noack.theory.bounds.certificate_terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -236,21 +236,23 @@ POLICY_KINDS: dict[str, Callable[[System, Rng], PolicyCase]] = {
 }  # fmt: skip
 
 
-def policy_case(
-    kind: str, system: System, seed: int, push: float = 0.0
-) -> tuple[Scenario, EventRule, System]:
+def in_whole_ns(system: System) -> System:
+    """The system with steps of a whole number of nanoseconds."""
+    return replace(system, step_s=max(round(system.step_s * 1e9), 1) / 1e9)
+
+
+def policy_case(kind: str, system: System, seed: int) -> tuple[Scenario, EventRule, System]:
     """Return a loop with a policy: its scenario, the same rule, and the loop in whole ns.
 
-    In a third of the cases the loop is in zero-order hold. ``push`` bounds a disturbance of each
-    state.
+    In a third of the cases the loop is in zero-order hold.
     """
     rng = np.random.default_rng(seed)
-    system = replace(system, step_s=max(round(system.step_s * 1e9), 1) / 1e9)
+    system = in_whole_ns(system)
     if rng.uniform() < 1 / 3:
         system = replace(system, H=np.zeros_like(system.H))
     settings, rule = POLICY_KINDS[kind](system, rng)
     rate_hz = 1 / (system.sample_steps * system.step_s)
-    return scenario_with(system, settings, push, rate_hz=rate_hz), rule, system
+    return scenario_with(system, settings, rate_hz=rate_hz), rule, system
 
 
 def scenario_of(system: System, trigger: dict[str, Any], **tables: dict[str, Any]) -> Scenario:
@@ -275,7 +277,10 @@ def scenario_of(system: System, trigger: dict[str, Any], **tables: dict[str, Any
 
 
 def scenario_with(system: System, trigger: dict[str, Any], push: float = 0.0, **plant: Any) -> Scenario:
-    """The same in the system's norm; the rates have no effect where conditions are given."""
+    """The same in the system's norm; the rates have no effect where conditions are given.
+
+    ``push`` bounds a disturbance of each state.
+    """
     trigger.get("rule", trigger)["weight"] = system.weight.tolist()
     if push:
         bound = [push] * len(system.A)

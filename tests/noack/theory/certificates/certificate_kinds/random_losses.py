@@ -14,8 +14,8 @@ import numpy as np
 
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.random_losses.fixed_times import mean_squares
 from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed

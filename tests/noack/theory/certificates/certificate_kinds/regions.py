@@ -15,7 +15,7 @@ from noack.core.linear_systems import Vector
 from noack.plants.systems.jacobian_enclosure import EnclosedMotion, Inclusion
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.region import _Box
 from noack.theory.certificates.solution import Search

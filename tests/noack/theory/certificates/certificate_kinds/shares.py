@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
+from noack.theory.bounds.certificate_terms import NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.terms import NoCertificateError
 from noack.theory.certificates.certified_bounds import KnownStateBounds, KnownStatePart, ScenarioCertificate
 from tests.noack.theory.certificates import disturbed_loops
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed

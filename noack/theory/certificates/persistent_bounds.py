@@ -20,10 +20,16 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import (
+    CertificatePart,
+    Constants,
+    NetworkConditions,
+    NoCertificateError,
+    TriggerBound,
+)
 from noack.theory.bounds.disturbances import EstimationError, bound_forcing
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part, TriggerBound
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.solution import Problem, Search, sharpened
 
@@ -160,29 +166,29 @@ class DisturbedCertificate:
         return decaying, added[0] if added else None
 
     @cached_property
-    def _decaying(self) -> Part:
+    def _decaying(self) -> CertificatePart:
         return self._at_rate(self.trigger.alpha_per_s, TriggerBound(self.trigger.beta, None))
 
-    def _at_rate(self, rate_per_s: float, bound: TriggerBound) -> Part:
+    def _at_rate(self, rate_per_s: float, bound: TriggerBound) -> CertificatePart:
         """What follows from the start, scaled by a rate."""
         plant = self._plant(rate_per_s)
-        return Part(plant.error, plant, bound, self._estimation.decaying(rate_per_s))
+        return CertificatePart(plant.error, plant, bound, self._estimation.decaying(rate_per_s))
 
     @cached_property
-    def _persistent(self) -> Part:
+    def _persistent(self) -> CertificatePart:
         plant = self._plant(0.0)
         at_rest = replace(plant, start=np.zeros_like(plant.start), forcing=self._forcing(plant))
         bound = TriggerBound(self.trigger.floor, None, unit=1.0)
-        return Part(plant.error, at_rest, bound, self._estimation.persistent())
+        return CertificatePart(plant.error, at_rest, bound, self._estimation.persistent())
 
     @cached_property
-    def _together(self) -> Part:
+    def _together(self) -> CertificatePart:
         """Everything without decay; the trigger's bound depends on the conditions."""
         plant = self._plant(0.0)
         pushed = replace(plant, forcing=self._forcing(plant))
         decaying, persistent = self._estimation.decaying(0.0), self._estimation.persistent()
         estimation = persistent._replace(fixed=persistent.fixed + decaying.fixed)
-        return Part(plant.error, pushed, TriggerBound(0.0, None), estimation)
+        return CertificatePart(plant.error, pushed, TriggerBound(0.0, None), estimation)
 
     def _plant(self, alpha_per_s: float) -> PlantGains:
         loop = loop_of(self.resolved)
@@ -209,8 +215,8 @@ class DisturbedCertificate:
 
 
 def solve_two_parts(
-    decaying: Part,
-    persistent: Part,
+    decaying: CertificatePart,
+    persistent: CertificatePart,
     conditions: NetworkConditions,
     earlier_error: float = 0.0,
     *,

@@ -17,10 +17,10 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.scenario.resolution import LoopMatrices
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.bounds.contraction import Stack, product, spectral_norms
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, response
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.certificates.solution import solve
 
 _ROUNDS_PER_SCALE, _ROUNDS, _ROUNDS_PER_ENTRY = 15, 40, 12

@@ -132,7 +132,7 @@ class TriggerBound(NamedTuple):
         return (self, *self.also)
 
 
-class Part(NamedTuple):
+class CertificatePart(NamedTuple):
     """One of several bounds that are added: with its own decay rate and its own inputs."""
 
     error: ErrorGains

@@ -3,9 +3,9 @@
 Tests may be sampled, updates act within d of their events, and inputs may be held. From the moment
 an update acts on, the plant's input is K x_c + q with ‖q‖ ≤ q̂, the part due to the age of the
 input. So z = (x, e_c) follows the system of ``delivery_flow.py``, with two changes: e_c begins with
-what has entered within d, at most ``late``, and q drives z through (BU, −BU). Both are bounded by
-the certificate's constants; what they change is added to every bound. Each bound that becomes
-smaller is inserted into all others.
+what has entered within d, at most ``first_error``, and q drives z through (BU, −BU). Both are
+bounded by the certificate's constants; what they change is added to every bound. Each bound that
+becomes smaller is inserted into all others.
 
 **The next event.** After an event e_s begins at 0. If updates act at once and no input is held, it
 is C_r z(t_k) after r, C_r = (0, I) e^{Fr} − e^{(H+αI)r} (0, I), as long as no update is received.
@@ -21,11 +21,11 @@ from functools import cached_property
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.theory.bounds.certificate_terms import MEASURED, CertificatePart, Constants, NetworkConditions
 from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.gains import Output
-from noack.theory.bounds.terms import MEASURED, Constants, NetworkConditions, Part
-from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, InputEffects, error_after
-from noack.theory.certificates.deliveries.delivery_reach import Reach, Starts
+from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, InputEffects, error_since_event
+from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoid, Reach
 from noack.theory.certificates.deliveries.inserted_bounds import InsertedInequalities
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
 from noack.theory.certificates.deliveries.lost_events import SensorErrors, bend_of_error, errors_after_losses
@@ -36,8 +36,8 @@ _SHORTEST_S, _LEAST_SHARE, _LEAST = 1e-9, 1e-6, 1e-200
 _SHORT, _MOST_STEPS = 0.005, 16
 
 
-def is_scheduled_flow(part: Part) -> bool:
-    """Return whether the constants of a loop without inputs can be sharpened."""
+def can_be_sharpened(part: CertificatePart) -> bool:
+    """Whether it is the part of one known plant, without disturbances and without an observer."""
     error, plant, bound, estimation = part
     is_known = plant.is_one_plant and plant.forcing is None and estimation == MEASURED
     return (
@@ -48,19 +48,21 @@ def is_scheduled_flow(part: Part) -> bool:
     )
 
 
-def scheduled_constants(constants: Constants, part: Part, conditions: NetworkConditions) -> Constants:
+def sharpened_constants(
+    constants: Constants, part: CertificatePart, conditions: NetworkConditions
+) -> Constants:
     """Return the constants with the bounds from the flow between updates."""
     spacing_s = constants.inter_event_s or conditions.spacing_s
     if spacing_s == 0 and conditions.delay_s > 0:
         return constants
-    flow = _ScheduledFlow(part, conditions, spacing_s)
-    known = flow.known
+    bounds = _SharpenedBounds(part, conditions, spacing_s)
+    known = bounds.known
     if not np.isfinite(known.signals).all():
         return constants
-    flow.insert()
+    bounds.insert()
     for _ in range(_ROUNDS):
         earlier = known.errors[Output.WEIGHTED], known.states[Output.WEIGHTED]
-        if not flow.follow():
+        if not bounds.sharpen_by_flow():
             break
         later = known.errors[Output.WEIGHTED], known.states[Output.WEIGHTED]
         if all(new > _SETTLED * old for new, old in zip(later, earlier, strict=True)):
@@ -68,26 +70,26 @@ def scheduled_constants(constants: Constants, part: Part, conditions: NetworkCon
     unit = part.bound.beta if part.bound.unit is None else part.bound.unit
     sharpened = {
         "delta": known.errors[Output.WEIGHTED] / unit,
-        "overshoot": known.sensor / unit,
+        "overshoot": known.sensor_error / unit,
         "input_error": known.input_error,
         "state": known.states[Output.STATE],
         "state_weighted": known.states[Output.WEIGHTED],
         "mismatch": known.states[Output.MISMATCH],
-        "received_input_error": known.received,
+        "received_input_error": known.received_input_error,
     }
     smaller = {name: min(value, getattr(constants, name)) for name, value in sharpened.items()}
-    later_s = constants.inter_event_s and max(flow.spacing_s, constants.inter_event_s)
+    later_s = constants.inter_event_s and max(bounds.spacing_s, constants.inter_event_s)
     return constants._replace(**smaller, inter_event_s=later_s)
 
 
-class _ScheduledFlow:
+class _SharpenedBounds:
     """The bounds of one loop, made smaller in turns; events are ``spacing_s`` apart."""
 
-    def __init__(self, part: Part, conditions: NetworkConditions, spacing_s: float) -> None:
+    def __init__(self, part: CertificatePart, conditions: NetworkConditions, spacing_s: float) -> None:
         self._part, self._conditions, self.spacing_s = part, conditions, spacing_s
-        self._step = InsertedInequalities(part, conditions, 0.0)
-        self.known = self._step.known(spacing_s)
-        self._late_s = self._step.late_s
+        self._inequalities = InsertedInequalities(part, conditions, 0.0)
+        self.known = self._inequalities.solved_bounds(spacing_s)
+        self._acts_within_s = self._inequalities.acts_within_s
 
     @cached_property
     def _ellipsoids(self) -> InvariantEllipsoids:
@@ -96,82 +98,87 @@ class _ScheduledFlow:
         # An event that is due to an integral, or to a deadline, does not need this ‖e_s‖_W.
         needs_level = bound.ago_s == 0 and math.isinf(bound.forced_s)
         level = bound.reached or 0.0 if self._is_ideal and needs_level else 0.0
-        return InvariantEllipsoids(self._part.plant, largest, self._step.age_gains, level)
+        return InvariantEllipsoids(self._part.plant, largest, self._inequalities.age_gains, level)
 
     @property
     def _is_ideal(self) -> bool:
-        return self._late_s == 0 and self._conditions.hold_s == 0
+        return self._acts_within_s == 0 and self._conditions.hold_s == 0
 
     def insert(self) -> None:
         """Insert bounds into the inequalities until they have settled."""
         for _ in range(_MOST_INSERTED):
             previous = self.known.signals
-            self._step.insert(self.known, self.spacing_s)
+            self._inequalities.insert(self.known, self.spacing_s)
             if (self.known.signals >= _NEARLY * previous).all():
                 break
 
-    def follow(self) -> bool:
+    def sharpen_by_flow(self) -> bool:
         """Make bounds smaller by the flow; return whether there is an ellipsoid."""
         known, conditions = self.known, self._conditions
         limit = known.errors[Output.WEIGHTED]
         effects_of = None if self._is_ideal else self._input_effects
-        reach = self._ellipsoids.within(limit, effects_of, conditions.start_s)
+        reach = self._ellipsoids.reach_within(limit, effects_of, conditions.start_s)
         if reach is None:
             return False
-        known.signals[0] = min(known.signals[0], reach.effects.held)
+        known.signals[0] = min(known.signals[0], reach.effects.age_input)
         inverse = self._part.plant.error.inverse_weight
         for name, C in self._part.plant.outputs.items():
             known.states[name] = min(known.states[name], reach.sup_state(C @ inverse))
-        gain = reach.starts.flow.gain
-        size = max(reach.sup(np.hstack([0 * gain, gain])), float(spectral_norm(gain)) * reach.effects.late)
+        gain = reach.ellipsoid.flow.gain
+        at_first = float(spectral_norm(gain)) * reach.effects.first_error
+        size = max(reach.sup(np.hstack([0 * gain, gain])), at_first)
         known.errors[Output.GAIN] = min(known.errors[Output.GAIN], size)
-        if self.spacing_s >= max(self._late_s, _SHORTEST_S):  # before, the last update has acted
-            size = max(self._after_losses(reach), reach.effects.late)
+        if self.spacing_s >= max(self._acts_within_s, _SHORTEST_S):  # before, the last update has acted
+            size = max(self._after_losses(reach), reach.effects.first_error)
             for output, bound in known.errors.items():
                 known.errors[output] = min(bound, size * self._part.plant.error.now(output))
         self.insert()
-        self.spacing_s = max(self.spacing_s, self._step.next_event_s(known))
+        self.spacing_s = max(self.spacing_s, self._inequalities.next_event_s(known))
         self.insert()
         return True
 
-    def _input_effects(self, starts: Starts, size: float) -> InputEffects:
+    def _input_effects(self, ellipsoid: DeliveryEllipsoid, size: float) -> InputEffects:
         """Return what delay and hold change as long as ‖ΛWx‖ ≤ c, ``size``.
 
         x_c, from which the input is computed, is e^{(H+αI)τ} x of the event of the last update.
         """
         known, plant = self.known, self._part.plant
-        gains = self._step.age_gains.items()
-        age_input = sum(gain * starts.model_sups[C] for C, gain in gains) * size
+        gains = self._inequalities.age_gains.items()
+        age_input = sum(gain * ellipsoid.model_sups[C] for C, gain in gains) * size
         age_input = min(float(known.signals[0]), age_input)
-        input_error = max(known.errors[Output.GAIN] + age_input, self._step.start_error)
+        input_error = max(known.errors[Output.GAIN] + age_input, self._inequalities.start_error)
         R_E = plant.outputs[Output.MISMATCH] @ plant.error.inverse_weight
-        mismatch_in_ellipsoid = size * float(spectral_norm(R_E @ starts.inverse)) * ROUNDING
+        mismatch_in_ellipsoid = size * float(spectral_norm(R_E @ ellipsoid.inverse)) * ROUNDING
         mismatch = min(float(known.signals[4]), mismatch_in_ellipsoid)
-        return InputEffects(age_input, self._step.entered(self._late_s, input_error, mismatch), self._late_s)
+        return InputEffects(
+            age_input,
+            self._inequalities.entered(self._acts_within_s, input_error, mismatch),
+            self._acts_within_s,
+        )
 
     def _after_losses(self, reach: Reach) -> float:
         """Bound ‖e_c‖_W after as many losses as there may be, until the next update acts."""
         known, error, conditions = self.known, self._part.plant.error, self._conditions
-        sensor = self._of_sensor
+        sensor = self._sensor_errors
         level = 0.0 if sensor.integrates else sensor.level
         bend = bend_of_error(reach, level or float(sensor.sizes.max())) if sensor.level else 0.0
         if level and reach.effects.is_none:
-            at_event = max(float(errors_at_events(known.lost)[-1]), _LEAST_SHARE * reach.limit)
+            at_event = max(float(errors_at_events(known.after_losses)[-1]), _LEAST_SHARE * reach.limit)
             at_events = replace(reach, limit=at_event)
             later_s = _next_event_s(at_events, level, self.spacing_s, bend)
             later_s = min(later_s, self._part.bound.forced_s)
-            self.spacing_s = max(self.spacing_s, self._tested_s(later_s))
+            self.spacing_s = max(self.spacing_s, self._next_test_s(later_s))
         kernel = error.kernels[Output.WEIGHTED]
-        known.lost, apart_s = errors_after_losses(
-            reach, known.lost, sensor, self._bounded, self.spacing_s, kernel, bend
+        known.after_losses, apart_s = errors_after_losses(
+            reach, known.after_losses, sensor, self._unit_outputs, self.spacing_s, kernel, bend
         )
-        self.spacing_s = self._tested_s(apart_s)
+        self.spacing_s = self._next_test_s(apart_s)
         # An event comes after the first input has been applied.
-        entered = self._step.entered(conditions.delay_s, *known.signals[3:5].tolist())
-        return error.stretch(conditions.delay_s) * float(known.lost[-1]) + entered
+        entered = self._inequalities.entered(conditions.delay_s, *known.signals[3:5].tolist())
+        return error.stretch(conditions.delay_s) * float(known.after_losses[-1]) + entered
 
     @property
-    def _bounded(self) -> list[Matrix]:
+    def _unit_outputs(self) -> list[Matrix]:
         """Matrices Y with ‖Y z‖ ≤ 1 at all times: the bounds of W x, E x and K e_c."""
         plant, known = self._part.plant, self.known
         gain, inverse = plant.error.split_K[1], plant.error.inverse_weight
@@ -181,7 +188,7 @@ class _ScheduledFlow:
         return [*rows, np.hstack([np.zeros_like(gain), gain])]
 
     @property
-    def _of_sensor(self) -> SensorErrors:
+    def _sensor_errors(self) -> SensorErrors:
         """What is known of e_s between two events."""
         known, bound, conditions = self.known, self._part.bound, self._conditions
         level, h_s = bound.reached or 0.0, conditions.sampling_s
@@ -189,12 +196,14 @@ class _ScheduledFlow:
             level *= bound.ago_s
         if bound.ago_s and not bound.is_mean:
             level = 0.0  # an event may need no e_s
-        tested = known.tested if h_s == conditions.spacing_s else math.inf
+        tested = known.tested_sensor_error if h_s == conditions.spacing_s else math.inf
         begin_s = bound.untested_s + h_s if bound.untested_s else 0.0
         test_s, forced_s = conditions.spacing_s, bound.forced_s
-        return SensorErrors(known.present, tested, begin_s, test_s, level, bound.is_mean, forced_s)
+        return SensorErrors(
+            known.sensor_after_losses, tested, begin_s, test_s, level, bound.is_mean, forced_s
+        )
 
-    def _tested_s(self, time_s: float) -> float:
+    def _next_test_s(self, time_s: float) -> float:
         """Round a time up to the tests."""
         grid_s = self._conditions.spacing_s
         return grid_s * math.ceil(time_s / grid_s - 1e-9) if grid_s else time_s
@@ -211,17 +220,17 @@ def _next_event_s(at_events: Reach, level: float, known_s: float, bend: float) -
     It is at least the known one. Over a step s, e_s differs from its chord by at most s²/8 times a
     bound of its second derivative, which holds as long as ‖e_s‖_W is below the level.
     """
-    flow, reached_s = at_events.starts.flow, known_s
+    flow, reached_s = at_events.ellipsoid.flow, known_s
     if not (0 < known_s < math.inf and 0 < bend < math.inf):
         return known_s
-    size, evaluations = at_events.sup(error_after(flow, reached_s)), 0
+    size, evaluations = at_events.sup(error_since_event(flow, reached_s)), 0
     slope = size / reached_s
     while size < level:
         step_s = min(math.sqrt(4 * (level - size) / bend), reached_s)
         if slope * step_s > 0.99 * (level - size):
             step_s = 0.99 * (level - size) / slope
         while evaluations < _MOST_STEPS and step_s > _SHORT * reached_s:
-            later, evaluations = at_events.sup(error_after(flow, reached_s + step_s)), evaluations + 1
+            later, evaluations = at_events.sup(error_since_event(flow, reached_s + step_s)), evaluations + 1
             if max(size, later) + step_s**2 / 8 * bend < level:
                 break
             step_s *= 0.6
