@@ -96,7 +96,7 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
 
 
 @pytest.mark.parametrize(
-    ("name", "settings", "request"),
+    ("name", "settings", "asked"),
     [
         ("lane_periodic", (), DesignRequest(effort=0, most=8)),
         ("lane_periodic", (), DesignRequest(effort=0, window=8)),
@@ -111,9 +111,9 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
     ],
 )
 def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
-    name: str, settings: tuple[str, ...], request: DesignRequest
+    name: str, settings: tuple[str, ...], asked: DesignRequest
 ) -> None:
-    found = searched(shipped(name, *settings), request)
+    found = searched(shipped(name, *settings), asked)
     given, best = found.given, found.best
     assert best.rung >= given.rung
     assert best.cost <= found.search.limit or best == given
@@ -122,7 +122,7 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
         assert LossMargin(resolve(found.shown.scenario)).coarse_bounds().upper < 1
     if name != "double_integrator":
         assert best.rung > given.rung
-    if request.window:
+    if asked.window:
         assert isinstance(found.shown.scenario.network.guarantee.rules[-1], LossesInWindow)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from cosim.studies.design import event_design
 from cosim.studies.design.event_design import Certified, EventSearch
-from cosim.studies.design.network_search import NetworkSearch, Reached, Wish
+from cosim.studies.design.network_search import DesignRequest, NetworkSearch, ReachedRung
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -35,7 +35,7 @@ class Wanted(NamedTuple):
     """A loop and what is asked for."""
 
     scenario: Scenario
-    wish: Wish
+    request: DesignRequest
     system: System | None = None
     """The same loop, with events."""
 
@@ -44,10 +44,10 @@ class Design(NamedTuple):
     """What is said of both loops with periodic updates."""
 
     search: NetworkSearch
-    given: Reached
-    best: Reached
+    given: ReachedRung
+    best: ReachedRung
 
-    def maps(self, reached: Reached, rung: int) -> LoopMaps:
+    def maps(self, reached: ReachedRung, rung: int) -> LoopMaps:
         """Return a loop on a rung."""
         resolved = resolve(self.search.scenario_of(reached.candidate, rung))
         return LoopMaps(resolved, self.search.ladder[max(rung, 0)].period_ns)
@@ -71,12 +71,12 @@ def _random_periodic(rng: Rng, **fixed: Any) -> Wanted:
     fewest = rng.random() < 0.2
     window = None if fewest or rng.random() < 0.7 else int(rng.integers(2, 6))
     most = int(rng.integers(2, 7))
-    wish = Wish(
+    request = DesignRequest(
         "transmissions" if fewest else "network", window, most=None if fewest or window else most,
         weights=weights, cost=float(rng.choice([1.0, 1.2, 3.0])), effort=int(rng.integers(16)),
     )  # fmt: skip
     horizon_s = 4e-9 * unit_ns if fewest else 1.0  # the longest period
-    return Wanted(scenario.model_copy(update={"horizon_s": horizon_s}), wish)
+    return Wanted(scenario.model_copy(update={"horizon_s": horizon_s}), request)
 
 
 def _random_events(rng: Rng, **fixed: Any) -> Wanted:
@@ -98,17 +98,17 @@ def _random_events(rng: Rng, **fixed: Any) -> Wanted:
         controller={"rate_hz": rate_hz}, network={"loss": {"model": "bernoulli", "probability": 0.5}},
         certificate={"late_periods": 0, "network_delay_s": system.delay_steps * system.step_s},
     )  # fmt: skip
-    return Wanted(scenario, Wish(most=int(rng.integers(1, 5)), effort=0), system)
+    return Wanted(scenario, DesignRequest(most=int(rng.integers(1, 5)), effort=0), system)
 
 
 def _designed(wanted: Wanted) -> Design | EventDesign | None:
     """Search, briefly; None: nothing is certified."""
     if wanted.system is None:
-        search = NetworkSearch(wanted.scenario, wanted.wish)
+        search = NetworkSearch(wanted.scenario, wanted.request)
         found = Design(search, *search.run())
         return found if found.best.stability else None
     with patch.multiple(event_design, COSTS_OF_INPUT=(1.0,), _ALPHAS=(0.5,)):
-        events = EventSearch(wanted.scenario, wanted.wish, 0, draws=4)
+        events = EventSearch(wanted.scenario, wanted.request, 0, draws=4)
         events.certificate = cache(events.certificate)  # type: ignore[method-assign]
         _, best = events.run()
     certificate = events.certificate(best.loop, best.m) if best.m else None
