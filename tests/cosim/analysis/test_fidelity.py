@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,14 @@ def test_a_loop_that_amplifies_rounding_or_accumulates_events_is_not_compared() 
     unstable = lane(None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20")
     with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
         compute_fidelity(unstable, max_events=200)
+
+
+@pytest.mark.parametrize(("residual", "explained"), [(0.1, True), (0.11, False)])
+def test_a_residual_of_a_tenth_is_explained_and_no_more(
+    fidelity: Fidelity, residual: float, explained: bool
+) -> None:
+    other = replace(fidelity, explained_relative=residual)
+    assert (other.explained, "too large" not in other.verdict) == (explained, explained)
 
 
 def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:

@@ -177,8 +177,9 @@ def test_samples_at_the_time_of_an_event_are_those_after_it() -> None:
     before = run.at(np.nextafter(run.event_s, 0))
     np.testing.assert_allclose(before.e_s, [state.e_s for state in run.before], atol=1e-12)
     assert run.at([]).x.shape == (0, 2)
-    with pytest.raises(ValueError, match="lie in"):
-        run.at([-1.0])
+    for outside_s in (-1e-9, run.reached_s + 1e-9):
+        with pytest.raises(ValueError, match="lie in"):
+            run.at([outside_s])
     with pytest.raises(ValueError, match="order"):
         run.at([1e-3, 0.0])
 

@@ -81,6 +81,29 @@ def test_directions_are_separate_and_a_flow_may_have_packets_in_only_one(path: P
     assert set(read_fates(path, ["up"]).decisions) == {("up", "forward"), ("up", "reverse")}
 
 
+@pytest.mark.parametrize(
+    ("words", "losses", "is_kept"),
+    [
+        ("mansd 2", (1, 1, 0), True), ("mansd 2", (1, 1, 1), False),
+        ("atmost 1 in 3", (1, 0, 0, 1), True), ("atmost 1 in 3", (1, 0, 1), False),
+    ],
+)  # fmt: skip
+def test_a_trace_has_the_guarantee_of_its_link_if_its_losses_keep_it(
+    path: Path, words: str, losses: tuple[int, ...], is_kept: bool
+) -> None:
+    """They do not if the guarantee changed during the recording."""
+    events, burst = arrived(len(losses)), 0
+    for event, is_lost in zip(events, losses, strict=True):
+        burst = (burst + 1) * is_lost
+        event["consecutive_losses"] = burst
+        event["fate"], event["delay_ns"] = (Fate.DROPPED, -1) if is_lost else (Fate.DELIVERED, 0)
+    link = settings_of(words)
+    with FateRecorder(path, [spec_of(link)]) as recorder:
+        recorder.take(events, NOTHING)
+    guarantee = {"mansd": link.mansd, "constraints": link.constraints}
+    assert read_fates(path).guarantees["a", "forward"] == (guarantee if is_kept else {})
+
+
 def test_events_beyond_the_queue_limit_are_reported_missing_at_once(
     path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -44,6 +44,11 @@ def test_the_published_response_times(own: Any, others: Any, expected_us: int) -
     assert response_ns(Sender(own[0] * US, 1000 * US), senders) == expected_us * US
 
 
+def test_loops_that_need_the_whole_link_have_no_bound() -> None:
+    assert response_ns(Sender(100, 50), {Sender(100, 50): 1}) == math.inf
+    assert response_ns(Sender(100, 50), {Sender(100, 49): 1}) < math.inf
+
+
 def longest_ns(scheduler: Scheduler, sizes: Any, arrivals: Any) -> list[int]:
     """Return the longest delay of each flow's packets on a link that sends a byte in 1 us.
 
