@@ -102,7 +102,7 @@ def advance(
     for k in range(len(work.signs)):
         work.signs[k] = np.sign(work.values[k])
     left_s, step_s, smallest_s, jumps = duration_s, duration_s, _SMALLEST * duration_s, 0
-    work.start[:] = work.values
+    copy(work.values, work.start)
     for _ in range(_MAX_STEPS):
         if left_s <= smallest_s:
             return DONE
@@ -126,11 +126,17 @@ def advance(
                 jumps += 1
                 turn(work, jumps)
                 rates(model, work.point, v, parameters, work.signs, work.values, work.slopes[6])
-        z[:] = work.point
-        work.start[:] = work.values
-        work.slopes[0] = work.slopes[6]
+        copy(work.point, z)
+        copy(work.values, work.start)
+        copy(work.slopes[6], work.slopes[0])
         left_s -= part_s
     return TOO_MANY_STEPS
+
+
+def copy(source: Vector, target: Vector) -> None:
+    """Copy numbers. With ``target[:] = source`` numba compiles the message of unlike sizes, too."""
+    for n in range(len(target)):
+        target[n] = source[n]
 
 
 def attempt(
