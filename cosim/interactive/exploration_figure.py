@@ -29,7 +29,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.scenario.scenario import Scenario
 
-BAND, KEPT = "90 % of draws", "for comparison"
+BAND, EDGE, KEPT = "90 % of draws", "edge of the 90 % of draws", "for comparison"
 _SMALLEST = 1e-6
 """Smallest value on a logarithmic axis, as a share of the largest; an error is 0 after a reset."""
 _DECADES = 7
@@ -152,7 +152,7 @@ def _certified(guarantee: Guarantee, values: Vector) -> Line:
 
 
 def _edge(ensemble: Ensemble, values: Vector) -> Line:
-    return Line(x=ensemble.t_s, y=values, label=BAND, colour=PLANT, width=0.75, dash=DOTTED)
+    return Line(x=ensemble.t_s, y=values, label=EDGE, colour=PLANT, width=0.75, dash=DOTTED)
 
 
 def _reference_line(reference: Exploration, values: Vector) -> Line:

@@ -255,7 +255,7 @@ def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
         "margin",
         f"{margin.scenario}: growth of the worst loss pattern per {margin.period_s:g} s, "
         f"{times}, {margin.between_updates}{delay}",
-        ("M", "maximum consecutive losses (M − 1)", "at least", "at most", "verdict"),
+        ("M", "M − 1", "at least", "at most", "verdict"),
         [(str(m), str(m - 1), *_growth(growth), growth.verdict) for m, growth in margin.caps],
     )
     if margin.compared.guarantees:

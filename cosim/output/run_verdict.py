@@ -5,6 +5,7 @@ Read :func:`verdict` (three lines), :func:`remarks` (what limits the validity of
 """
 
 import math
+import re
 import shutil
 import sys
 from collections import Counter, defaultdict
@@ -65,6 +66,8 @@ _ROSE = 1.001
 """Where this multiple of the first ‖x‖ is exceeded, it is said."""
 _MOST_LOOPS, _MOST_REASONS, _MOST_VIOLATIONS = 12, 3, 5
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
+"""A number in a reason."""
 
 
 class VerdictLine(NamedTuple):
@@ -409,20 +412,36 @@ def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> Non
 
 
 def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
-    """Return why claims are void, and in which loops; nothing if the verdict says it."""
-    reasons = defaultdict[str, list[str]](list)
+    """Return why claims are void, and in which loops; nothing if the verdict says it.
+
+    Reasons that differ only in numbers are one.
+    """
+    reasons = defaultdict[str, list[tuple[str, str]]](list)
     for loop in loops:
         for why in sorted({claim.why for claim in loop.claims if claim.verdict == "void"}):
-            reasons[why].append(loop.name)
+            reasons[_NUMBER.sub("", why)].append((why, loop.name))
     if len(reasons) == 1:
         return []
-    shown = sorted(reasons.items(), key=lambda reason: -len(reason[1]))[:_MOST_REASONS]
-    lines = [
-        f"void: {why} ({names[0] if len(names) == 1 else f'{len(names)} loops'})" for why, names in shown
-    ]
-    if more := len(reasons) - len(lines):
-        lines.append(f"and {more} more reason{'s' * (more > 1)}: the summaries of the loops have them")
+    lines = list[str]()
+    for alike in reasons.values():
+        names = [*dict.fromkeys(name for _, name in alike)]
+        where = names[0] if len(names) == 1 else f"{len(names)} loops"
+        lines.append(f"void: {_with_ranges([why for why, _ in alike])} ({where})")
+    more = len(lines) - _MOST_REASONS
+    if more > 0:
+        rest = f"and {more} more reason{'s' * (more > 1)}: the summaries of the loops have them"
+        lines[_MOST_REASONS:] = [rest]
     return lines
+
+
+def _with_ranges(texts: Sequence[str]) -> str:
+    """Return one text for several that differ only in numbers."""
+    ranges = list[str]()
+    for numbers in zip(*(_NUMBER.findall(text) for text in texts), strict=True):
+        low, high = min(numbers, key=float), max(numbers, key=float)
+        ranges.append(low if low == high else f"{low} to {high}")
+    following = iter(ranges)
+    return _NUMBER.sub(lambda _: next(following), texts[0])
 
 
 def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim]) -> None:

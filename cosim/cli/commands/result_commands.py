@@ -196,6 +196,7 @@ def export(
     Options:
         file_format: Format of the file, or of the folder's files.
         out: File, or folder of CSV or FMUs; RUN.mat and so on by default.
+        settings: Change one setting of the scenario, for fmu only.
         certificates: Certificates of each loop in a file of MATLAB; about a second for each loop.
 
     Examples:

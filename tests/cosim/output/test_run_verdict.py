@@ -117,6 +117,21 @@ def test_the_verdict_of_several_loops_counts_them() -> None:
     )
 
 
+def test_reasons_of_several_loops_that_differ_only_in_numbers_are_one_line(tmp_path: Path) -> None:
+    outcome = finalize(simulate_run(shipped("different_loops"), tmp_path), report=False, view=False)
+    reasons = ["gain 1.5, not below 1", "gain 2.25, not below 1", "gain 1.5, not below 1", "an input was old"]
+    loops = [
+        loop.model_copy(update={"claims": [Claim(**claim("void", why=why))]})
+        for loop, why in zip(outcome.summary.loops, reasons, strict=True)
+    ]
+    summary = outcome.summary.model_copy(update={"loops": loops})
+    print_outcome(Console(file=(file := io.StringIO())), replace(outcome, summary=summary))
+    assert [line for line in file.getvalue().splitlines() if line.startswith("void: ")] == [
+        "void: gain 1.5 to 2.25, not below 1 (3 loops)",
+        f"void: an input was old ({loops[3].name})",
+    ]
+
+
 def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
     again = [LOST | {"what": f"MANSD violated: {n} lost"} for n in range(7, 13)]
     text = printed(outcome, assumption_violations=[LOST, *again])
