@@ -24,6 +24,8 @@ _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
 _LINE_EVERY_S = 5.0
 """Time between two lines about the completed runs, if there is no terminal."""
+_LEAST_SHARE = 0.1
+"""Of the work, from which on the remaining time is estimated: the first tries may take longer."""
 
 
 class PipeSafeConsole(Console):
@@ -169,8 +171,9 @@ def work_bar(description: str, *, lines: bool = False) -> Iterator[Callable[[flo
             now_s = time.monotonic()
             if lines and not console.is_terminal and 0 < share < 1 and now_s - line_s >= _LINE_EVERY_S:
                 line_s, spent_s = now_s, now_s - began_s
-                left = f"about {spent_s / share - spent_s:.0f} s left"
-                line = f"noack: {description}: {100 * share:.0f} % after {spent_s:.0f} s, {left}"
+                line = f"noack: {description}: {100 * share:.0f} % after {spent_s:.0f} s"
+                if share >= _LEAST_SHARE:
+                    line += f", about {spent_s / share - spent_s:.0f} s left"
                 console.print(line, highlight=False, markup=False, soft_wrap=True)
 
         yield show
