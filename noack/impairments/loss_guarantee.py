@@ -3,7 +3,8 @@
 A rule is a counter: from its state and the next outcome follow its next state and a value. The
 outcome keeps the rule if the value is at most the rule's limit; a delivery always does. These
 counters are the one definition of the guarantee for the checks of records, for the controller and
-for the adversary. At the end, from :func:`list_moves` on: whether one guarantee implies another.
+for the adversary; ``native/guarantee.c`` enforces them in the emulator. At the end, from
+:func:`list_moves` on: whether one guarantee implies another.
 """
 
 from abc import ABC, abstractmethod
