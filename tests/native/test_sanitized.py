@@ -28,9 +28,9 @@ FILES = (
     "tests/netem/capture/test_pcapng.py", "tests/noack/protocol/test_wire_format.py",
     "tests/netem/test_link_state.py", "tests/netem/test_channel.py", "tests/noack/impairments/test_mansd.py",
     "tests/cosim/simulation/test_virtual_time.py",
-    "tests/cosim/simulation/test_several_loops.py", "tests/cosim/analysis/test_replay.py",
+    "tests/cosim/simulation/test_several_loops.py", "tests/cosim/analysis/replay/test_run_replay.py",
     "tests/cosim/analysis/adversary/test_worst_patterns.py", "tests/noack/runtime/test_live_driver.py",
-    "tests/noack/runtime/test_peer_sockets.py", "tests/cosim/output/export/test_fmu_export.py",
+    "tests/noack/runtime/test_udp_sockets.py", "tests/cosim/output/export/test_fmu_export.py",
 )  # fmt: skip
 NAMES = (
     "machines_under_sanitizers", "link_numbers", "wire", "pcapng", "plain_network", "no_network", "in_time",

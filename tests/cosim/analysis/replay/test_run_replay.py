@@ -34,7 +34,7 @@ from tests.cosim.record.changed_records import changed, flipped
 from tests.cosim.simulation.outage import Reborn, simulate_with
 from tests.helpers.machine_parts import controller_of
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 SHORT = (
     "horizon_s=1.0", "plant.rate_hz=50", "controller.rate_hz=50",
     "trigger.beta=0.01", "network.loss.probability=0.4",
