@@ -32,7 +32,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import NOBODY, needs_root
 from tests.command_line import invoke
-from tests.noack.runtime.test_invitation import INVITED
+from tests.noack.runtime.test_join_ticket import INVITED
 
 OWN = f"noack-{os.getuid()}"
 EMULATOR = "lab"

@@ -9,13 +9,16 @@ from tests.fuzz.harness import kept, parsers
 EXAMPLES = {"record": 10, "telemetry": 15, "campaign": 15}
 """Number of examples for slow parsers; 25 for the others. The long run is `make fuzz`."""
 
+OF_THE_CORE = ("wire", "link_numbers")
+NAMES = [pytest.param(name, marks=[pytest.mark.sanitized] * (name in OF_THE_CORE)) for name in parsers()]
+
 splices = st.lists(
     st.tuples(st.integers(0, 2**16), st.integers(0, 2**16), st.none() | st.binary()), max_size=6
 )
 """Begin and end of replaced bytes, and the new bytes; None: the other input up to its end."""
 
 
-@pytest.mark.parametrize("name", parsers())
+@pytest.mark.parametrize("name", NAMES)
 def test_every_input_of_the_corpus_is_read_or_refused_in_one_line(name: str) -> None:
     under_test = parsers()[name]
     inputs = [*under_test.seeds, *kept(name)]
@@ -24,7 +27,7 @@ def test_every_input_of_the_corpus_is_read_or_refused_in_one_line(name: str) -> 
         under_test.run(data)
 
 
-@pytest.mark.parametrize("name", parsers())
+@pytest.mark.parametrize("name", NAMES)
 def test_inputs_near_the_corpus_are_read_or_refused_in_one_line(name: str) -> None:
     under_test = parsers()[name]
     inputs = st.sampled_from([*under_test.seeds, *kept(name)])

@@ -21,6 +21,8 @@ from tests.helpers.machine_parts import SteppedMachines
 from tests.helpers.wire_decoder import NO_VECTOR
 from tests.noack.machines.any_machines import MS, Sizes, controller, plant, sensor, set_number, sizes, text_of
 
+pytestmark = pytest.mark.sanitized
+
 TIMES_NS, NUMBERS = 2**62, 2**63
 """Times and numbers of messages are less."""
 VALUES = (0.0, -0.0, 1.0, -3.7, 1e154, 1e308, -1e308, 5e-324, np.inf, -np.inf, np.nan)

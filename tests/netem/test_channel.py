@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -41,6 +42,7 @@ def plain(value: Any) -> bytes | int:
     return bytes(value) if isinstance(value, bytes | np.void) else int(value)
 
 
+@pytest.mark.sanitized
 @given(any_link, any_link, st.none() | any_link, arrivals, st.sampled_from([0, 2**40]))
 def test_the_channel_does_what_the_plain_network_does(
     first: LinkSettings,
@@ -87,6 +89,7 @@ def test_the_channel_makes_room_for_any_number_of_delayed_datagrams(content: dic
     assert left == [[(0, data)] for data in sent]
 
 
+@pytest.mark.sanitized
 def test_numbers_of_no_network_are_refused(content: dict[str, Any]) -> None:
     channel = channel_of(resolve(validate(content, "")))
     own = channel.core

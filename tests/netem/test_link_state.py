@@ -169,6 +169,7 @@ def test_a_refused_change_leaves_a_link_as_it_was(monkeypatch: pytest.MonkeyPatc
     assert link.decide(0, 72, 0).release_ns == MS
 
 
+@pytest.mark.sanitized
 def test_packets_that_must_pass_pass_a_queue_that_cannot_be_served_in_time() -> None:
     served = Opportunities(times_ms=(0, 10**12), overhead_bytes=65_535, queue=2)
     link = LinkState(LinkSettings(impairments=(served,), mansd=0), 1, "late")

@@ -135,7 +135,7 @@ def run_pytest(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str
 FAILS = """
 import socket
 
-def test_fails(lossy_udp):
+def test_that_no_datagram_arrives(lossy_udp):
     with socket.socket(type=socket.SOCK_DGRAM) as server, socket.socket(type=2) as client:
         server.bind(("127.0.0.1", 0))
         server.settimeout(100)

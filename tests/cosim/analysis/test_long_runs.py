@@ -2,19 +2,13 @@
 
 from typing import Any
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.quantiles import EXACT, RESOLUTION, QuantileSketch
 from cosim.analysis.summary.run_summary import summarise
 from cosim.record import run_record
 from cosim.record.align import align_tables
-from cosim.record.decimation import decimate
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import PLANT_STEP
@@ -77,50 +71,3 @@ def test_the_results_do_not_depend_on_the_parts(record: RunRecord, monkeypatch: 
     in_parts.kind = record.kind
     assert len(list(in_parts.slices())) > 5
     assert without_sums(results(in_parts)) == without_sums(whole)
-
-
-def test_quantiles_of_many_values_have_the_stated_error() -> None:
-    values = np.random.default_rng(1).lognormal(3, 2, EXACT + 5000)
-    values[:1000] *= -1
-    sketch = QuantileSketch.of(np.array_split(values, 40))
-    for share in (0.0, 0.0005, 0.01, 0.5, 0.99, 0.999, 0.999999):
-        exact = float(np.quantile(values, share, method="lower"))
-        assert sketch.quantiles(share)[0] == pytest.approx(exact, rel=RESOLUTION)
-    assert sketch.quantiles(1.0)[0] == values.max()
-    few = QuantileSketch.of(np.array_split(values[-5000:], 7))
-    assert few.quantiles(0.99)[0] == np.quantile(values[-5000:], 0.99)
-    assert QuantileSketch().quantiles(0.5) == [None]
-
-
-# --- curves ---------------------------------------------------------------------------------------
-
-
-VALUES = arrays(
-    np.float64,
-    st.integers(0, 300),
-    elements=st.one_of(st.floats(-5, 5, width=16), st.just(np.nan)),
-)
-
-
-@given(VALUES, st.integers(1, 20), st.integers(0, 5))
-def test_each_column_keeps_its_extremes_and_its_ends(y: np.ndarray, columns: int, step: int) -> None:
-    """Compared column by column, as plotted on the screen."""
-    t = np.cumsum(np.arange(len(y)) % (step + 1) + 0.5)
-    keep = decimate(t, y, columns)
-    assert np.array_equal(keep, np.unique(keep))
-    if len(y) <= 4 * columns:
-        assert len(keep) == len(y)
-        return
-    assert len(keep) <= 4 * columns
-    column = np.minimum((t - t[0]) / (t[-1] - t[0]) * columns, columns - 1).astype(int)
-    # Indices that rounding assigns to a neighbouring column are compared in neither.
-    edge = np.abs((t - t[0]) / (t[-1] - t[0]) * columns - column) < 1e-9
-    for c in np.unique(column):
-        inside = (column == c) & ~edge
-        kept = np.isin(np.arange(len(y)), keep) & (column == c)
-        seen = y[inside & np.isfinite(y)]
-        if len(seen):
-            assert np.nanmin(y[kept]) <= seen.min()
-            assert np.nanmax(y[kept]) >= seen.max()
-    assert keep[0] == 0
-    assert keep[-1] == len(y) - 1

@@ -315,7 +315,7 @@ REPORT = {
 }  # fmt: skip
 
 
-def test_the_states_follow_each_other() -> None:
+def test_what_a_live_run_reports_sets_its_state_and_its_lines() -> None:
     run = LiveRun(20.0)
     assert run.state == "starting"
     said(run, "started", run_dir="/runs/one")

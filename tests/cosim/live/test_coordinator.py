@@ -1,7 +1,6 @@
-"""The coordinator: admission, lost connections, changes of a run, and where it may listen."""
+"""The coordinator: admission, lost connections, changes of a run."""
 
 import json
-from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -9,15 +8,13 @@ from typing import Any, cast
 import pytest
 import zenoh
 
-from cosim.live import coordinator, remote_access
+from cosim.live import coordinator
 from cosim.live.coordinator import AdmissionPass, ChangeRequests, Coordinator
 from noack.core.errors import CallerError
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
-from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import load
 from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
-from tests.helpers.approved import compare_lines, lines_of_error
 
 JUNK: list[bytes | None] = [
     None, b"", b"{", b"\xff", b"[]", b"{}", b"null", b'{"rows": 1}', b"[" * 100_000,
@@ -189,77 +186,3 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
     found = requested(requests, {})["runtime_parameters"]
     assert (found["network.mansd"], found["network.loss"]["probability"]) == (2, 0.2)
     assert [one.number for one in requests.announced] == [0, 1]
-
-
-# --- other hosts ----------------------------------------------------------------------------------
-
-ROBOT = '[controller]\nssh = "robot"\n'
-
-
-def test_a_run_listens_at_addresses_that_others_can_reach() -> None:
-    """A port may be missing."""
-
-    def found(text: str) -> list[str]:
-        try:
-            return ["{} port {}".format(*remote_access.listen_address(json.loads(text)))]
-        except CallerError as error:
-            return [str(error).partition(" (")[0]]
-
-    compare_lines(Path(__file__).with_name("addresses.txt"), found)
-
-
-def test_one_loop_records_the_bounds_of_its_clocks() -> None:
-    one = load(Path("scenarios/lane_following.toml"))
-    assert remote_access.with_clocks(one).clocks == ClocksSection()
-    strict = one.model_copy(update={"clocks": ClocksSection(largest_error_us=5.0)})
-    assert remote_access.with_clocks(strict) is strict
-
-
-def test_a_flood_of_connections_is_reported_at_its_begin_and_end() -> None:
-    watch = remote_access.ConnectionFloodWatch()
-
-    def lines(*counts: int) -> list[str]:
-        for count in counts:
-            watch.next_interval(Counter({"192.0.2.7": count, "192.0.2.8": count // 2}))
-        return [watch.lines.get_nowait() for _ in range(watch.lines.qsize())]
-
-    assert lines(3, 0, 40) == []
-    (begin,) = lines(4000, 4000)
-    assert begin == (
-        "flood: 6000 connections without an invitation in a second, from 2 addresses, most from "
-        "192.0.2.7; processes with an invitation can still join"
-    )
-    assert lines(0, 0, 4000, 0, 0) == []
-    assert lines(0) == ["the flood is over: 18000 connections without an invitation ended"]
-    assert len(lines(4000, 0, 0, 0)) == 1  # the next end is reported later
-    assert len(lines(0, 0, 0)) == 1
-
-
-@pytest.fixture
-def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file of hosts, on a machine with an ssh client."""
-    script = tmp_path / "bin" / "ssh"
-    script.parent.mkdir()
-    script.write_text("#!/bin/sh\n")
-    script.chmod(0o755)
-    monkeypatch.setenv("PATH", str(script.parent))
-    return tmp_path / "hosts.toml"
-
-
-def test_processes_without_a_table_run_on_this_host(hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    hosts.write_text(f'listen = "192.0.2.1:7400"\n{ROBOT}')
-    found = remote_access.listening_for(hosts)
-    assert found.address == ("192.0.2.1", 7400)
-    assert found.invitation is None
-    assert {role: host.ssh for role, host in found.hosts.items()} == {"controller": "robot"}
-    monkeypatch.setenv("PATH", str(hosts.parent))
-    with pytest.raises(CallerError, match="no ssh client is installed"):
-        remote_access.listening_for(hosts)
-
-
-def test_a_mistake_in_a_file_of_hosts_gives_the_approved_line(hosts: Path) -> None:
-    def mistake(line: str) -> list[str]:
-        hosts.write_text(json.loads(line))
-        return lines_of_error(lambda: remote_access.listening_for(hosts), FILE=hosts)
-
-    compare_lines(Path(__file__).with_name("host_mistakes.txt"), mistake)

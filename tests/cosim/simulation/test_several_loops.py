@@ -47,7 +47,10 @@ def run(content: Content, *loops: Content) -> RecordedRun:
 
 
 @pytest.mark.parametrize("protocol", ["none", "ack"])
-@pytest.mark.parametrize("delay", [[], [{"kind": "delay", "delay_s": 0.012, "jitter_s": 0.009}]])
+@pytest.mark.parametrize(
+    "delay",
+    [[], pytest.param([{"kind": "delay", "delay_s": 0.012, "jitter_s": 0.009}], marks=pytest.mark.sanitized)],
+)
 def test_the_first_loop_is_the_run_without_loops(short: Content, protocol: str, delay: list[Content]) -> None:
     """Losses and delays are drawn per flow: other loops do not change the first."""
     short["network"] |= {"protocol": protocol, "impairments": delay}
@@ -74,6 +77,7 @@ def crowded(short: Content) -> Content:
     return short
 
 
+@pytest.mark.sanitized
 def test_the_guarantee_holds_per_loop_when_the_shared_queue_overflows(crowded: Content) -> None:
     """All packets leave one after the other: the gaps are at least their transmission time."""
     shared = run(crowded, {"name": "a", "count": 20})
@@ -96,6 +100,7 @@ def test_the_guarantee_holds_per_loop_when_the_shared_queue_overflows(crowded: C
     assert (gaps_ns <= gap_ns + 1).mean() > 0.95
 
 
+@pytest.mark.sanitized
 def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     shared = run(crowded, {"name": "a", "count": 3}, {"name": "b", "mode": "zoh"})
     found = replay(shared.network)
@@ -137,6 +142,7 @@ def error_levels(record: RunRecord) -> list[int]:
     return levels
 
 
+@pytest.mark.sanitized
 def test_updates_report_their_errors_to_a_queue_that_chooses_by_them(crowded: Content) -> None:
     triggers: Content = {
         "decaying": {"beta": 0.01, "alpha_per_s": 0.2, "floor": 0.01},

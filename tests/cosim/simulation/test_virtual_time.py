@@ -52,6 +52,7 @@ def test_random_loops_run_as_by_the_plain_driver(first: int) -> None:
         require_equal(simulate(scenario), shuttled(scenario))
 
 
+@pytest.mark.sanitized
 def test_a_scripted_network_decides_as_in_the_plain_driver() -> None:
     scenario = resolved("unstable_pendulum", "horizon_s=3.0")
 
@@ -61,6 +62,7 @@ def test_a_scripted_network_decides_as_in_the_plain_driver() -> None:
     require_equal(simulate(scenario, decide), shuttled(scenario, decide))
 
 
+@pytest.mark.sanitized
 def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
     given = shipped("unstable_pendulum", "horizon_s=1.0").model_dump(mode="json", exclude_none=True)
     rate = {"kind": "rate", "rate_bps": 50_000, "queue": 6}
@@ -84,6 +86,7 @@ def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
     assert found.loops[4]["plant_step"]["x"].shape[1] == 3
 
 
+@pytest.mark.sanitized
 def test_numbers_of_no_simulation_are_refused() -> None:
     scenario = resolved("unstable_pendulum", "horizon_s=1.0")
     run = VirtualRun(scenario, (scenario,))

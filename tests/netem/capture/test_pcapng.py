@@ -33,6 +33,8 @@ from tests.netem.capture.reader import (
     read,
 )
 
+pytestmark = pytest.mark.sanitized
+
 
 @given(st.lists(events, max_size=5))
 def test_an_independent_reader_finds_what_was_written(described: list[dict[str, Any]]) -> None:

@@ -25,7 +25,7 @@ from noack.runtime.address import address_text
 from noack.runtime.connections import metrics_server as servers
 from tests.helpers.waiting import wait_for
 from tests.netem.control.fake_relay import FakeRelay, options, press_q, read_until, terminal
-from tests.noack.runtime.test_log_and_metrics import read, slow_reader
+from tests.noack.runtime.connections.test_metrics_server import read, slow_reader
 
 Values = dict[str, float]
 

@@ -194,6 +194,7 @@ def test_the_guarantee_holds_in_any_replay(
 HISTORIES = list(itertools.product([False, True], repeat=9))
 
 
+@pytest.mark.sanitized
 @pytest.mark.parametrize(
     "words",
     ["mansd 2", "atmost 3 in 10", "mansd 2 recover 4", "atmost 3 in 8 atmost 4 in 9 recover 3"],

@@ -20,6 +20,8 @@ from noack.protocol.wire_format import Encoder, Flow, Header, Message, Rejection
 from tests.helpers.approved import compare_text
 from tests.oracles.wire import ACCEPTED, KEY, RUN, BothReceivers, datagram
 
+pytestmark = pytest.mark.sanitized
+
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = (DOCS / "wire.md").read_text(encoding="utf-8")
 FLOWS = {"measurement": 1, "update": 2, "actuation": 3, "acknowledgement": 4}

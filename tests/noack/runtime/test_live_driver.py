@@ -63,6 +63,7 @@ UDP_SEGMENT, UDP_GRO = 103, 104
 DATAGRAM_BYTES = 32 + 2 * 8 + 16
 
 
+@pytest.mark.sanitized
 @pytest.mark.parametrize("together", [2, 40, 64])
 def test_datagrams_that_the_kernel_passes_together_are_handled_one_by_one(
     content: dict[str, Any], together: int
@@ -83,6 +84,7 @@ def test_datagrams_that_the_kernel_passes_together_are_handled_one_by_one(
         assert [row[0] for row in rows] == [one.loop for one in given]
 
 
+@pytest.mark.sanitized
 def test_messages_of_loops_that_tick_together_are_sent_together(content: dict[str, Any]) -> None:
     with closing(Live("plant", [scenario(content)] * 50, since_ns=HOUR_NS)) as live:
         live.peer.setsockopt(socket.IPPROTO_UDP, UDP_GRO, 1)
@@ -92,6 +94,7 @@ def test_messages_of_loops_that_tick_together_are_sent_together(content: dict[st
         assert sum(sizes) == live.driver.core.sent * DATAGRAM_BYTES
 
 
+@pytest.mark.sanitized
 @pytest.mark.parametrize(("loops", "encrypted"), [(1, False), (1, True), (3, False), (70, True)])
 def test_messages_are_handled_in_order_and_answered(
     content: dict[str, Any], loops: int, encrypted: bool
@@ -123,6 +126,7 @@ def test_messages_are_handled_in_order_and_answered(
         assert [one["accepted"] for one in each] == [len(given) // loops] * loops
 
 
+@pytest.mark.sanitized
 @pytest.mark.parametrize("loops", [1, 20])
 @pytest.mark.parametrize("rest_ns", [0, 1_000_000])
 @pytest.mark.parametrize("role", ["plant", "controller"])
@@ -150,6 +154,7 @@ def test_ticks_are_done_in_order_and_never_early(
         assert len(sent) > loops
 
 
+@pytest.mark.sanitized
 def test_acknowledgements_have_a_socket_and_counters_of_their_own(content: dict[str, Any]) -> None:
     network = content["network"] | {"protocol": "ack"}
     resolved = scenario(content, network=network)
@@ -171,6 +176,7 @@ def test_acknowledgements_have_a_socket_and_counters_of_their_own(content: dict[
         assert sorted(live.rows.tables) == ["sensor_acknowledgement", SENSOR_MEASUREMENT]
 
 
+@pytest.mark.sanitized
 def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
         live.driver.core.senders[0] = -1
@@ -181,6 +187,7 @@ def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
         assert (report["sent"], report["send_errors"]) == (0, {text: 1})
 
 
+@pytest.mark.sanitized
 def test_numbers_that_it_cannot_act_on_are_refused(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
         live.driver.core.receiver_count = 3

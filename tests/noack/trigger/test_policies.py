@@ -1,8 +1,8 @@
 """The policies' tables, and a user's class as a trigger.
 
 Each policy is compared with the rule as it is stated: at measurements in
-tests/cosim/simulation/test_whole_loop.py, in continuous time in .../test_exact_events.py, and
-by the search for the worst pattern in tests/cosim/analysis/adversary/test_worst_patterns.py.
+tests/cosim/simulation/test_whole_loop.py, in continuous time in .../test_exact_simulation.py,
+and by the search for the worst pattern in tests/cosim/analysis/adversary/test_worst_patterns.py.
 """
 
 import json

@@ -134,6 +134,7 @@ def test_the_search_finds_the_worst_of_all_patterns(policy: str, mode: str) -> N
         assert worst.event_s == pytest.approx([STEP_S * k for k in event_steps(record)])
 
 
+@pytest.mark.sanitized
 @pytest.mark.parametrize(
     "sections",
     [
@@ -194,7 +195,9 @@ def test_a_watchdog_that_may_trip_is_refused() -> None:
     ],
     ids=["disturbance", "noise", "observer"],
 )
-def test_no_signs_are_worse_than_those_found(sections: dict[str, Any], objective: Objective) -> None:
+def test_the_found_signs_of_the_disturbances_are_the_worst_of_all(
+    sections: dict[str, Any], objective: Objective
+) -> None:
     """Events every 0.15 s, whatever is measured: so the worst signs are those of the responses."""
     periodic = {"policy": "periodic", "period_s": 0.15}
     resolved = scenario_of(periodic, horizon_s=0.35, network={"mansd": 0}, **sections)
@@ -214,7 +217,8 @@ def test_no_signs_are_worse_than_those_found(sections: dict[str, Any], objective
     assert not search_result.exact
 
 
-def test_causes_that_end_too_early_are_refused() -> None:
+@pytest.mark.sanitized
+def test_disturbances_for_too_few_steps_are_refused() -> None:
     """The core checks what Python hands to it."""
     loop = SampledLoop(scenario_of(EXAMPLES["mixed"]))
     runs, ones = loop.start(), np.ones(loop.last + 1)

@@ -124,7 +124,8 @@ def vectors(run: Any, table: str, name: str) -> Any:
 
 @pytest.mark.parametrize(
     ("name", "settings"),
-    [("lane_following", {"horizon_s": 6.0}), ("double_integrator", BURSTS),
+    [("lane_following", {"horizon_s": 6.0}),
+     pytest.param("double_integrator", BURSTS, marks=pytest.mark.sanitized),
      ("lane_constrained", SLOW_TICKS)],
     ids=["plain", "bursts, delays, copies and damage", "constraints, a known start, slow ticks"],
 )  # fmt: skip
@@ -159,6 +160,7 @@ def test_a_run_is_that_of_a_simulation(name: str, settings: Any, folders: Folder
     np.testing.assert_array_equal(np.array(u)[[*rows]], expected)
 
 
+@pytest.mark.sanitized
 def test_steps_may_have_any_length(folders: Folders) -> None:
     """A channel with steps ten times as long gives the controller packets ahead of their time."""
     first, second = folders(noack.load("double_integrator", BURSTS))
@@ -183,6 +185,7 @@ def sent(channel: Fmu, steps: range) -> list[list[float]]:
     return found
 
 
+@pytest.mark.sanitized
 def test_instances_are_separate_and_can_begin_or_go_on_again(folders: Folders) -> None:
     folder, other = folders(noack.load("double_integrator", BURSTS))
     one, two = Fmu(folder).start(), Fmu(folder).start()
@@ -204,6 +207,7 @@ def test_instances_are_separate_and_can_begin_or_go_on_again(folders: Folders) -
         instance.slave.freeInstance()
 
 
+@pytest.mark.sanitized
 def test_what_is_called_at_the_wrong_time_is_an_error(folders: Folders) -> None:
     channel, controller = map(Fmu, folders(noack.load("double_integrator", BURSTS)))
     slave, now = channel.slave, "must not be called now"
@@ -245,6 +249,7 @@ def test_what_is_called_at_the_wrong_time_is_an_error(folders: Folders) -> None:
     assert now in channel.refuses(slave.doStep, 0.0, H_S)
 
 
+@pytest.mark.sanitized
 def test_packets_that_no_run_has_are_not_used(folders: Folders) -> None:
     controller = Fmu(folders(noack.load("double_integrator"))[1]).start()
     wrong = (
@@ -262,6 +267,7 @@ def test_packets_that_no_run_has_are_not_used(folders: Folders) -> None:
     assert np.isfinite(controller.get("x_c")).all()
 
 
+@pytest.mark.sanitized
 def test_resources_that_are_damaged_give_one_line(folders: Folders) -> None:
     folder, other = folders(noack.load("double_integrator"))
     path = folder / "resources/noack.bin"

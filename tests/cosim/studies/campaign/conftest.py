@@ -17,6 +17,7 @@ from tests.command_line import invoke
 Write = Callable[..., Path]
 Command = Callable[..., Result]
 Few = tuple[Campaign, list[Point]]
+HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from cosim.studies.campaign.campaign_workers import (
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from noack.core.errors import CallerError, PeerError
 from tests.cosim.studies.campaign.conftest import Command, Write, few_of
-from tests.cosim.studies.campaign.test_store import files
+from tests.cosim.studies.campaign.test_chunk_store import files
 from tests.helpers.waiting import wait_for
 
 Start = Callable[[], "subprocess.Popen[str]"]

@@ -52,6 +52,7 @@ def test_each_socket_receives_its_peer_and_the_port_cannot_be_bound_again(stack:
             thief.bind(endpoint.getsockname())
 
 
+@pytest.mark.sanitized
 def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
         sent = 0
@@ -104,6 +105,7 @@ def test_a_process_needs_a_socket_for_each_peer(
             LoopChannel(endpoint, live.driver, Flow.UPDATE, source=own, destination=own)
 
 
+@pytest.mark.sanitized
 def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
     peer, rare = (LOOPBACK, 1), (LOOPBACK, 2)
     count = SourceCount([peer, rare])
@@ -125,6 +127,7 @@ def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
 # --- addresses ------------------------------------------------------------------------------------
 
 
+@pytest.mark.sanitized
 @given(st.one_of(st.ip_addresses(v=4), st.ip_addresses(v=6)), st.integers(0, 65_535))
 def test_addresses_survive_formatting_and_parsing(host: object, port: int) -> None:
     address = (str(host), port)

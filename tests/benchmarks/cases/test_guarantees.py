@@ -1,4 +1,4 @@
-"""Benchmarks: figures from given measurements, programs, and the guarantee with few decisions."""
+"""The benchmark of the guarantees: what it counts as a violation, and as a loose or missing bound."""
 
 from dataclasses import replace
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.cases import guarantees as bench
+from benchmarks.report import Row
 from cosim.analysis.adversary import Objective, find_worst
 from netem.tc_words import settings_of
 from noack.scenario.sections import POLICIES
@@ -48,3 +49,25 @@ def test_a_bound_below_the_worst_run_is_reported() -> None:
     assert row.holds
     assert 0.1 < (row.value or 0.0) < 1.0
     assert bench.row_of("", replace(worst, certified=worst.value * 0.99)).holds is False
+
+
+def test_a_missing_certificate_fails() -> None:
+    loop = bench.loop_named("double_integrator", 1.0, "identity")
+    (row,) = bench.tightness_rows(loop, "relative", {"policy": "relative", "sigma": 5.0})
+    assert row.name == "double_integrator, relative: certificates"
+    assert row.holds is False
+    assert row.note
+
+
+def test_a_loose_bound_of_the_error_fails() -> None:
+    rows = [
+        Row("a: e_c", 0.9, ""),
+        Row("a: x", 0.1, ""),
+        Row("b: e_c", 0.45, ""),
+        Row("c: certificates", 0, ""),
+    ]
+    assert bench.smallest_share(rows).value == 0.45
+    assert bench.smallest_share(rows).note == "b: e_c"
+    assert bench.smallest_share(rows).holds is False
+    assert bench.smallest_share(rows[:2]).holds is True
+    assert bench.smallest_share(rows[1:2]).holds is None

@@ -34,7 +34,7 @@ from tests.cosim.record.changed_records import changed, flipped
 from tests.cosim.simulation.outage import Reborn, simulate_with
 from tests.helpers.machine_parts import controller_of
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 SHORT = (
     "horizon_s=1.0", "plant.rate_hz=50", "controller.rate_hz=50",
     "trigger.beta=0.01", "network.loss.probability=0.4",
@@ -64,6 +64,7 @@ def columns() -> Iterator[tuple[str, str]]:
                 yield table, column
 
 
+@pytest.mark.sanitized
 def test_a_run_is_replayed_bit_for_bit() -> None:
     found = replay(RECORD)
     assert found.bit_exact
@@ -212,6 +213,7 @@ def test_a_delivery_of_a_dropped_update_is_found() -> None:
     assert differences["sensor → netem"] is None
 
 
+@pytest.mark.sanitized
 @pytest.mark.parametrize("table", [PLANT_STEP, CONTROLLER_STEP])
 def test_ticks_after_the_runs_end_are_not_made(table: str) -> None:
     """Of a period of 10¹⁸ ns, the times of ten more steps would not fit 64 bits."""
@@ -227,6 +229,7 @@ def test_ticks_after_the_runs_end_are_not_made(table: str) -> None:
     assert f"{OWNER[table]}: replayed up to input {last + 1}" in found.gaps
 
 
+@pytest.mark.sanitized
 def test_a_recorded_measurement_after_the_runs_end_is_not_taken() -> None:
     """The observer would make 10⁹ steps up to it."""
     rows = OBSERVED[SENSOR_MEASUREMENT].copy()
@@ -238,6 +241,7 @@ def test_a_recorded_measurement_after_the_runs_end_is_not_taken() -> None:
     assert sensor.compared == 20
 
 
+@pytest.mark.sanitized
 @pytest.mark.parametrize("ticks", [True, False])
 def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
     content: dict[str, Any], ticks: bool
@@ -262,6 +266,7 @@ def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
     assert found.verdict().inputs == sum(map(len, rows.values()))
 
 
+@pytest.mark.sanitized
 @settings(max_examples=60)
 @given(st.integers(0, len(RECORDS) - 1), st.data())
 def test_a_record_with_any_numbers_is_replayed(number: int, data: st.DataObject) -> None:

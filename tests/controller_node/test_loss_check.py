@@ -1,0 +1,67 @@
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from controller_node.loss_check import LossCheck
+from noack.impairments.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossesInWindow,
+    LossGuarantee,
+    LossRule,
+)
+
+MS = 1_000_000
+
+
+def check_of(mansd: int, *constraints: LossRule, known_start: bool = True) -> LossCheck:
+    return LossCheck(LossGuarantee((LongestBurst(mansd), *constraints)), None, known_start=known_start)
+
+
+def violations(check: LossCheck, sequence: int, losses: int) -> Sequence[str]:
+    """Add an update that was sent at ``sequence`` milliseconds."""
+    found = check.add(sequence, sequence - losses - 1, losses, sequence * MS, sequence * MS)
+    assert all((one.t_ns, one.level) == (sequence * MS, "violation") for one in found)
+    return [one.text for one in found]
+
+
+@given(st.lists(st.booleans(), max_size=25))
+def test_further_constraints_are_checked_over_all_updates_so_far(delivered: list[bool]) -> None:
+    """At most 2 losses in 5, and 2 deliveries between bursts; each against its definition."""
+    window, recovery = LossesInWindow(2, 5), DeliveriesBetweenBursts(2)
+    check = check_of(30, window, recovery)
+    last = -1
+    for i in (number for number, arrives in enumerate(delivered) if arrives):
+        found = violations(check, i, i - last - 1)
+        ends = range(last + 1, i)  # the losses that this update shows
+        too_many = any(sum(not one for one in delivered[max(j - 4, 0) : j + 1]) > 2 for j in ends)
+        too_soon = i - last > 1 and delivered[last - 1 : last + 1] == [False, True]
+        assert [text.partition(" violated")[0] for text in found] == [
+            rule.name for rule, broken in ((window, too_many), (recovery, too_soon)) if broken
+        ]
+        last = i
+
+
+@pytest.mark.parametrize(
+    ("known", "lost", "expected"),
+    [
+        (False, 0, None),
+        (False, 1, "no delivered t_0: 1 "),
+        (False, 2, "no delivered t_0: 2 "),
+        (False, 3, "MANSD violated: 3 successive dropouts"),
+        (True, 0, None),
+        (True, 2, None),
+        (True, 3, "MANSD violated: 3 successive dropouts"),
+    ],
+)
+def test_lost_first_updates_are_a_violation_without_a_known_start(
+    known: bool, lost: int, expected: str | None
+) -> None:
+    check = check_of(2, known_start=known)
+    found = violations(check, lost, lost)
+    assert len(found) == (expected is not None)
+    assert all(text.startswith(str(expected)) for text in found)
+    # The flow has begun: a gap within the limit is no violation.
+    assert violations(check, lost + 2, 1) == []

@@ -1,0 +1,93 @@
+"""The figures of a campaign."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosim.output.figures.figure_description import Band
+from cosim.output.figures.figure_files import inline
+from cosim.studies.campaign.campaign_figures import (
+    _left_out,
+    curve_figure,
+    distribution_figure,
+    heat_map_figure,
+    pareto_figure,
+    undominated,
+)
+from cosim.studies.campaign.campaign_file import CampaignAxis
+from cosim.studies.campaign.campaign_report import written
+from cosim.studies.campaign.metrics import estimate
+from tests.cosim.studies.campaign.conftest import HOSTILE
+
+points = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12)
+
+
+@given(points)
+def test_the_front_is_what_nothing_dominates(drawn: list[tuple[int, int]]) -> None:
+    x, y = np.array(drawn, dtype=float).T
+    front = {(x[i], y[i]) for i in undominated(x, y)}
+    expected = {
+        (a, b) for a, b in drawn
+        if not any((c <= a and d <= b) and (c, d) != (a, b) for c, d in drawn)
+    }  # fmt: skip
+    assert front == expected
+    assert len(undominated(x, y)) == len(expected)
+    assert (np.diff(x[undominated(x, y)]) > 0).all()
+
+
+def test_figures_and_texts_accept_infinite_single_and_many_values() -> None:
+    never, one = estimate(np.full(4, math.inf)), estimate(np.array([2.0]))
+    assert written(never) == "never"
+    assert written(estimate(np.array([1.0, 3.0]))) == "2 ± 13"
+    assert written(estimate(np.array([-1.0, math.inf]))) == "−1 (50 % of runs)"
+    many = estimate(np.geomspace(1e-9, 1e9, 50))
+    drawn = []
+    for values in ([never], [never, one, many]):
+        labels = [str(i) for i in range(len(values))]
+        series = {f"series {i}": values for i in range(12)}
+        pairs = {name: (values, list(reversed(values))) for name in series}
+        drawn += [
+            pareto_figure(pairs, "transmissions", "cost"),
+            curve_figure(None, labels, series, HOSTILE, "cost"),
+        ]
+    drawn.append(curve_figure(np.array([1.0]), ["1"], {"a": [one]}, "x", "settling_s"))
+    for matrix in (np.full((2, 3), np.nan), np.array([[1.0, np.nan, 1e9]])):
+        rows = (("x", ["a", "b", "c"]), ("y", ["d", "e"][: len(matrix)]))
+        drawn.append(heat_map_figure({f"map {i}": matrix for i in range(4)}, *rows, "cost"))
+    values = {"a": np.full(3, math.inf), "b": np.array([1.0]), "c": np.geomspace(1e-3, 1e3, 9)}
+    drawn.append(distribution_figure(values, "cost"))
+    for figure in drawn:
+        assert inline(figure).startswith("<svg")
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "label", "logarithmic"),
+    [
+        ("network.impairments.0.rate_bps", (10_000, 30_000, 100_000), "rate [bit/s]", True),
+        ("plant.rate_hz", (10, 20, 50, 100, 200, 500, 1000), "rate [Hz]", True),
+        ("trigger.alpha_per_s", (0.1, 0.2, 0.3), "rate [1/s]", False),  # not far apart
+        ("network.mansd", (1, 2, 5, 10, 15, 20), "rate", False),  # evenly
+        ("network.impairments.0.delay_s", (0, 0.01, 1.0), "rate [s]", False),  # with 0
+    ],
+)
+def test_an_axis_has_the_unit_of_its_key_and_is_logarithmic_if_its_values_grow_by_factors(
+    key: str, values: tuple[float, ...], label: str, logarithmic: bool
+) -> None:
+    axis = CampaignAxis(name="rate", key=key, values=values)
+    series = {"a": [estimate(np.ones(3)) for _ in values]}
+    drawn = curve_figure(np.array(values, np.float64), axis.labels, series, axis.heading, "cost")
+    assert (drawn.rows[0].panels[0].x.label, drawn.rows[0].panels[0].x.logarithmic) == (label, logarithmic)
+
+
+def test_a_caption_says_what_the_means_leave_out() -> None:
+    whole, half, none = (estimate(np.array(values)) for values in ([1.0, 2.0], [1.0, np.inf], [np.inf] * 2))
+    assert _left_out([whole]) == ""
+    assert _left_out([whole, half]).endswith("left out, at one point 50 % of them")
+    assert _left_out([whole, none]).endswith("left out; where none is left, the point is missing")
+    figure = curve_figure(np.array([1.0, 2.0]), ["1", "2"], {"a": [whole, half]}, "x", "cost")
+    ((panel,),) = (row.panels for row in figure.rows)
+    (band,) = (item for item in panel.items if isinstance(item, Band))
+    assert np.isfinite(band.high).tolist() == [True, False]  # a single run has no interval

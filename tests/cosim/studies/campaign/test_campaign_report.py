@@ -1,0 +1,81 @@
+"""The output of a campaign: the page, the written files and the command line."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.output.result_tables import ResultTable
+from cosim.studies.campaign import campaign_grid
+from cosim.studies.campaign.campaign_file import load
+from cosim.studies.campaign.campaign_grid import base_of
+from cosim.studies.campaign.campaign_report import without_constants, write_report
+from cosim.studies.campaign.campaign_summary import summarise
+from cosim.studies.campaign.chunk_store import Store
+from tests.cosim.studies.campaign.conftest import HOSTILE, Command, Write
+
+
+def test_an_exceeded_certificate_is_reported_in_every_output(
+    write: Write, plan: dict[str, Any], tmp_path: Path, run_command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(campaign_grid, "certified_error", lambda resolved: 1e-3)
+    done = run_command(write(plan, figures=[]))
+    assert done.exit_code == 1
+    assert "28 of 28 runs exceed a certified bound." in done.output
+    assert 'class="verdict bad"' in (tmp_path / "out" / "campaign.html").read_text()
+
+
+def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
+    write: Write, plan: dict[str, Any], tmp_path: Path, run_command: Command
+) -> None:
+    path = write(plan, figures=[])
+    done = run_command(path, "--json", "--draws", "4")
+    assert done.exit_code == 0, done.output
+    report = json.loads(done.stdout)
+    assert report.pop("made") == 16
+    assert all(Path(file).exists() for file in report.pop("files"))
+    assert json.loads((tmp_path / "out" / "summary.json").read_text()) == report
+    done = run_command(path, "--json", "--tables", str(tmp_path / "tables"))
+    assert json.loads(done.stdout)["made"] == 4 * (7 - 3)
+    names = {file.name for file in (tmp_path / "tables").iterdir()}
+    assert names == {"campaign.csv", "campaign.tex", "differences.csv", "differences.tex"}
+    rows = (tmp_path / "tables/campaign.csv").read_text().splitlines()
+    assert len(rows) == 1 + 4
+    assert "transmissions" in rows[0]
+
+
+def test_the_page_is_one_file_and_escapes_user_text(write: Write, plan: dict[str, Any], full: Store) -> None:
+    plan["axes"][1]["title"] = HOSTILE
+    path = write(plan, description=HOSTILE)
+    campaign = load(path)
+    summary = summarise(campaign, full)
+    write_report(summary, full, base_of(campaign, path)[1])
+    html = (full.folder / "campaign.html").read_text(encoding="utf-8")
+    assert "<script" not in html
+    assert "http" not in html.replace('"http-equiv', "").replace("http-equiv=", "")
+    assert html.count("<figure id=") == len(campaign.figures)
+    assert html.count("<svg") == len(campaign.figures)
+
+
+def test_terminal_tables_print_names_literally_and_list_failed_runs(
+    write: Write, plan: dict[str, Any], run_command: Command
+) -> None:
+    name = "[/x] [red]"
+    plan["axes"][0]["variants"] = {name: {"mode": "model"}, "ZOH": {"mode": "zoh"}}
+    result = run_command(write(plan, figures=[], draws=2, metrics={"most_events": 1}))
+    assert result.exit_code == 0, result.output
+    text = " ".join(result.stdout.split())
+    assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in text
+
+
+def test_columns_that_are_the_same_at_all_points_are_named_once() -> None:
+    rows = [("MB", "0.1", "3 ± 1", "–"), ("MB", "0.5", "4 ± 1", "–")]
+    full = ResultTable("campaign", "c", ("policy", "β", "cost", "bound used"), rows)
+    table, names = without_constants(full, 2)
+    assert (table.caption, names) == ("c; everywhere policy MB, bound used –", 1)
+    assert (table.headings, table.rows) == (["β", "cost"], [["0.1", "3 ± 1"], ["0.5", "4 ± 1"]])
+    only_labels = full._replace(rows=[("MB", "0.1", "3", "–"), ("MB", "0.5", "3", "–")])
+    for unchanged in (full._replace(rows=rows[:1]), only_labels, full._replace(rows=[])):
+        assert without_constants(unchanged, 2) == (unchanged, 2)

@@ -1,0 +1,69 @@
+"""Standard error as JSON Lines."""
+
+import io
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from noack.core.errors import ExitStatus
+from noack.runtime.command_line import LogFormat, failed, log_event, log_format, print_to_stderr
+from tests.command_line import invoke
+
+Object = dict[str, Any]
+
+
+def objects(text: str) -> list[Object]:
+    found = [json.loads(line) for line in text.splitlines()]
+    for one in found:
+        assert {"time", "level", "source", "message"} <= one.keys()
+        assert one["time"].endswith("Z")
+    return found
+
+
+def standard_error(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    return stream
+
+
+def test_each_line_of_the_log_becomes_a_json_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    error = standard_error(monkeypatch)
+    with log_format(LogFormat.JSONL):
+        print_to_stderr("noack: warning: no disk")
+        print_to_stderr("noack netem: ready")
+        print("a plain", "\x1b[31mline\x1b[0m\n\nand one\tmore", file=sys.stderr)
+        failed("wrong\ntwice", ExitStatus.CALLER, source="noack netem", as_json=False)
+    print_to_stderr("text again")
+    *lines, last = error.getvalue().splitlines()
+    assert last == "text again"
+    found = [(one["level"], one["source"], one["message"]) for one in objects("\n".join(lines))]
+    assert found == [
+        ("warning", "noack", "no disk"),
+        ("info", "noack netem", "ready"),
+        ("info", "noack", "a plain line"),
+        ("info", "noack", r"and one\tmore"),
+        ("error", "noack netem", "wrong"),
+        ("error", "noack netem", "twice"),
+    ]
+
+
+def test_an_event_has_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    error = standard_error(monkeypatch)
+    assert not log_event("info", "noack", "text", event="progress")
+    with log_format(LogFormat.JSONL):
+        assert log_event("info", "noack", "m", event="progress", x=math.inf, n=3, p=Path("a"))
+        (found,) = objects(error.getvalue())
+        error.close()  # as a closed pipe, it is ignored
+        assert log_event("info", "noack", "m")
+    assert (found["event"], found["x"], found["n"], found["p"]) == ("progress", None, 3, "a")
+
+
+def test_a_mistake_becomes_a_json_object() -> None:
+    done = invoke("run", "nowhere", "--log-format", "jsonl")
+    (found,) = objects(done.stderr)
+    assert (done.exit_code, found["level"]) == (2, "error")
+    assert found["message"].startswith("nowhere: no such file")
