@@ -783,7 +783,7 @@ typedef struct { /* place 0 is the flow of every run, place 1 that of the acknow
     noack_wire wire;
     noack_clock clock;
     int64_t spin_ns; /* time before a tick in which it does not sleep */
-    int64_t rest_ns; /* if a tick is nearer after others, it sleeps so long, to do several at once */
+    int64_t coalescing_ns; /* if a tick is nearer after others, it sleeps so long, to do several */
     int64_t receiver_count;
     int64_t receivers[2]; /* sockets */
     int64_t senders[2];   /* sockets, connected to where the flows go; -1: none */

@@ -62,8 +62,8 @@ _ADMISSION_TIMEOUT_S = 10.0
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
 _FEW_LOOPS = 8
-_REST_SHARE = 25
-_LONGEST_REST_NS = 800_000
+_COALESCING_SHARE = 25
+_LONGEST_COALESCING_NS = 800_000
 """Ticks of more than a few loops that are nearer to others than this part of a period are done
 together: waking up for each takes CPU time."""
 _GRACE_TURNS = 3  # of housekeeping, 50 ms each, after the horizon for packets in flight
@@ -172,12 +172,12 @@ class RunProcess:
         return round(self.scenario.realtime.spin_us * 1000)
 
     @property
-    def rest_ns(self) -> int:
+    def coalescing_ns(self) -> int:
         """How long to gather the ticks of many loops."""
         if len(self.phases_ns) <= _FEW_LOOPS:
             return 0
         period_ns = min(loop.timing.plant_period_ns for loop in loops_of(self.scenario))
-        return min(int(period_ns / _REST_SHARE / self.scenario.speed), _LONGEST_REST_NS)
+        return min(int(period_ns / _COALESCING_SHARE / self.scenario.speed), _LONGEST_COALESCING_NS)
 
     @contextmanager
     def open_socket(self) -> Iterator[socket.socket]:
