@@ -9,9 +9,9 @@ with stoppable_imports():
     from controller_node.controller import controllers_of
     from noack.controllers.program_controller import ProgramControllerSettings
     from noack.core.errors import ExitStatus
+    from noack.runtime.join_run import join_run
     from noack.runtime.live_driver import run_machines
     from noack.runtime.node_driver import run_program
-    from noack.runtime.run_process import join_run
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:

@@ -153,7 +153,7 @@ class Controller(MachinePart):
         )
         self._set_point(controller, self.setpoint)
 
-    def redraw(self, controller: CData, memory: CoreMemory) -> None:
+    def set_drawn_values(self, controller: CData, memory: CoreMemory) -> None:
         """Set what x(0) determines."""
         self._memory = memory
         if self.x0 is not None:
@@ -225,9 +225,9 @@ def controllers_of(
 
     Of the plant's data they use at most x(0).
     """
-    parts, alike = parts_of(loops, partial(_part, start), _redrawn)
+    parts, templates = parts_of(loops, partial(_part, start), _redrawn)
     if not start.is_restart:
-        return LoopMachines(parts, phases_ns, alike=alike)
+        return LoopMachines(parts, phases_ns, templates=templates)
     phases = tuple(phases_ns or (0,) * len(loops))  # they determine the first ticks
     parts = [
         replace(part, start=start._replace(from_ns=start.from_ns - phase_ns))

@@ -35,7 +35,7 @@ PLATFORMS = {
 """The platforms for which ``make dist`` builds wheels, each by its tag: ziglang's names of them."""
 OWN = f"{sys.platform}_{platform.machine()}".lower()
 """The platform of this machine."""
-_LIVE = ("driver/driver.c", "relay/*.c")
+_LIVE = ("driver/driver.c", "driver/sockets.c", "relay/*.c")
 """Sockets and timers of live runs: only Linux has them. Elsewhere the library is without them."""
 MACHINES = ("loop/*.c", "elementary.c", "heap.c", "wire.c", "clock.c")
 """What a node needs: the steps of every role, wire format and clock. No sockets, no allocation, no

@@ -184,8 +184,11 @@ typedef struct {
 /* ---- State ----------------------------------------------------------------------------------- */
 
 typedef struct { /* a stage's memory of a flow */
-    int64_t phase;
-    double score;
+    union {                     /* by the kind of the stage: */
+        int64_t state;          /* of a Markov chain, or 1: a score is stored */
+        int64_t taken_until_ns; /* the slots of a schedule that begin before this time are taken */
+    };
+    double score; /* of the packet before */
 } noack_stage_memory;
 
 typedef struct { /* a link's state of a flow */
@@ -216,7 +219,7 @@ typedef struct { /* a stage's state that all flows share; departure times lie in
     int64_t dropped_before;    /* 1: the law dropped the previous packet; drop_next_ns is not new */
     int64_t used, left_bytes;  /* opportunities: which of those at busy_until_ns, from 1; its rest */
     int64_t total_bytes;       /* all bytes that were put into the queue */
-    int64_t phase, step;       /* Gilbert-Elliott, common to all flows: state, and number of its step */
+    int64_t state, step;       /* Gilbert-Elliott, common to all flows: state, and number of its step */
     int64_t waiting, waits;    /* packets that wait until the link is free: the place + 1 of the first
                                   one, 0: none; how many */
 } noack_queue;
@@ -780,7 +783,7 @@ typedef struct { /* place 0 is the flow of every run, place 1 that of the acknow
     noack_wire wire;
     noack_clock clock;
     int64_t spin_ns; /* time before a tick in which it does not sleep */
-    int64_t rest_ns; /* if a tick is nearer after others, it sleeps so long, to do several at once */
+    int64_t coalescing_ns; /* if a tick is nearer after others, it sleeps so long, to do several */
     int64_t receiver_count;
     int64_t receivers[2]; /* sockets */
     int64_t senders[2];   /* sockets, connected to where the flows go; -1: none */

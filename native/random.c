@@ -121,9 +121,9 @@ double noack_normal_score(double u) {
 double latent(double correlation, double innovation, noack_stage_memory *memory, double u) {
     double z = -noack_normal_score(u);
     if (correlation != 0.0) {
-        if (memory->phase != 0)
+        if (memory->state != 0)
             z = correlation * memory->score + innovation * z;
-        memory->phase = 1;
+        memory->state = 1;
         memory->score = z;
     }
     return z;

@@ -16,7 +16,8 @@ with stoppable_imports():
     from noack.core.errors import ExitStatus, NoackError
     from noack.protocol.roles import ENDS
     from noack.runtime.command_line import Parser, failed
-    from noack.runtime.run_process import RunProcess, add_options, join_run
+    from noack.runtime.join_run import add_options, join_run
+    from noack.runtime.run_process import RunProcess
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -35,7 +35,7 @@ from noack.impairments.loss_prediction import expected_loss, read_files, with_ta
 from noack.impairments.words import OWN_TIME_S
 from noack.runtime.address import address_text, parse_address, parse_destination
 from noack.runtime.command_line import Parser
-from noack.runtime.run_process import add_options
+from noack.runtime.join_run import add_options
 
 LINK_NAME = "relay"
 """Name of the link that the command line describes."""

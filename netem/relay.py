@@ -17,8 +17,8 @@ from netem.relay_links import (
     LinkSpec,
     OpenLink,
     Tap,
-    let_wait,
     open_links,
+    set_receive_timeout,
     stamp_arrivals,
 )
 from netem.relay_memory import RelayDirection, RelayMemory
@@ -257,7 +257,7 @@ class Relay:
             reverse.row.sends = core.NOACK_LISTENING_SOCKET
             return
         if len(self.specs) == 1 and not link.spec.return_path:
-            self._memory.wait_for_only(link.endpoint.fileno(), number, let_wait(link.endpoint))
+            self._memory.wait_for_only(link.endpoint.fileno(), number, set_receive_timeout(link.endpoint))
         else:
             self._memory.watch(link.endpoint.fileno(), number)
         sends = core.NOACK_OWN_SOCKET

@@ -141,7 +141,7 @@ BUCKETS: int = core.NOACK_BUCKETS
 """Number of buckets. The last one also counts all longer times: 4.8 hours and more."""
 
 
-def lower_ns(bucket: int) -> int:
+def bucket_start_ns(bucket: int) -> int:
     """Return the shortest time of a bucket."""
     if bucket < _STEPS:
         return bucket
@@ -149,18 +149,13 @@ def lower_ns(bucket: int) -> int:
     return (_STEPS + (bucket & (_STEPS - 1))) << shift
 
 
-def coarse(counts: NDArray[np.int64]) -> list[list[int]]:
+def coarse_histogram(counts: NDArray[np.int64]) -> list[list[int]]:
     """Return a coarser histogram for people and plots: four buckets for each doubling.
 
     Each entry is the shortest time in ns and the count of a bucket that is not empty.
     """
     joined = counts.reshape(-1, _JOINED).sum(axis=1)
-    return [[lower_ns(_JOINED * k), int(joined[k])] for k in np.flatnonzero(joined).tolist()]
-
-
-def empty() -> NDArray[np.int64]:
-    """Return an empty histogram, (BUCKETS,)."""
-    return np.zeros(BUCKETS, dtype=np.int64)
+    return [[bucket_start_ns(_JOINED * k), int(joined[k])] for k in np.flatnonzero(joined).tolist()]
 
 
 def quantile_ns(counts: Sequence[int] | NDArray[np.int64], share: float) -> float:
@@ -169,7 +164,7 @@ def quantile_ns(counts: Sequence[int] | NDArray[np.int64], share: float) -> floa
     if reached[-1] == 0:
         return float("nan")
     bucket = int(np.searchsorted(reached, max(share * reached[-1], 1)))
-    return (lower_ns(bucket) + lower_ns(bucket + 1) - 1) / 2
+    return (bucket_start_ns(bucket) + bucket_start_ns(bucket + 1) - 1) / 2
 
 
 _BUFFER_BYTES = 4 * 1024 * 1024
@@ -285,8 +280,8 @@ def stamp_arrivals(endpoint: Endpoint) -> None:
         endpoint.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
 
-def let_wait(endpoint: Endpoint) -> int:
-    """Let receiving from a socket wait; return how long, in ns."""
+def set_receive_timeout(endpoint: Endpoint) -> int:
+    """Let receiving from a socket wait for a time at most; return this time in ns."""
     endpoint.setblocking(True)
     endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, RECEIVE_WAIT_NS // 1000))
     return RECEIVE_WAIT_NS

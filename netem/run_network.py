@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from netem.channel import PACKET_ROW, Datagram, at_start, due_settings, link_name
-from netem.relay_links import let_wait, stamp_arrivals
+from netem.relay_links import set_receive_timeout, stamp_arrivals
 from netem.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.clock import RunClock
 from noack.core.core_library import Rows, core
@@ -93,7 +93,7 @@ class RunNetwork:
         for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
             stamp_arrivals(endpoint)
             if len(receivers) == 1:
-                self._memory.wait_for_only(endpoint.fileno(), place, let_wait(endpoint))
+                self._memory.wait_for_only(endpoint.fileno(), place, set_receive_timeout(endpoint))
             else:
                 self._memory.watch(endpoint.fileno(), place)
         core.noack_relay_read_stamps(relay)

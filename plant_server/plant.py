@@ -236,7 +236,7 @@ class Plant(MachinePart):
                     "Bd": np.zeros((n, sources)),
                 },
             )
-        self.redraw(plant, memory)
+        self.set_drawn_values(plant, memory)
         self.watchdog.fill(plant, memory, self.period_ns)
         widths = (0, 0) if self.disturbance is None else self.disturbance.widths
         noisy = self.measuring is not None and self.measuring.is_noisy
@@ -249,7 +249,7 @@ class Plant(MachinePart):
             signal.width, signal.rows, signal.first = width, BLOCK, -BLOCK
             signal.values = memory.zeros(BLOCK * width)
 
-    def redraw(self, plant: CData, memory: CoreMemory) -> None:
+    def set_drawn_values(self, plant: CData, memory: CoreMemory) -> None:
         """Set the state, and the matrices of a linear system."""
         n, system = plant.machine.n, self.system
         reals_at(plant.x, n)[:], reals_at(plant.z, plant.internal)[:] = system.x, system.z
@@ -303,8 +303,8 @@ def plants_of(
 
     A plant cannot be restarted during the run: ``start`` has no effect.
     """
-    parts, alike = parts_of(loops, _part, _redrawn)
-    return LoopMachines(parts, phases_ns, alike=alike)
+    parts, templates = parts_of(loops, _part, _redrawn)
+    return LoopMachines(parts, phases_ns, templates=templates)
 
 
 def _part(resolved: Scenario) -> Plant:

@@ -185,7 +185,7 @@ class Sensor(MachinePart):
         if self.x0 is not None:
             self._start(sensor, 0, self.x0)
 
-    def redraw(self, sensor: CData, memory: CoreMemory) -> None:
+    def set_drawn_values(self, sensor: CData, memory: CoreMemory) -> None:
         """Set what x(0) determines."""
         self._memory = memory
         if self.observer is not None:
@@ -305,8 +305,8 @@ def sensors_of(
     Of the plant's data they use at most x(0). After a restart, a sensor transmits its first
     measurement.
     """
-    parts, alike = parts_of(loops, partial(_part, start), partial(_redrawn, start))
-    return LoopMachines(parts, phases_ns, alike=alike)
+    parts, templates = parts_of(loops, partial(_part, start), partial(_redrawn, start))
+    return LoopMachines(parts, phases_ns, templates=templates)
 
 
 def _part(start: Start, resolved: Scenario) -> Sensor:

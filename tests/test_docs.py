@@ -32,7 +32,7 @@ from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.loss_models import LOSS_MODELS
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.command_line import Parser
-from noack.runtime.run_process import add_options
+from noack.runtime.join_run import add_options
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES, AnyDisturbance, AnyObserver

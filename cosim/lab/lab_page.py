@@ -25,10 +25,10 @@ from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draf
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.exploration_figure import CERTIFICATE, ExploredRun, exploration_figure
 from cosim.interactive.form import by_field, filled, form_of
+from cosim.lab.figure_sources import LiveSource, RecordedSource, report_address
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.page_parts import PageParts, TextPanel, controls_part, figure_part, form_part, value_text
 from cosim.lab.run_views import Reference, compare, verdict_of
-from cosim.lab.sources import LiveSource, RecordedSource, report_address
 from cosim.output.figures.figure_format import FigureFormat, figure_width_in
 from cosim.output.page_kit import TERMS
 from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, VerdictLine

@@ -27,7 +27,7 @@ from cosim.analysis.summary.summary_model import (
     read_summary,
 )
 from cosim.live.monitoring.progress import work_bar
-from cosim.live.processes.end_helpers import EndHelpers, PreparedEnding
+from cosim.live.processes.finalize_helpers import FinalizeHelpers, RunEndingWithHelpers
 from cosim.output.viewer.rerun_program import is_installed, require_viewer
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -76,7 +76,7 @@ def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again
     """
     run_dir = ending.run_dir
     with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
-        prepared = ending.helpers if isinstance(ending, PreparedEnding) else None
+        prepared = ending.helpers if isinstance(ending, RunEndingWithHelpers) else None
         if prepared is not None:
             stack.enter_context(closing(prepared))
         if not (scenario_file := run_dir / SCENARIO_FILE).exists():
@@ -86,12 +86,12 @@ def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again
         is_shown = not unfinished or (run_dir / REPORTS_FILE).is_file()
         is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
         scenario, _ = scenarios_of(run_dir)
-        helpers = stack.enter_context(closing(prepared or EndHelpers(scenario)))
+        helpers = stack.enter_context(closing(prepared or FinalizeHelpers(scenario)))
         helpers.start()
         with work_bar("the record of the run") as show:
             each = partial(helpers.each, show=show)
             run = finish_record(run_dir, each, helpers.early) if unfinished else load_run(run_dir)
-        summary, over_time = _judged(run, ending, helpers)
+        summary, over_time = _judge_run(run, ending, helpers)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
         if view and (again or not is_shown):
@@ -151,7 +151,7 @@ class Expectations(NamedTuple):
     """None if they cannot be computed, which the claims then report."""
 
 
-class _Judged(NamedTuple):
+class _LoopResults(NamedTuple):
     """What the end of a run finds out about a loop."""
 
     summary: LoopSummary
@@ -159,19 +159,19 @@ class _Judged(NamedTuple):
     """Only of several loops; None if it could not be computed."""
 
 
-def _judged(
-    run: RecordedRun, ending: RunEnding, helpers: EndHelpers
+def _judge_run(
+    run: RecordedRun, ending: RunEnding, helpers: FinalizeHelpers
 ) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
     """Judge every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.loops), None
-    beside = ReplayBeside(helpers, ending.run_dir) if helpers.count and loops == 1 else None
+    replay_in_helper = ReplayInHelper(helpers, ending.run_dir) if helpers.count and loops == 1 else None
 
-    def judge_here(block: range) -> list[_Judged]:
-        return _judged_loops(run, ending, beside, block, helpers.expectations(block))
+    def judge_here(block: range) -> list[_LoopResults]:
+        return _judge_loops(run, ending, replay_in_helper, block, helpers.expectations(block))
 
-    def judge_in_helper(block: range) -> list[_Judged]:
+    def judge_in_helper(block: range) -> list[_LoopResults]:
         own = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason)
-        return helpers.call(_judged_stored, own, block, helpers.expectations(block))
+        return helpers.call(_judge_stored_loops, own, block, helpers.expectations(block))
 
     with (
         work_bar(f"claims of {loops} loops") as show,
@@ -219,22 +219,24 @@ _stored_run = cache(load_run)
 
 
 @np.errstate(all="ignore")
-def _judged_stored(ending: RunEnding, block: range, known: Sequence[Expectations] | None) -> list[_Judged]:
-    return _judged_loops(_stored_run(ending.run_dir), ending, None, block, known)
+def _judge_stored_loops(
+    ending: RunEnding, block: range, known: Sequence[Expectations] | None
+) -> list[_LoopResults]:
+    return _judge_loops(_stored_run(ending.run_dir), ending, None, block, known)
 
 
 def _record_stored(run_dir: Path, summary: RunSummary, over_time: Sequence[LoopOverTime] | None) -> None:
     _write_recording(_stored_run(run_dir), summary, run_dir, None, over_time)
 
 
-def _judged_loops(
+def _judge_loops(
     run: RecordedRun,
     ending: RunEnding,
-    beside: "ReplayBeside | None",
+    replay_in_helper: "ReplayInHelper | None",
     block: range,
     known: Sequence[Expectations] | None,
-) -> list[_Judged]:
-    """Judge some loops, of which expectations may be known; ``beside`` replays the only one."""
+) -> list[_LoopResults]:
+    """Judge some loops, of which expectations may be known; a helper may replay the only one."""
     records = run.together(block)
     expected = known or _expectations([record.scenario for record in records])
     shared = SharedMachines(records if len(block) > 1 else ())
@@ -250,7 +252,7 @@ def _judged_loops(
         if len(run.loops) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
-        judged.append(_with_results(run, summary, claims[0], shared, beside))
+        judged.append(_with_results(run, summary, claims[0], shared, replay_in_helper))
         del claims[0]  # with its samples
     return judged
 
@@ -272,10 +274,10 @@ def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:
     return [shared[key] for key in keys]
 
 
-class ReplayBeside:
+class ReplayInHelper:
     """The replay of the only loop of a run by another process."""
 
-    def __init__(self, helpers: EndHelpers, run_dir: Path) -> None:
+    def __init__(self, helpers: FinalizeHelpers, run_dir: Path) -> None:
         self._verdict = helpers.submit(stored_verdict, run_dir)
 
     def part(self) -> ReplayPart | None:
@@ -291,8 +293,8 @@ def _with_results(
     summary: LoopSummary,
     claims: RunClaims,
     shared: SharedMachines,
-    beside: ReplayBeside | None,
-) -> _Judged:
+    replay_in_helper: ReplayInHelper | None,
+) -> _LoopResults:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
     record = claims.record
     results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, len(run.loops))}
@@ -305,13 +307,13 @@ def _with_results(
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
     if record.kind == "live":
-        replayed = (beside and beside.part()) or _replay(record, shared)
+        replayed = (replay_in_helper and replay_in_helper.part()) or _replay(record, shared)
         results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
     over_time = None
     with suppress(Exception):  # the recording reports it
         if len(run.loops) > 1:
             over_time = loop_over_time(record, run.phases_ns[record.number])
-    return _Judged(summary.model_copy(update=results), over_time)
+    return _LoopResults(summary.model_copy(update=results), over_time)
 
 
 def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from cosim.lazy_modules import lazy_modules
 from cosim.live.coordinator import Coordinator
 from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
 from cosim.live.processes.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
-from cosim.live.processes.end_helpers import PreparedEnding, lasting_helpers
+from cosim.live.processes.finalize_helpers import RunEndingWithHelpers, lasting_helpers
 from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.record.run_directory import (
     LEAST_FREE_BYTES,
@@ -52,7 +52,8 @@ with lazy_modules():  # asyncio and TLS
     from cosim.live import remote_access
 
 _STOP_TIMEOUT_S = 15.0
-DEFAULT_S = 30.0
+DEFAULT_START_S = 30.0
+"""Wall time within which all processes have to be ready, if the scenario gives none."""
 _MOST_SLOWED = 20.0
 _OVERLOADED = 1.5
 """From this slow-down on, the message names the load as the likely cause."""
@@ -73,7 +74,7 @@ def launch(
     watcher: Watcher | None = None,
     server: ForkServer | None = None,
     listening: "remote_access.ListenSettings | None" = None,
-) -> PreparedEnding:
+) -> RunEndingWithHelpers:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
     Args:
@@ -122,7 +123,7 @@ def launch(
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
-    return PreparedEnding(run_dir, ticket.run_id, status, reason, startup_s, helpers)
+    return RunEndingWithHelpers(run_dir, ticket.run_id, status, reason, startup_s, helpers)
 
 
 def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str]) -> Scenario:
@@ -294,7 +295,7 @@ class _Run:
     def _start_within_s(self) -> float:
         given_s = self._scenario.start_within_s
         if given_s is None:
-            return float("inf") if self._by_hand else DEFAULT_S
+            return float("inf") if self._by_hand else DEFAULT_START_S
         return given_s
 
     def _overdue(self) -> str:

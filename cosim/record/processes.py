@@ -92,8 +92,8 @@ def report_entries(run_dir: Path) -> Entries:
 def entries_of_loop(entries: Entries, number: int, rows_of_others: Callable[[int, str, int], int]) -> Entries:
     """Return the reports as of one loop: with its own rows, and its own counters of datagrams.
 
-    ``others(number, table, generation)`` returns how many rows of a table of the network are of
-    other loops. Rows of the network that are missing in the record are missing in every loop.
+    ``rows_of_others(number, table, generation)`` returns how many rows of a table of the network
+    are of other loops. Rows of the network that are missing in the record are missing in every loop.
     """
     reports = []
     for role, report in entries:

@@ -1,68 +1,20 @@
-/* The live driver: messages and ticks of the machines of a process, in real time. */
-#define _GNU_SOURCE
-#include "../core.h"
+/* The live driver: messages and ticks of the machines of a process, in real time. Its sockets are
+   in sockets.c. */
+#include "driver.h"
 
 #include <errno.h>
-#include <netinet/in.h>
-#include <netinet/udp.h>
 #include <sched.h>
-#include <stddef.h>
-#include <string.h>
 #include <sys/epoll.h>
-#include <sys/socket.h>
 #include <sys/syscall.h>
 #include <sys/timerfd.h>
 #include <time.h>
 #include <unistd.h>
 
 enum {
-    BUFFERS = 64, /* datagrams that are handled or sent at once; the kernel segments as many */
-    TICKS = 64,   /* that are done before it receives again */
-    BUFFER_BYTES = 576, /* a longer datagram is cut, and rejected by its length */
-    MESSAGES = 16,      /* received at once; the last place is for a datagram that Python adds */
-    MESSAGE_BYTES = BUFFERS * BUFFER_BYTES, /* a message of the kernel has several datagrams */
+    TICKS = 64,         /* that are done before it receives again */
     MANY_BYTES = 98304, /* of rows: as many go to the recorder without a pause */
     EARLY_NS = 1000     /* a timer may expire so much before its time */
 };
-
-typedef union { /* room for the size of the datagrams in a message */
-    struct cmsghdr head;
-    uint8_t bytes[CMSG_SPACE(sizeof(int))];
-} control;
-
-typedef struct { /* a datagram that was received */
-    uint8_t *data;
-    int64_t size_bytes;
-    const uint8_t *name;
-} arrival;
-
-typedef struct {
-    struct mmsghdr in_headers[MESSAGES], out_headers[BUFFERS];
-    struct iovec in_vectors[MESSAGES], out_vectors[BUFFERS];
-    control in_controls[MESSAGES];
-    uint8_t in_names[MESSAGES][NOACK_NAME_BYTES];
-    int64_t message_next, message_end; /* the messages of which datagrams are still to be taken */
-    int64_t taken_bytes;               /* of the next one */
-    arrival arrivals[BUFFERS];
-    int64_t in_next, in_end; /* the current datagram, and the end of those taken */
-    int64_t is_unsegmented;  /* 1: the kernel does not segment what this process sends */
-    int64_t out_count, sealed_count;
-    int64_t is_sealing;        /* 1: Python encrypts what waits to be sent */
-    int64_t reason;            /* why the driver returns then */
-    int64_t is_accepted;       /* 1: the current datagram has become the message */
-    int64_t is_ticking;        /* 1: a tick waits for an answer */
-    int64_t now_ns;            /* time of the message or tick */
-    int64_t batch;             /* datagrams that one call receives */
-    int64_t timer_ns;          /* when the timer expires, on the monotonic clock */
-    int8_t out_flows[BUFFERS]; /* the sockets of what waits to be sent */
-    pauses pauses;
-    int64_t has_more;  /* 1: a socket may have more datagrams than were received */
-    int64_t first;     /* the socket that is read first the next time */
-    int64_t has_asked; /* 1: the present step has asked Python */
-    noack_message message;
-    uint8_t out_data[BUFFERS][BUFFER_BYTES];
-    uint8_t in_data[MESSAGES][MESSAGE_BYTES];
-} driver_scratch;
 
 int64_t clock_ns(int clock) {
     struct timespec now;
@@ -73,8 +25,6 @@ int64_t clock_ns(int clock) {
 int64_t run_time_ns(const noack_clock *clock) {
     return noack_clock_at_ns(clock, clock_ns(CLOCK_MONOTONIC));
 }
-
-static driver_scratch *scratch_of(const noack_driver *driver) { return driver->scratch; }
 
 int64_t noack_driver_scratch_bytes(void) { return (int64_t)sizeof(driver_scratch); }
 
@@ -87,149 +37,14 @@ const char *noack_driver_check(const noack_driver *driver) {
         return "clock.speed: not above 0";
     if (driver->clock.slew_ppb < 0 || driver->clock.slew_ppb >= NS_PER_S)
         return "clock.slew_ppb: not from 0 to 10^9";
-    if (driver->spin_ns < 0 || driver->rest_ns < 0 || driver->rest_ns >= NS_PER_S)
-        return "spin_ns, rest_ns: a time below 0 or of 1 s";
+    if (driver->spin_ns < 0 || driver->coalescing_ns < 0 || driver->coalescing_ns >= NS_PER_S)
+        return "spin_ns, coalescing_ns: a time below 0 or of 1 s";
     if (driver->receiver_count < 0 || driver->receiver_count > 2)
         return "receiver_count: not from 0 to 2";
     for (int k = 0; k < 2; k++)
         if (!is_name(&driver->sources[k]))
             return "name_bytes: not from 0 to 32";
     return NULL;
-}
-
-static void renew_header(driver_scratch *own, int64_t k) {
-    own->in_headers[k].msg_hdr.msg_namelen = NOACK_NAME_BYTES;
-    own->in_headers[k].msg_hdr.msg_control = &own->in_controls[k];
-    own->in_headers[k].msg_hdr.msg_controllen = sizeof own->in_controls[k];
-}
-
-/* Let epoll report a file that can be read by a bit; return 0 or errno. */
-static int64_t watch(const noack_driver *driver, int64_t fd, uint64_t bit) {
-    struct epoll_event event = {.events = EPOLLIN, .data.u64 = bit};
-    return epoll_ctl((int)driver->epoll, EPOLL_CTL_ADD, (int)fd, &event) == 0 ? 0 : errno;
-}
-
-int64_t noack_driver_open(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
-    for (int k = 0; k < BUFFERS; k++) {
-        own->out_vectors[k] = (struct iovec){own->out_data[k], 0};
-        own->out_headers[k].msg_hdr =
-            (struct msghdr){.msg_iov = &own->out_vectors[k], .msg_iovlen = 1};
-    }
-    for (int k = 0; k < MESSAGES; k++) {
-        own->in_vectors[k] = (struct iovec){own->in_data[k], MESSAGE_BYTES};
-        own->in_headers[k].msg_hdr = (struct msghdr){
-            .msg_name = own->in_names[k], .msg_iov = &own->in_vectors[k], .msg_iovlen = 1};
-        renew_header(own, k);
-    }
-    /* A call that has received as many as it may does not look for another one. */
-    own->batch = min_of(driver->process->loops, MESSAGES - 1);
-    driver->senders[0] = driver->senders[1] = -1;
-    driver->timer = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC);
-    driver->epoll = epoll_create1(EPOLL_CLOEXEC);
-    return driver->timer < 0 || driver->epoll < 0 ? errno : watch(driver, driver->timer, 0);
-}
-
-int64_t noack_driver_watch(noack_driver *driver) {
-    int64_t error = 0;
-    for (int k = 0; k < driver->receiver_count && error == 0; k++)
-        error = watch(driver, driver->receivers[k], UINT64_C(1) << k);
-    return error;
-}
-
-static void close_fd(int64_t *fd) {
-    if (*fd >= 0)
-        close((int)*fd);
-    *fd = -1;
-}
-
-void noack_driver_close(noack_driver *driver) {
-    close_fd(&driver->epoll);
-    close_fd(&driver->timer);
-}
-
-/* Whether a name is that of a peer: the same family, port and host. */
-static int is_peer(const uint8_t name[NOACK_NAME_BYTES], const noack_peer *peer) {
-    sa_family_t family;
-    memcpy(&family, name, sizeof family);
-    if (peer->name_bytes == 0 || memcmp(name, peer->name, 4) != 0)
-        return 0;
-    size_t host = family == AF_INET ? offsetof(struct sockaddr_in, sin_addr)
-                                    : offsetof(struct sockaddr_in6, sin6_addr);
-    return memcmp(name + host, peer->name + host, family == AF_INET ? 4 : 16) == 0;
-}
-
-void noack_driver_add_datagram(
-    noack_driver *driver, const uint8_t name[NOACK_NAME_BYTES], const uint8_t *data,
-    int64_t size_bytes) {
-    driver_scratch *own = scratch_of(driver);
-    uint8_t *place = own->in_data[MESSAGES - 1];
-    size_bytes = min_of(size_bytes, BUFFER_BYTES);
-    memcpy(place, data, (size_t)size_bytes);
-    memcpy(own->in_names[MESSAGES - 1], name, NOACK_NAME_BYTES);
-    if (own->in_next == own->in_end)
-        own->in_next = own->in_end = 0;
-    own->arrivals[own->in_end++] = (arrival){place, size_bytes, own->in_names[MESSAGES - 1]};
-}
-
-/* Send datagrams of one size as one message, which goes through the kernel once. Return their
-   number, or -1 if that fails: the network's interface may refuse such messages. */
-static int send_segmented(driver_scratch *own, int fd, int64_t place, int64_t count) {
-    uint16_t size = (uint16_t)own->out_vectors[place].iov_len;
-    control size_control = {
-        .head = {
-            .cmsg_level = IPPROTO_UDP,
-            .cmsg_type = UDP_SEGMENT,
-            .cmsg_len = CMSG_LEN(sizeof size)}};
-    memcpy(CMSG_DATA(&size_control.head), &size, sizeof size);
-    struct msghdr message = {
-        .msg_iov = &own->out_vectors[place],
-        .msg_iovlen = (size_t)count,
-        .msg_control = &size_control,
-        .msg_controllen = CMSG_SPACE(sizeof size)};
-    if (sendmsg(fd, &message, MSG_DONTWAIT) >= 0)
-        return (int)count;
-    own->is_unsegmented = errno == EINVAL || errno == EIO || errno == EMSGSIZE;
-    return -1;
-}
-
-/* Send datagrams of one socket, from a place on; return the number of those that were sent, or -1.
- */
-static int call_send(driver_scratch *own, int fd, int64_t place, int64_t count) {
-    const struct iovec *vectors = &own->out_vectors[place];
-    int64_t equal = 1;
-    while (equal < count && vectors[equal].iov_len == vectors[0].iov_len)
-        equal++;
-    if (equal > 1 && !own->is_unsegmented) {
-        int sent = send_segmented(own, fd, place, equal);
-        if (sent > 0 || !own->is_unsegmented)
-            return sent;
-    }
-    if (count > 1)
-        return sendmmsg(fd, &own->out_headers[place], (unsigned)count, MSG_DONTWAIT);
-    const struct iovec *vector = &own->out_vectors[place];
-    return send(fd, vector->iov_base, vector->iov_len, MSG_DONTWAIT) < 0 ? -1 : 1;
-}
-
-/* Send the datagrams that wait; a failure is counted. An ICMP error of an earlier datagram makes
-   one call fail, too, so each is tried twice. */
-static void send_all(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
-    int has_failed = 0;
-    for (int64_t k = 0, end; k < own->out_count;) {
-        for (end = k + 1; end < own->out_count && own->out_flows[end] == own->out_flows[k];)
-            end++;
-        int sent = call_send(own, (int)driver->senders[own->out_flows[k]], k, end - k);
-        if (sent > 0) {
-            driver->sent += sent;
-            k += sent;
-            has_failed = 0;
-        } else if (errno != EINTR && !(has_failed ^= 1)) {
-            driver->errors[errno & (NOACK_ERRNOS - 1)]++;
-            k++;
-        }
-    }
-    own->out_count = own->sealed_count = 0;
 }
 
 /* Write the datagram of the message that a machine sends, if it sends one. There must be room. */
@@ -379,11 +194,12 @@ static void set_timer(noack_driver *driver, int64_t wall_ns, int64_t at_ns) {
 static int64_t sleep_until_needed(
     noack_driver *driver, int64_t wall_ns, int64_t tick_ns, int64_t wait_ns) {
     driver_scratch *own = scratch_of(driver);
-    int rests = own->pauses.worked && !own->has_more && 0 < tick_ns && tick_ns < driver->rest_ns;
+    int coalesces =
+        own->pauses.worked && !own->has_more && 0 < tick_ns && tick_ns < driver->coalescing_ns;
     own->pauses.worked = 0;
-    if (rests) {
-        struct timespec rest = {0, driver->rest_ns};
-        return clock_nanosleep(CLOCK_MONOTONIC, 0, &rest, NULL) == EINTR
+    if (coalesces) {
+        struct timespec pause = {0, driver->coalescing_ns};
+        return clock_nanosleep(CLOCK_MONOTONIC, 0, &pause, NULL) == EINTR
                    ? -1
                    : (INT64_C(1) << driver->receiver_count) - 1;
     }
@@ -401,78 +217,6 @@ static int64_t sleep_until_needed(
     return (int64_t)ready;
 }
 
-/* Receive at most a number of messages from a place on; return their number. After an ICMP error of
-   a datagram, it fails once. Of several loops, a message may have several datagrams. */
-static int64_t call_receive(driver_scratch *own, int fd, int64_t place, int64_t most) {
-    if (own->batch > 1)
-        return recvmmsg(fd, &own->in_headers[place], (unsigned)most, MSG_DONTWAIT, NULL);
-    socklen_t name_bytes = NOACK_NAME_BYTES;
-    ssize_t size_bytes = recvfrom(
-        fd, own->in_data[place], BUFFER_BYTES, MSG_DONTWAIT,
-        (struct sockaddr *)own->in_names[place], &name_bytes);
-    own->in_headers[place].msg_len = (unsigned)max_of(size_bytes, 0);
-    own->in_headers[place].msg_hdr.msg_controllen = 0;
-    return size_bytes < 0 ? -1 : 1;
-}
-
-/* The size of the datagrams in a message; only the last one may be smaller. */
-static int64_t segment_bytes(const struct mmsghdr *message) {
-    struct msghdr head = message->msg_hdr;
-    for (struct cmsghdr *part = CMSG_FIRSTHDR(&head); part; part = CMSG_NXTHDR(&head, part))
-        if (part->cmsg_level == IPPROTO_UDP && part->cmsg_type == UDP_GRO) {
-            int size_bytes;
-            memcpy(&size_bytes, CMSG_DATA(part), sizeof size_bytes);
-            return max_of(size_bytes, 1);
-        }
-    return message->msg_len;
-}
-
-/* Take datagrams out of the messages that were received, and count their sources. */
-static void take_arrivals(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
-    own->in_next = own->in_end = 0;
-    /* One place is left for a datagram that Python adds. */
-    while (own->message_next < own->message_end && own->in_end < BUFFERS - 1) {
-        int64_t number = own->message_next, all_bytes = own->in_headers[number].msg_len;
-        int64_t size_bytes =
-            min_of(segment_bytes(&own->in_headers[number]), all_bytes - own->taken_bytes);
-        const uint8_t *name = own->in_names[number];
-        own->arrivals[own->in_end++] =
-            (arrival){own->in_data[number] + own->taken_bytes, size_bytes, name};
-        own->taken_bytes += size_bytes;
-        int64_t source = 0;
-        while (source < 2 && !is_peer(name, &driver->sources[source]))
-            source++;
-        if (source < 2)
-            driver->sources[source].received++;
-        else
-            driver->foreign++;
-        if (own->taken_bytes == all_bytes) {
-            renew_header(own, number);
-            own->taken_bytes = 0;
-            own->message_next++;
-        }
-    }
-}
-
-/* Receive messages from the sockets that have some. They are read first in turn: one that always
-   has many would leave no room for the other. */
-static void receive(noack_driver *driver, int64_t ready) {
-    driver_scratch *own = scratch_of(driver);
-    own->message_next = own->message_end = own->taken_bytes = own->has_more = 0;
-    for (int64_t turn = 0; turn < driver->receiver_count; turn++) {
-        int64_t k = (own->first + turn) % driver->receiver_count;
-        int64_t most = min_of(own->batch, MESSAGES - 1 - own->message_end);
-        if (!(ready >> k & 1) || most == 0)
-            continue;
-        int64_t taken = call_receive(own, (int)driver->receivers[k], own->message_end, most);
-        own->message_end += max_of(taken, 0);
-        own->has_more |= taken == most;
-    }
-    own->first ^= 1;
-    take_arrivals(driver);
-}
-
 /* How long to wait for, at most, or 0 if the time for housekeeping has come. */
 static int64_t wait_for_ns(
     noack_driver *driver, int64_t until_ns, int64_t now_ns, int64_t tick_ns) {
@@ -480,7 +224,7 @@ static int64_t wait_for_ns(
         return max_of(noack_clock_wait_ns(&driver->clock, until_ns - now_ns), 1);
     if (until_ns == INT64_MIN) /* what has been received is still to be handled */
         return 1;
-    if (driver->rest_ns > 0) /* no moment is better than another */
+    if (driver->coalescing_ns > 0) /* no moment is better than another */
         return 0;
     int64_t overdue_ns = noack_clock_wait_ns(&driver->clock, now_ns - until_ns);
     return put_off_ns(&scratch_of(driver)->pauses, overdue_ns, tick_ns, 0, 0);
@@ -503,14 +247,14 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
         if (must_seal(driver))
             return NOACK_DRIVER_SEAL;
         if (own->out_count > 0)
-            send_all(driver);
+            send_datagrams(driver);
         if (own->reason == NOACK_DRIVER_OPEN)
             point_to(
                 driver, own->arrivals[own->in_next].data, own->arrivals[own->in_next].size_bytes);
         if (own->reason != NOACK_DRIVER_NOTHING)
             return own->reason;
         if (own->in_next == own->in_end && own->message_next < own->message_end)
-            take_arrivals(driver);
+            take_datagrams(driver);
         if (until_ns == INT64_MIN && own->in_next == own->in_end)
             return NOACK_DRIVEN;
         if (has_many_rows(driver->process))
@@ -527,7 +271,7 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
         if (ready < 0)
             return NOACK_DRIVEN;
         if (ready > 0)
-            receive(driver, ready);
+            receive_datagrams(driver, ready);
     }
 }
 

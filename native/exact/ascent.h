@@ -9,7 +9,7 @@
 enum { FAST_STEPS = 60, TURNS = FAST_STEPS + 1100 }; /* more than any two doubles need */
 static const double CLOSE = 1e-5; /* relative size of the last step; its cube is rounding */
 
-typedef search_point look_function(const void *curve, const level_search *search, double s);
+typedef search_point evaluate_function(const void *curve, const level_search *search, double s);
 
 /* The next point, if it is in the bracket, else a safe one. low_s is below the root, if there is
    one; there is one below high_s if beyond. */
@@ -31,9 +31,9 @@ static inline double safe_step(double value, double slope, double most, double s
     return least(slope > 0.0 ? -2.0 * value / (slope + root) : (root - slope) / most, span);
 }
 
-/* The root of an increasing h in (at.s, ahead_s), or NONE. look gives h and its derivatives. */
+/* The root of an increasing h in (at.s, ahead_s), or NONE. evaluate gives h and its derivatives. */
 static inline __attribute__((always_inline)) double ascend(
-    look_function *look, const void *curve, const level_search *search, search_point at,
+    evaluate_function *evaluate, const void *curve, const level_search *search, search_point at,
     double ahead_s) {
     double low_s = at.s, high_s = ahead_s;
     int beyond = 0;
@@ -46,7 +46,7 @@ static inline __attribute__((always_inline)) double ascend(
         following = bracketed(following, turn, low_s, high_s, beyond);
         if (following == at.s)
             return at.s;
-        at = look(curve, search, following);
+        at = evaluate(curve, search, following);
         if (at.excess >= 0.0) {
             high_s = at.s;
             beyond = 1;

@@ -24,24 +24,24 @@ __attribute__((constructor)) static void ask_processor(void) {
     instructions = (kept & 0xe6) == 0xe6 && (b & wide) == wide ? 2 : 1;
 }
 
-static const exact_code *const of_2[] = {
+static const exact_code *const code_avx512[] = {
     &exact_fused_3, &exact_wide_4, &exact_wide_8, &exact_fused_16, &exact_fused_64};
-static const exact_code *const of_1[] = {
+static const exact_code *const code_avx2[] = {
     &exact_fused_3, &exact_fused_4, &exact_fused_8, &exact_fused_16, &exact_fused_64};
-static const exact_code *const of_0[] = {&exact_plain_3, &exact_plain_4, &exact_plain_64};
-static const exact_code *const *const codes[] = {of_0, of_1, of_2};
+static const exact_code *const code_plain[] = {&exact_plain_3, &exact_plain_4, &exact_plain_64};
+static const exact_code *const *const code_by_instructions[] = {code_plain, code_avx2, code_avx512};
 #else
 enum { instructions = 0 };
-static const exact_code *const of_0[] = {
+static const exact_code *const code_plain[] = {
     &exact_plain_3, &exact_plain_4, &exact_plain_8, &exact_plain_16, &exact_plain_64};
-static const exact_code *const *const codes[] = {of_0};
+static const exact_code *const *const code_by_instructions[] = {code_plain};
 #endif
 
 int64_t noack_exact_instructions(void) { return instructions; }
 
 /* The code for the fewest states that suffice. That for 3 sums in another order than the others. */
 static const exact_code *code_for(const noack_exact *exact) {
-    const exact_code *const *code = codes[instructions];
+    const exact_code *const *code = code_by_instructions[instructions];
     int64_t entries = max_of(exact->n, exact->m);
     while ((*code)->n < entries || ((*code)->n == 3 && entries != 3))
         code++;

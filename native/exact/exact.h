@@ -50,8 +50,8 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     int integrates, quadratic; /* what is compared; otherwise |W e_s| or nothing */
     int dynamic;
     int is_static; /* H = 0: r, d and q stay as they are between events */
-    int apart;     /* d is not 0: the models differ, or */
-    int renewed;   /* q is not 0: the reference is not x_c */
+    int has_d;     /* d is not 0: the models differ, or */
+    int has_q;     /* q is not 0: the reference is not x_c */
     double grid_s;
     /* shared by all runs; matrices in column-major order, columns padded to a stride */
     double *H, *K, *H_k, *KH_k;

@@ -29,7 +29,7 @@ double polynomial(const double *g, int degree, double s) {
     return total;
 }
 
-static inline search_point look(const void *curve, const level_search *search, double s) {
+static inline search_point evaluate(const void *curve, const level_search *search, double s) {
     const double *g = ((const scalar_curve *)curve)->g;
     int degree = ((const scalar_curve *)curve)->degree;
     double level = level_at(search, s), rate = search->rate;
@@ -56,7 +56,7 @@ double first_root(const double *g, int degree, const level_search *search, doubl
     scalar_curve curve = {g, degree};
     double rate = search->rate, end_s = search->end_s, ahead_s = end_s;
     double most = bend_of(g, degree, end_s);
-    search_point at = look(&curve, search, 0.0);
+    search_point at = evaluate(&curve, search, 0.0);
     if (at.excess > grain || (at.excess >= -grain && at.slope > 0.0))
         return 0.0;
     if (end_s <= 0.0)
@@ -65,7 +65,7 @@ double first_root(const double *g, int degree, const level_search *search, doubl
     for (int steps = 0; steps < MOST_STEPS; steps++) {
         double s = at.s;
         if (at.slope > (most + rate * rate * level_at(search, s)) * (ahead_s - s)) {
-            s = ascend(look, &curve, search, at, ahead_s);
+            s = ascend(evaluate, &curve, search, at, ahead_s);
             if (s != NONE || ahead_s == end_s)
                 return s;
             s = ahead_s;
@@ -85,7 +85,7 @@ double first_root(const double *g, int degree, const level_search *search, doubl
             ahead_s = end_s;
             most = bend_of(g, degree, ahead_s);
         }
-        at = look(&curve, search, s);
+        at = evaluate(&curve, search, s);
         if (at.excess >= 0.0)
             return s;
     }

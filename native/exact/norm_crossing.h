@@ -31,7 +31,8 @@ typedef struct {
 } vector_curve;
 
 /* A point of a search, forward or backward. */
-static inline curve_point look(const double *curve, int p, const level_search *search, double s) {
+static inline curve_point evaluate(
+    const double *curve, int p, const level_search *search, double s) {
     if (s == 0.0 && !search->backward) {
         lanes half = load(curve + 2 * STRIDE);
         return (curve_point){load(curve), load(curve + STRIDE), add(half, half)};
@@ -46,7 +47,7 @@ static inline curve_point look(const double *curve, int p, const level_search *s
    root and the same sign. */
 static inline search_point look_at_square(const void *curve, const level_search *search, double s) {
     const vector_curve *own = curve;
-    curve_point at = look(own->c, own->p, search, s);
+    curve_point at = evaluate(own->c, own->p, search, s);
     double level = level_at(search, s), square = level * level, rate = search->rate;
     return (search_point){
         s, dot(at.y, at.y) - square, 2.0 * (dot(at.y, at.dy) + rate * square),
@@ -80,7 +81,7 @@ static double first_exit(
             return NONE;
     }
     double most = bend(curve, p, end_s), level = search->level;
-    curve_point at = look(curve, p, search, 0.0);
+    curve_point at = evaluate(curve, p, search, 0.0);
     for (int steps = 0; steps < most_steps; steps++) {
         double square = dot(at.y, at.y), mixed = dot(at.y, at.dy), speed = dot(at.dy, at.dy);
         double size = sqrt(square);
@@ -116,7 +117,7 @@ static double first_exit(
             ahead_s = end_s;
             most = bend(curve, p, ahead_s);
         }
-        at = look(curve, p, search, s);
+        at = evaluate(curve, p, search, s);
         level = level_at(search, s);
     }
     return UNRESOLVED;

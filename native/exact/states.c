@@ -28,37 +28,37 @@ static inline double size_of(lanes v) { return sqrt(dot(v, v)); }
 /* Write the coefficients of degree begin to end; those of quadratic forms times a factor. The last
    three arguments are constants, each combination of which has code. */
 static inline __attribute__((always_inline)) void expand_with(
-    exact_memory *memory, models state, double factor, int begin, int end, int moves, int apart,
-    int renewed) {
+    exact_memory *memory, models state, double factor, int begin, int end, int moves, int has_d,
+    int has_q) {
     const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *D_k = memory->D_k;
     const double *KH_k = memory->KH_k, *weight = memory->weight;
     double *rs = memory->r, *es = memory->e, *ds = memory->d, *qs = memory->q, *xs = memory->x;
     double *us = memory->u, *errors = memory->own_error, *weighted = memory->own_weighted;
-    lanes x_c = renewed ? subtract(state.r, state.q) : state.r;
+    lanes x_c = has_q ? subtract(state.r, state.q) : state.r;
     int quadratic = memory->quadratic;
     for (int k = begin; k <= end; k++) {
         int table = k * N * STRIDE, at = k * STRIDE;
         lanes r = filled(0.0), d = r, q = r, e = times(X_k + table, state.r);
         e = add(times(A_k + table, state.e), e);
-        if (renewed)
+        if (has_q)
             e = add(e, times(D_k + table, state.q));
         if (moves || k == 0) {
             r = times(H_k + table, state.r);
-            d = apart ? times(H_k + table, state.d) : d;
-            q = renewed ? times(H_k + table, state.q) : q;
+            d = has_d ? times(H_k + table, state.d) : d;
+            q = has_q ? times(H_k + table, state.q) : q;
             store(rs + at, r);
-            if (apart || k == 0)
+            if (has_d || k == 0)
                 store(ds + at, d);
-            if (renewed || k == 0)
+            if (has_q || k == 0)
                 store(qs + at, q);
             store(us + at, times(KH_k + table, x_c));
         }
         lanes x = subtract(r, e), e_s = add(e, d);
         store(es + at, e);
         store(xs + at, x);
-        if (weight != NULL || renewed)
-            store(weighted + at, weigh(weight, renewed ? subtract(e, q) : e));
-        if (!quadratic && apart)
+        if (weight != NULL || has_q)
+            store(weighted + at, weigh(weight, has_q ? subtract(e, q) : e));
+        if (!quadratic && has_d)
             store(errors + at, weigh(weight, e_s));
         if (quadratic) {
             int64_t place = at * memory->blocks;
@@ -70,18 +70,18 @@ static inline __attribute__((always_inline)) void expand_with(
 }
 
 static void expand(exact_memory *memory, const models *state, double factor, int begin, int end) {
-    int own = memory->weight != NULL || memory->renewed;
+    int own = memory->weight != NULL || memory->has_q;
     memory->weighted = own ? memory->own_weighted : memory->e;
-    memory->error = memory->apart ? memory->own_error : memory->weighted;
-    if (memory->renewed && !memory->has_D_k) {
+    memory->error = memory->has_d ? memory->own_error : memory->weighted;
+    if (memory->has_q && !memory->has_D_k) {
         driven(memory->A, memory->minus_BK, memory->H_k, memory->D_k);
         memory->has_D_k = 1;
     }
-    if (memory->renewed)
+    if (memory->has_q)
         expand_with(memory, *state, factor, begin, end, 1, 1, 1);
     else if (memory->is_static)
         expand_with(memory, *state, factor, begin, end, 0, 1, 0);
-    else if (memory->apart)
+    else if (memory->has_d)
         expand_with(memory, *state, factor, begin, end, 1, 1, 0);
     else
         expand_with(memory, *state, factor, begin, end, 1, 0, 0);
@@ -89,12 +89,12 @@ static void expand(exact_memory *memory, const models *state, double factor, int
 
 /* The same state with the plant's own as the reference, if that is small beside the present one:
    their difference would lose its digits. */
-static models renewed(exact_memory *memory, models state) {
+static models renew_reference(exact_memory *memory, models state) {
     const double small = 1e-8; /* of a square */
     lanes x = plant_of(state);
     if (dot(x, x) < small * dot(state.r, state.r)) {
         state = (models){x, filled(0.0), sensor_error(state), subtract(state.q, state.e)};
-        memory->renewed = 1;
+        memory->has_q = 1;
     }
     return state;
 }
@@ -287,7 +287,7 @@ static progress begin(exact_memory *memory, exact_run *run) {
     double farthest_s = memory->reach_s[DEGREES - 1];
     if (memory->dynamic && memory->rule->decay_per_s > 0.0)
         farthest_s = least(farthest_s, SLOWEST / memory->rule->decay_per_s);
-    memory->renewed = 0;
+    memory->has_q = 0;
     run->growth = growth_at(memory->exact, run->t_s);
     return (progress){
         .state = state,
@@ -315,7 +315,7 @@ static int64_t take_event(exact_memory *memory, exact_run *run, progress *now) {
     now->last_s = now->t_s;
     now->begins = 1;
     now->state = updated(now->state, now->agree);
-    memory->renewed &= !now->agree;
+    memory->has_q &= !now->agree;
     return GOES_ON;
 }
 
@@ -372,11 +372,11 @@ follow_piece(exact_memory *memory, exact_run *run, progress *now) {
     const noack_exact *exact = memory->exact;
     if (now->begins)
         begin_span(memory, now);
-    now->state = renewed(memory, now->state);
+    now->state = renew_reference(memory, now->state);
     rule_phase phase = phase_at(memory, &now->span, now->t_s);
     double end_s = least(phase.until_s, exact->horizon_s), left_s = end_s - now->t_s;
     comparison compared = comparison_at(memory, phase, now->state, now->auxiliary);
-    memory->apart = !now->agree || memory->renewed;
+    memory->has_d = !now->agree || memory->has_q;
     if (phase.compares && !now->looked && !is_within(now->state, LARGEST, phase.threshold))
         return NOACK_EXACT_DIVERGED;
     int p;
@@ -461,12 +461,12 @@ static void sample(
     int64_t n = memory->exact->n, pieces = 0, expanded = 0;
     models at = state_of(state);
     double farthest_s = memory->reach_s[DEGREES - 1];
-    memory->apart = 1;
-    memory->renewed = 0;
+    memory->has_d = 1;
+    memory->has_q = 0;
     for (int64_t i = 0; i < count; i++, states += 3 * n) {
         while (t_s[i] - start_s > farthest_s && farthest_s > 0.0 && pieces++ < MOST_PIECES) {
             if (!expanded) {
-                at = renewed(memory, at);
+                at = renew_reference(memory, at);
                 expand(memory, &at, 1.0, 0, HIGHEST);
             }
             at = state_at(memory, HIGHEST, farthest_s);
@@ -474,7 +474,7 @@ static void sample(
             expanded = 0;
         }
         if (!expanded) {
-            at = renewed(memory, at);
+            at = renew_reference(memory, at);
             expand(memory, &at, 1.0, 0, HIGHEST);
         }
         expanded = 1;

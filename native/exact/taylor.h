@@ -6,9 +6,9 @@
        r' = H r        d' = H d        q' = H q        e' = A e - E r + BK q,
 
    since x' = A x + BK x_c. The reference is x_c, and q is 0, unless x has become small beside it:
-   then the reference is x itself from there on (renewed()). e_s = e + d and e_c = e - q. After an
-   event e_s is exactly 0, since d = -e or both are 0. A small mismatch E and the errors that it
-   drives keep their relative accuracy.
+   then the reference is x itself from there on (renew_reference()). e_s = e + d and e_c = e - q.
+   After an event e_s is exactly 0, since d = -e or both are 0. A small mismatch E and the errors
+   that it drives keep their relative accuracy.
 
    The Taylor coefficients of degree k are H_k r, H_k d, H_k q and A_k e + X_k r + D_k q. Their
    tables are computed once per plant:
@@ -133,9 +133,9 @@ static inline models state_at(const exact_memory *memory, int p, double s) {
     if (memory->is_static)
         return state;
     state.r = value(memory->r, p, s);
-    if (memory->apart)
+    if (memory->has_d)
         state.d = value(memory->d, p, s);
-    if (memory->renewed)
+    if (memory->has_q)
         state.q = value(memory->q, p, s);
     return state;
 }

@@ -9,7 +9,7 @@ void apply_four_state(packet *packet, const noack_stage *stage, noack_stage_memo
     double uniform[2];
     draw(packet, stage, 0, uniform);
     double u = uniform[0];
-    int64_t now = memory->phase + 1;
+    int64_t now = memory->state + 1;
     if (now == 1) {
         if (u < own->p13)
             now = 3;
@@ -26,7 +26,7 @@ void apply_four_state(packet *packet, const noack_stage *stage, noack_stage_memo
     } else {
         now = 1;
     }
-    memory->phase = now - 1;
+    memory->state = now - 1;
     if (now >= 3)
         refuse(packet->decision, NOACK_DROPPED);
 }

@@ -19,8 +19,8 @@ static void change_state(
             power *= base;
         base *= base;
     }
-    double bad = own->share_bad, before = channel->phase == BAD ? 1.0 : 0.0;
-    channel->phase = u < bad + (before - bad) * power ? BAD : GOOD;
+    double bad = own->share_bad, before = channel->state == BAD ? 1.0 : 0.0;
+    channel->state = u < bad + (before - bad) * power ? BAD : GOOD;
 }
 
 /* If a delay is correlated with loss, the packet gets a score: the scores in the bad state are the
@@ -32,19 +32,19 @@ void apply_gilbert_elliott(packet *packet, const noack_stage *stage, noack_stage
     if (own->step_ns > 0) {
         noack_queue *channel = &packet->link->queues[packet->stage];
         change_state(own, channel, packet->decision->arrival_ns, uniform[0]);
-        memory->phase = channel->phase;
-    } else if (memory->phase == BAD) {
+        memory->state = channel->state;
+    } else if (memory->state == BAD) {
         if (uniform[0] < own->bad_to_good)
-            memory->phase = GOOD;
+            memory->state = GOOD;
     } else if (uniform[0] < own->good_to_bad) {
-        memory->phase = BAD;
+        memory->state = BAD;
     }
     if (own->scored) {
         draw(packet, stage, 1, other);
         double bad = own->share_bad;
         packet->flow->score = -noack_normal_score(
-            memory->phase == BAD ? other[0] * bad : bad + other[0] * (1.0 - bad));
+            memory->state == BAD ? other[0] * bad : bad + other[0] * (1.0 - bad));
     }
-    if (uniform[1] < (memory->phase == BAD ? own->loss_in_bad : own->loss_in_good))
+    if (uniform[1] < (memory->state == BAD ? own->loss_in_bad : own->loss_in_good))
         refuse(packet->decision, NOACK_DROPPED);
 }

@@ -36,14 +36,14 @@ static int64_t turn_ns(const turns *turns, int64_t number) {
 
 /* Whether a packet that arrives at now_ns finds few enough slots taken. */
 static int has_room(const turns *turns, const noack_stage_memory *memory, int64_t now_ns) {
-    int64_t number = turn_from(turns, max_of(now_ns, memory->phase));
+    int64_t number = turn_from(turns, max_of(now_ns, memory->taken_until_ns));
     return number - turn_from(turns, now_ns + 1) < turns->own->queue;
 }
 
 /* Take a slot for a packet that arrives at now_ns; return its begin. */
 static int64_t take_turn(const turns *turns, noack_stage_memory *memory, int64_t now_ns) {
-    int64_t begin_ns = turn_ns(turns, turn_from(turns, max_of(now_ns, memory->phase)));
-    memory->phase = begin_ns + 1;
+    int64_t begin_ns = turn_ns(turns, turn_from(turns, max_of(now_ns, memory->taken_until_ns)));
+    memory->taken_until_ns = begin_ns + 1;
     return begin_ns;
 }
 

@@ -24,7 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.relay import Relay
-from netem.relay_links import DIRECTIONS, Direction, DirectionReport, LinkReport, coarse, quantile_ns
+from netem.relay_links import (
+    DIRECTIONS,
+    Direction,
+    DirectionReport,
+    LinkReport,
+    coarse_histogram,
+    quantile_ns,
+)
 from netem.tc_words import words_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
@@ -348,8 +355,8 @@ def _direction(
         ],
         "delay_ns": quantiles(report.delays),
         "lateness_ns": quantiles(report.lateness),
-        "delay_histogram": coarse(report.delays),
-        "lateness_histogram": coarse(report.lateness),
+        "delay_histogram": coarse_histogram(report.delays),
+        "lateness_histogram": coarse_histogram(report.lateness),
         "recent": _recent(report, earlier, seconds) if earlier is not None and seconds > 0 else None,
     }
 

@@ -80,8 +80,8 @@ class MachinePart(ABC):
         """Fill the core's structure, at the start of the machine's work."""
 
     @abstractmethod
-    def redraw(self, structure: CData, memory: CoreMemory) -> None:
-        """Set what the draws determine, in a copy of a structure that an alike part has filled."""
+    def set_drawn_values(self, structure: CData, memory: CoreMemory) -> None:
+        """Set what the draws determine, in a copy of another loop's structure."""
 
     @abstractmethod
     def answer(self, question: int, structure: CData) -> Sequence[Notice]:
@@ -108,11 +108,11 @@ def parts_of(
     ``part`` makes the part of such a first loop; ``redrawn`` changes it for the others.
     """
     firsts: dict[tuple[int, ...], int] = {}
-    alike = [firsts.setdefault(settings_key(loop), number) for number, loop in enumerate(loops)]
+    templates = [firsts.setdefault(settings_key(loop), number) for number, loop in enumerate(loops)]
     parts: list[Part] = []
-    for number, (loop, first) in enumerate(zip(loops, alike, strict=True)):
+    for number, (loop, first) in enumerate(zip(loops, templates, strict=True)):
         parts.append(part(loop) if number == first else redrawn(parts[first], loop))
-    return parts, alike
+    return parts, templates
 
 
 def set_machine(
@@ -155,8 +155,8 @@ class LoopMachines:
     Args:
         parts: the machine of each loop.
         phases_ns: when each loop begins, in the run's time; by default 0.
-        alike: the number of the first loop, for each loop, from which it differs in draws only; by
-            default its own.
+        templates: the loop whose structure each loop's is a copy of, since they differ in draws
+            only; by default its own.
         rows: rows of each table until they must be taken; by default as many as suit the loops.
 
     Raises:
@@ -168,7 +168,7 @@ class LoopMachines:
         parts: Sequence[MachinePart],
         phases_ns: Sequence[int] | None = None,
         *,
-        alike: Sequence[int] | None = None,
+        templates: Sequence[int] | None = None,
         rows: int | None = None,
     ) -> None:
         self.parts = tuple(parts)
@@ -178,7 +178,7 @@ class LoopMachines:
         self._notices: list[Notice] = []
         self.core: CData = self._memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
-        self._fill_machines(alike or range(len(self.parts)))
+        self._fill_machines(templates or range(len(self.parts)))
         self._counting = {k for k, part in enumerate(self.parts) if part.counts_every_message}
         """Loops of which every message may matter."""
         self._message = ffi.new("noack_message *")
@@ -192,7 +192,7 @@ class LoopMachines:
             raise ValueError(f"{self.role.name}: {ffi.string(wrong).decode()}")
         core.noack_process_begin(self.core)
 
-    def _fill_machines(self, alike: Sequence[int]) -> None:
+    def _fill_machines(self, templates: Sequence[int]) -> None:
         process, count, keep = self.core, len(self.parts), self._memory.keep
         process.role, process.loops = self.role.number, count
         machines = keep(ffi.new(f"{self.role.structure}[]", count))
@@ -201,7 +201,7 @@ class LoopMachines:
         self.machines: CData = machines
         """(loops,) The structures of the machines."""
         copies: dict[int, list[int]] = {}
-        for number, first in enumerate(alike):
+        for number, first in enumerate(templates):
             copies.setdefault(first, []).append(number)
         for first, (_, *others) in copies.items():
             mark = self._memory.size
@@ -210,7 +210,7 @@ class LoopMachines:
                 self._memory.copy(machines, first, others, mark)
             for number in others:
                 if self.parts[number] is not self.parts[first]:
-                    self.parts[number].redraw(machines[number], self._memory)
+                    self.parts[number].set_drawn_values(machines[number], self._memory)
         for structure, phase_ns in zip(machines, self.phases_ns, strict=True):
             structure.machine.phase_ns = phase_ns
 
@@ -271,7 +271,7 @@ class LoopMachines:
         """Do what a step needs before it goes on."""
         loop = self.core.asking
         self._keep_notices(loop, self.parts[loop].answer(question, self.machines[loop]))
-        self._note_counting(loop)
+        self._update_counting(loop)
 
     def take_rows(self, *, last: bool = False) -> list[tuple[str, Rows]]:
         """Return the rows since the last call, by table, and empty the core's tables.
@@ -327,7 +327,7 @@ class LoopMachines:
             machine.inputs += 1
             machine.change_ns = schedule.next_ns
             outputs += [_with_loop(loop, output) for output in announced]
-            self._note_counting(loop)
+            self._update_counting(loop)
         return outputs
 
     def _inspect(self, rows: Rows) -> None:
@@ -337,9 +337,9 @@ class LoopMachines:
         for own in np.split(notable, np.flatnonzero(np.diff(notable[LOOP])) + 1):
             loop = int(own[LOOP][0])
             self._keep_notices(loop, self.parts[loop].inspect(own))
-            self._note_counting(loop)
+            self._update_counting(loop)
 
-    def _note_counting(self, loop: int) -> None:
+    def _update_counting(self, loop: int) -> None:
         if self.parts[loop].counts_every_message:
             self._counting.add(loop)
         else:

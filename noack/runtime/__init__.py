@@ -1,6 +1,6 @@
 """A process in a run: its UDP sockets, real-time loop, control plane (zenoh) and telemetry.
 
-Read ``run_process.py`` first, from top to bottom. It uses, in this order:
+Read ``join_run.py`` first, then ``run_process.py`` from top to bottom. They use, in this order:
 
 * ``command_line.py`` and ``join_ticket.py``, with which a process starts,
 * ``control_plane.py``, its messages (``control_messages.py``) and the life cycle that they change

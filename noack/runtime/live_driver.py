@@ -49,7 +49,7 @@ def run_machines(process: RunProcess, machines: LoopMachines) -> None:
         process.wire,
         admitted_ns=process.admitted_ns,
         spin_ns=process.spin_ns,
-        rest_ns=process.rest_ns,
+        coalescing_ns=process.coalescing_ns,
     )
     with process.open_socket() as endpoint:
         addresses = process.join(endpoint.getsockname()[:2])
@@ -91,7 +91,7 @@ class LiveDriver:
         wire: what their datagrams have in common.
         admitted_ns: messages from before this time of the run are stale.
         spin_ns: busy-wait for this time before a tick.
-        rest_ns: sleep for this time if the next tick is nearer, to do several at once.
+        coalescing_ns: sleep for this time if the next tick is nearer, to do several at once.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class LiveDriver:
         *,
         admitted_ns: int = 0,
         spin_ns: int = 0,
-        rest_ns: int = 0,
+        coalescing_ns: int = 0,
     ) -> None:
         self.machines, self._wire = machines, wire
         self._scratch = np.zeros(core.noack_driver_scratch_bytes() + 64, np.uint8)
@@ -112,7 +112,7 @@ class LiveDriver:
                 "wire": wire.core[0],
                 "clock": {"speed": 1.0},
                 "spin_ns": spin_ns,
-                "rest_ns": rest_ns,
+                "coalescing_ns": coalescing_ns,
                 "scratch": ffi.cast("void *", -(-self._scratch.ctypes.data // 64) * 64),
             },
         )

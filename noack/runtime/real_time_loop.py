@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S, RunClock
-from noack.protocol.roles import Notice, Record
+from noack.protocol.roles import LOOP_ROLES, Notice, Record
 
 _HOUSEKEEPING_S = 0.05
 _OVERLOAD_PAUSE_S = 0.002
@@ -44,7 +44,12 @@ _TURNS_TO_WAIT = 2 * _TURNS_TO_CATCH_UP
 """Of housekeeping, for the others: they may be late, and then need a moment to say that they are
 done."""
 _PR_SET_TIMERSLACK = 29
-_LAST_PLACE = 3
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_MADV_POPULATE_READ, _MADV_POPULATE_WRITE = 22, 23
+"""Constants of Linux, from <linux/prctl.h> and <sys/mman.h>."""
+_LAST_PLACE = len(LOOP_ROLES) - 1
+"""Place of the last process of the loop, which alone has the scenario's priority. Each earlier one
+has a priority lower by 1."""
 _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 _LARGE_BYTES = 16 * 2**20
 _MAPPINGS = Path("/proc/self/smaps")
@@ -233,12 +238,6 @@ def _cpu_dma_latency(undo: ExitStack) -> None:
     descriptor = os.open(_CPU_DMA_LATENCY, os.O_WRONLY)
     undo.callback(os.close, descriptor)
     os.write(descriptor, struct.pack("i", 0))
-
-
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
-
-
-_MADV_POPULATE_READ, _MADV_POPULATE_WRITE = 22, 23
 
 
 def lock_memory() -> None:

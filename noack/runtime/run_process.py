@@ -1,32 +1,25 @@
-"""A process in a run, from its command line to its exit status.
+"""A process in a run, from its admission to its report.
 
-It gets a ticket, asks for admission, waits at the start barrier, runs its loop and reports. It ends
-at the horizon, on the coordinator's stop, when its launcher has ended, or on SIGINT and SIGTERM.
-Its rows go to the recorder, or else to the run directory's spool. Read :func:`run_process` first,
-then :class:`RunProcess` from top to bottom.
+It asks for admission, waits at the start barrier, runs its loop and reports. It ends at the
+horizon, on the coordinator's stop, when its launcher has ended, or on SIGINT and SIGTERM. Its rows
+go to the recorder, or else to the run directory's spool. Read ``join_run.py`` first, which gets the
+ticket, then :class:`RunProcess` from top to bottom.
 """
 
-import argparse
-import json
 import os
 import select
 import signal
 import socket
 import sys
-import time
-import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from functools import cached_property
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Protocol, TypeVar
-
-from setproctitle import setproctitle
+from typing import Protocol
 
 from noack.core.clock import NS_PER_S, RunClock
-from noack.core.errors import CallerError, ExitStatus, NoackError, NoAnswerError, PeerError, one_line
-from noack.core.process_limits import exhausted_limit, require_limits
+from noack.core.errors import CallerError, NoackError, PeerError, one_line
 from noack.protocol.record_tables import OWNER, clock_table
 from noack.protocol.roles import (
     BEGINNING,
@@ -40,8 +33,8 @@ from noack.protocol.roles import (
     Start,
 )
 from noack.protocol.wire_format import Wire
-from noack.runtime.address import Address, address_text
-from noack.runtime.command_line import TICKET_ON_STDIN, Parser, Signals, failed, print_to_stderr
+from noack.runtime.address import Address
+from noack.runtime.command_line import Signals, print_to_stderr
 from noack.runtime.control_messages import (
     Admission,
     AdmissionRequest,
@@ -54,14 +47,7 @@ from noack.runtime.control_messages import (
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
 from noack.runtime.host_clocks.clock_offset import SlewedRunClock
 from noack.runtime.host_clocks.reference_clock import ClockRecord, ReferenceClock, reference_clock
-from noack.runtime.join_ticket import (
-    DEFAULT_SESSION,
-    STANDARD_INPUT,
-    Ticket,
-    find_ticket,
-    loads,
-    read_invitation,
-)
+from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Driver, ProcessSockets, realtime, run_loop
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
@@ -76,18 +62,14 @@ _ADMISSION_TIMEOUT_S = 10.0
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
 _FEW_LOOPS = 8
-_REST_SHARE = 25
-_LONGEST_REST_NS = 800_000
+_COALESCING_SHARE = 25
+_LONGEST_COALESCING_NS = 800_000
 """Ticks of more than a few loops that are nearer to others than this part of a period are done
 together: waking up for each takes CPU time."""
 _GRACE_TURNS = 3  # of housekeeping, 50 ms each, after the horizon for packets in flight
-_RUNS = Path("runs")
-_POLL_S = 0.1
-_TICKET_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctrl-C ends the wait
 _BUFFER_BYTES, _LARGEST_BUFFER_BYTES = 4 * 1024 * 1024, 256 * 1024 * 1024
 """Receive buffer for each loop, and for all. At 50,000 datagrams a second the largest covers a
 stall of 7 s. The kernel takes what is in use."""
-T = TypeVar("T")
 
 
 class Reconfigurable(Protocol):
@@ -190,12 +172,12 @@ class RunProcess:
         return round(self.scenario.realtime.spin_us * 1000)
 
     @property
-    def rest_ns(self) -> int:
+    def coalescing_ns(self) -> int:
         """How long to gather the ticks of many loops."""
         if len(self.phases_ns) <= _FEW_LOOPS:
             return 0
         period_ns = min(loop.timing.plant_period_ns for loop in loops_of(self.scenario))
-        return min(int(period_ns / _REST_SHARE / self.scenario.speed), _LONGEST_REST_NS)
+        return min(int(period_ns / _COALESCING_SHARE / self.scenario.speed), _LONGEST_COALESCING_NS)
 
     @contextmanager
     def open_socket(self) -> Iterator[socket.socket]:
@@ -337,7 +319,7 @@ class RunProcess:
         if (reason := self.plane.stop_requested()) is not None:
             return reason
         if self.ticket.launched:
-            return LAUNCHER_GONE if lifeline_cut() else None
+            return LAUNCHER_GONE if launcher_has_ended() else None
         # A running loop does not need the control plane. A launched process has its lifeline: on
         # a busy machine the coordinator may only seem to be gone.
         waiting = self.life.state in (State.REQUESTED, State.AT_BARRIER)
@@ -374,149 +356,7 @@ class RunProcess:
             )
 
 
-def lifeline_cut() -> bool:
+def launcher_has_ended() -> bool:
     """Whether the launcher has closed this process's standard input, as it does by ending."""
     readable, _, _ = select.select([sys.stdin.fileno()], (), (), 0)
     return bool(readable) and os.read(sys.stdin.fileno(), 1) == b""
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that all processes have."""
-    origin = parser.add_mutually_exclusive_group()
-    origin.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
-    origin.add_argument("--invitation", type=Path, metavar="FILE", help="from `noack record --listen`")
-    parser.add_argument(
-        "--runs",
-        type=Path,
-        default=_RUNS,
-        metavar="DIRECTORY",
-        help="of an invited process: where rows stay that cannot be sent to the recorder",
-    )
-    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
-
-
-@contextmanager
-def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunProcess]:
-    """Be a process of a run within the context: from its admission to the report of its end.
-
-    The run is that of an invitation, or else of a session on this host. A process that was invited
-    keeps below ``--runs`` what it cannot send to the recorder.
-
-    Args:
-        role: of the process.
-        arguments: the options of :func:`add_options`; None: those of the command line.
-
-    Raises:
-        SystemExit: the process ends with another status than 0. A caller's or a peer's error, also
-            one from within the context, has then become one line on standard error, without a
-            traceback; with ``--json`` also a document on standard output.
-    """
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    parser = Parser(
-        prog=f"noack {role}",
-        description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
-    )
-    add_options(parser)
-    signals = Signals()
-    with _exit_status(role, signals, as_json="--json" in words):
-        options = parser.parse_args(words)
-        with signals.handled():
-            require_limits()
-            if options.invitation is None:
-                ticket = _ticket(role, options.session, signals)
-            else:
-                ticket = _invited(role, options.invitation, options.runs, signals)
-            if ticket.launched:
-                setproctitle(f"noack {role}")  # in lists of processes
-            process = _admitted(role, ticket, signals)
-            with process.plane:
-                try:
-                    yield process
-                except Exception as error:
-                    process.fail(error)
-                    raise
-                finally:
-                    process.life.apply(Event.END)
-                    process.plane.report_end(process.ended)
-        if options.json:
-            print(json.dumps(process.report, indent=2))
-        if signals.received is None and not ticket.launched:
-            print(f"noack {role}: ended: {process.ended}", file=sys.stderr)
-            if process.ended != HORIZON:
-                sys.exit(ExitStatus.FAILED)
-
-
-@contextmanager
-def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None]:
-    """Turn errors and signals within the context into a line and an exit status."""
-    source = f"noack {role}"
-    try:
-        yield
-    except NoackError as error:
-        if signals.received is None:
-            sys.exit(failed(str(error), error.exit_status, source=source, as_json=as_json))
-    except Exception as error:
-        if (line := exhausted_limit(error)) is not None:
-            sys.exit(failed(line, ExitStatus.FAILED, source=source, as_json=as_json))
-        traceback.print_exc()
-        print(f"{source}: internal error, see above", file=sys.stderr)
-        sys.exit(ExitStatus.FAILED)
-    if signals.received is not None:
-        sys.exit(signals.status)
-
-
-def _ticket(role: str, session: str, signals: Signals) -> Ticket:
-    if os.environ.pop(TICKET_ON_STDIN, None):
-        return loads(sys.stdin.buffer.readline().decode())
-    ticket = _wait_for(
-        lambda: find_ticket(session),
-        signals,
-        f"noack {role}: waiting for `noack record SCENARIO` on this host (session {session!r}); of "
-        "a run on another host, give its --invitation; Ctrl-C ends",
-    )
-    if ticket is None:
-        raise PeerError(f"no run to join in session {session!r}: start `noack record SCENARIO` first")
-    print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
-    return ticket
-
-
-def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> Ticket:
-    """Wait for an invitation and return its ticket; raise CallerError or PeerError without one."""
-    if invitation != STANDARD_INPUT and invitation.parent.is_dir():
-        waiting = f"noack {role}: waiting for {invitation}; Ctrl-C ends"
-        if not _wait_for(invitation.exists, signals, waiting):
-            raise PeerError("no invitation")
-    ticket = read_invitation(invitation, runs)
-    assert ticket.remote is not None  # else it is no invitation
-    host_port = address_text((ticket.remote.host, ticket.remote.port))
-    print(f"noack {role}: joining run of {ticket.scenario.name!r} at {host_port}", file=sys.stderr)
-    return ticket
-
-
-def _wait_for(find: Callable[[], T], signals: Signals, waiting: str) -> T:
-    """Return what is found once it is true; after a signal, or a day, what is found then."""
-    until_s = time.monotonic() + _TICKET_TIMEOUT_S
-    if not find():
-        print(waiting, file=sys.stderr)
-    while not (result := find()) and signals.received is None and time.monotonic() < until_s:
-        time.sleep(_POLL_S)
-    return result
-
-
-def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:
-    """Connect to a run and request admission; raise PeerError without an admission.
-
-    A launched process tries again while its launcher lives. On a busy machine a connection may
-    fail, or zenoh may not learn of the coordinator's queryables: then no request is answered.
-    """
-    while True:
-        try:
-            with ExitStack() as stack:
-                plane = stack.enter_context(ControlPlane(ticket, role))
-                process = RunProcess(role, ticket, plane, signals)
-                process.request_admission()
-                stack.pop_all()
-                return process
-        except NoAnswerError:
-            if not ticket.launched or signals.received or lifeline_cut():
-                raise

@@ -258,7 +258,7 @@ def _dependent_defaults(resolved: "scenario.Scenario") -> Iterator[str]:
         )
     if resolved.start_within_s is None:
         yield (
-            f"start_within_s: {launcher.DEFAULT_S:g}, longer on a busy machine; with "
+            f"start_within_s: {launcher.DEFAULT_START_S:g}, longer on a busy machine; with "
             "`noack record`: unlimited"
         )
 

@@ -39,8 +39,9 @@ from noack.protocol.roles import BEGINNING, LOOP_ROLES, RECORDER, RESTART, Notic
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane, header_of
+from noack.runtime.join_run import join_run
 from noack.runtime.life_cycle import LAUNCHED_LOST_S, LAUNCHER_GONE
-from noack.runtime.run_process import RunProcess, join_run
+from noack.runtime.run_process import RunProcess
 from noack.runtime.spool import NOTICES
 from noack.runtime.telemetry import first_row
 from noack.scenario.parameter_changes import change_notice

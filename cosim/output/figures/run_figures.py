@@ -40,10 +40,10 @@ from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR
 from cosim.output.figures.timing_figures import (
     clock_errors,
     clocks_figure,
+    inter_event_figure,
     largest_text,
     latency_figure,
     lateness_figure,
-    times_figure,
 )
 from cosim.record.align import AlignedRun, Reals, aligned_parts
 from cosim.record.decimation import decimate_all
@@ -96,7 +96,7 @@ def run_figures(
         "errors": lambda: _errors(record.scenario, aligned().run, bounds("e_c")),
         "state-norm": lambda: _state_norm(record, bounds("x")),
         "input": lambda: _input(record),
-        "inter-event": lambda: _inter_event(record, bounds("inter_event")),
+        "inter-event": lambda: inter_event_figure(record, bounds("inter_event")),
         "losses": lambda: _losses(record),
     }
     if record.kind == "live" if timed is None else timed:
@@ -423,18 +423,6 @@ def _dashed(curves: Sequence[Line]) -> str:
 
 def _seconds(t_ns: NDArray[np.int64]) -> Reals:
     return np.asarray(t_ns / NS_PER_S, dtype=np.float64)
-
-
-def _inter_event(record: RunRecord, bounds: list[Line]) -> FigureDescription:
-    event_s, horizon_s = _seconds(record.events()["t_ns"]), record.scenario.horizon_s
-    interval_s, title = np.diff(event_s), "Inter-event times"
-    dots = Marks(x=event_s[1:], y=interval_s, colour=SENSOR, framed=True)
-    shortest = f", the shortest {interval_s.min():.3g} s" if len(interval_s) else ""
-    label = "inter-event time [s]"
-    return times_figure("inter-event", title, dots, label, horizon_s, bounds).captioned(
-        "Inter-event times, over time and as a histogram." + (" Dashed: claimed bounds." if bounds else ""),
-        f"Inter-event times on a logarithmic axis{shortest}.",
-    )
 
 
 def _losses(record: RunRecord) -> FigureDescription:

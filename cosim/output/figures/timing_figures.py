@@ -1,4 +1,4 @@
-"""The figures of a loop's times: latencies, lateness of its processes, and their clocks."""
+"""The figures of a loop's times: between events, latencies, lateness of its processes, their clocks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ from cosim.output.figures.figure_description import (
     one_panel,
     time_axis,
 )
-from cosim.output.figures.palette import CONTROLLER, THRESHOLD
+from cosim.output.figures.palette import CONTROLLER, SENSOR, THRESHOLD
 from cosim.record.align import Reals
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
@@ -39,7 +39,7 @@ _RANKS = 120
 _SHORTEST_US = 0.1  # a logarithmic axis has no zero
 
 
-def times_figure(
+def _times_figure(
     name: str, title: str, dots: Marks, label: str, until_s: float, bounds: Sequence[Line] = ()
 ) -> FigureDescription:
     """Describe values over time, and their histogram on the same logarithmic axis."""
@@ -59,12 +59,25 @@ def times_figure(
     return one_panel(name, panel, 2.1)
 
 
+def inter_event_figure(record: RunRecord, bounds: Sequence[Line]) -> FigureDescription:
+    """Describe the times between successive events."""
+    event_s, horizon_s = record.events()["t_ns"] / NS_PER_S, record.scenario.horizon_s
+    interval_s, title = np.diff(event_s), "Inter-event times"
+    dots = Marks(x=event_s[1:], y=interval_s, colour=SENSOR, framed=True)
+    shortest = f", the shortest {interval_s.min():.3g} s" if len(interval_s) else ""
+    label = "inter-event time [s]"
+    return _times_figure("inter-event", title, dots, label, horizon_s, bounds).captioned(
+        "Inter-event times, over time and as a histogram." + (" Dashed: claimed bounds." if bounds else ""),
+        f"Inter-event times on a logarithmic axis{shortest}.",
+    )
+
+
 def latency_figure(record: RunRecord) -> FigureDescription:
     """Describe the wall time from each event to the update of the controller."""
     event_ns, taken_us = latency_us(record)
     dots = Marks(x=event_ns / NS_PER_S, y=taken_us, colour=CONTROLLER, framed=True)
     title, horizon_s = "Sensor-to-controller latency", record.scenario.horizon_s
-    return times_figure("latency", title, dots, "latency [wall µs]", horizon_s).captioned(
+    return _times_figure("latency", title, dots, "latency [wall µs]", horizon_s).captioned(
         "Sensor-to-controller latency: wall time from the event to the controller's update.",
         f"Latencies of {len(taken_us)} updates, the longest {largest_text(taken_us)} µs.",
     )

@@ -74,7 +74,7 @@ class SampledWork:
     most_events: int
 
     def run(self, draws: range) -> NDArray[np.void]:
-        """Compute consecutive draws; one row of ``batch_interface.ROW`` each."""
+        """Compute consecutive draws; one row of ``exact_simulation.ROW`` each."""
         rows = np.zeros(len(draws), ROW)
         for row, draw in zip(rows, draws, strict=True):
             record = simulate(drawn_scenario(self.scenario, self.seed, draw))

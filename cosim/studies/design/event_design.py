@@ -23,16 +23,15 @@ from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.design_page import DesignOutcome, LoopResult, figure_of, gain_text
 from cosim.studies.design.design_search import WORDS, bounds_of
 from cosim.studies.design.design_space import lqr_gain
+from cosim.studies.design.network_outcome import periodic_outcome
 from cosim.studies.design.network_search import (
     COSTS_OF_INPUT,
     DesignRequest,
     NetworkSearch,
     Progress,
     examined_m,
-    nelder_mead,
-    periodic_outcome,
-    scaled_steps,
 )
+from cosim.studies.design.simplex_search import nelder_mead, scaled_steps
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector, spectral_abscissa
 from noack.core.number_format import NONE, at_most

@@ -1,14 +1,16 @@
 """The search for a gain and a hold strategy that tolerate the most losses, or the fewest updates.
 
-The sensor is time-triggered. A *ladder* has what is asked for, from easy to hard: M = 1, 2, …; m =
-0, 1, … losses in a window; or longer and longer periods. A loop *reaches* a rung if every loss
-pattern of its guarantee is proven stable there.
+The sensor is time-triggered. The *requirements* are listed from easy to hard: M = 1, 2, …; m = 0, 1,
+… losses in a window; or longer and longer periods. A *level* is the index of a requirement in this
+list. A loop meets a requirement if every loss pattern of its guarantee is proven stable.
 
 1. The given loop is examined; regulators (LQR) over a grid of weights are the further starts.
-2. A quick lower bound of the growth (``loop_growth.py``) excludes what cannot reach a rung. What is
-   left is judged: the margin's certified upper bound must be below 1.
-3. From the best starts, the lower bound at the next rung is minimised over K without gradients
+2. A quick lower bound of the growth (``quick_estimate.py``) excludes loops that cannot meet a
+   requirement. The others are judged: the margin's certified upper bound must be below 1.
+3. From the best starts, the lower bound at the next level is minimised over K without gradients
    (Nelder and Mead). As soon as it is below 1, the loop is judged, and the search aims higher.
+
+``network_outcome.py`` has what is shown of a search.
 """
 
 import itertools
@@ -19,18 +21,14 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.margin_search import stability_document
-from cosim.output.figures import palette
-from cosim.output.figures.figure_description import Axis, FigureDescription, Item, Line, Marks, Panel, Rule
-from cosim.studies.design.design_page import DesignOutcome, LoopResult, figure_of, gain_text
 from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.hold_strategies import HOLDS, Hold, given_hold
-from cosim.studies.design.loop_growth import PatternGraph, QuickLoop
+from cosim.studies.design.quick_estimate import PatternGraph, QuickLoop
+from cosim.studies.design.simplex_search import nelder_mead, scaled_steps
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.core.number_format import NONE, at_least, at_most
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
@@ -52,14 +50,9 @@ Progress = Callable[[float], None]
 COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
 """Factors of R of the regulators that the search begins with."""
 _LONGER = 1.02
-"""Ratio of successive periods of the ladder, where measurements are close enough."""
-_RUNGS = 400
+"""Ratio of successive required periods, where measurements are close enough."""
+_MOST_PERIODS = 400
 _MOST_M = 16
-_MOST_POINTS = 60
-_CAPTION = (
-    "Growth of the worst loss pattern found, per period: a lower bound, quickly computed. Below 1 "
-    "every pattern may be stable; the marks are where this is proven."
-)
 _SLACK = 0.002
 """The search wants log growth below −_SLACK: a loop at the limit takes long to judge."""
 _STARTS = 4
@@ -73,7 +66,7 @@ class GainCandidate(NamedTuple):
     K: Rows
 
 
-class Rung(NamedTuple):
+class Requirement(NamedTuple):
     """What a loop must tolerate."""
 
     name: str
@@ -110,16 +103,16 @@ class DesignRequest:
     """Number of loops that the search without gradients may try."""
 
 
-class ReachedRung(NamedTuple):
-    """A loop with the highest rung that it is proven to reach."""
+class CertifiedLoop(NamedTuple):
+    """A loop with the highest requirement that it is proven to meet."""
 
     candidate: GainCandidate
-    rung: int
-    """Its number in the ladder; −1: none."""
+    level: int
+    """Index of this requirement; −1: none is met."""
     stability: Stability | None
-    """The certificate there; None: there is none."""
+    """The certificate for it; None: there is none."""
     beyond: Stability | None
-    """What is known about the next rung; None: there is none, or its cost is above the limit."""
+    """What is known about the next requirement; None: there is none, or its cost is above the limit."""
     cost: float
     """Without losses; infinite: the loop is unstable then."""
 
@@ -148,7 +141,7 @@ def examined_m(scenario: Scenario, most: int) -> int:
     return most if burst is None else min(most, burst + 1)
 
 
-def ladder_of(scenario: Scenario, request: DesignRequest, margin: LossMargin) -> list[Rung]:
+def list_requirements(scenario: Scenario, request: DesignRequest, margin: LossMargin) -> list[Requirement]:
     """Return what a loop must tolerate, from easy to hard."""
     network, period_ns = scenario.network, margin.longest_ns
     if request.goal == "transmissions":
@@ -156,27 +149,27 @@ def ladder_of(scenario: Scenario, request: DesignRequest, margin: LossMargin) ->
     if request.window is not None:
         if not 2 <= request.window <= 64:
             raise CallerError(f"--window: from 2 to 64 updates, not {request.window}")
-        rungs = []
+        requirements = []
         for m in range(request.window):
             rules = (AtMost(losses=m, window=request.window),) if m else ()
             guarantee = LossGuarantee((LongestBurst(m), *(rule.rule for rule in rules)))
             settings: dict[str, object] = {"mansd": m, "constraints": rules}
             name = f"m = {m} of {request.window}"
-            rungs.append(Rung(name, m, guarantee, period_ns, settings))
-        return rungs
+            requirements.append(Requirement(name, m, guarantee, period_ns, settings))
+        return requirements
     return [
-        Rung(f"M = {m}", m, capped(network.guarantee, m - 1), period_ns, {"mansd": m - 1})
+        Requirement(f"M = {m}", m, capped(network.guarantee, m - 1), period_ns, {"mansd": m - 1})
         for m in range(1, examined_m(scenario, request.most or _MOST_M) + 1)
     ]
 
 
-def _periods(scenario: Scenario, margin: LossMargin) -> Iterator[Rung]:
+def _periods(scenario: Scenario, margin: LossMargin) -> Iterator[Requirement]:
     step_ns = scenario.timing.measurement_period_ns
     longest = scenario.timing.horizon_ns // step_ns
     steps = max(margin.loop.times.delay_ns // step_ns + 1, margin.longest_ns // step_ns // 16, 1)
-    for _ in range(_RUNGS):
+    for _ in range(_MOST_PERIODS):
         period_s = steps * step_ns / NS_PER_S
-        yield Rung(f"{period_s:g} s", period_s, margin.guarantee, steps * step_ns, {})
+        yield Requirement(f"{period_s:g} s", period_s, margin.guarantee, steps * step_ns, {})
         steps = max(steps + 1, round(steps * _LONGER))
         if steps > longest:
             return
@@ -209,7 +202,7 @@ class NetworkSearch:
                 f'trigger.policy = "{scenario.trigger.policy}": the search is for periodic '
                 "updates; give their --period"
             )
-        self.ladder = ladder_of(self.scenario, request, margin)
+        self.requirements = list_requirements(self.scenario, request, margin)
         n, m = self.plant.n, self.plant.m
         self.weights = request.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
@@ -222,7 +215,7 @@ class NetworkSearch:
         """Largest cost; infinite if the given loop is unstable without losses."""
         self.tried = self.judged = 0
         self.highest: dict[Hold, int] = {}
-        """By hold strategy: the highest rung on which a loop was tried and is not excluded."""
+        """By hold strategy: the highest level at which a loop was tried and not excluded."""
         self._graphs: dict[tuple[LossGuarantee, int, Hold, int], PatternGraph] = {}
 
     def quick_loop(self, candidate: GainCandidate, period_ns: int) -> QuickLoop:
@@ -238,105 +231,110 @@ class NetworkSearch:
         times = self._times._replace(period_ns=period_ns)
         return times._replace(timeout_ns=hold.timeout_ns(times), holds_input=hold.timeout_input == "hold")
 
-    def graph(self, rung: Rung, hold: Hold) -> PatternGraph:
-        """Return the loss patterns of a rung; those that were the worst ones depend on the hold."""
-        times = self.times(hold, rung.period_ns)
-        key = rung.guarantee, times.slots, hold, 0 if hold.timeout_s is None else rung.period_ns
+    def graph(self, requirement: Requirement, hold: Hold) -> PatternGraph:
+        """Return the loss patterns of a requirement; those that were the worst depend on the hold."""
+        times = self.times(hold, requirement.period_ns)
+        period_ns = 0 if hold.timeout_s is None else requirement.period_ns
+        key = requirement.guarantee, times.slots, hold, period_ns
         if key not in self._graphs:
-            self._graphs[key] = PatternGraph(list_bursts(rung.guarantee, times))
+            self._graphs[key] = PatternGraph(list_bursts(requirement.guarantee, times))
         return self._graphs[key]
 
-    def growth(self, candidate: GainCandidate, rung: int) -> float:
+    def growth(self, candidate: GainCandidate, level: int) -> float:
         """Return a lower bound of the logarithm of the growth per period."""
         self.tried += 1
-        setting = self.ladder[rung]
-        loop = self.quick_loop(candidate, setting.period_ns)
-        graph = self.graph(setting, candidate.hold)
+        requirement = self.requirements[level]
+        loop = self.quick_loop(candidate, requirement.period_ns)
+        graph = self.graph(requirement, candidate.hold)
         return graph.growth(loop.maps(graph.bursts))
 
-    def cost(self, candidate: GainCandidate, rung: int) -> float:
+    def cost(self, candidate: GainCandidate, level: int) -> float:
         """Return the cost without losses."""
-        return self.quick_loop(candidate, self.ladder[max(rung, 0)].period_ns).cost(self.plant.x0)
+        return self.quick_loop(candidate, self.requirements[max(level, 0)].period_ns).cost(self.plant.x0)
 
-    def excess(self, candidate: GainCandidate, rung: int) -> float:
+    def excess(self, candidate: GainCandidate, level: int) -> float:
         """Return what is minimised: the growth, and by how much the cost exceeds its limit."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             plant = self.plant
             rate_per_s = spectral_abscissa(plant.A_model + plant.B_model @ np.array(candidate.K))
             if not rate_per_s < 0:
                 return _UNSTABLE + min(rate_per_s, _UNSTABLE)
-            cost = self.cost(candidate, rung)
-            growth = self.growth(candidate, rung)
+            cost = self.cost(candidate, level)
+            growth = self.growth(candidate, level)
             if not math.isfinite(cost) or not math.isfinite(growth):
                 return _UNSTABLE / 2 + min(max(growth, 0.0), _UNSTABLE / 4)
         if cost <= self.limit:
             if growth < -_SLACK:
-                self.highest[candidate.hold] = max(rung, self.highest.get(candidate.hold, -1))
+                self.highest[candidate.hold] = max(level, self.highest.get(candidate.hold, -1))
             return growth
         return max(growth, -_SLACK) + _SLACK + math.log(cost / self.limit)
 
-    def climb(self, candidate: GainCandidate, rung: int) -> tuple[int, float]:
-        """Return the highest rung that is not excluded, from one on, and the excess at the next."""
-        while rung < len(self.ladder):
-            if (excess := self.excess(candidate, rung)) >= -_SLACK:
-                return rung - 1, excess
-            rung += 1
-        return rung - 1, -math.inf
+    def highest_possible(self, candidate: GainCandidate, level: int) -> tuple[int, float]:
+        """Return the highest level from the given one on that is not excluded, and the next one's excess."""
+        while level < len(self.requirements):
+            if (excess := self.excess(candidate, level)) >= -_SLACK:
+                return level - 1, excess
+            level += 1
+        return level - 1, -math.inf
 
-    def scenario_of(self, candidate: GainCandidate, rung: int) -> Scenario:
-        """Return the scenario of a loop on a rung, not resolved."""
-        setting, scenario = self.ladder[max(rung, 0)], self.scenario
-        trigger = scenario.trigger.model_copy(update={"period_s": setting.period_ns / NS_PER_S})
+    def scenario_of(self, candidate: GainCandidate, level: int) -> Scenario:
+        """Return the scenario of a loop at a level, not resolved."""
+        requirement, scenario = self.requirements[max(level, 0)], self.scenario
+        trigger = scenario.trigger.model_copy(update={"period_s": requirement.period_ns / NS_PER_S})
         return scenario.model_copy(
             update={
                 "model": scenario.model.model_copy(update={"gain": candidate.K}),
                 "trigger": trigger,
-                **candidate.hold.changes(scenario, self._times._replace(period_ns=setting.period_ns)),
-                "network": scenario.network.model_copy(update=setting.network),
+                **candidate.hold.changes(scenario, self._times._replace(period_ns=requirement.period_ns)),
+                "network": scenario.network.model_copy(update=requirement.network),
             }
         )
 
-    def judge(self, candidate: GainCandidate, rung: int) -> Stability:
-        """Return the certified bounds of a loop on a rung."""
+    def judge(self, candidate: GainCandidate, level: int) -> Stability:
+        """Return the certified bounds of a loop at a level."""
         self.judged += 1
-        margin = LossMargin(resolve(self.scenario_of(candidate, rung)))
+        margin = LossMargin(resolve(self.scenario_of(candidate, level)))
         stability = margin.first_bounds()
         return margin.coarse_bounds() if stability.verdict == "undecided" else stability
 
-    def reach(self, candidate: GainCandidate, most: int, least: int = -1) -> tuple[int, Stability | None]:
-        """Return the highest certified rung from ``most`` down to above ``least``."""
-        for rung in range(most, least, -1):
-            if (stability := self.judge(candidate, rung)).verdict == "stable":
-                return rung, stability
+    def highest_certified(
+        self, candidate: GainCandidate, most: int, least: int = -1
+    ) -> tuple[int, Stability | None]:
+        """Return the highest certified level from ``most`` down to above ``least``."""
+        for level in range(most, least, -1):
+            if (stability := self.judge(candidate, level)).verdict == "stable":
+                return level, stability
         return least, None
 
-    def first(self) -> ReachedRung:
-        """Return what the given loop reaches; its bounds are refined until they decide."""
+    def first(self) -> CertifiedLoop:
+        """Return what the given loop is proven to meet; its bounds are refined until they decide."""
         start = 0
         if self.request.goal == "transmissions":
             period_ns = self._times.period_ns
-            start = max(i for i, rung in enumerate(self.ladder) if rung.period_ns <= period_ns)
-        top, _ = self.climb(self.original, start)
+            start = max(i for i, required in enumerate(self.requirements) if required.period_ns <= period_ns)
+        top, _ = self.highest_possible(self.original, start)
         if top < start:
-            top = next((i for i in range(start, -1, -1) if self.climb(self.original, i)[0] >= i), -1)
-        return self.completed(self.original, top)
+            top = next(
+                (i for i in range(start, -1, -1) if self.highest_possible(self.original, i)[0] >= i), -1
+            )
+        return self.certify(self.original, top)
 
-    def completed(self, candidate: GainCandidate, most: int) -> ReachedRung:
-        """Return a loop with refined bounds on its rung and on the next one.
+    def certify(self, candidate: GainCandidate, most: int) -> CertifiedLoop:
+        """Return a loop with refined bounds at the highest certified level and at the next one.
 
-        A designed loop stays on a rung beyond which its cost would exceed the limit.
+        A designed loop stays at a level beyond which its cost would exceed the limit.
         """
-        rung = most
+        level = most
         stability = None
-        while rung >= 0 and (stability := self.judge(candidate, rung)).verdict != "stable":
-            rung, stability = rung - 1, None
+        while level >= 0 and (stability := self.judge(candidate, level)).verdict != "stable":
+            level, stability = level - 1, None
         following, limit = None, math.inf if candidate == self.original else self.limit
-        while rung + 1 < len(self.ladder) and self.cost(candidate, rung + 1) <= limit:
-            following = self.judge(candidate, rung + 1)
+        while level + 1 < len(self.requirements) and self.cost(candidate, level + 1) <= limit:
+            following = self.judge(candidate, level + 1)
             if following.verdict != "stable":
                 break
-            rung, stability, following = rung + 1, following, None
-        return ReachedRung(candidate, rung, stability, following, self.cost(candidate, rung))
+            level, stability, following = level + 1, following, None
+        return CertifiedLoop(candidate, level, stability, following, self.cost(candidate, level))
 
     def regulators(self) -> list[GainCandidate]:
         """Return LQR gains of the model with all hold strategies."""
@@ -353,210 +351,72 @@ class NetworkSearch:
 
         return self.request.holds is None or behaviour(self.original.hold) in map(behaviour, self.holds)
 
-    def run(self, progress: Progress = lambda share: None) -> tuple[ReachedRung, ReachedRung]:
-        """Return what the given loop reaches, and the best loop found."""
+    def run(self, progress: Progress = lambda share: None) -> tuple[CertifiedLoop, CertifiedLoop]:
+        """Return what the given loop is proven to meet, and the best loop found."""
         original = self.first()
-        self.tried, best, rung = 0, original.candidate, -1
+        self.tried, best, level = 0, original.candidate, -1
         if self.keeps_given_hold:
-            rung = original.rung
+            level = original.level
         progress(0.1)
         starts = [GainCandidate(hold, original.candidate.K) for hold in self.holds]
         starts += self.regulators()
         ranked = sorted(
-            ((*self.climb(start, max(rung, 0)), start) for start in starts),
+            ((*self.highest_possible(start, max(level, 0)), start) for start in starts),
             key=lambda entry: (-entry[0], entry[1]),
         )
         for top, _, candidate in ranked[:_STARTS]:
-            if top > rung:
-                reached, stability = self.reach(candidate, top, rung)
+            if top > level:
+                new_level, stability = self.highest_certified(candidate, top, level)
                 if stability is not None:
-                    best, rung = candidate, reached
+                    best, level = candidate, new_level
         progress(0.3)
         first_of_each = {candidate.hold: candidate for _, _, candidate in reversed(ranked)}
         for hold, candidate in first_of_each.items():
-            if hold not in self.highest:  # it was tried from the given loop's rung on
-                self.climb(candidate, 0)
-        pool = [best] if rung >= 0 else []
+            if hold not in self.highest:  # it was tried from the given loop's level on
+                self.highest_possible(candidate, 0)
+        pool = [best] if level >= 0 else []
         pool += [candidate for _, _, candidate in ranked[:_STARTS]]
         pool = list(dict.fromkeys([*pool, *first_of_each.values()]))
         share = max(self.request.effort // len(pool), 1)
         for number, start in enumerate(pool):
             candidate = start
             tries_left = share
-            while tries_left > 0 and rung + 1 < len(self.ladder):
+            while tries_left > 0 and level + 1 < len(self.requirements):
                 tried_before = self.tried
-                improved = self._improve(candidate, rung + 1, tries_left)
+                improved = self._improve(candidate, level + 1, tries_left)
                 tries_left -= max(self.tried - tried_before, 1)
                 if improved is None:
                     break
                 candidate = improved
-                top, _ = self.climb(candidate, rung + 1)
-                reached, stability = self.reach(candidate, max(top, rung + 1), rung)
+                top, _ = self.highest_possible(candidate, level + 1)
+                new_level, stability = self.highest_certified(candidate, max(top, level + 1), level)
                 if stability is None:
                     break
-                best, rung = candidate, reached
+                best, level = candidate, new_level
             progress(0.3 + 0.6 * (number + 1) / len(pool))
-        return original, original if best == original.candidate else self.completed(best, rung)
+        return original, original if best == original.candidate else self.certify(best, level)
 
     def by_hold(self) -> Iterator[tuple[str, str]]:
-        """Yield the hold strategies with the names of their highest rungs."""
+        """Yield the hold strategies with the names of their highest requirements."""
         for hold in self.holds:
-            rung = self.highest.get(hold, -1)
-            yield hold.text, self.ladder[rung].name if rung >= 0 else "nothing"
+            level = self.highest.get(hold, -1)
+            yield hold.text, self.requirements[level].name if level >= 0 else "nothing"
 
-    def _improve(self, start: GainCandidate, rung: int, most: int) -> GainCandidate | None:
-        """Return a loop near ``start`` whose lower bound is below 1 on a rung; None: none found."""
+    def _improve(self, start: GainCandidate, level: int, most: int) -> GainCandidate | None:
+        """Return a loop near ``start`` whose lower bound at a level is below 1; None: none found."""
         K = np.array(start.K)
         scale = scaled_steps(K)
 
+        def moved(steps: Vector) -> GainCandidate:
+            return _rounded(start.hold, (K.ravel() + scale * steps).reshape(K.shape))
+
         def objective(steps: Vector) -> float:
-            candidate = _rounded(start.hold, (K.ravel() + scale * steps).reshape(K.shape))
-            excess = self.excess(candidate, rung)
-            if excess < -_SLACK:
-                raise _FoundError(candidate)
-            return excess
+            return self.excess(moved(steps), level)
 
-        try:
-            nelder_mead(objective, K.size, 0.3, most, tolerance=1e-5)
-        except _FoundError as success:
-            return success.candidate
-        return None
-
-
-def nelder_mead(
-    objective: Callable[[Vector], float], size: int, first_step: float, most: int, tolerance: float = 1e-4
-) -> None:
-    """Minimise without gradients from 0 on.
-
-    Args:
-        objective: to be minimised.
-        size: number of unknowns.
-        first_step: size of the first simplex.
-        most: largest number of evaluations.
-        tolerance: difference of values at which the search ends.
-    """
-    from scipy.optimize import minimize  # slow to import
-
-    simplex = np.vstack([np.zeros(size), first_step * np.eye(size)])
-    minimize(
-        objective,
-        np.zeros(size),
-        method="Nelder-Mead",
-        options={"maxfev": most, "adaptive": True, "initial_simplex": simplex, "fatol": tolerance},
-    )
-
-
-def scaled_steps(K: Matrix) -> Vector:
-    """Return the unit of a search's steps of each entry of a gain."""
-    return np.ravel(np.maximum(np.abs(K), 0.1 * np.abs(K).max(axis=1, keepdims=True)))
+        steps = nelder_mead(objective, K.size, 0.3, most, tolerance=1e-5, enough=-_SLACK)
+        return None if steps is None else moved(steps)
 
 
 def _rounded(hold: Hold, K: Matrix) -> GainCandidate:
     """Return a candidate with six digits: what is judged is what is printed."""
     return GainCandidate(hold, tuple(tuple(float(f"{entry:.6g}") for entry in row) for row in K))
-
-
-class _FoundError(Exception):
-    """Ends a minimisation."""
-
-    def __init__(self, candidate: GainCandidate) -> None:
-        super().__init__()
-        self.candidate = candidate
-
-
-def periodic_outcome(search: NetworkSearch, original: ReachedRung, best: ReachedRung) -> DesignOutcome:
-    """Return what is shown of a search."""
-    return DesignOutcome(
-        search.scenario.name,
-        "proven stable for every loss pattern",
-        _loop_result(search, original, is_excluded=not search.keeps_given_hold),
-        _loop_result(search, best),
-        list(_notes(search, original, best)),
-        search.scenario_of(best.candidate, best.rung),
-        best.rung >= 0,
-        best.candidate != original.candidate,
-        {
-            "goal": search.request.goal,
-            "window": search.request.window,
-            "cost_limit": search.limit,
-            "tried": search.tried,
-            "judged": search.judged,
-            "highest_by_hold": dict(search.by_hold()),
-        },
-        _figure(search, original, best),
-        tuple(search.by_hold()),
-    )
-
-
-def _loop_result(search: NetworkSearch, reached: ReachedRung, *, is_excluded: bool = False) -> LoopResult:
-    ladder, (hold, K), proven = search.ladder, reached.candidate, reached.stability
-    rung = ladder[max(reached.rung, 0)]
-    sent = search.scenario.timing.measurement_period_ns / rung.period_ns
-    reach = rung.name + (", the most examined" * (reached.rung == len(ladder) - 1))
-    if reached.rung < 0:
-        reach = "nothing proven"
-    growth = (
-        f"{at_least(proven.lower, decimals=5)} to {at_most(proven.upper, decimals=5)}" if proven else NONE
-    )
-    cells = {
-        "proven stable for": reach,
-        "growth per period there": growth,
-        "the next one": _next_rung_text(ladder, reached),
-        "cost without losses": f"{reached.cost:.4g}",
-        "share of measurements sent": f"{100 * sent:.3g} %",
-        "between updates": hold.text + " (not in --holds)" * is_excluded,
-        "K": gain_text(K),
-    }
-    certified = None if reached.rung < 0 else rung.number
-    document: dict[str, object] = {"certified": certified, "cost": reached.cost, "transmitted": sent}
-    document |= {"mode": hold.mode, "hold": hold.text, "K": K}
-    for name, stability in (("stability", proven), ("beyond", reached.beyond)):
-        document[name] = stability and stability_document(stability)
-    return LoopResult(reach, cells, document)
-
-
-def _notes(search: NetworkSearch, original: ReachedRung, best: ReachedRung) -> Iterator[str]:
-    """Yield what the reader should know of a search."""
-    limit = f"{search.limit:.4g}" if math.isfinite(search.limit) else "any size"
-    yield (
-        f"the best of {search.tried:,} loops tried, with a cost of at most {limit}; what it "
-        "tolerates is proven, that it is the best is not"
-    )
-    if best.rung < original.rung:
-        hold = original.candidate.hold.text
-        yield f"the given loop tolerates more than the designed one; --holds excludes its strategy, {hold}"
-    period_s = search.period_ns / NS_PER_S
-    if search.request.period_s is not None and round(search.request.period_s * NS_PER_S) != search.period_ns:
-        yield f"--period {search.request.period_s:g}: updates are sent at measurements, every {period_s:g} s"
-
-
-def _next_rung_text(ladder: Sequence[Rung], reached: ReachedRung) -> str:
-    if reached.rung + 1 == len(ladder):
-        return "not examined"
-    if reached.beyond is None:
-        return f"{ladder[reached.rung + 1].name}: costs too much"
-    destabilised = reached.beyond.verdict == "destabilised"
-    result = f"{reached.beyond.text} destabilises" if destabilised else "undecided"
-    return f"{ladder[reached.rung + 1].name}: {result}"
-
-
-def _figure(search: NetworkSearch, original: ReachedRung, best: ReachedRung) -> FigureDescription:
-    """Describe the growth of both loops over the ladder."""
-    ladder, request = search.ladder, search.request
-    top = min(max(best.rung, original.rung) + 4, len(ladder))
-    rungs = np.unique(np.linspace(0, top - 1, min(top, _MOST_POINTS)).astype(int))
-    numbers = np.array([rung.number for rung in ladder])
-    items: list[Item] = [Rule(at=1.0, colour=palette.CERTIFIED, label="stable below")]
-    for reached, label, colour in ((original, "given", palette.NETWORK), (best, "designed", palette.LOST)):
-        growth = np.exp(np.minimum([search.growth(reached.candidate, int(i)) for i in rungs], 1.1))
-        items.append(Line(x=numbers[rungs], y=growth, colour=colour, label=label, marker="o"))
-        if reached.stability is not None:
-            x, y = numbers[[reached.rung]], np.array([reached.stability.upper])
-            mark_label = f"{label}: proven"
-            items.append(Marks(x=x, y=y, colour=colour, marker="*", size=12, label=mark_label))
-    x_label = "M" if request.window is None else f"losses in {request.window} updates"
-    if request.goal == "transmissions":
-        x_label = "time between updates [s]"
-    x_axis = Axis(label=x_label, whole=request.goal == "network")
-    panel = Panel(items=items, x=x_axis, y=Axis(label="growth per period"))
-    return figure_of("growth", panel, _CAPTION)

@@ -3,7 +3,7 @@
 The method is Dormand & Prince's pair of orders 5 and 4 with error control. An ordinary integrator
 reduces its steps at a jump until they meet the tolerance, which takes hundreds of evaluations. Here
 the signs are held within a step, so that the equations are smooth there. If a switching value has
-another sign at a step's end, the step is repeated up to the change, and the sign is turned (Hairer,
+another sign at a step's end, the step is repeated up to the change, and the sign is reversed (Hairer,
 Nørsett and Wanner, "Solving Ordinary Differential Equations I", section II.6).
 
 ``rates(model, z, v, parameters, signs, values, slope)`` writes the k switching values and dz/dt
@@ -20,6 +20,8 @@ from noack.core.linear_systems import Matrix, Vector
 
 Rates = Callable[..., None]
 """Equations, as described above."""
+Equations = tuple[Rates, object, Vector, object]
+"""The equations with their arguments that are constant: rates, model, v, parameters."""
 DONE = 0
 TOO_MANY_STEPS = -2
 TOO_SMALL_STEPS = -3
@@ -97,6 +99,7 @@ def advance(
         tolerances: relative and absolute tolerance of a step.
         work: buffers, which carry nothing from one call to the next.
     """
+    equations = (rates, model, v, parameters)
     work.signs[:] = 0.0
     rates(model, z, v, parameters, work.signs, work.values, work.slopes[0])
     for k in range(len(work.signs)):
@@ -107,7 +110,7 @@ def advance(
         if left_s <= smallest_s:
             return DONE
         step_s = min(step_s, left_s)
-        error = attempt(rates, model, z, v, parameters, step_s, tolerances, work)
+        error = compute_step(equations, z, step_s, tolerances, work)
         factor = 5.0
         if error > 0.0:
             factor = min(max(0.9 * error**-0.2, 0.2), factor)
@@ -117,14 +120,14 @@ def advance(
                 return TOO_SMALL_STEPS
             continue
         part_s = step_s
-        if margin(work.signs, work.values) >= 0.0:
+        if least_signed_value(work.signs, work.values) >= 0.0:
             step_s *= factor
         else:
-            part_s *= locate(rates, model, z, v, parameters, step_s, work)
-            attempt(rates, model, z, v, parameters, part_s, tolerances, work)
-            if margin(work.signs, work.values) < 0.0:
+            part_s *= first_sign_change(equations, z, step_s, work)
+            compute_step(equations, z, part_s, tolerances, work)
+            if least_signed_value(work.signs, work.values) < 0.0:
                 jumps += 1
-                turn(work, jumps)
+                reverse_signs(work, jumps)
                 rates(model, work.point, v, parameters, work.signs, work.values, work.slopes[6])
         copy(work.point, z)
         copy(work.values, work.start)
@@ -139,17 +142,15 @@ def copy(source: Vector, target: Vector) -> None:
         target[n] = source[n]
 
 
-def attempt(
-    rates: Rates,
-    model: object,
+def compute_step(
+    equations: Equations,
     z: Vector,
-    v: Vector,
-    parameters: object,
     step_s: float,
     tolerances: tuple[float, float],
     work: StepBuffers,
 ) -> float:
     """Compute all stages of a step; return its error relative to the tolerance, NaN included."""
+    rates, model, v, parameters = equations
     relative, absolute = tolerances
     for stage in range(1, 7):
         for n in range(len(z)):
@@ -168,7 +169,7 @@ def attempt(
     return math.sqrt(total / len(z))
 
 
-def margin(signs: Vector, values: Vector) -> float:
+def least_signed_value(signs: Vector, values: Vector) -> float:
     """Return the smallest of the values times their signs: negative if a value has another sign."""
     least = math.inf
     for k in range(len(signs)):
@@ -177,23 +178,22 @@ def margin(signs: Vector, values: Vector) -> float:
     return least
 
 
-def locate(
-    rates: Rates,
-    model: object,
+def first_sign_change(
+    equations: Equations,
     z: Vector,
-    v: Vector,
-    parameters: object,
     step_s: float,
     work: StepBuffers,
 ) -> float:
     """Return the part of the step until just after the first change of a sign, at most 1.
 
     The state within the step is the cubic polynomial through both ends with their slopes. The
-    margin's root in it is found by the Illinois method (regula falsi, with halved values).
+    root of its least signed value is found by the Illinois method (regula falsi, with halved values).
     """
+    rates, model, v, parameters = equations
     for k in range(len(work.signs)):
         work.changing[k] = work.signs[k] if work.signs[k] * work.values[k] < 0.0 else 0.0
-    at_low, at_high = margin(work.changing, work.start), margin(work.changing, work.values)
+    at_low = least_signed_value(work.changing, work.start)
+    at_high = least_signed_value(work.changing, work.values)
     beyond, close = _BEYOND * (at_low - at_high), 0.1 * _BEYOND * (at_low - at_high)
     at_low, at_high = at_low + beyond, at_high + beyond
     low, high, last, part = 0.0, 1.0, 0, 1.0
@@ -209,7 +209,7 @@ def locate(
                 + step_s * part * remaining * (remaining * work.slopes[0, n] - part * work.slopes[6, n])
             )
         rates(model, work.between, v, parameters, work.signs, work.values, work.slopes[1])
-        now = margin(work.changing, work.values) + beyond
+        now = least_signed_value(work.changing, work.values) + beyond
         if abs(now) <= close:
             break
         if now < 0.0:
@@ -223,8 +223,8 @@ def locate(
     return part
 
 
-def turn(work: StepBuffers, jumps: int) -> None:
-    """Turn the signs that differ from their values'; after too many jumps, hold none any longer."""
+def reverse_signs(work: StepBuffers, jumps: int) -> None:
+    """Reverse the signs that differ from their values'; after too many jumps, hold none any longer."""
     for k in range(len(work.signs)):
         if work.signs[k] * work.values[k] < 0.0:
             work.signs[k] = -work.signs[k]

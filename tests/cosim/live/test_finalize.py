@@ -18,9 +18,9 @@ import pytest
 import cosim.live.finalize
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.summary_model import RunSummary
-from cosim.live.finalize import ReplayBeside, finalize, reopen
-from cosim.live.processes import end_helpers
-from cosim.live.processes.end_helpers import EndHelpers, PreparedEnding
+from cosim.live.finalize import ReplayInHelper, finalize, reopen
+from cosim.live.processes import finalize_helpers
+from cosim.live.processes.finalize_helpers import FinalizeHelpers, RunEndingWithHelpers
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORDING_FILE,
@@ -243,10 +243,10 @@ def many_loops(
     judged_alone: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
     """A copy of the run, whose end processes help with."""
-    monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
-    monkeypatch.setattr(end_helpers, "_LOOPS_AT_ONCE", LOOPS - 1)
+    monkeypatch.setattr(finalize_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(finalize_helpers, "_LOOPS_AT_ONCE", LOOPS - 1)
     monkeypatch.setattr(cosim.live.finalize, "_LEAST_LOOPS", LOOPS - 1)  # helpers judge loops, too
-    monkeypatch.setattr(end_helpers, "cores", lambda: 2)
+    monkeypatch.setattr(finalize_helpers, "cores", lambda: 2)
     run_dir, _ = judged_alone
     return Path(shutil.copytree(run_dir, tmp_path / run_dir.name))
 
@@ -260,7 +260,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
     is_killed: bool,
 ) -> None:
     given = (many_loops, 0, ExitStatus.OK, "horizon")
-    helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
+    helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
     helpers.start()
     helpers.submit(exec, _NEVER_IDLE).result()
     helpers.prepare(many_loops)
@@ -272,7 +272,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
         assert helpers.submit(os.getpid).result() != os.getpid()
         with pytest.raises(BrokenProcessPool):
             helpers.submit(os._exit, 1).result()
-    ending = PreparedEnding(*given, helpers=helpers)
+    ending = RunEndingWithHelpers(*given, helpers=helpers)
     _, expected = judged_alone
     assert finalize(ending, report=False, view=not is_killed).summary == expected
 
@@ -284,7 +284,7 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
     """Nor for who writes tables, if it has not even made the folder in which it would be told."""
     begun = Event()
 
-    def endless(helpers: EndHelpers, *_: object) -> None:
+    def endless(helpers: FinalizeHelpers, *_: object) -> None:
         if part == "_write_early":
             helpers._ended, helpers._writer = many_loops / "none" / "ended", current_thread()
         waiting = helpers.submit(time.sleep, 1e6)
@@ -292,12 +292,12 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
         waiting.result()
 
     for one in ("_prepare_loops", "_write_early", "_idle"):
-        monkeypatch.setattr(EndHelpers, one, endless if one == part else lambda *_: None)
-    monkeypatch.setattr(end_helpers, "_GRACE_S", 0.0)
-    helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
+        monkeypatch.setattr(FinalizeHelpers, one, endless if one == part else lambda *_: None)
+    monkeypatch.setattr(finalize_helpers, "_GRACE_S", 0.0)
+    helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
     helpers.prepare(many_loops)
     begun.wait()
-    ending = PreparedEnding(many_loops, 0, ExitStatus.OK, "horizon", helpers=helpers)
+    ending = RunEndingWithHelpers(many_loops, 0, ExitStatus.OK, "horizon", helpers=helpers)
     assert len(finalize(ending, report=False, view=False).summary.loops) == LOOPS
 
 
@@ -305,20 +305,20 @@ def _killed(*_: object) -> None:
     raise MemoryError
 
 
-@pytest.mark.parametrize("part", [ReplayBeside.part, _killed])
+@pytest.mark.parametrize("part", [ReplayInHelper.part, _killed])
 def test_the_replay_beside_is_that_of_this_process_and_is_not_lost(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch, part: Callable[..., Any]
 ) -> None:
-    monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
-    monkeypatch.setattr(end_helpers, "cores", lambda: 2)
+    monkeypatch.setattr(finalize_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(finalize_helpers, "cores", lambda: 2)
     asked = []
 
-    def told(self: ReplayBeside) -> Any:
+    def told(self: ReplayInHelper) -> Any:
         asked.append(self)
         with suppress(MemoryError):
             return part(self)
 
-    monkeypatch.setattr(ReplayBeside, "part", told)
+    monkeypatch.setattr(ReplayInHelper, "part", told)
     finalize(ended_well(run_dir), report=False, view=False)
     stored = summary_of(run_dir)["loops"][0]["replay"]
     assert stored == replay(load_record(run_dir)).verdict().model_dump()

@@ -14,8 +14,8 @@ from netem.client_table import LinkWarnings
 from netem.relay_links import (
     BUCKETS,
     LinkSpec,
-    coarse,
-    lower_ns,
+    bucket_start_ns,
+    coarse_histogram,
     open_links,
     quantile_ns,
     socket_name,
@@ -32,8 +32,8 @@ from tests.netem.relay.relays import HOSTS, drain, endpoints, link, name_of, run
 @given(st.integers(0, 2**44 - 1))
 def test_a_bucket_holds_its_times_to_three_percent(t_ns: int) -> None:
     bucket = core.noack_bucket_of(t_ns)
-    assert lower_ns(bucket) <= t_ns < lower_ns(bucket + 1)
-    assert lower_ns(bucket + 1) - lower_ns(bucket) <= max(1, lower_ns(bucket) / 32)
+    assert bucket_start_ns(bucket) <= t_ns < bucket_start_ns(bucket + 1)
+    assert bucket_start_ns(bucket + 1) - bucket_start_ns(bucket) <= max(1, bucket_start_ns(bucket) / 32)
     assert core.noack_bucket_of(-1 - t_ns) == 0
     assert core.noack_bucket_of(2**60) == BUCKETS - 1
 
@@ -44,7 +44,7 @@ def test_quantiles_and_the_coarse_histogram_are_those_of_the_times(times_ns: lis
     for share in (0.5, 0.99, 1.0):
         exact = float(np.quantile(times_ns, share, method="inverted_cdf"))
         assert quantile_ns(counts, share) == pytest.approx(exact, rel=1 / 32, abs=1)
-    steps = coarse(counts)
+    steps = coarse_histogram(counts)
     begins = [begin for begin, _ in steps]
     assert begins == sorted(begins)
     assert sum(n for _, n in steps) == len(times_ns)

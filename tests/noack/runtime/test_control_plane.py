@@ -15,16 +15,16 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 import noack.runtime.control_plane
-import noack.runtime.run_process
+import noack.runtime.join_run
 from cosim.live.coordinator import Coordinator
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.command_line import Signals
 from noack.runtime.control_messages import RunStart, parse_message
 from noack.runtime.control_plane import RUNS, ControlPlane, cause_of, label, run_name
+from noack.runtime.join_run import _admitted
 from noack.runtime.join_ticket import Ticket, new_ticket
 from noack.runtime.private_folder import private_folder
-from noack.runtime.run_process import _admitted
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import needs_root, output_of_another_user
@@ -166,8 +166,8 @@ def test_a_launched_process_connects_again_until_it_is_admitted(
             admission = {"generation": 0, "admitted_ns": 0, "from_ns": 0}
             return json.dumps(admission | {"address": None, "replaces": None}).encode()
 
-    monkeypatch.setattr(noack.runtime.run_process, "ControlPlane", Silent)
-    monkeypatch.setattr(noack.runtime.run_process, "lifeline_cut", lambda: False)
+    monkeypatch.setattr(noack.runtime.join_run, "ControlPlane", Silent)
+    monkeypatch.setattr(noack.runtime.join_run, "launcher_has_ended", lambda: False)
     asking = partial(_admitted, "plant", changed(ticket, launched=launched), Signals())
     if launched:
         assert asking().plane is cast(Any, tries[2])

@@ -128,14 +128,14 @@ def test_messages_are_handled_in_order_and_answered(
 
 @pytest.mark.sanitized
 @pytest.mark.parametrize("loops", [1, 20])
-@pytest.mark.parametrize("rest_ns", [0, 1_000_000])
+@pytest.mark.parametrize("coalescing_ns", [0, 1_000_000])
 @pytest.mark.parametrize("role", ["plant", "controller"])
 def test_ticks_are_done_in_order_and_never_early(
-    content: dict[str, Any], role: str, loops: int, rest_ns: int
+    content: dict[str, Any], role: str, loops: int, coalescing_ns: int
 ) -> None:
     resolved = scenario(content, horizon_s=0.05)
     phases_ns = [100_000 * k for k in range(loops)]
-    with closing(Live(role, [resolved] * loops, phases_ns, rest_ns=rest_ns)) as live:
+    with closing(Live(role, [resolved] * loops, phases_ns, coalescing_ns=coalescing_ns)) as live:
         live.drive(lambda: live.driver.next_deadline_ns() is None)
         table = PLANT_STEP if role == "plant" else CONTROLLER_STEP
         names = columns(live, table)

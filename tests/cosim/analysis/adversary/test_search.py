@@ -17,7 +17,7 @@ from scipy.integrate import quad
 from cosim.analysis.adversary import Worst
 from cosim.analysis.adversary.loop_flows import Objective, evaluate, measure_of
 from cosim.analysis.adversary.pattern_search import PatternSearch, search_tree
-from cosim.analysis.adversary.worst_pattern_search import find_worst as find_any
+from cosim.analysis.adversary.scenario_search import find_worst as find_any
 from noack.core.errors import ExitStatus
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario

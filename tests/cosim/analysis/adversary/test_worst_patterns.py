@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from cosim.analysis.adversary import Objective, conditions_of, find_worst
 from cosim.analysis.adversary.loop_flows import Pattern, SampledFlow, run_of
-from cosim.analysis.adversary.worst_run import bounds_of
+from cosim.analysis.adversary.worst_disturbances import disturbance_bounds
 from cosim.record.run_record import RunRecord
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate
@@ -204,7 +204,7 @@ def test_the_found_signs_of_the_disturbances_are_the_worst_of_all(
     certificate = certify(resolved, conditions_of(resolved, continuous=False))
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
     push, noise = (np.abs(part) for part in flow.loop.disturbances)
-    bounds = bounds_of(resolved)
+    bounds = disturbance_bounds(resolved)
     assert bounds is not None
     worst = 0.0
     for signs in product((-1.0, 1.0), repeat=len(noise) if len(noise) else len(push)):

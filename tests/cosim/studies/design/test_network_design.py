@@ -17,8 +17,9 @@ from cosim.simulation.virtual_time import simulate
 from cosim.studies.design.design_page import DesignOutcome
 from cosim.studies.design.event_design import Certified, EventSearch, design_for_network, event_outcome
 from cosim.studies.design.hold_strategies import read_holds
-from cosim.studies.design.loop_growth import PatternGraph
-from cosim.studies.design.network_search import DesignRequest, NetworkSearch, ReachedRung, periodic_outcome
+from cosim.studies.design.network_outcome import periodic_outcome
+from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
+from cosim.studies.design.quick_estimate import PatternGraph
 from noack.impairments.loss_guarantee import LossesInWindow
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -40,8 +41,8 @@ class Found(NamedTuple):
     """A search with its loops and what is shown of them."""
 
     search: NetworkSearch
-    given: ReachedRung
-    best: ReachedRung
+    given: CertifiedLoop
+    best: CertifiedLoop
     shown: DesignOutcome
 
 
@@ -87,7 +88,7 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
     beyond = pole.best.beyond
     assert beyond is not None
     assert beyond.verdict == "destabilised"
-    more = pole.search.scenario_of(pole.best.candidate, pole.best.rung + 1)
+    more = pole.search.scenario_of(pole.best.candidate, pole.best.level + 1)
     kept = pole.best.stability
     assert kept is not None
     assert final_size(more, kept.pattern) < 1e-3
@@ -115,13 +116,13 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
 ) -> None:
     found = searched(shipped(name, *settings), design_request)
     given, best = found.given, found.best
-    assert best.rung >= given.rung
+    assert best.level >= given.level
     assert best.cost <= found.search.limit or best == given
-    if best.rung >= 0:
+    if best.level >= 0:
         assert best.stability is not None
         assert LossMargin(resolve(found.shown.scenario)).coarse_bounds().upper < 1
     if name != "double_integrator":
-        assert best.rung > given.rung
+        assert best.level > given.level
     if design_request.window:
         assert isinstance(found.shown.scenario.network.guarantee.rules[-1], LossesInWindow)
 
@@ -131,8 +132,8 @@ def test_each_hold_strategy_has_the_most_that_its_best_loop_reached() -> None:
     (hold, of_hold), (model, of_model) = found.shown.by_hold
     assert (hold, model, of_model) == ("hold", "the model's input", "M = 8")
     alone = searched(shipped("lane_periodic"), DesignRequest(effort=0, most=8, holds=read_holds("zoh")))
-    assert of_hold == f"M = {alone.best.rung + 1}"
-    assert alone.best.rung < found.best.rung
+    assert of_hold == f"M = {alone.best.level + 1}"
+    assert alone.best.level < found.best.level
     assert found.shown.to_json()["highest_by_hold"] == {hold: of_hold, model: of_model}
 
 
@@ -153,12 +154,12 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         given = shipped("double_integrator", *more)
         search = NetworkSearch(given, DesignRequest(period_s=0.31, most=5))
         exact = LossMargin(resolve(search.scenario))
-        bursts = exact.bursts(search.ladder[4].guarantee)
+        bursts = exact.bursts(search.requirements[4].guarantee)
         quick = search.quick_loop(search.original, exact.longest_ns).maps(bursts)
         maps = np.array([exact.maps(one.slot, one.usable_ns, one.losses).middle for one in bursts])
         if not more or more == timeouts[0]:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
-        stability = exact.coarse_bounds(search.ladder[4].guarantee)
+        stability = exact.coarse_bounds(search.requirements[4].guarantee)
         lower = np.exp(PatternGraph(bursts).growth(quick))
         assert lower <= stability.upper
         assert lower == pytest.approx(stability.lower, rel=2e-2)
@@ -215,12 +216,12 @@ def test_the_holds_that_are_named_decide_also_about_the_given_timeout() -> None:
     request = DesignRequest(period_s=PERIOD_S, effort=0, holds=read_holds("zero"), cost=50)
     found = searched(shipped("unstable_pendulum", *given), request)
     assert found.best.candidate.hold in read_holds("zero")
-    assert found.best.rung < found.given.rung
+    assert found.best.level < found.given.level
     assert any("--holds excludes its strategy" in note for note in found.shown.notes)
     assert found.shown.given.cells["between updates"].endswith(" (not in --holds)")
     same = searched(shipped("unstable_pendulum", *ZERO), request)
     assert same.search.keeps_given_hold
-    assert same.best.rung >= same.given.rung
+    assert same.best.level >= same.given.level
 
 
 def test_a_period_between_two_measurements_is_said_to_be_longer() -> None:

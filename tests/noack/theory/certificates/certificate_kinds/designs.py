@@ -16,7 +16,7 @@ import numpy as np
 
 from cosim.studies.design import event_design
 from cosim.studies.design.event_design import Certified, EventSearch
-from cosim.studies.design.network_search import DesignRequest, NetworkSearch, ReachedRung
+from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -44,13 +44,13 @@ class Design(NamedTuple):
     """What is said of both loops with periodic updates."""
 
     search: NetworkSearch
-    given: ReachedRung
-    best: ReachedRung
+    given: CertifiedLoop
+    best: CertifiedLoop
 
-    def maps(self, reached: ReachedRung, rung: int) -> LoopMaps:
-        """Return a loop on a rung."""
-        resolved = resolve(self.search.scenario_of(reached.candidate, rung))
-        return LoopMaps(resolved, self.search.ladder[max(rung, 0)].period_ns)
+    def maps(self, loop: CertifiedLoop, level: int) -> LoopMaps:
+        """Return a loop at a level."""
+        resolved = resolve(self.search.scenario_of(loop.candidate, level))
+        return LoopMaps(resolved, self.search.requirements[max(level, 0)].period_ns)
 
 
 class EventDesign(NamedTuple):
@@ -132,14 +132,14 @@ def _simulate(case: Case, rng: Rng) -> Observed:
     if isinstance(found, EventDesign):
         return _simulate_events(wanted.system, found, rng)
     worst, runs = dict.fromkeys(("growth", "pattern", "cost", "limit"), 0.0), 0
-    worst["rung"] = (found.given.rung + 2) / (found.best.rung + 2)
+    worst["rung"] = (found.given.level + 2) / (found.best.level + 2)
     if found.best != found.given:
         worst["limit"] = found.best.cost / found.search.limit
     for one in (found.given, found.best):
-        cost = found.maps(one, one.rung).cost(found.search.plant.x0, *found.search.weights)
+        cost = found.maps(one, one.level).cost(found.search.plant.x0, *found.search.weights)
         if cost != one.cost:  # both may be infinite
             worst["cost"] = max(worst["cost"], cost / one.cost, one.cost / cost)
-        for rung, stability in ((one.rung, one.stability), (one.rung + 1, one.beyond)):
+        for rung, stability in ((one.level, one.stability), (one.level + 1, one.beyond)):
             if stability is not None:
                 tried, shares = growth_shares(found.maps(one, rung), stability, rng)
                 runs, worst = runs + tried, worst | {name: max(shares[name], worst[name]) for name in shares}
@@ -163,8 +163,8 @@ def _simulate_events(given: System, found: EventDesign, rng: Rng) -> Observed:
 
 
 def _one_rung_further(found: Design) -> Design:
-    rung = min(found.best.rung + 1, len(found.search.ladder) - 1)
-    return found._replace(best=found.best._replace(rung=rung, beyond=None))
+    rung = min(found.best.level + 1, len(found.search.requirements) - 1)
+    return found._replace(best=found.best._replace(level=rung, beyond=None))
 
 
 def _given_gain(found: Design) -> Design:
@@ -179,7 +179,7 @@ def _given_hold(found: Design) -> Design:
 def _no_cost_of_inputs(found: Design) -> Design:
     Q, R = found.search.weights
     with patch.object(found.search, "weights", (Q, 0 * R)):
-        cost = found.search.cost(found.best.candidate, found.best.rung)
+        cost = found.search.cost(found.best.candidate, found.best.level)
     return found._replace(best=found.best._replace(cost=cost))
 
 

@@ -1,4 +1,4 @@
-"""Processes that help with the end of a long run, and prepare it while the run goes on.
+"""Processes that help to finalise a long run, and prepare this while the run goes on.
 
 What follows from the scenario alone is computed at idle priority: a process of the run that wakes
 up takes the core at once. What is not computed when the run ends, or is lost with a helper, is
@@ -38,7 +38,7 @@ _LOOPS_AT_ONCE = 16
 _POLL_S = 0.005
 
 
-class EndHelpers:
+class FinalizeHelpers:
     """Processes on all cores but one; none if the end of the run takes no time.
 
     Args:
@@ -208,9 +208,9 @@ class EndHelpers:
 
 
 @contextmanager
-def lasting_helpers(scenario: Scenario) -> Iterator[EndHelpers]:
+def lasting_helpers(scenario: Scenario) -> Iterator[FinalizeHelpers]:
     """Have helpers during a run and, unless an error ends it, for its end."""
-    helpers = EndHelpers(scenario)
+    helpers = FinalizeHelpers(scenario)
     try:
         yield helpers
     except BaseException:
@@ -219,7 +219,7 @@ def lasting_helpers(scenario: Scenario) -> Iterator[EndHelpers]:
 
 
 @dataclass(frozen=True)
-class PreparedEnding(RunEnding):
+class RunEndingWithHelpers(RunEnding):
     """How a run ended whose end was prepared."""
 
-    helpers: EndHelpers | None = None
+    helpers: FinalizeHelpers | None = None

@@ -36,14 +36,12 @@ from cosim.analysis.adversary.pattern_search import (
     search_beam,
     search_tree,
 )
-from cosim.analysis.adversary.worst_run import (
-    Bounds,
-    Worst,
-    bounds_of,
-    certified_value,
-    reported,
+from cosim.analysis.adversary.worst_disturbances import (
+    DisturbanceBounds,
+    disturbance_bounds,
     worst_disturbances,
 )
+from cosim.analysis.adversary.worst_run import Worst, certified_value, reported
 from cosim.simulation.continuous import (
     ContinuousLoop,
     ContinuousRun,
@@ -66,7 +64,12 @@ NODES = 500_000
 BEAM = 512
 _NODES_TO_IMPROVE = 200_000
 _CONFIRMED = 1e-5
-_MOST_PUSHES, _TIMES, _GAIN = 10, 6, 1 + 1e-6
+_MOST_ROUNDS = 10
+"""Largest number of times that the disturbances are made worse."""
+_TIMES_PER_ROUND = 6
+"""Number of events at whose times they are made worst in each round."""
+_LEAST_GAIN = 1 + 1e-6
+"""Factor by which a round has to raise the value for another one to follow."""
 
 
 def find_worst(
@@ -125,13 +128,15 @@ def _find_sampled(
     search = PatternSearch(flow, resolved.network.guarantee, report)
     exact = _search(search, own_run.delivered[first_event:], beam, most_nodes)
     worst, lossless = _run(flow, search.pattern), run_of(flow, lambda event: True)
-    bounds = bounds_of(resolved) if objective in (Objective.ERROR, Objective.STATE) else None
+    bounds = disturbance_bounds(resolved) if objective in (Objective.ERROR, Objective.STATE) else None
     if bounds is not None:
         exact = False
-        pushed_flow, worst = _push(flow, bounds, worst)
-        second_search = PatternSearch(pushed_flow, resolved.network.guarantee, report)
+        disturbed_flow, worst = _worsen_disturbances(flow, bounds, worst)
+        second_search = PatternSearch(disturbed_flow, resolved.network.guarantee, report)
         _search(second_search, worst.delivered[first_event:], beam, most_nodes)
-        _, worst = _push(pushed_flow, bounds, max(_run(pushed_flow, second_search.pattern), worst))
+        _, worst = _worsen_disturbances(
+            disturbed_flow, bounds, max(_run(disturbed_flow, second_search.pattern), worst)
+        )
         search.nodes += second_search.nodes
         search.runs += second_search.runs
     return Worst(
@@ -157,25 +162,27 @@ def _run(flow: SampledFlow, pattern: Pattern) -> SampledRun:
     return run_of(flow, lambda event: event - first_event >= len(pattern) or pattern[event - first_event])
 
 
-def _push(flow: SampledFlow, bounds: Bounds, worst: SampledRun) -> tuple[SampledFlow, SampledRun]:
+def _worsen_disturbances(
+    flow: SampledFlow, bounds: DisturbanceBounds, worst: SampledRun
+) -> tuple[SampledFlow, SampledRun]:
     """Return the flow with worse disturbances and noise, and its run with the same losses.
 
     They are made worst for the time of the largest value, some events, and the horizon.
     """
     first_event = 0 if flow.loop.known_start else 1
     previous_value = -math.inf
-    for _ in range(_MOST_PUSHES):
-        if not worst.value > previous_value * _GAIN:
+    for _ in range(_MOST_ROUNDS):
+        if not worst.value > previous_value * _LEAST_GAIN:
             break
         previous_value = worst.value
         base_flow, base_run = flow, worst
-        some_s = base_run.event_s[:: len(base_run.event_s) // _TIMES + 1]
+        some_s = base_run.event_s[:: len(base_run.event_s) // _TIMES_PER_ROUND + 1]
         for at_s in (base_run.at_s or 0.0, *some_s, flow.horizon_s):
             for loop in worst_disturbances(base_flow, bounds, base_run, at_s):
-                pushed_flow = replace(flow, loop=loop)
-                candidate = _run(pushed_flow, base_run.delivered[first_event:])
+                disturbed_flow = replace(flow, loop=loop)
+                candidate = _run(disturbed_flow, base_run.delivered[first_event:])
                 if candidate.value > worst.value:
-                    flow, worst = pushed_flow, candidate
+                    flow, worst = disturbed_flow, candidate
     return flow, worst
 
 

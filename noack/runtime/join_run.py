@@ -1,0 +1,181 @@
+"""How a process becomes part of a run, from its command line to its exit status.
+
+It waits for a ticket or an invitation, and is admitted to the run. ``run_process.py`` has what it
+does then. Read :func:`join_run` first.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from setproctitle import setproctitle
+
+from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
+from noack.core.process_limits import exhausted_limit, require_limits
+from noack.runtime.address import address_text
+from noack.runtime.command_line import TICKET_ON_STDIN, Parser, Signals, failed
+from noack.runtime.control_plane import ControlPlane
+from noack.runtime.join_ticket import (
+    DEFAULT_SESSION,
+    STANDARD_INPUT,
+    Ticket,
+    find_ticket,
+    loads,
+    read_invitation,
+)
+from noack.runtime.life_cycle import HORIZON, Event
+from noack.runtime.run_process import RunProcess, launcher_has_ended
+
+_RUNS = Path("runs")
+_POLL_S = 0.1
+_TICKET_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctrl-C ends the wait
+T = TypeVar("T")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that all processes have."""
+    origin = parser.add_mutually_exclusive_group()
+    origin.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    origin.add_argument("--invitation", type=Path, metavar="FILE", help="from `noack record --listen`")
+    parser.add_argument(
+        "--runs",
+        type=Path,
+        default=_RUNS,
+        metavar="DIRECTORY",
+        help="of an invited process: where rows stay that cannot be sent to the recorder",
+    )
+    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
+
+
+@contextmanager
+def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunProcess]:
+    """Be a process of a run within the context: from its admission to the report of its end.
+
+    The run is that of an invitation, or else of a session on this host. A process that was invited
+    keeps below ``--runs`` what it cannot send to the recorder.
+
+    Args:
+        role: of the process.
+        arguments: the options of :func:`add_options`; None: those of the command line.
+
+    Raises:
+        SystemExit: the process ends with another status than 0. A caller's or a peer's error, also
+            one from within the context, has then become one line on standard error, without a
+            traceback; with ``--json`` also a document on standard output.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    parser = Parser(
+        prog=f"noack {role}",
+        description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
+    )
+    add_options(parser)
+    signals = Signals()
+    with _exit_status(role, signals, as_json="--json" in words):
+        options = parser.parse_args(words)
+        with signals.handled():
+            require_limits()
+            if options.invitation is None:
+                ticket = _ticket(role, options.session, signals)
+            else:
+                ticket = _invited(role, options.invitation, options.runs, signals)
+            if ticket.launched:
+                setproctitle(f"noack {role}")  # in lists of processes
+            process = _admitted(role, ticket, signals)
+            with process.plane:
+                try:
+                    yield process
+                except Exception as error:
+                    process.fail(error)
+                    raise
+                finally:
+                    process.life.apply(Event.END)
+                    process.plane.report_end(process.ended)
+        if options.json:
+            print(json.dumps(process.report, indent=2))
+        if signals.received is None and not ticket.launched:
+            print(f"noack {role}: ended: {process.ended}", file=sys.stderr)
+            if process.ended != HORIZON:
+                sys.exit(ExitStatus.FAILED)
+
+
+@contextmanager
+def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None]:
+    """Turn errors and signals within the context into a line and an exit status."""
+    source = f"noack {role}"
+    try:
+        yield
+    except NoackError as error:
+        if signals.received is None:
+            sys.exit(failed(str(error), error.exit_status, source=source, as_json=as_json))
+    except Exception as error:
+        if (line := exhausted_limit(error)) is not None:
+            sys.exit(failed(line, ExitStatus.FAILED, source=source, as_json=as_json))
+        traceback.print_exc()
+        print(f"{source}: internal error, see above", file=sys.stderr)
+        sys.exit(ExitStatus.FAILED)
+    if signals.received is not None:
+        sys.exit(signals.status)
+
+
+def _ticket(role: str, session: str, signals: Signals) -> Ticket:
+    if os.environ.pop(TICKET_ON_STDIN, None):
+        return loads(sys.stdin.buffer.readline().decode())
+    ticket = _wait_for(
+        lambda: find_ticket(session),
+        signals,
+        f"noack {role}: waiting for `noack record SCENARIO` on this host (session {session!r}); of "
+        "a run on another host, give its --invitation; Ctrl-C ends",
+    )
+    if ticket is None:
+        raise PeerError(f"no run to join in session {session!r}: start `noack record SCENARIO` first")
+    print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
+    return ticket
+
+
+def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> Ticket:
+    """Wait for an invitation and return its ticket; raise CallerError or PeerError without one."""
+    if invitation != STANDARD_INPUT and invitation.parent.is_dir():
+        waiting = f"noack {role}: waiting for {invitation}; Ctrl-C ends"
+        if not _wait_for(invitation.exists, signals, waiting):
+            raise PeerError("no invitation")
+    ticket = read_invitation(invitation, runs)
+    assert ticket.remote is not None  # else it is no invitation
+    host_port = address_text((ticket.remote.host, ticket.remote.port))
+    print(f"noack {role}: joining run of {ticket.scenario.name!r} at {host_port}", file=sys.stderr)
+    return ticket
+
+
+def _wait_for(find: Callable[[], T], signals: Signals, waiting: str) -> T:
+    """Return what is found once it is true; after a signal, or a day, what is found then."""
+    until_s = time.monotonic() + _TICKET_TIMEOUT_S
+    if not find():
+        print(waiting, file=sys.stderr)
+    while not (result := find()) and signals.received is None and time.monotonic() < until_s:
+        time.sleep(_POLL_S)
+    return result
+
+
+def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:
+    """Connect to a run and request admission; raise PeerError without an admission.
+
+    A launched process tries again while its launcher lives. On a busy machine a connection may
+    fail, or zenoh may not learn of the coordinator's queryables: then no request is answered.
+    """
+    while True:
+        try:
+            with ExitStack() as stack:
+                plane = stack.enter_context(ControlPlane(ticket, role))
+                process = RunProcess(role, ticket, plane, signals)
+                process.request_admission()
+                stack.pop_all()
+                return process
+        except NoAnswerError:
+            if not ticket.launched or signals.received or launcher_has_ended():
+                raise
