@@ -130,13 +130,15 @@ class DeliveryEllipsoid:
         by_input = self.shape @ flow.input_error
         squares, largest = by_input @ by_input.T / 2, 0.0
         size = float(np.linalg.norm(by_input, 2))
-        for gamma in size * np.exp(np.linspace(-4.0, 0.0, 17)) if size else ():
-            low, high = 0.0, -2 * float(logarithmic_norm(S)) / gamma
-            for _ in range(_HALVINGS if high > 0 else 0):
+        if size:
+            gamma = size * np.exp(np.linspace(-4.0, 0.0, 17))
+            low, high = np.zeros(len(gamma)), -2 * logarithmic_norm(S).clip(max=0.0) / gamma
+            for _ in range(_HALVINGS):
                 middle = (low + high) / 2
-                growth = float(logarithmic_norm(S + middle / gamma * squares)) + middle * gamma / 2
-                low, high = (middle, high) if growth < 0 else (low, middle)
-            largest = max(largest, low)
+                moved = S + (middle / gamma)[:, None, None] * squares
+                grows = logarithmic_norm(moved) + middle * gamma / 2 >= 0
+                low, high = np.where(grows, low, middle), np.where(grows, middle, high)
+            largest = float(low.max())
         bounds = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
         return largest, bounds.frobenius_bounds(np.ones(1), np.array([_ALONE]))[:, 0], bounds
 
