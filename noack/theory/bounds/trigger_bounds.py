@@ -386,7 +386,7 @@ def _mean_ages_s(bound: TriggerBound, sampling_s: float) -> Vector | None:
 def first_passage_s(
     plant: PlantGains, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector, start: Vector
 ) -> Vector:
-    """Return times before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
+    """Return times before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``, (…, loops).
 
     Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
 
@@ -397,7 +397,7 @@ def first_passage_s(
 
     Args:
         plant: one plant, or as many as there are values, (loops,).
-        level: ‖e_s‖_W at an event, (loops,).
+        level: one ‖e_s‖_W or several of each loop, (…, loops).
         mismatch: sup‖R_E x‖, (loops,).
         input_error: π', the input error without the effect of the present e_s, (loops,).
         error_gain: k = ‖K W^{−1}‖, (loops,).
@@ -410,30 +410,32 @@ def first_passage_s(
     # The first window is twice the time to the level at the initial speed, limited.
     window_s = np.where(speed > 0, 2 * level / np.where(speed > 0, speed, 1.0), LONGEST_S)
     window_s = window_s.clip(_SHORTEST_S, LONGEST_S)
-    known_s, cells = np.zeros(len(level)), np.full(len(level), COARSE_CELLS)
-    is_open = level > start
+    is_open, shape, loops = (level > start).ravel(), level.shape, level.shape[-1]
+    level, window_s = level.ravel(), window_s.ravel()
+    known_s, cells = np.zeros(level.size), np.full(level.size, COARSE_CELLS)
     while is_open.any():
         count = int(cells[is_open].min())
-        open_loops = np.flatnonzero(is_open & (cells == count))
-        columns = Columns(*(column[open_loops] if column.ndim == 3 else column for column in plant.columns))
+        places = np.flatnonzero(is_open & (cells == count))
+        loop = places % loops
+        columns = Columns(*(column[loop] if column.ndim == 3 else column for column in plant.columns))
         error = plant.error
-        growth = error.growths(columns, window_s[open_loops], count, error.stacked_norm)[Output.WEIGHTED]
+        growth = error.growths(columns, window_s[places], count, error.stacked_norm)[Output.WEIGHTED]
         first_cells = _first_crossed(
-            growth, level[open_loops], mismatch[open_loops], input_error[open_loops], error_gain[open_loops],
+            growth, level[places], mismatch[loop], input_error[loop], error_gain[loop],
             np.array([column and column * error.stretch(until_s) for column, until_s in zip(
-                start[open_loops].tolist(), window_s[open_loops].tolist(), strict=True
+                start[loop].tolist(), window_s[places].tolist(), strict=True
             )]),
         )  # fmt: skip
-        for loop, edge_s, cell in zip(open_loops.tolist(), growth.mismatch.edges_s, first_cells, strict=True):
+        for place, edge_s, cell in zip(places.tolist(), growth.mismatch.edges_s, first_cells, strict=True):
             if cell < count:
-                known_s[loop] = max(known_s[loop], edge_s[cell])
-                is_open[loop] = count != _FINE_CELLS
-                window_s[loop], cells[loop] = edge_s[cell + 1], _FINE_CELLS
-            elif window_s[loop] >= LONGEST_S:
-                known_s[loop], is_open[loop] = window_s[loop], False
+                known_s[place] = max(known_s[place], edge_s[cell])
+                is_open[place] = count != _FINE_CELLS
+                window_s[place], cells[place] = edge_s[cell + 1], _FINE_CELLS
+            elif window_s[place] >= LONGEST_S:
+                known_s[place], is_open[place] = window_s[place], False
             else:  # not reached, also after a coarse grid's overestimate: extend the window
-                known_s[loop], window_s[loop] = window_s[loop], 2 * window_s[loop]
-    return known_s
+                known_s[place], window_s[place] = window_s[place], 2 * window_s[place]
+    return known_s.reshape(shape)
 
 
 def _first_crossed(

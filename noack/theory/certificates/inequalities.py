@@ -424,22 +424,21 @@ class ErrorInequalities:
         other_input_error = constants.earlier_input_error
         estimation = np.where(searched, constants.estimation_error, 0.0)
         # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
-        times_s = [
-            np.minimum(
-                first_passage_s(
-                    self._plant,
-                    np.where(searched, bound.reached - estimation, 0.0),
-                    np.where(searched, constants.mismatch, 0.0),
-                    np.where(searched, np.maximum(other_input_error, self._first_input_error), 0.0),
-                    error_gain,
-                    estimation,
-                ),
-                bound.ago_s or math.inf,
-            )
+        reached = [
+            (bound.reached, bound.ago_s or math.inf)
             for bound in self._bound.every
             if bound.reached is not None
         ]
-        found_s = np.max(times_s, axis=0)
+        levels, most_s = (np.array(values)[:, None] for values in zip(*reached, strict=True))
+        passed_s = first_passage_s(
+            self._plant,
+            np.where(searched, levels - estimation, 0.0),
+            np.where(searched, constants.mismatch, 0.0),
+            np.where(searched, np.maximum(other_input_error, self._first_input_error), 0.0),
+            error_gain,
+            estimation,
+        )
+        found_s = np.minimum(passed_s, most_s).max(axis=0)
         found_s = np.maximum(np.minimum(found_s, self._bound.forced_s), self._bound.apart_s)
         if (grid_s := self._conditions.spacing_s) == 0:
             return np.asarray(found_s)

@@ -39,7 +39,7 @@ _CHORDS = 2
 """So often the chord of a threshold is shortened by the bound of x that it has given."""
 Added = tuple[Constants, Constants | None]
 """Constants whose bounds are added."""
-_RATES = (0.05, 0.2, 0.4, 0.7)
+_RATES = (0.7, 0.4, 0.2, 0.05)
 """Rates that are tried, as shares of the loop's decay rate."""
 SHARES = (0.5, 0.2, 0.8)
 """Values of λ that are tried."""
@@ -162,7 +162,7 @@ class DisturbedCertificate:
             return (yield Problem((self._at_rate(rate_per_s, of_start), *persistent_parts), conditions))
 
         x0 = loop_of(self.resolved).x0
-        decaying, *added = yield from choose_rate(solved, self.slowest_per_s, x0)
+        decaying, *added = yield from choose_rate(solved, self.slowest_per_s, x0, x0)
         return decaying, added[0] if added else None
 
     @cached_property
@@ -256,7 +256,9 @@ def solve_two_parts(
     return best
 
 
-def choose_rate(solved: Callable[[float], Search[Some]], decay_per_s: float, start: Vector) -> Search[Some]:
+def choose_rate(
+    solved: Callable[[float], Search[Some]], decay_per_s: float, start: Vector, starts: Matrix
+) -> Search[Some]:
     """Search for the constants for a rate, where none is given.
 
     It is the rate at which the first constants' bound of ‖x‖ falls to ‖x(0)‖/10 first.
@@ -265,23 +267,30 @@ def choose_rate(solved: Callable[[float], Search[Some]], decay_per_s: float, sta
         solved: searches for constants for a rate in 1/s.
         decay_per_s: the decay rate of the loop.
         start: x(0), (n,).
+        starts: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k), that is bounded.
 
     Raises: what ``solved`` raises at the smallest rate.
     """
-    candidates = list[tuple[float, Some]]()
+    at_first = float(np.linalg.norm(starts, 2))
+    best, best_s = None, math.inf
     for share in _RATES:
         rate_per_s = share * decay_per_s
+        # No bound of ‖x‖ is below its first value, so a small rate is often not worth trying.
+        if best is not None and tenth_s(at_first, rate_per_s, start) > best_s:
+            break
         try:
             constants = yield from solved(rate_per_s)
         except (NotDecayingError, NoCertificateError):
-            if not candidates:
+            if best is None and share == _RATES[-1]:
                 raise
-            break  # larger rates have larger gains
-        candidates.append((tenth_s(constants[0], start), constants))
-    return min(candidates, key=lambda timed: timed[0])[1]
+            continue  # smaller rates have smaller gains
+        if best is None or tenth_s(constants[0].state, rate_per_s, start) <= best_s:
+            best, best_s = constants, tenth_s(constants[0].state, rate_per_s, start)
+    assert best is not None
+    return best
 
 
-def tenth_s(constants: Constants, start: Matrix) -> float:
-    """Return when the bound of ‖x‖ falls to ‖x(0)‖/10."""
+def tenth_s(state: float, rate_per_s: float, start: Vector) -> float:
+    """Return when a bound of ‖x‖, ``state`` at first, falls to ‖x(0)‖/10."""
     size = float(np.linalg.norm(start)) or 1.0
-    return math.log(max(10 * constants.state / size, 1.0)) / constants.rate_per_s
+    return math.log(max(10 * state / size, 1.0)) / rate_per_s

@@ -357,7 +357,7 @@ class CertificateScope:
         # Inputs of an earlier run are bounded without a rate.
         if not self._held and 0 < decay < math.inf and self._start_error == 0.0:
             with contextlib.suppress(NotDecayingError, NoCertificateError):
-                (constants,) = yield from choose_rate(at_rate, decay, self._loop.x0)
+                (constants,) = yield from choose_rate(at_rate, decay, self._loop.x0, self._start)
                 return constants
         return (yield from self._solve(conditions, 0.0, 0.0, None))
 

@@ -19,6 +19,7 @@ neither delayed nor held, the ellipsoid need only contain x at the first deliver
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 
 import numpy as np
@@ -69,6 +70,8 @@ _OTHERS = 0.1
 """Their share at first, beside the best two."""
 _HALVINGS = 12
 _ROUNDS, _POWER, _LEAST_WEIGHT, _NEARLY = 40, 0.3, 1e-9, 0.97
+_BEST = 1 + 1e-5
+"""A bound is not improved further if no weights make it smaller by more than this factor."""
 _CONDITION = 1e-10
 """Smallest over largest eigenvalue of a sum of forms that is used."""
 
@@ -127,13 +130,15 @@ class DeliveryEllipsoid:
         by_input = self.shape @ flow.input_error
         squares, largest = by_input @ by_input.T / 2, 0.0
         size = float(np.linalg.norm(by_input, 2))
-        for gamma in size * np.exp(np.linspace(-4.0, 0.0, 17)) if size else ():
-            low, high = 0.0, -2 * float(logarithmic_norm(S)) / gamma
-            for _ in range(_HALVINGS if high > 0 else 0):
+        if size:
+            gamma = size * np.exp(np.linspace(-4.0, 0.0, 17))
+            low, high = np.zeros(len(gamma)), -2 * logarithmic_norm(S).clip(max=0.0) / gamma
+            for _ in range(_HALVINGS):
                 middle = (low + high) / 2
-                growth = float(logarithmic_norm(S + middle / gamma * squares)) + middle * gamma / 2
-                low, high = (middle, high) if growth < 0 else (low, middle)
-            largest = max(largest, low)
+                moved = S + (middle / gamma)[:, None, None] * squares
+                grows = logarithmic_norm(moved) + middle * gamma / 2 >= 0
+                low, high = np.where(grows, low, middle), np.where(grows, middle, high)
+            largest = float(low.max())
         bounds = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
         return largest, bounds.frobenius_bounds(np.ones(1), np.array([_ALONE]))[:, 0], bounds
 
@@ -155,7 +160,14 @@ class Reach:
 
     def sup(self, C: Matrix) -> float:
         """Bound ‖C z‖ at all times, for C of shape (q, 2n)."""
-        return max(self._sup(_CellBounds(self.ellipsoid, C), 0), self._from_start(C))
+        bounds = _CellBounds(self.ellipsoid, C)
+        # If the larger one is known well enough, the smaller one need not be.
+        after = self._sup_after_last_node(bounds, math.inf)
+        followed = self._sup_followed(bounds, after)
+        if after > followed:
+            after = self._sup_after_last_node(bounds, followed)
+            followed = self._sup_followed(bounds, after)
+        return max(self.size * max(followed, after), self._from_start(C))
 
     def sup_state(self, C: Matrix) -> float:
         """Bound ‖C W x‖ at all times, for C of shape (q, n)."""
@@ -180,7 +192,9 @@ class Reach:
         largest, input_errors, bounds = self.ellipsoid.drive_limit
         input_errors = input_errors + (self._changes(bounds) + self.effects.age_input) / self.size
         first_cell = int(np.argmax(np.append(input_errors, np.inf) * ROUNDING >= largest))
-        return self._sup(self.ellipsoid.state_bounds, first_cell) <= self.size
+        states = self.ellipsoid.state_bounds
+        is_inside = self._sup_after_last_node(states, 1.0, most=1.0) <= 1
+        return is_inside and self._sup_followed(states, 1.0, first_cell) <= 1
 
     def _changes(self, bounds: "_CellBounds") -> Vector:
         """Bound what delay and hold change of C z over the cells, (k,)."""
@@ -201,26 +215,33 @@ class Reach:
         """The cells that are followed."""
         return int(np.argmax(np.append(self._error_changes, np.inf) > self.followed_share * self.limit))
 
-    def _sup(self, bounds: "_CellBounds", first_cell: int) -> float:
+    def _sup_followed(self, bounds: "_CellBounds", enough: float, first_cell: int = 0) -> float:
+        """Bound ‖C z‖ over the cells that are followed, for c = 1; see :meth:`_CellBounds.sup`."""
         # All is in proportion to c, for D/c.
         limits, changes = self.limit + self._error_changes, self._changes(bounds)
         cells = slice(first_cell, self._followed_cells)
-        after = self._sup_after_last_node(bounds)
-        followed = bounds.sup(limits / self.size, self._state_levels, changes / self.size, cells, after)
-        return float(self.size * max(followed, after))
+        return bounds.sup(limits / self.size, self._state_levels, changes / self.size, cells, enough)
 
-    def _sup_after_last_node(self, bounds: "_CellBounds") -> float:
-        """Bound ‖C z‖ after the last node that is followed, for c = 1."""
+    def _sup_after_last_node(self, bounds: "_CellBounds", enough: float, *, most: float = math.inf) -> float:
+        """Bound ‖C z‖ after the last node that is followed, for c = 1.
+
+        A bound of at most ``enough`` is not improved, nor one that cannot become at most ``most``.
+        """
         changes = self.effects.age_input * bounds.unit_effects[1]
         cells, moved, forms, roots = self._last_windows
         Y = bounds.C @ moved
         images = Y[:, None] @ roots
         sizes = spectral_norms(images.reshape(-1, *images.shape[2:])).reshape(images.shape[:2])
+        added = changes[cells] / self.size
+        smallest = float((sizes.min(axis=1) * ROUNDING + added).min())
+        if smallest <= enough:
+            return smallest
         first_weights = np.full(forms.shape[:2], _OTHERS / forms.shape[1])
         first_weights[:, _FOUR] += (1 - _OTHERS) * _SHARES[sizes.argmin(axis=1)]
-        largest, _ = largest_outputs(forms, Y, 0.0, first_weights, improve_all=True)
-        by_window = np.minimum(sizes.min(axis=1) * ROUNDING, largest) + changes[cells] / self.size
-        return float(by_window.min())
+        largest, _ = largest_outputs(
+            forms, Y, enough, first_weights, wanted=Wanted.SMALLEST, added=added, most=min(smallest, most)
+        )
+        return min(smallest, float((largest + added).min()))
 
     @cached_property
     def _last_windows(self) -> tuple[NDArray[np.int64], Stack, Stack, Stack]:
@@ -373,7 +394,7 @@ class _CellBounds:
         rows = rows @ turn[:, None]
         forms = rows.swapaxes(-1, -2) @ rows
         ends = self.C @ np.array([flow.states[cells], flow.states[cells + 1]]) @ turn
-        bounds, weights = largest_outputs(forms, ends[1], 0.0, first_weights, improve_all=True)
+        bounds, weights = largest_outputs(forms, ends[1], 0.0, first_weights, wanted=Wanted.ALL)
         inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
         sizes = np.linalg.eigvalsh(ends @ inverse @ ends.swapaxes(-1, -2))[..., -1].max(axis=0)
         sizes = np.where(np.isfinite(bounds), sizes.clip(min=0.0), np.inf)
@@ -402,21 +423,31 @@ def _balancing_coordinates(rows: Stack) -> Stack:
     return np.asarray(np.linalg.inv(np.linalg.qr(together, mode="r")))
 
 
+class Wanted(Enum):
+    """Which of several bounds are improved."""
+
+    ALL = "all of them"
+    LARGEST = "those that are nearly as large as the largest one"
+    SMALLEST = "those that may become the smallest one"
+
+
 def largest_outputs(
     forms: Stack,
     Y: Stack,
     enough: float,
     first_weights: Stack | None = None,
     *,
-    improve_all: bool = False,
+    wanted: Wanted = Wanted.LARGEST,
     cap: Vector | float = math.inf,
+    added: Vector | float = 0.0,
+    most: float = math.inf,
 ) -> tuple[Vector, Stack]:
     """Bound ‖Y z‖ for all z with forms of at most 1, (j,), by weights, (j, i), from some on.
 
-    None below ``enough`` is improved, and only the largest ones unless all of them are wanted.
-    Bounds above ``cap`` count as that.
+    No bound below ``enough`` is improved, and none that cannot become at most ``most``. Bounds above
+    ``cap`` count as that, and all of them with what is ``added``.
     """
-    bounds = np.full(len(forms), np.inf)
+    bounds, possible = np.full(len(forms), np.inf), np.zeros(len(forms))
     weights = np.full(forms.shape[:2], 1 / forms.shape[1]) if first_weights is None else first_weights
     active, best = np.arange(len(forms)), weights.copy()
     for _ in range(_ROUNDS):
@@ -429,13 +460,22 @@ def largest_outputs(
         bounds[active] = np.minimum(bounds[active], sizes)
         # The forms of the z with the largest ‖Y z‖: those above the mean need more weight.
         z = (Z @ vectors[:, :, -1:])[..., 0]
-        sizes = np.einsum("ja,jiab,jb->ji", z, chosen, z).clip(min=0.0)
-        weights[active] *= (sizes / sizes.max(axis=1, keepdims=True).clip(min=1e-300)) ** _POWER
+        of_z = np.einsum("ja,jiab,jb->ji", z, chosen, z).clip(min=0.0)
+        largest = of_z.max(axis=1).clip(min=1e-300)
+        # Scaled to forms of at most 1, this z is possible, whatever the weights are.
+        possible[active] = np.maximum(possible[active], values[:, -1] / np.sqrt(largest))
+        weights[active] *= (of_z / largest[:, None]) ** _POWER
         weights = weights.clip(min=_LEAST_WEIGHT)
         weights /= weights.sum(axis=1, keepdims=True)
-        sizes = np.minimum(bounds, cap)
-        least = enough if improve_all else max(enough, _NEARLY * float(sizes.max()))
-        active = np.flatnonzero(sizes > least)
+        sizes, least = np.minimum(bounds, cap) + added, enough
+        if wanted is Wanted.LARGEST:
+            least = max(enough, _NEARLY * float(sizes.max()))
+        elif wanted is Wanted.SMALLEST:
+            if (smallest := float(sizes.min())) <= enough:
+                break
+            most = min(most, smallest)
+        may_become_smaller = (bounds > _BEST * possible) & (possible + added <= most)
+        active = np.flatnonzero((sizes > least) & may_become_smaller)
         if not len(active):
             break
     sums = np.linalg.eigvalsh(np.einsum("ji,jiab->jab", best, forms))

@@ -104,7 +104,7 @@ class _SumOfErrors:
         return np.asarray(np.fmin(late_s * self._highest, self._by_input.max(axis=1).cumsum(axis=1)))
 
 
-class _OpenLoopErrors:
+class _OpenLoopGains:
     """The gains of e_c, followed from the last test before each lost event in open loop.
 
     The input is computed from x_c, so e_c follows G − BK = H + αI − BK while no update acts. At
@@ -112,41 +112,59 @@ class _OpenLoopErrors:
     are those of :class:`_SumOfErrors`.
     """
 
-    def __init__(
-        self, plant: PlantGains, growths: Growths, conditions: NetworkConditions, spacing_s: float
-    ) -> None:
-        error, all_growths = plant.error, [growth for row in growths for growth in row]
-        self._growths, self._lost = growths, conditions.dropouts
+    def __init__(self, plant: PlantGains, growths: Growths) -> None:
+        self._plant, self._growths = plant, [growth for row in growths for growth in row]
+
+    @cached_method
+    def _without_losses(self, later_s: float) -> Stack:
+        """Return the gains of b, and of q and R_E x, then without means, (5, o, g)."""
+        plant, error = self._plant, self._plant.error
         generator = error.scaled_H - plant.B @ error.K
         driven = np.hstack([plant.columns.input_error, plant.columns.mismatch])
         groups, any_age = (0, plant.columns.input_error.shape[1]), np.ones(1)
+        gains_by_growth = []
+        for growth in self._growths:
+            ages_s = growth.ages_s + later_s
+            until_s = float(ages_s.max())
+            alone = response_until(generator, error.inverse_weight, until_s, COARSE_CELLS)
+            pairs = response_until(generator, driven, until_s, COARSE_CELLS, groups=groups)
+            kept_by_output = alone.through_each(error.stacked)
+            entered = pairs.through_groups(error.stacked)
+            rows = []
+            for C in error.outputs:
+                by_input, by_mismatch = entered[C]
+                growth_sizes = Growth(by_mismatch, by_input, np.zeros(COARSE_CELLS))
+                means = growth_sizes.means(ages_s if until_s else any_age)
+                rows.append((kept_by_output[C].sup_on_grid(), *means[:2], *growth_sizes.totals[:2]))
+            gains_by_growth.append(rows)
+        return np.array(gains_by_growth).transpose(2, 1, 0)
 
-        def gains(later_s: float, apart_s: float) -> Stack:
-            """Return those of b, of a lost error, and of q and R_E x, then without means, (6, o, g)."""
-            gains_by_growth = []
-            for growth in all_growths:
-                ages_s = growth.ages_s + later_s
-                until_s = float(ages_s.max())
-                alone = response_until(generator, error.inverse_weight, until_s, COARSE_CELLS)
-                pairs = response_until(generator, driven, until_s, COARSE_CELLS, groups=groups)
-                kept_by_output = alone.through_each(error.stacked)
-                entered = pairs.through_groups(error.stacked)
-                rows = []
-                for C in error.outputs:
-                    by_input, by_mismatch = entered[C]
-                    growth_sizes = Growth(by_mismatch, by_input, np.zeros(COARSE_CELLS))
-                    means = growth_sizes.means(ages_s if until_s else any_age)
-                    rows.append((kept_by_output[C].sup_on_grid(), *means[:2], *growth_sizes.totals[:2]))
-                gains_by_growth.append(rows)
-            stay, *entered_by = np.array(gains_by_growth).transpose(2, 1, 0)
-            # A lost error has been followed by its model since, and by the open loop from then on.
-            remaining_s = np.array([max(apart_s - growth.longest_s, 0.0) for growth in all_growths])
-            remaining = {C: error.kernels[C].sups(remaining_s) for C in error.outputs}
-            redirected = np.array([*remaining.values()]) + entered_by[2] * remaining[Output.GAIN]
-            return np.array([stay, np.minimum(stay * remaining[Output.WEIGHTED], redirected), *entered_by])
+    @cached_method
+    def after(self, later_s: float, apart_s: float) -> Stack:
+        """Return the gains of b, of a lost error, and of q and R_E x, then without means, (6, o, g)."""
+        error = self._plant.error
+        stay, *entered_by = self._without_losses(later_s)
+        # A lost error has been followed by its model since, and by the open loop from then on.
+        remaining_s = np.array([max(apart_s - growth.longest_s, 0.0) for growth in self._growths])
+        remaining = {C: error.kernels[C].sups(remaining_s) for C in error.outputs}
+        redirected = np.array([*remaining.values()]) + entered_by[2] * remaining[Output.GAIN]
+        return np.array([stay, np.minimum(stay * remaining[Output.WEIGHTED], redirected), *entered_by])
 
-        self._step, self._between = gains(0.0, spacing_s)[:, :1], gains(0.0, 0.0)[:, :1]
-        self._whole = gains(conditions.delay_s, 0.0)
+
+class _OpenLoopErrors:
+    """Bounds of e_c in open loop, by :class:`_OpenLoopGains`, for events ``spacing_s`` apart."""
+
+    def __init__(
+        self,
+        plant: PlantGains,
+        growths: Growths,
+        gains: _OpenLoopGains,
+        conditions: NetworkConditions,
+        spacing_s: float,
+    ) -> None:
+        self._growths, self._lost = growths, conditions.dropouts
+        self._step, self._between = gains.after(0.0, spacing_s)[:, :1], gains.after(0.0, 0.0)[:, :1]
+        self._whole = gains.after(conditions.delay_s, 0.0)
         until_s = max(conditions.delay_s, conditions.start_s)
         self._late = plant.growth(until_s, COARSE_CELLS).totals[:2] if until_s else (0.0, 0.0)
 
@@ -354,7 +372,12 @@ class InsertedInequalities(ErrorInequalities):
 
     @cached_method
     def _open_loop_errors(self, spacing_s: float) -> _OpenLoopErrors:
-        return _OpenLoopErrors(self._plant, self._growths, self._conditions, spacing_s)
+        gains = self._open_loop_gains
+        return _OpenLoopErrors(self._plant, self._growths, gains, self._conditions, spacing_s)
+
+    @cached_property
+    def _open_loop_gains(self) -> _OpenLoopGains:
+        return _OpenLoopGains(self._plant, self._growths)
 
     def _missing_events(self, spacing_s: float) -> int:
         """Return how many events may be missing: lost, or in flight."""

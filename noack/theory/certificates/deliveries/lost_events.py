@@ -23,7 +23,7 @@ from noack.core.linear_systems import Matrix, Vector, exponential
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import KernelBounds, response_until
 from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, bend_rows, bend_terms
-from noack.theory.certificates.deliveries.delivery_reach import Reach, largest_outputs
+from noack.theory.certificates.deliveries.delivery_reach import Reach, Wanted, largest_outputs
 
 _NEAR, _RATIO, _MOST_NODES = np.linspace(0.0, 1.0, 20).tolist(), 1.03, 300
 """First nodes of r in units of δ; then the ratio from node to node."""
@@ -206,8 +206,9 @@ class _LostEvent:
             by_input = flow.unit_effects(bend_rows(flow))[1][flow.cell_at(most_s)]
             difference = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._input_changes.max())
             bend = bend + self._age_input * float(by_input) + difference
-        enough = 0.0 if sensor.integrates else 0.9 * level
-        ends, _ = largest_outputs(self._forms[is_near], self._e_s[is_near], enough, improve_all=True)
+        enough, most = (0.0, math.inf) if sensor.integrates else (0.9 * level, level)
+        forms, e_s = self._forms[is_near], self._e_s[is_near]
+        ends, _ = largest_outputs(forms, e_s, enough, wanted=Wanted.ALL, most=most)
         steps_s = np.diff(self._r_s[is_near])
         cells = np.maximum(ends[1:], ends[:-1]) + steps_s**2 / 8 * bend + self._input_changes[1:][is_near[1:]]
         if sensor.integrates:
