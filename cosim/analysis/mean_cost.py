@@ -79,33 +79,44 @@ class MeanCost:
         return f"{text}; stationary: {cost.stationary.cost_per_s:.6g} /s"
 
 
+def require_weight(name: str, weight: Matrix, *, definite: bool = False) -> None:
+    """Raise CallerError unless a weight of a cost is symmetric and positive (semi)definite, (k, k)."""
+    if not np.allclose(weight, weight.T, rtol=1e-12, atol=0.0):
+        raise CallerError(f"{name}: must be symmetric")
+    smallest = np.linalg.eigvalsh(weight)[0]
+    # Rounding may leave a singular weight with a small negative eigenvalue.
+    if smallest < -1e-12 * np.abs(weight).max() or (definite and smallest <= 0):
+        raise CallerError(f"{name}: must be positive {'definite' if definite else 'semidefinite'}")
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what overflows is not known
 def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None = None) -> MeanCost:
     """Return the mean of the cost ∫ xᵀQx + uᵀRu dt.
 
     Args:
         resolved: the resolved scenario, with a time-triggered sensor.
-        Q: weight of the state, (n, n); None: the identity.
-        R: weight of the input, (m, m); None: the identity.
+        Q: weight of the state, (n, n), positive semidefinite; None: the identity.
+        R: weight of the input, (m, m), positive semidefinite; None: the identity.
 
     Raises:
-        CallerError: the loop is not covered; the message names the setting.
+        CallerError: a weight is wrong, or the loop is not covered; the message names the setting.
     """
     loop, link = loop_of(resolved), resolved.network.link
     n, size = loop.n, loop.n + loop.m
     forms = np.zeros((size + 1, size, size))
     entries = np.arange(size)
     forms[entries, entries, entries] = 1.0  # one form for each entry's square
+    Q, R = np.eye(n) if Q is None else Q, np.eye(loop.m) if R is None else R
     for name, weight, width in (("Q", Q, n), ("R", R, loop.m)):
-        if weight is not None and weight.shape != (width, width):
+        if weight.shape != (width, width):
             raise CallerError(f"{name}: expected {width} x {width} numbers")
-    forms[size, :n, :n] = np.eye(n) if Q is None else (Q + Q.T) / 2
-    forms[size, n:, n:] = np.eye(loop.m) if R is None else (R + R.T) / 2
+        require_weight(name, weight)
+    forms[size, :n, :n], forms[size, n:, n:] = Q, R
     periods = periods_of(resolved, forms)
 
     def attempt(guarantee: LossGuarantee) -> CostUnder | str:
         try:
-            with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not known
-                return _cost_under(resolved, periods, guarantee)
+            return _cost_under(resolved, periods, guarantee)
         except NotPredictableError as error:
             return f"not known: {error}"
 

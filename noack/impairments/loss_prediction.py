@@ -366,6 +366,8 @@ class OutcomeChain(NamedTuple):
 def loss_process(settings: LinkSettings) -> LossProcess:
     """Return the losses of a link's direction without its guarantee.
 
+    A loss rate that is kept becomes the probability with which the emulator drops packets.
+
     Raises:
         NotPredictableError: they cannot be computed; the message is the reason.
     """
@@ -376,7 +378,10 @@ def loss_process(settings: LinkSettings) -> LossProcess:
             raise NotPredictableError(f"the losses are known only {impairment.prediction_note}")
     if reordered:
         raise NotPredictableError("packets may arrive out of order, which counts as a loss")
-    start, moves, lost = joint_chain(settings)
+    try:
+        start, moves, lost = joint_chain(with_target_loss(settings))
+    except ValueError as error:  # the loss rate cannot be kept
+        raise NotPredictableError(str(error)) from None
     return LossProcess(start, moves, lost, settings.first_delivered)
 
 

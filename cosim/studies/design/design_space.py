@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
+from cosim.analysis.mean_cost import require_weight
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.scenario.resolution import loop_of, resolve
@@ -185,12 +186,8 @@ def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
     Raises:
         CallerError: Q or R is not a valid weight, or no P makes the loop stable.
     """
-    for name, matrix, least in (("--Q", Q, "semidefinite"), ("--R", R, "definite")):
-        if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
-            raise CallerError(f"{name}: must be symmetric")
-        smallest = np.linalg.eigvalsh(matrix)[0]
-        if smallest < -1e-12 * np.abs(matrix).max() or (least == "definite" and smallest <= 0):
-            raise CallerError(f"{name}: must be positive {least}")
+    require_weight("--Q", Q)
+    require_weight("--R", R, definite=True)
     try:
         P = solve_continuous_are(A, B, Q, R)
     except np.linalg.LinAlgError:

@@ -404,7 +404,7 @@ def update_delay_ns(resolved: Scenario) -> int:
             delay_ns += round(impairment.delay_s * NS_PER_S)
         elif impairment.kind not in _WITHOUT_DELAY:
             raise CallerError(
-                f"network.impairments.{number}: {impairment.kind}: the margin is for a constant "
+                f"network.impairments.{number}: {impairment.kind}: this needs a constant "
                 "delay; use delay_s alone"
             )
     return delay_ns

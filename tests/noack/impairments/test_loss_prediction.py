@@ -246,6 +246,19 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
         assert all_lost <= longest * (1 + 1e-9)
 
 
+def test_a_kept_rate_is_that_of_the_losses_under_the_guarantee() -> None:
+    """p(1 − p²)/(1 − p³) = 0.4 for the probability p of the losses without the guarantee."""
+    kept = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.4, "keep": True}}
+    p = loss_process(LinkSettings.model_validate({"impairments": (kept,), "mansd": 2})).largest_probability
+    assert p * (1 - p**2) / (1 - p**3) == pytest.approx(0.4, rel=1e-9)
+
+
+def test_losses_of_which_no_rate_can_be_kept_have_no_prediction() -> None:
+    kept = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.1, "keep": True}}
+    with pytest.raises(NotPredictableError, match="10%"):
+        process(kept, {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.8}})
+
+
 def test_losses_that_depend_on_times_have_no_prediction() -> None:
     with pytest.raises(NotPredictableError):
         process(INDEPENDENT, {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.05})
