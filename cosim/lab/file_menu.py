@@ -1,0 +1,114 @@
+"""The menu of the lab page with what can be saved: the scenario, its address, data and figure."""
+
+import io
+import re
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pyarrow as pa
+from nicegui import ui
+from pyarrow import csv
+
+from cosim.interactive.exploration import Exploration
+from cosim.interactive.exploration_figure import ExploredRun, exploration_figure
+from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
+from cosim.output.figures.figure_format import FigureFormat, figure_width_in
+from cosim.output.page_kit import TERMS
+from noack.core.errors import NoackError
+from noack.core.file_access import write_whole
+from noack.core.linear_systems import Vector
+
+_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}\.toml")
+
+
+class FileMenu:
+    """The menu in the header."""
+
+    def __init__(
+        self,
+        services: LabServices,
+        calls: PageCalls,
+        session: Session,
+        shown: Callable[[], ExploredRun | None],
+    ) -> None:
+        self._services, self._calls, self._session = services, calls, session
+        self._shown = shown
+        opener = ui.button(icon="more_vert").props('flat color=white dense aria-label="files"')
+        with opener, ui.menu():
+            ui.menu_item("save as scenario …", self._ask)
+            ui.menu_item("copy link to these settings", self._share)
+            ui.menu_item("data of the figure (CSV)", self._data)
+            for kind in (FigureFormat.SVG, FigureFormat.PDF):
+                ui.menu_item(f"figure ({kind.upper()})", partial(self._figure, kind))
+            ui.menu_item("glossary", self._open_words)
+        with ui.dialog() as self._words, ui.card(), ui.element("dl").classes("lab-words"):
+            for term, meaning in TERMS:
+                for tag, text in (("dt", term), ("dd", meaning)):
+                    with ui.element(tag):
+                        ui.label(text)
+        with ui.dialog() as self._dialog, ui.card():
+            ui.label(f"Save in {services.folder}")
+            self._name = ui.input(
+                "file name",
+                value="my_loop.toml",
+                validation={"a name like my_loop.toml": lambda text: bool(_NAME.fullmatch(text))},
+            ).classes("w-64")
+            self._replace = ui.checkbox("replace a file of this name")
+            with ui.row():
+                ui.button("save", on_click=self._save)
+                ui.button("cancel", on_click=self._dialog.close).props("flat")
+
+    def _open_words(self) -> None:
+        self._words.open()
+
+    def _ask(self) -> None:
+        self._dialog.open()
+
+    def _save(self) -> None:
+        if not _NAME.fullmatch(self._name.value):
+            return
+        path = self._services.folder / self._name.value
+        if path.exists() and not self._replace.value:
+            ui.notify(f"{path.name} exists; tick the box to replace it", type="warning")
+            return
+        try:
+            write_whole(path, self._session.draft.text.encode())
+        except NoackError as error:
+            ui.notify(str(error), type="negative")
+            return
+        self._dialog.close()
+        ui.notify(f"saved as {path.name}; noack run {path.name}", type="positive")
+
+    async def _share(self) -> None:
+        address = await ui.run_javascript("location.href", timeout=ANSWER_S)
+        ui.clipboard.write(address)
+        ui.notify("copied; it opens as long as this page runs", type="positive")
+
+    def _data(self) -> None:
+        if (shown := self._shown()) is not None:
+            ui.download(csv_of(shown.run), "exploration.csv", "text/csv")
+
+    async def _figure(self, kind: FigureFormat) -> None:
+        if (shown := self._shown()) is not None:
+            content = await self._calls.compute(figure_file, shown, kind)
+            ui.download(content, f"exploration.{kind}")
+
+
+def csv_of(run: Exploration) -> bytes:
+    """Return the curves of a run as CSV."""
+    columns: dict[str, Vector | None] = {"t_s": run.t_s}
+    for name, states in (("x", run.x), ("x_s", run.x_s), ("x_c", run.x_c)):
+        columns |= {f"{name}_{i}": values for i, values in enumerate(states.T, start=1)}
+    columns |= {"e_s_norm": run.e_s_norm, "e_c_norm": run.e_c_norm, "threshold": run.threshold}
+    known = {name: np.ascontiguousarray(v) for name, v in columns.items() if v is not None}
+    text = io.BytesIO()
+    csv.write_csv(pa.table(known), text)
+    return text.getvalue()
+
+
+def figure_file(shown: ExploredRun, kind: FigureFormat) -> bytes:
+    """Return the figure as a file's content; called in the worker process."""
+    from cosim.output.figures.figure_files import file_content  # needs matplotlib
+
+    return file_content(exploration_figure(shown), kind, figure_width_in(kind, None))
