@@ -70,6 +70,8 @@ _OTHERS = 0.1
 """Their share at first, beside the best two."""
 _HALVINGS = 12
 _ROUNDS, _POWER, _LEAST_WEIGHT, _NEARLY = 40, 0.3, 1e-9, 0.97
+_CLEARLY = 0.98
+"""Share of a sufficient bound from which on a bound at one end of a cell is not improved."""
 _BEST = 1 + 1e-5
 """A bound is not improved further if no weights make it smaller by more than this factor."""
 _CONDITION = 1e-10
@@ -341,7 +343,8 @@ class _CellBounds:
                 return float(highest[cells[-1]]) * ROUNDING
             settled = cells[rounds[cells] == len(_WIDTHS)]
             if len(settled):
-                values = self._joint_bounds(limits, levels, settled, logits[settled, None])
+                wanted = (enough - added[settled]).clip(min=0.0)
+                values = self._joint_bounds(limits, levels, settled, logits[settled, None], wanted)
                 highest[settled] = np.minimum(highest[settled], values + added[settled])
                 rounds[settled], joint = rounds[settled] + 1, joint + 1
                 continue
@@ -371,9 +374,12 @@ class _CellBounds:
         return np.asarray(ends + self._sags_s2[cells, None] * bends)
 
     def _joint_bounds(
-        self, limits: Vector, levels: Vector, cells: NDArray[np.int64], logits: Stack
+        self, limits: Vector, levels: Vector, cells: NDArray[np.int64], logits: Stack, enough: Vector
     ) -> Vector:
-        """Return bounds by all conditions at several earlier nodes, (k,); the bends are as above."""
+        """Return bounds by all conditions at several earlier nodes, (k,); the bends are as above.
+
+        One that is clearly below ``enough`` is not improved.
+        """
         flow, n = self._flow, self._flow.n
         times_s = flow.edges_s[cells, None] * (np.arange(1, _EARLIER + 1) / _EARLIER)
         nodes = np.minimum(flow.edges_s.searchsorted(times_s, side="right") - 1, cells[:, None])
@@ -394,7 +400,7 @@ class _CellBounds:
         rows = rows @ turn[:, None]
         forms = rows.swapaxes(-1, -2) @ rows
         ends = self.C @ np.array([flow.states[cells], flow.states[cells + 1]]) @ turn
-        bounds, weights = largest_outputs(forms, ends[1], 0.0, first_weights, wanted=Wanted.ALL)
+        bounds, weights = largest_outputs(forms, ends[1], _CLEARLY * enough, first_weights)
         inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
         sizes = np.linalg.eigvalsh(ends @ inverse @ ends.swapaxes(-1, -2))[..., -1].max(axis=0)
         sizes = np.where(np.isfinite(bounds), sizes.clip(min=0.0), np.inf)
@@ -434,7 +440,7 @@ class Wanted(Enum):
 def largest_outputs(
     forms: Stack,
     Y: Stack,
-    enough: float,
+    enough: Vector | float,
     first_weights: Stack | None = None,
     *,
     wanted: Wanted = Wanted.LARGEST,
@@ -469,11 +475,11 @@ def largest_outputs(
         weights /= weights.sum(axis=1, keepdims=True)
         sizes, least = np.minimum(bounds, cap) + added, enough
         if wanted is Wanted.LARGEST:
-            least = max(enough, _NEARLY * float(sizes.max()))
+            least = np.maximum(enough, _NEARLY * float(sizes.max()))
         elif wanted is Wanted.SMALLEST:
-            if (smallest := float(sizes.min())) <= enough:
+            if (sizes <= enough).any():
                 break
-            most = min(most, smallest)
+            most = min(most, float(sizes.min()))
         may_become_smaller = (bounds > _BEST * possible) & (possible + added <= most)
         active = np.flatnonzero((sizes > least) & may_become_smaller)
         if not len(active):
