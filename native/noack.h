@@ -184,11 +184,9 @@ typedef struct {
 /* ---- State ----------------------------------------------------------------------------------- */
 
 typedef struct { /* a stage's memory of a flow */
-    union {                     /* by the kind of the stage: */
-        int64_t state;          /* of a Markov chain, or 1: a score is stored */
-        int64_t taken_until_ns; /* the slots of a schedule that begin before this time are taken */
-    };
-    double score; /* of the packet before */
+    int64_t state;          /* of a Markov chain, or 1: a score is stored */
+    int64_t taken_until_ns; /* the slots of a schedule that begin before this time are taken */
+    double score;           /* of the packet before */
 } noack_stage_memory;
 
 typedef struct { /* a link's state of a flow */

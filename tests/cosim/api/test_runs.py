@@ -50,7 +50,7 @@ def test_a_run_of_several_loops_has_each_loop_as_a_run() -> None:
     assert run.loops["fast-2"].table("plant_step").num_rows == steps.count(1)
     assert run.loops["held"].scenario.mode == "zoh"
     assert isinstance(run.plot("loops"), Figure)
-    with pytest.raises(noack.NoackError, match=r"3 loops: take one .* they are fast-1, fast-2, held"):
+    with pytest.raises(noack.NoackError, match=r"3 loops, .* --loop NAME.*; they are fast-1, fast-2, held"):
         run.samples()
 
 

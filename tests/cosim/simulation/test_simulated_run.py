@@ -115,13 +115,15 @@ def test_a_report_is_refused_if_the_scenario_has_other_loops_than_the_record(run
 
 
 @pytest.mark.usefixtures("no_recording")
-def test_the_summary_of_all_loops_says_why_claims_are_void(tmp_path: Path) -> None:
+def test_the_verdict_of_all_loops_says_why_claims_are_void(tmp_path: Path) -> None:
+    """Their reasons differ in numbers only, so that the verdict's second line has them."""
     settings = ("horizon_s=1", "certificate.late_periods=20", 'loops=[{ name = "p", count = 3 }]')
     late = simulated(tmp_path, *settings, options=["--no-report"])
     claims = [claim for one in json.loads(late.stdout)["loops"] for claim in one["claims"]]
     reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
     shown = invoke("summary", tmp_path / "latest").stdout
-    assert len(re.findall("^void: ", shown, re.MULTILINE)) == min(len(reasons), 3) > 0
+    assert any(f"no certificate: {why}" in shown for why in reasons)
+    assert not re.findall("^void: ", shown, re.MULTILINE)
 
 
 @pytest.mark.parametrize("loop", [None, "periodic"])
