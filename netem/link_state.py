@@ -205,7 +205,8 @@ class LinkState:
         for name in ("flows", "memory", "recent_ns", "losses"):
             old = self._memory[name]
             empty = core.NOACK_NEVER_NS if name == "recent_ns" else 0
-            self._memory[name] = np.concatenate((old, np.full_like(old, empty)))
+            # The type is given: numpy would pack the rows of padded structures.
+            self._memory[name] = np.concatenate((old, np.full_like(old, empty)), dtype=old.dtype)
         self.flows = self._memory["flows"].view(self.flows.dtype)
         self.core.rows = len(self.flows)
         self._point(self.core)
