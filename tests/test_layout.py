@@ -35,7 +35,7 @@ LINES = {
     "noack/theory": 12120,
     "noack/traces": 1320,
     "noack/trigger": 1060,
-    "netem": 6510,
+    "netem": 6515,
     "cosim/analysis": 8205,
     "cosim/api": 1685,
     "cosim/cli": 3395,
