@@ -419,11 +419,11 @@ def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
     reasons = defaultdict[str, list[tuple[str, str]]](list)
     for loop in loops:
         for why in sorted({claim.why for claim in loop.claims if claim.verdict == "void"}):
-            reasons[_NUMBER.sub("", why)].append((why, loop.name))
+            reasons[_NUMBER.sub("#", why)].append((why, loop.name))
     if len(reasons) == 1:
         return []
     lines = list[str]()
-    for alike in reasons.values():
+    for alike in sorted(reasons.values(), key=lambda alike: -len({name for _, name in alike})):
         names = [*dict.fromkeys(name for _, name in alike)]
         where = names[0] if len(names) == 1 else f"{len(names)} loops"
         lines.append(f"void: {_with_ranges([why for why, _ in alike])} ({where})")
