@@ -1,6 +1,6 @@
 """Designs for a network: what ``noack design --for network`` says of the given and the best loop.
 
-With periodic updates each growth is compared with repeated patterns, as for margins, on the rung
+With periodic updates each growth is compared with repeated patterns, as for margins, on the level
 that is reached and on the next one; the cost is integrated anew. With events, the bounds for the
 largest M are compared with runs. The searches are short: what they say is attacked, not how good
 they are.
@@ -124,7 +124,7 @@ def _certify(case: Case, change: Callable[[Any], Any] = lambda found: found) -> 
     case.found = change(found)
     if isinstance(found, EventDesign):
         return dict.fromkeys(("e_s", "e_c", "x", "1/δ"), 1.0)
-    return {"growth": 1.0, "pattern": 1.0, "cost": 1 + 1e-6, "rung": 1.0, "limit": 1 + 1e-6}
+    return {"growth": 1.0, "pattern": 1.0, "cost": 1 + 1e-6, "level": 1.0, "limit": 1 + 1e-6}
 
 
 def _simulate(case: Case, rng: Rng) -> Observed:
@@ -132,16 +132,16 @@ def _simulate(case: Case, rng: Rng) -> Observed:
     if isinstance(found, EventDesign):
         return _simulate_events(wanted.system, found, rng)
     worst, runs = dict.fromkeys(("growth", "pattern", "cost", "limit"), 0.0), 0
-    worst["rung"] = (found.given.level + 2) / (found.best.level + 2)
+    worst["level"] = (found.given.level + 2) / (found.best.level + 2)
     if found.best != found.given:
         worst["limit"] = found.best.cost / found.search.limit
     for one in (found.given, found.best):
         cost = found.maps(one, one.level).cost(found.search.plant.x0, *found.search.weights)
         if cost != one.cost:  # both may be infinite
             worst["cost"] = max(worst["cost"], cost / one.cost, one.cost / cost)
-        for rung, stability in ((one.level, one.stability), (one.level + 1, one.beyond)):
+        for level, stability in ((one.level, one.stability), (one.level + 1, one.beyond)):
             if stability is not None:
-                tried, shares = growth_shares(found.maps(one, rung), stability, rng)
+                tried, shares = growth_shares(found.maps(one, level), stability, rng)
                 runs, worst = runs + tried, worst | {name: max(shares[name], worst[name]) for name in shares}
     return Observed(runs, worst)
 
@@ -162,9 +162,9 @@ def _simulate_events(given: System, found: EventDesign, rng: Rng) -> Observed:
     return search_losses(system, rng, worst_of=worst)
 
 
-def _one_rung_further(found: Design) -> Design:
-    rung = min(found.best.level + 1, len(found.search.requirements) - 1)
-    return found._replace(best=found.best._replace(level=rung, beyond=None))
+def _one_level_further(found: Design) -> Design:
+    level = min(found.best.level + 1, len(found.search.requirements) - 1)
+    return found._replace(best=found.best._replace(level=level, beyond=None))
 
 
 def _given_gain(found: Design) -> Design:
@@ -197,7 +197,7 @@ DESIGNS = Kind(
         for mistake, change, draw in (
             # The first one is tried by pytest: it is the quickest to be detected.
             ("no cost of inputs", _no_cost_of_inputs, _random_periodic),
-            ("one rung further", _one_rung_further, partial(_random_periodic, rate_per_s=1.0)),
+            ("one level further", _one_level_further, partial(_random_periodic, rate_per_s=1.0)),
             ("the gain of the given loop", _given_gain, _random_periodic),
             ("the hold of the given loop", _given_hold, _random_periodic),
             ("one loss less, with events", _one_loss_less, partial(_random_events, **FAR)),
