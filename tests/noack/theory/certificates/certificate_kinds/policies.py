@@ -23,6 +23,7 @@ from noack.theory.bounds.certificate_terms import NetworkConditions, TriggerBoun
 from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.deliveries import due_deliveries
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.decaying import search
@@ -404,6 +405,15 @@ def without(name: str) -> Callable[[Scenario, Conditions], Any]:
     return broken
 
 
+def without_later_times(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
+    """The certificate if nothing followed from what is left of the first return."""
+    with (
+        patch.object(due_deliveries._Course, "returned", lambda course, last: (0.0, 0.0)),
+        patch.object(due_deliveries, "_AT_ONCE", 1),
+    ):
+        return certify(resolved, conditions)
+
+
 INSTANT = {"delay_steps": 0, "hold_steps": 0, "known_start": True, "window": (1, 1), "recovery": 0}
 LATE = {"n": 2, "m": 1, "known_start": True, "window": (1, 1), "recovery": 0, "lag_steps": 0,
         "sample_steps": 2, "mansd": 1}  # fmt: skip
@@ -430,6 +440,7 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
             **LATE, "sample_steps": 1, "delay_steps": 6, "hold_steps": 0, "step_share": 0.03,
         },
     ),
+    "periodic, no later times": ("periodic", without_later_times, {}),
     "lyapunov, no start without an input": (
         "lyapunov", without("start_s"), {
             **LATE, "delay_steps": 2, "hold_steps": 0, "mismatch": 0.0, "known_start": False,
