@@ -24,7 +24,7 @@ from noack.theory.certificates.certified_bounds import envelope_formula
 from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
 from noack.theory.margins.loss_margin import Stability
-from noack.theory.random_losses.moments import UnlimitedLosses
+from noack.theory.random_losses.unlimited_losses import UnlimitedLosses
 
 
 def print_certificates(console: Console, results: Certificates, chosen: Certificates | None = None) -> None:

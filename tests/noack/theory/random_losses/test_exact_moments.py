@@ -18,7 +18,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.loss_margin import loop_times
 from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop, repeated
-from noack.theory.random_losses.loop_moments import (
+from noack.theory.random_losses.exact_moments import (
     LoopMoments,
     LoopPeriods,
     MomentStep,

@@ -88,11 +88,11 @@ def random_growth(resolved: Scenario, losses: LossProcess) -> RandomGrowth:
     outcomes = losses.outcomes(LossGuarantee())
     mean_square = almost_sure = mean_square_growth(maps, outcomes)
     if times.slots == 1:
-        almost_sure = min(mean_square, sure_growth(*maps[0], outcomes))
+        almost_sure = min(mean_square, almost_sure_growth(*maps[0], outcomes))
     return RandomGrowth(mean_square, almost_sure)
 
 
-def sure_growth(delivered: IntervalMatrix, lost: IntervalMatrix, outcomes: OutcomeChain) -> float:
+def almost_sure_growth(delivered: IntervalMatrix, lost: IntervalMatrix, outcomes: OutcomeChain) -> float:
     """Bound the growth of ‖z‖ per period in almost all runs.
 
     Args:

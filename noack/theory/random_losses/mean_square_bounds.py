@@ -22,7 +22,7 @@ concave: any tangent bounds it, and then the inequalities are linear. Without h 
 bound for every p̄ < 1.
 
 The bounds are made smaller afterwards, by quadratic functions of the loop's state
-(:mod:`~noack.theory.random_losses.quadratic_moments`), which need bounds of ‖e_s‖ and of what the
+(:mod:`~noack.theory.random_losses.stochastic_lyapunov`), which need bounds of ‖e_s‖ and of what the
 input's age does to p: a first bound is that of the inequalities, and each one makes others smaller.
 """
 
@@ -37,8 +37,8 @@ from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
 from noack.theory.certificates.inequalities import solve_inequalities
-from noack.theory.random_losses.quadratic_moments import (
-    Known,
+from noack.theory.random_losses.stochastic_lyapunov import (
+    KnownRms,
     LossyFlow,
     QuadraticFunction,
     quadratic_functions,
@@ -189,7 +189,7 @@ class _MomentInequalities:
                 break
         return bounds
 
-    def _known_parts(self, bounds: _Bounds) -> Known:
+    def _known_parts(self, bounds: _Bounds) -> KnownRms:
         """What is known of the parts of v; errors[C] bounds both ‖C e_c‖ and ‖C(e_c − ê_c)‖ with a delay."""
         states, errors, conditions = bounds.states, bounds.errors, self._conditions
         gains = dict(self._ages)
@@ -202,7 +202,7 @@ class _MomentInequalities:
             other += by_rate * errors[Output.GAIN_RATE]
         aged = by_rate * (states[Output.GAIN_RATE] + errors[Output.GAIN_RATE])
         at_start = float(self._start_error) + errors[Output.GAIN] + in_flight if conditions.start_s else 0.0
-        return Known(bounds.sensor_error, other, aged, at_start)
+        return KnownRms(bounds.sensor_error, other, aged, at_start)
 
     def _driving(self, bounds: _Bounds) -> _Signals:
         """Return rows that bound R_E x, and p at all times: before and after the first input, at t_a.

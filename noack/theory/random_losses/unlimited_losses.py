@@ -1,6 +1,6 @@
 """Bounds of a loop without a limit on consecutive losses: bursts, and moments.
 
-Mean squares at every fixed time: :mod:`~noack.theory.random_losses.fixed_times`.
+Mean squares at every fixed time: :mod:`~noack.theory.random_losses.mean_square_bounds`.
 
 At an event of the continuous trigger, where ‖e_s‖_W = β, the distribution of the number of missing
 events is known exactly, and (I1) gives a bound by itself: :func:`moment_at_events`.
@@ -31,7 +31,7 @@ from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gain
 from noack.theory.certificates.assumptions import below
 from noack.theory.certificates.conditions import most_events
 from noack.theory.certificates.scenario_certificates import CertificateScope
-from noack.theory.random_losses.fixed_times import MeanSquares, mean_squares
+from noack.theory.random_losses.mean_square_bounds import MeanSquares, mean_squares
 
 ORDERS = (1, 2)
 """r of the moments at events, and of a run's largest values."""

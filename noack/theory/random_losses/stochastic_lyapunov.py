@@ -1,4 +1,4 @@
-"""Mean squares at every fixed time without a limit on the losses, by one quadratic function.
+"""Mean squares at every fixed time without a limit on the losses, by a stochastic Lyapunov function.
 
 All signals are scaled by e^{αt}. Let q be what the lost events since the last delivered one have
 left in x_s, by (I1): had every delivered update arrived at once, e_c would be ê_c = q + e_s. With
@@ -51,7 +51,7 @@ Blocks = tuple[Vector, *tuple[Matrix, ...]]
 """Numbers that are to be positive, and symmetric matrices that are to be positive definite."""
 
 
-class Known(NamedTuple):
+class KnownRms(NamedTuple):
     """Root mean squares that hold already, scaled by e^{αt}."""
 
     sensor_error: float
@@ -81,7 +81,7 @@ class QuadraticFunction(NamedTuple):
     """ζ, ζ_f and ζ_h; 0 for what there is not, (3,)."""
     loop: "LossyFlow"
 
-    def level(self, known: Known) -> float:
+    def level(self, known: KnownRms) -> float:
         """Bound of the mean of xᵀXx + yᵀPy, at every fixed time."""
         loop, of_other = self.loop, self.of_inputs[0]
         entering = self.of_sensor_error * known.sensor_error**2 + of_other * loop.other(known) ** 2
@@ -90,11 +90,11 @@ class QuadraticFunction(NamedTuple):
         added = self.added * known.sensor_error**2
         return float(max(first, entering / (2 * self.rate_per_s)) + begun + added)
 
-    def bound_state(self, C: Matrix, known: Known) -> float:
+    def bound_state(self, C: Matrix, known: KnownRms) -> float:
         """Bound of the root mean square of ‖C x‖."""
         return _root(self.state, C @ self.loop.inverse_weight, self.level(known))
 
-    def bound_error(self, C: Matrix, known: Known) -> float:
+    def bound_error(self, C: Matrix, known: KnownRms) -> float:
         """Bound of the root mean square of ‖C ê_c‖."""
         turned = C @ self.loop.inverse_weight
         return _root(self.errors, np.hstack([turned, turned]), self.level(known))
@@ -146,7 +146,7 @@ class LossyFlow:
         ])  # fmt: skip
         self.entering = np.vstack([self.input, 0 * self.input, -self.input])
 
-    def other(self, known: Known) -> float:
+    def other(self, known: KnownRms) -> float:
         """Bound ω of w."""
         return known.other + (0.0 if self.counts_age else known.aged)
 
@@ -167,7 +167,7 @@ class LossyFlow:
         return np.asarray((D + D.T) / 2 * _INFLATED)
 
 
-def quadratic_functions(loop: LossyFlow, known: Known) -> list[QuadraticFunction]:
+def quadratic_functions(loop: LossyFlow, known: KnownRms) -> list[QuadraticFunction]:
     """Return functions V for several λ, each for a small bound of ‖x‖ or of ‖ê_c‖_W.
 
     There may be none: if nothing decays, each update is lost, there is no input, or because of rounding;
@@ -199,7 +199,7 @@ class _Search:
     """The inequalities for one λ, in a vector of unknowns."""
 
     def __init__(
-        self, loop: LossyFlow, known: Known, share: float, of_state: Matrix, of_error: Matrix
+        self, loop: LossyFlow, known: KnownRms, share: float, of_state: Matrix, of_error: Matrix
     ) -> None:
         self._loop, self._rate = loop, share * loop.decay_per_s
         n = len(loop.model)
