@@ -19,7 +19,7 @@ from cosim.analysis.summary.run_summary import Outcome, summarise
 from cosim.analysis.summary.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.output.report_page import Report, page
 from cosim.output.run_tables import key_numbers
-from cosim.output.run_verdict import print_outcome
+from cosim.output.terminal_output import print_outcome
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
