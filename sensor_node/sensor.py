@@ -35,8 +35,9 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.roles import BEGINNING, Notice, Start
 from noack.protocol.wire_format import Flow
+from noack.scenario.estimation import assumed_model
 from noack.scenario.parameter_changes import ChangeSchedule
-from noack.scenario.resolution import assumed_model, loop_of, policy_of, setpoint_of
+from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.trigger.trigger_rule import CodedPolicy, EventTrigger, Policy, fill_rule, rule_rows
 

@@ -23,9 +23,9 @@ from cosim.output.terminal_output import print_outcome
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
-from noack.protocol.record_tables import NETEM_PACKET, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import NETEM_PACKET, SENSOR_MEASUREMENT, network_tables
 from noack.protocol.roles import GENERATION, RESTART
-from noack.scenario.resolution import network_tables, resolve
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed as altered
 from tests.helpers.summaries import summary_of, with_values
