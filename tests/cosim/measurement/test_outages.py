@@ -1,6 +1,7 @@
 """Outages: of a real trace, of simulated ones, and the tests' closed forms."""
 
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
