@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 import noack
 from cosim.doctor.machine_measures import _runtime_folder_problem
 from cosim.measurement.live_measurement import ProbeRows
-from cosim.output.viewer.recording import RecordingFile
+from cosim.output.viewer.loop_recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
 from netem.capture import CaptureWriter
 from netem.control import control_server as emulator_session

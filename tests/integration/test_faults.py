@@ -22,7 +22,8 @@ from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import MachineError
 from noack.protocol.roles import ROLES
 from tests.command_line import invoke
-from tests.cosim.output.viewer.test_viewer import is_left, read
+from tests.cosim.output.viewer.recordings import read
+from tests.helpers.waiting import is_left
 from tests.integration import conftest as live
 
 Start = Callable[..., live.Running]

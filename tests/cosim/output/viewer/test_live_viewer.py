@@ -1,3 +1,5 @@
+"""A recording in a viewer: live, in a window or a browser, at the time of the largest error."""
+
 import contextlib
 import http.client
 import os
@@ -5,21 +7,16 @@ import shutil
 import signal
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin, urlsplit
 
-import numpy as np
 import psutil
 import pytest
 import rerun.chunk
 import rerun.experimental
-from numpy.typing import NDArray
-from rerun.error_utils import RerunWarning
 
-from cosim.output.viewer.blueprint import ShownLoop, over_time
 from cosim.output.viewer.live_viewer import (
     RECORDING,
     LiveView,
@@ -30,114 +27,17 @@ from cosim.output.viewer.live_viewer import (
     script_to_open_at,
     view_recording,
 )
-from cosim.output.viewer.pictures.picture import TIMELINE, Frames
-from cosim.output.viewer.recording import APPLICATION_ID, LoopView, RecordingFile, ViewError
-from cosim.output.viewer.run_recording import RunRecording
-from cosim.record.align import AlignedRun
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus
-from tests.cosim.output.test_texts import compare
+from tests.cosim.output.viewer.recordings import K, add_samples, another_process, new_view, read
 from tests.helpers.shipped import resolved
 from tests.helpers.summaries import summary_of
-from tests.helpers.waiting import wait_for
+from tests.helpers.waiting import is_left, wait_for
 from tests.integration.conftest import noack_command
-
-Floats = NDArray[np.float64]
-
-STATES = ["V", "r", "psi", "Y_g"]
-STEP_NS = 2_000_000
-S = 1_000_000_000
-K = 100
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "killpg"), reason="tells by process groups what is left behind"
 )
-
-
-def new_view(path: Path, live: LiveView | None = None, horizon_s: float = 20.0) -> RunRecording:
-    scenario = resolved("lane_following", f"horizon_s={horizon_s}")
-    return RunRecording(scenario, path, 1, {0: scenario}, live=live)
-
-
-def times(first: int, k: int = K) -> NDArray[np.int64]:
-    return (first + np.arange(k)) * STEP_NS
-
-
-def add_samples(view: RunRecording, batches: int, n: int = 4) -> None:
-    """Samples with values that encode their series, coordinate and step."""
-    for batch in range(batches):
-        t_ns = times(batch * K)
-        norm = t_ns.astype(np.float64) * 1e-9
-        x: Floats = norm[:, None] + np.arange(n)
-        bounds, none = np.stack([norm + 3, norm + 4], axis=1), np.full(K, -1)
-        states, norms = (x, x + 100, x + 200), (norm, norm + 1, norm + 2)
-        found = AlignedRun(t_ns, *states, norm, *norms, received=none, sensor=none)
-        view.views[0].samples(found, bounds, bounds + 2)
-
-
-Chunks = dict[str, list[Any]]
-
-
-def read(path: Path, kind: str = "recording") -> Chunks:
-    """Chunks of the file by entity."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RerunWarning)  # a file without footer is read in full
-        reader = rerun.chunk.RrdReader(path)
-    (store,) = reader.recordings() if kind == "recording" else reader.blueprints()
-    chunks: Chunks = {}
-    for chunk in reader.stream(store=store):
-        chunks.setdefault(chunk.entity_path.removeprefix("/"), []).append(chunk)
-    return chunks
-
-
-def column(chunks: list[Any], name: str) -> list[Any]:
-    return [value for c in chunks for value in c.to_record_batch().column(name).to_pylist()]
-
-
-def of_views(layout: Chunks, name: str) -> list[str]:
-    """A property of every view of a layout that has it."""
-    return [
-        value
-        for entity, chunks in layout.items() if entity.startswith("view/")
-        for c in chunks if name in c.to_record_batch().schema.names
-        for (value,) in column([c], name)
-    ]  # fmt: skip
-
-
-def series(chunks: Chunks, entity: str) -> tuple[NDArray[np.int64], Floats]:
-    """Times in ns (k,) and scalars (k, series) of one entity, in the order of the file."""
-    moving = [c for c in chunks[entity] if not c.is_static]
-    assert all(c.timeline_names == [TIMELINE] for c in moving)
-    batches = [c.to_record_batch() for c in moving]
-    t_ns = np.concatenate([b.column("t").to_numpy(zero_copy_only=False) for b in batches])
-    return t_ns.astype(np.int64), np.array(column(moving, "Scalars:scalars"), dtype=np.float64)
-
-
-def is_left(group: int) -> bool:
-    """Whether a process of the group is alive; a zombie does not count."""
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
-            if os.getpgid(process.pid) == group and process.status() != psutil.STATUS_ZOMBIE:
-                return True
-    return False
-
-
-@contextlib.contextmanager
-def another_process(code: str, path: Path) -> Iterator[subprocess.Popen[str]]:
-    """Run code with a path as ``path``, and kill it at the end."""
-    with subprocess.Popen(
-        [sys.executable, "-c", "import pathlib, sys; path = pathlib.Path(sys.argv[1]);" + code, str(path)],
-        cwd=Path(__file__).parents[4],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={name: value for name, value in os.environ.items() if "DISPLAY" not in name},
-        text=True,
-        start_new_session=True,
-    ) as child:
-        try:
-            yield child
-        finally:
-            child.kill()
 
 
 def get(url: str, host: str | None = None) -> tuple[int, bytes]:
@@ -157,75 +57,6 @@ def live() -> Iterator[LiveView]:
     view = LiveView(native=False)
     yield view
     view.close()
-
-
-@pytest.mark.parametrize("horizon_s", [20.0, 200.0])
-def test_the_file_contains_every_sample_exactly(tmp_path: Path, horizon_s: float) -> None:
-    """Short recordings have an index, long ones none."""
-    path = tmp_path / "recording.rrd"
-    with new_view(path, horizon_s=horizon_s) as view:
-        add_samples(view, 5)
-        view.views[0].inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
-        x = np.zeros((3, 4))
-        for _ in range(2):  # the picture has a maximum frame rate
-            view.views[0].move(times(0, 3), Frames(np.zeros(3), x, x, x))
-    chunks = read(path)
-    assert sum(c.num_rows for c in chunks["picture/plant"] if not c.is_static) == 1
-    for i, name in enumerate(STATES):
-        t_ns, values = series(chunks, f"state/{name}")
-        np.testing.assert_array_equal(t_ns, times(0, 5 * K))
-        x = t_ns * 1e-9 + i
-        np.testing.assert_array_equal(values, np.stack((x, x + 100, x + 200), axis=1))
-    t_ns, values = series(chunks, "error/norm")
-    np.testing.assert_array_equal(values, (t_ns * 1e-9)[:, None] + [3, 0, 1, 2])
-    t_ns, values = series(chunks, "error/log10")
-    certified = 10 ** values[:, 4]
-    np.testing.assert_allclose(certified, t_ns * 1e-9 + 4, rtol=1e-12)
-    t_ns, values = series(chunks, "size/log10")
-    bounds = (t_ns * 1e-9)[:, None] + [5, 6]
-    np.testing.assert_allclose(10 ** values[:, :2], bounds, rtol=1e-12)
-    t_ns, values = series(chunks, "input")
-    np.testing.assert_array_equal(values, np.stack((np.arange(K), -np.arange(K)), axis=1))
-
-
-def test_the_recording_shows_what_was_approved(tmp_path: Path) -> None:
-    """Names, colours and texts of what is drawn, and the panels of the layout."""
-    path = tmp_path / "recording.rrd"
-    new_view(path).close()
-    reader = rerun.chunk.RrdReader(path)
-    (recording,), (layout,) = reader.recordings(), reader.blueprints()
-    assert recording.application_id == layout.application_id == APPLICATION_ID
-    shown = [
-        f"{entity} {name}: {value}"
-        for entity, chunks in sorted(read(path).items())
-        for batch in (chunk.to_record_batch() for chunk in chunks if chunk.is_static)
-        for name in sorted(batch.schema.names)
-        if name.endswith((":names", ":labels", ":colors", ":text"))
-        for value in batch.column(name).to_pylist()
-    ]
-    shown += sorted(of_views(read(path, "blueprint"), "ViewBlueprint:display_name"))
-    compare("recording.txt", "\n".join(shown))
-
-
-def test_a_file_that_cannot_be_created_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ViewError, match=r"nowhere/recording.rrd: cannot create"):
-        new_view(tmp_path / "nowhere" / "recording.rrd")
-
-
-def test_a_disk_that_fills_during_the_run_is_reported_by_the_closing(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    code = (
-        "import resource; from tests.cosim.output.viewer import test_viewer as t; view = t.new_view(path);"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000));"
-        "t.add_samples(view, 50); view.close()"
-    )
-    with another_process(code, path) as child:
-        _, errors = child.communicate()
-        assert child.returncode == 1
-    last = errors.splitlines()[-1]
-    assert "ViewError" in last
-    assert str(path) in last
-    assert "the recording is incomplete" in last
 
 
 def rows_of(path: Path) -> int:
@@ -439,17 +270,6 @@ def test_only_the_page_of_a_finished_run_moves_the_cursor(tmp_path: Path) -> Non
         assert opening_time_ns(path) == T_NS
         assert get(page)[1].endswith(script_to_open_at(T_NS))
         assert b"openAt" not in get(page + "re_viewer.js")[1]
-
-
-def test_a_loop_without_a_picture_has_a_panel_for_every_coordinate(tmp_path: Path) -> None:
-    """Names with special characters give different entities, too."""
-    path, shown = tmp_path / "recording.rrd", ShownLoop("", ["a/b", "a b", "ψ"], ["u"])
-    with RecordingFile(path, "1", over_time(shown.panels(), 1.0), indexed=True) as file:
-        LoopView(file, shown)
-    entities = {entity for entity in read(path) if entity.startswith("state/")}
-    origins = of_views(read(path, "blueprint"), "ViewBlueprint:space_origin")
-    assert len(entities) == 3
-    assert entities <= {origin.removeprefix("/") for origin in origins}
 
 
 def test_a_display_is_detected_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Feeds the recording of a run from its tables, as they grow or all at once."""
+"""Feeds the recording of a loop from its tables, as they grow or all at once."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.output.viewer.loop_recording import LoopView
 from cosim.output.viewer.pictures.picture import Frames
-from cosim.output.viewer.recording import LoopView
 from cosim.record.align import (
     AlignedRun,
     ControllerTrack,
@@ -76,7 +76,7 @@ def log_level(notice: Mapping[str, object]) -> str:
     return "WARN" if notice["level"] in _WARNINGS else "INFO"
 
 
-class ViewFeed:
+class LoopFeed:
     """Aligns growing tables and passes complete batches to the view.
 
     Args:

@@ -8,9 +8,9 @@ import pytest
 
 from cosim.analysis.summary import network_summary as network
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.run_feed import RunFeed
+from cosim.output.viewer.live_feed import LiveFeed
+from cosim.output.viewer.loop_feed import LoopFeed
 from cosim.output.viewer.run_recording import ERROR, MAP, QUEUE, SHARE, SIZE, open_recording
-from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun
 from cosim.simulation.virtual_time import simulate_loops
@@ -19,7 +19,7 @@ from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.scenario.resolution import loop_of
 from tests.cosim.live.recording.test_claim_monitor import live_rows
-from tests.cosim.output.viewer.test_viewer import Chunks, read, series
+from tests.cosim.output.viewer.recordings import Chunks, read, series
 from tests.helpers.shipped import resolved, shipped
 
 
@@ -27,7 +27,7 @@ from tests.helpers.shipped import resolved, shipped
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops are not given up, and no lag is named, on a busy machine."""
     for name in ("_NAMED_S", "_PATIENCE_S"):
-        monkeypatch.setattr(f"cosim.output.viewer.run_feed.{name}", np.inf)
+        monkeypatch.setattr(f"cosim.output.viewer.live_feed.{name}", np.inf)
 
 
 def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks, list[str]]:
@@ -36,7 +36,7 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks
     run = simulate_loops(shipped("shared_bottleneck", *given))
     scenario, said = run.network.scenario, list[str]()
     with open_recording(scenario, folder, 9, None) as view:
-        feed = RunFeed(scenario, view, said.append)
+        feed = LiveFeed(scenario, view, said.append)
         for table, rows in live_rows(run):
             feed.add(table, rows)
             feed.advance()
@@ -75,10 +75,10 @@ def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phas
 def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cosim.output.viewer.run_feed._TURN_S", -1.0)  # one loop a turn
-    monkeypatch.setattr("cosim.output.viewer.run_feed._NAMED_S", 0.05)
-    monkeypatch.setattr("cosim.output.viewer.run_feed._PATIENCE_S", 0.5)
-    monkeypatch.setattr("cosim.output.viewer.run_feed._SHARE", 1e-4)
+    monkeypatch.setattr("cosim.output.viewer.live_feed._TURN_S", -1.0)  # one loop a turn
+    monkeypatch.setattr("cosim.output.viewer.live_feed._NAMED_S", 0.05)
+    monkeypatch.setattr("cosim.output.viewer.live_feed._PATIENCE_S", 0.5)
+    monkeypatch.setattr("cosim.output.viewer.live_feed._SHARE", 1e-4)
     _, found, said = shown(tmp_path, 3)
     assert "in detail end here" in said[-1]
     assert len(series(found, ERROR)[0]) == network.INTERVALS
@@ -106,7 +106,7 @@ def received(view: Mock) -> list[tuple[int, bool]]:
 
 def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:
     view = Mock()
-    feed = ViewFeed(SCENARIO, view)
+    feed = LoopFeed(SCENARIO, view)
     delivery = np.zeros(1, TYPES["controller_delivery"])
     delivery["t_ns"] = delivery["model_t_ns"] = 100 * MS
     delivery["sequence"] = 5

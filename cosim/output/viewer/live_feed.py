@@ -1,6 +1,4 @@
-"""Feeds the recording of a run while it goes on.
-
-That of several loops is thinned so that a viewer keeps up.
+"""Feeds the recording of a run while it goes on; several loops are thinned so that a viewer keeps up.
 
 The loops that are shown in detail have a feed each, and share a part of the recorder's time. All
 loops together are shown as in the finished recording: largest values in intervals of the run. What
@@ -23,8 +21,8 @@ from cosim.analysis.summary.network_summary import (
     places,
     times_inside,
 )
+from cosim.output.viewer.loop_feed import LAG_S, SHOWN, LoopFeed, log_level
 from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
-from cosim.output.viewer.table_feed import LAG_S, SHOWN, ViewFeed, log_level
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
@@ -52,7 +50,7 @@ _LONGEST_NS = 2**50
 """Longer than any run; 2**13 loops have keys of 63 bits."""
 
 
-class RunFeed:
+class LiveFeed:
     """Passes the rows of a run to its recording.
 
     Args:
@@ -68,7 +66,7 @@ class RunFeed:
         self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
         self._together = _AllLoops(scenario, loops, view) if view.is_shared else None
         self._feeds = {
-            number: ViewFeed(loops[number], loop_view, certified=not view.is_shared)
+            number: LoopFeed(loops[number], loop_view, certified=not view.is_shared)
             for number, loop_view in view.views.items()
         }
         self._tables = SHOWN if view.is_shared else (*SHOWN, *CLOCK_TABLES)
