@@ -21,7 +21,7 @@ from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, Endi
 from netem.capture import CaptureWriter
 from netem.control import control_server as emulator_session
 from netem.fates import FateRecorder
-from netem.relay_links import LinkSpec
+from netem.relay.relay_links import LinkSpec
 from noack.core.errors import CallerError, NoackError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime import control_plane

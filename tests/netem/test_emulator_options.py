@@ -13,8 +13,8 @@ from netem import stand_alone
 from netem.__main__ import main
 from netem.emulator_options import command_line_parser as parser
 from netem.emulator_options import parsed, specs_of
-from netem.relay import Relay
-from netem.relay_links import LinkSpec
+from netem.relay.relay import Relay
+from netem.relay.relay_links import LinkSpec
 from netem.tc_words import EXAMPLES, KEYWORDS, load_links, parse, settings_of
 from noack.impairments.kinds.loss import LOSS_WORDS
 from tests.helpers.approved import compare_lines
@@ -53,7 +53,7 @@ _OF_THE_SYSTEM = re.compile(r"\((\[Errno|Name or service).*\)$")
 def test_a_mistake_ends_the_program_with_the_approved_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(Path(__file__).parents[3])
+    monkeypatch.chdir(Path(__file__).parents[2])
 
     def mistake(arguments: str) -> list[str]:
         assert main(shlex.split(arguments)) == 2
@@ -62,7 +62,7 @@ def test_a_mistake_ends_the_program_with_the_approved_line(
         assert err.count("\n") == 1
         return [_OF_THE_SYSTEM.sub("(…)", err.strip()).replace(str(Path.cwd()), "FOLDER")]
 
-    compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
+    compare_lines(Path(__file__).with_name("option_mistakes.txt"), mistake)
 
 
 @pytest.mark.parametrize("columns", ["120", "60"])

@@ -95,7 +95,7 @@ class DirectionReport:
     flows: Sequence[FlowReport]
     """At most 16: the present clients that sent most."""
     delays: NDArray[np.int64]
-    """(k,) Histogram of the time from arrival to departure; see :mod:`netem.relay_links`."""
+    """(k,) Histogram of the time from arrival to departure; see :mod:`netem.relay.relay_links`."""
     lateness: NDArray[np.int64]
     """(k,) Histogram of the time from a delayed datagram's release time to its departure."""
 
@@ -128,7 +128,7 @@ class Tap(Protocol):
     """Whether it needs payloads."""
 
     def take(self, events: Events, data: Bytes) -> None:
-        """Receive events, (k,) of :data:`netem.relay_links.EVENT`, and their payloads.
+        """Receive events, (k,) of :data:`netem.relay.relay_links.EVENT`, and their payloads.
 
         Both arrays are overwritten after the call.
         """

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from noack.protocol.wire_format import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
-from tests.netem.capture.reader import file_of
+from tests.netem.capture_reader import file_of
 
 Tshark = Callable[..., str]
 
@@ -41,7 +41,7 @@ def tshark(tmp_path: Path) -> Tshark:
     return run
 
 
-DOCS = Path(__file__).parents[3] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 RUN = 0x0123_4567_89AB_CDEF
 Fields = dict[str, list[dict[str, str]]]
 

@@ -9,7 +9,7 @@ import jsonschema
 import tomli_w
 from hypothesis import assume, given
 
-from netem.relay_links import LinkSpec
+from netem.relay.relay_links import LinkSpec
 from netem.tc_words import LinksFile, json_schema, load_links, parse, settings_of, words_of
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario import toml_file
@@ -24,7 +24,7 @@ def test_words_are_the_approved_impairments() -> None:
         assert settings_of(words_of(parsed)) == parsed
         return [one.model_dump_json(exclude_unset=True) for one in parsed.impairments]
 
-    compare_lines(Path(__file__).with_name("settings.txt"), impairments)
+    compare_lines(Path(__file__).with_name("word_settings.txt"), impairments)
 
 
 def test_settings_may_come_anywhere_and_impairments_keep_their_order() -> None:
@@ -49,11 +49,11 @@ def test_all_settings_survive_being_written_and_read(settings: LinkSettings) -> 
 
 def test_the_lines_about_mistakes_are_those_that_were_approved() -> None:
     compare_lines(
-        Path(__file__).with_name("mistakes.txt"), lambda words: lines_of_error(lambda: parse(words))
+        Path(__file__).with_name("word_mistakes.txt"), lambda words: lines_of_error(lambda: parse(words))
     )
 
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 
 TWO = """
 [[link]]

@@ -7,8 +7,8 @@ from contextlib import suppress
 
 import numpy as np
 
-from netem.client_table import ClientTable, LinkWarnings, UnintendedLosses
-from netem.relay_links import (
+from netem.relay.client_table import ClientTable, LinkWarnings, UnintendedLosses
+from netem.relay.relay_links import (
     DIRECTIONS,
     Direction,
     DirectionReport,
@@ -21,7 +21,7 @@ from netem.relay_links import (
     set_receive_timeout,
     stamp_arrivals,
 )
-from netem.relay_memory import RelayDirection, RelayMemory
+from netem.relay.relay_memory import RelayDirection, RelayMemory
 from netem.shell.devices import DeviceLink
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError

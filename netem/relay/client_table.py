@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from netem.relay_links import (
+from netem.relay.relay_links import (
     Direction,
     Endpoint,
     LinkSpec,
@@ -22,7 +22,7 @@ from netem.relay_links import (
     return_path,
     stamp_arrivals,
 )
-from netem.relay_memory import RelayDirection, RelayMemory, name_array
+from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
 from netem.shell.devices import DeviceLink
 from noack.core.core_library import core
 from noack.runtime.address import address_text, packed_name

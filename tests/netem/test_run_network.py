@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cosim.shipped_files import find_shipped
-from netem.relay_links import LinkSpec
+from netem.relay.relay_links import LinkSpec
 from netem.run_network import NetworkChannel, RunNetwork
 from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings

@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from netem.fates import METADATA, FateRecorder, read_fates
-from netem.relay_links import EVENT
+from netem.relay.relay_links import EVENT
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.protocol.record_tables import Fate
 from tests.fuzz.parsers.fates import DOCUMENT, TABLE
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record, spec_of
+from tests.netem.fate_links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record, spec_of
 from tests.noack.impairments.any_link_settings import harsh
 from tests.oracles.link import Link
 
@@ -186,7 +186,7 @@ def test_a_wrong_trace_is_refused_with_the_approved_line(path: Path) -> None:
         return lines_of_error(lambda: read_fates(write(path, table, document)), FILE=path)
 
     assert len(read_fates(write(path, TABLE)).decisions["up", "forward"]) == 2
-    compare_lines(Path(__file__).with_name("mistakes.txt"), refusal)
+    compare_lines(Path(__file__).with_name("fate_mistakes.txt"), refusal)
 
 
 def test_files_that_are_no_fate_traces_are_refused(path: Path, tmp_path: Path) -> None:

@@ -17,11 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.capture import CaptureWriter, PcapngSection
-from netem.relay_links import DIRECTIONS, EVENT, Bytes, Events
+from netem.relay.relay_links import DIRECTIONS, EVENT, Bytes, Events
 from noack.core.errors import CallerError
 from tests.helpers.approved import compare_lines
 from tests.helpers.waiting import wait_for
-from tests.netem.capture.reader import (
+from tests.netem.capture_reader import (
     INTERFACES,
     SPECS,
     T_NS,
@@ -76,7 +76,7 @@ def test_each_fate_has_the_approved_comment() -> None:
         (packet,) = read(file_of(json.loads(fields))).packets
         return [packet.comment]
 
-    compare_lines(Path(__file__).with_name("comments.txt"), comment)
+    compare_lines(Path(__file__).with_name("capture_comments.txt"), comment)
 
 
 def test_a_checksum_of_0_is_sent_as_ffff() -> None:
