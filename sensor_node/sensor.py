@@ -306,7 +306,7 @@ def sensors_of(
     Of the plant's data they use at most x(0). After a restart, a sensor transmits its first
     measurement.
     """
-    parts, templates = parts_of(loops, partial(_part, start), partial(_redrawn, start))
+    parts, templates = parts_of(loops, partial(_part, start), partial(_with_draws_of, start))
     return LoopMachines(parts, phases_ns, templates=templates)
 
 
@@ -329,13 +329,13 @@ def _part(start: Start, resolved: Scenario) -> Sensor:
     )
 
 
-def _redrawn(start: Start, sensor: Sensor, resolved: Scenario) -> Sensor:
-    """Return a sensor as another one, whose plant has other draws."""
+def _with_draws_of(start: Start, sensor: Sensor, resolved: Scenario) -> Sensor:
+    """Return a sensor with the draws of a loop that is alike otherwise."""
     schedule, observer = sensor.schedule, sensor.observer
     return replace(
         sensor,
         x0=None if sensor.x0 is None else np.array(resolved.plant.initial_state),
-        schedule=None if schedule is None else schedule.of_alike(resolved),
+        schedule=None if schedule is None else schedule.for_similar_loop(resolved),
         observer=None if observer is None else observer_of(resolved, restarted=start.is_restart),
     )
 
