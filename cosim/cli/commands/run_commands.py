@@ -17,7 +17,7 @@ from noack.core.number_format import number
 
 with lazy_modules():
     from cosim.analysis.summary import summary_model
-    from cosim.interactive import draft
+    from cosim.interactive import scenario_draft
     from cosim.lab import lab_server
     from cosim.live import remote_access
     from cosim.live.monitoring import progress, ros2_bridge
@@ -58,7 +58,7 @@ def lab(
         raise CallerError(
             "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the repository"
         )
-    edited = draft.open_draft(source.scenario)
+    edited = scenario_draft.open_draft(source.scenario)
     for key, value in map(scenario_file.setting_of, source.settings or ()):
         edited = edited.with_value(key, value)
     _ = edited.scenario  # report mistakes here

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from cosim.interactive.controls import example_of
-from cosim.interactive.draft import Draft, DraftError, Mistake, value_text
+from cosim.interactive.scenario_draft import Draft, DraftError, Mistake, value_text
+from cosim.interactive.sliders import example_of
 from noack.core.errors import NoackError
 from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.interactive.controls import controls_of, dragged
-from cosim.interactive.draft import Draft, DraftError, draft_of_query, known_scenarios, open_draft
+from cosim.interactive.scenario_draft import Draft, DraftError, draft_of_query, known_scenarios, open_draft
+from cosim.interactive.sliders import controls_of, dragged
 from cosim.shipped_files import shipped_names
 from noack.core.errors import CallerError
 from noack.scenario import toml_file

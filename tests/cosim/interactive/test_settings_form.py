@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from cosim.interactive.controls import chosen, controls_of, dragged
-from cosim.interactive.draft import DraftError, draft_of_query, open_draft
-from cosim.interactive.form import Field, by_field, filled, form_of
+from cosim.interactive.scenario_draft import DraftError, draft_of_query, open_draft
+from cosim.interactive.settings_form import Field, by_field, filled, form_of
+from cosim.interactive.sliders import chosen, controls_of, dragged
 from cosim.shipped_files import shipped_names
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs/scenario.schema.json").read_text(encoding="utf-8"))

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from pydantic import BaseModel
 
-from cosim.interactive.draft import Draft
+from cosim.interactive.scenario_draft import Draft
 from noack.core.clock import NS_PER_S
 from noack.scenario.runtime_parameters import trigger_parameters
 from noack.scenario.scenario import Scenario
