@@ -1,7 +1,6 @@
 """Terminal output about a run: its verdict and key numbers, or all tables; what is wrong; its files.
 
-:func:`print_outcome` prints the lines of :mod:`cosim.output.run_verdict` with the tables of
-:mod:`cosim.output.run_tables`. Parts of it are printed by other commands, too.
+:func:`print_outcome` prints the texts of ``run_verdict.py`` with the tables of ``run_tables.py``.
 """
 
 import re

@@ -86,11 +86,8 @@ def _intervals(record: RunRecord, until_s: float) -> Iterator[tuple[_Start, Inte
 
     def interval(t_ns: NDArray[np.int64], x: Matrix) -> Interval:
         model = [propagate(x[0], int(age_ns)) for age_ns in t_ns - t_ns[0]]
-        return Interval(
-            np.asarray(t_ns * 1e-9),
-            np.linalg.norm(x, axis=1),
-            np.linalg.norm(np.array(model), axis=1),
-        )
+        norms = (np.linalg.norm(states, axis=1) for states in (x, np.array(model)))
+        return Interval(np.asarray(t_ns * 1e-9), *norms)
 
     start: _Start | None = None
     t_ns, x = np.zeros(0, np.int64), np.zeros((0, record.loop.n))

@@ -36,6 +36,6 @@ Words of names and fields, and their symbols in the docstrings:
 * ``known``: the bounds that hold already (``KnownBounds``). ``after_losses`` has one for each number
   of events that have been lost since a delivery.
 * ``gap``: the time g between two delivered events. ``removal``: J, what the next update removes from
-  the input's error; ``pulse``: what J of earlier events adds to ‖Λξ‖. ``ages``, ``aged``: of w, what
-  the age of the input adds.
+  the input's error; ``pulse``: what J of earlier events adds to ‖Λξ‖. ``ages``: ‖w‖ from the age of
+  the input, in each cell.
 """
