@@ -30,9 +30,8 @@ Words of names and fields, and their symbols in the docstrings:
   (``size`` is c) and ‖e_c‖_W ≤ D since then (``limit`` is D).
 * ``effects``: what delay and hold change of the flow. ``age_input`` bounds ‖q‖, the part of the
   input that its age adds; ``first_error`` bounds ‖e_c‖_W when an update acts.
-* ``bend``: a bound of a second derivative. ``sag``: how far a function can differ from its chord
-  over a cell, step²/8 · bend.
-* ``forms``: matrices Q with zᵀQz ≤ 1. ``level``: the least ‖e_s‖_W at an event.
+* ``bend`` and ``sag``: as in ``noack/theory/bounds``. ``forms``: matrices Q with zᵀQz ≤ 1. ``level``:
+  the least ‖e_s‖_W at an event.
 * ``known``: the bounds that hold already (``KnownBounds``). ``after_losses`` has one for each number
   of events that have been lost since a delivery.
 * ``gap``: the time g between two delivered events. ``removal``: J, what the next update removes from
