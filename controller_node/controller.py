@@ -225,7 +225,7 @@ def controllers_of(
 
     Of the plant's data they use at most x(0).
     """
-    parts, templates = parts_of(loops, partial(_part, start), _redrawn)
+    parts, templates = parts_of(loops, partial(_part, start), _with_draws_of)
     if not start.is_restart:
         return LoopMachines(parts, phases_ns, templates=templates)
     phases = tuple(phases_ns or (0,) * len(loops))  # they determine the first ticks
@@ -236,14 +236,14 @@ def controllers_of(
     return LoopMachines(parts, phases)
 
 
-def _redrawn(controller: Controller, resolved: Scenario) -> Controller:
-    """Return a controller as another one, whose plant has other draws."""
+def _with_draws_of(controller: Controller, resolved: Scenario) -> Controller:
+    """Return a controller with the draws of a loop that is alike otherwise."""
     law, schedule = controller.law, controller.schedule
     return replace(
         controller,
         law=law if isinstance(law, LinearFeedback) else law_of(resolved),
         x0=None if controller.x0 is None else np.array(resolved.plant.initial_state),
-        schedule=None if schedule is None else schedule.of_alike(resolved),
+        schedule=None if schedule is None else schedule.for_similar_loop(resolved),
     )
 
 

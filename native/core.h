@@ -138,8 +138,8 @@ static inline int is_scheduler(const noack_stage *stage) {
            || stage->kind == NOACK_MAXIMUM_ERROR;
 }
 
-/* waiting.c: the number of a packet's flow in the table of a stage. */
-int64_t flow_number(const packet *packet, const noack_stage *stage);
+/* waiting.c: what the table of a stage has for a packet's flow: a priority, or a deadline in ns. */
+int64_t flow_table_entry(const packet *packet, const noack_stage *stage);
 /* Let a packet enter the queue of its stage; the packets with the smallest key + time leave first,
    of which those with the same leave in order of arrival. */
 void enter_queue(packet *packet, int64_t key, int is_time);

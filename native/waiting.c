@@ -59,7 +59,7 @@ static void lower_key(noack_queue *queue, noack_waiting *waiting, int64_t place,
     queue->waiting = merge(waiting, queue->waiting, place + 1);
 }
 
-int64_t flow_number(const packet *packet, const noack_stage *stage) {
+int64_t flow_table_entry(const packet *packet, const noack_stage *stage) {
     int64_t row = packet->flow - packet->link->flows, last = stage->bottleneck.flows - 1;
     return packet->link->integers[stage->bottleneck.begin + min_of(row, last)];
 }

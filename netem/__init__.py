@@ -1,9 +1,8 @@
 """A user-space UDP network emulator that guarantees at most M - 1 consecutive losses per flow.
 
 ``link_state.py`` prepares a link for the core, which decides the fate of each packet;
-``channel.py`` is the network of a run without sockets. With sockets, read ``relay_links.py``,
-``relay_memory.py``, ``client_table.py`` and ``relay.py``, in this order. Relays are used by
-``run_network.py`` in a run, ``stand_alone.py`` as a program (options in ``emulator_options.py``,
-words in ``tc_words.py``, files in ``capture.py`` and ``fates.py``, live control in ``control``),
-``lossy_udp.py`` in tests, and ``shell`` around a command.
+``channel.py`` is the network of a run without sockets. With sockets, it is a ``relay``. Relays are
+used by ``run_network.py`` in a run, ``stand_alone.py`` as a program (options in
+``emulator_options.py``, words in ``tc_words.py``, files in ``capture.py`` and ``fates.py``, live
+control in ``control``), ``lossy_udp.py`` in tests, and ``shell`` around a command.
 """

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from netem.relay_links import LinkSpec
+from netem.relay.relay_links import LinkSpec
 from netem.tc_words import (
     GRAMMAR,
     KEYWORDS,

@@ -19,8 +19,8 @@ from netem.control.emulator_statistics import (
     Snapshot,
     statistics,
 )
-from netem.relay import Relay
-from netem.relay_links import DIRECTIONS, Direction, LinkSpec
+from netem.relay.relay import Relay
+from netem.relay.relay_links import DIRECTIONS, Direction, LinkSpec
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, why
 from noack.impairments.link_settings import LinkSettings

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from netem.channel import PACKET_ROW, Datagram, at_start, due_settings, link_name
-from netem.relay_links import set_receive_timeout, stamp_arrivals
-from netem.relay_memory import RelayDirection, RelayMemory, name_array
+from netem.relay.relay_links import set_receive_timeout, stamp_arrivals
+from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.clock import RunClock
 from noack.core.core_library import Rows, core
 from noack.impairments.link_settings import LinkSettings

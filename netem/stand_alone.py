@@ -29,8 +29,8 @@ from netem.control.emulator_statistics import (
 from netem.control.statistics_view import Screen, picture_of
 from netem.emulator_options import command_line_parser, explain, parsed, specs_of
 from netem.fates import FateRecorder, read_fates
-from netem.relay import Relay
-from netem.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, raise_file_limit, report_line
+from netem.relay.relay import Relay
+from netem.relay.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, raise_file_limit, report_line
 from netem.shell.devices import DeviceLink
 from noack.core.errors import CallerError, ExitStatus, NoackError, why
 from noack.core.file_access import open_growing

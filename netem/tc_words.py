@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple, Self, TypeVar
 
 from pydantic import BeforeValidator, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 
-from netem.relay_links import LinkSpec
+from netem.relay.relay_links import LinkSpec
 from noack.core.errors import CallerError, plain_mistake, shortened
 from noack.impairments.constraints import CONSTRAINTS, AnyConstraint
 from noack.impairments.feature import Constraint, Feature, Impairment

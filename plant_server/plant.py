@@ -303,7 +303,7 @@ def plants_of(
 
     A plant cannot be restarted during the run: ``start`` has no effect.
     """
-    parts, templates = parts_of(loops, _part, _redrawn)
+    parts, templates = parts_of(loops, _part, _with_draws_of)
     return LoopMachines(parts, phases_ns, templates=templates)
 
 
@@ -324,7 +324,7 @@ def _part(resolved: Scenario) -> Plant:
     )
 
 
-def _redrawn(plant: Plant, resolved: Scenario) -> Plant:
+def _with_draws_of(plant: Plant, resolved: Scenario) -> Plant:
     is_repeated = isinstance(plant.system, LinearSystem) and resolved.plant is plant.section
     if is_repeated and plant.disturbance is None and plant.measuring is None:
         return plant

@@ -35,8 +35,9 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.roles import BEGINNING, Notice, Start
 from noack.protocol.wire_format import Flow
+from noack.scenario.estimation import assumed_model
 from noack.scenario.parameter_changes import ChangeSchedule
-from noack.scenario.resolution import assumed_model, loop_of, policy_of, setpoint_of
+from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.trigger.trigger_rule import CodedPolicy, EventTrigger, Policy, fill_rule, rule_rows
 
@@ -305,7 +306,7 @@ def sensors_of(
     Of the plant's data they use at most x(0). After a restart, a sensor transmits its first
     measurement.
     """
-    parts, templates = parts_of(loops, partial(_part, start), partial(_redrawn, start))
+    parts, templates = parts_of(loops, partial(_part, start), partial(_with_draws_of, start))
     return LoopMachines(parts, phases_ns, templates=templates)
 
 
@@ -328,13 +329,13 @@ def _part(start: Start, resolved: Scenario) -> Sensor:
     )
 
 
-def _redrawn(start: Start, sensor: Sensor, resolved: Scenario) -> Sensor:
-    """Return a sensor as another one, whose plant has other draws."""
+def _with_draws_of(start: Start, sensor: Sensor, resolved: Scenario) -> Sensor:
+    """Return a sensor with the draws of a loop that is alike otherwise."""
     schedule, observer = sensor.schedule, sensor.observer
     return replace(
         sensor,
         x0=None if sensor.x0 is None else np.array(resolved.plant.initial_state),
-        schedule=None if schedule is None else schedule.of_alike(resolved),
+        schedule=None if schedule is None else schedule.for_similar_loop(resolved),
         observer=None if observer is None else observer_of(resolved, restarted=start.is_restart),
     )
 

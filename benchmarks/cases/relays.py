@@ -40,7 +40,7 @@ from benchmarks.report import (
     quantiles_us,
     say,
 )
-from netem.relay_links import LinkSpec
+from netem.relay.relay_links import LinkSpec
 from netem.shell.devices import open_devices
 from noack.impairments.link_settings import LinkSettings
 

@@ -22,7 +22,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import ACCURACY
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped, uncapped
-from noack.theory.random_losses.random_growth import RandomGrowth, random_growth
+from noack.theory.random_losses.almost_sure_growth import RandomGrowth, random_growth
 
 MOST_M = 16
 _LARGEST_EFFORT = 1e6

@@ -14,7 +14,7 @@ from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.random_losses.loop_moments import LoopMoments, LoopPeriods, periods_of, start_of
+from noack.theory.random_losses.exact_moments import LoopMoments, LoopPeriods, periods_of, start_of
 
 
 class Stationary(NamedTuple):

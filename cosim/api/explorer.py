@@ -12,8 +12,8 @@ from noack.core.file_access import write_whole
 from noack.core.number_format import as_text
 
 with lazy_modules():
-    from cosim.interactive import draft as drafts
     from cosim.interactive import exploration_figure as explored
+    from cosim.interactive import scenario_draft as drafts
     from cosim.output.figures import figure_drawing
 
 if TYPE_CHECKING:

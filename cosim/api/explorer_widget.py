@@ -11,8 +11,6 @@ from collections.abc import Callable, Mapping
 
 import ipywidgets as widgets
 
-from cosim.interactive.controls import Choice, Slider, chosen, controls_of, dragged
-from cosim.interactive.draft import Draft
 from cosim.interactive.exploration_figure import (
     CERTIFICATE,
     ENSEMBLE,
@@ -20,6 +18,8 @@ from cosim.interactive.exploration_figure import (
     DraftResults,
     exploration_figure,
 )
+from cosim.interactive.scenario_draft import Draft
+from cosim.interactive.sliders import Choice, Slider, chosen, controls_of, dragged
 from cosim.output.figures.figure_drawing import draw
 from cosim.output.figures.figure_layout import settings
 from noack.core.errors import NoackError

@@ -22,7 +22,7 @@ with lazy_modules():
     from cosim.live import finalize, launcher, remote_access
     from cosim.live.monitoring import progress, run_watcher
     from cosim.live.processes import fork_server
-    from cosim.output import run_verdict
+    from cosim.output import terminal_output
     from cosim.output.viewer import rerun_program
     from cosim.record import run_directory
     from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
@@ -200,7 +200,7 @@ def finalize_run(ending: "run_directory.RunEnding", options: OutputOptions) -> i
         error.add_note(f"`noack summary {ending.run_dir}` completes its record")
         raise
     run_watcher.log_end(outcome.status, outcome.reason, outcome.run_dir)
-    document, text = outcome.summary.to_json, run_verdict.print_outcome
+    document, text = outcome.summary.to_json, terminal_output.print_outcome
     cli.show(options.json, document, text, outcome, verbose=options.verbose)
     return outcome.status
 

@@ -1,6 +1,6 @@
 """Settings that one drags, and what follows from them: for the lab page and for notebooks.
 
-``draft`` is the edited scenario; ``controls`` has its sliders, ``form`` all its keys.
-``exploration`` (one run, or many) and ``scenario_guarantee`` (certificate and margin) are what
-``exploration_figure`` describes.
+``scenario_draft`` is the edited scenario; ``sliders`` has its sliders, ``settings_form`` all its
+keys. ``exploration`` (one run, or many) and ``scenario_guarantee`` (certificate and margin) are what
+``exploration_figure`` describes, and what ``exploration_words`` states in words.
 """

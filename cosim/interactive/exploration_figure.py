@@ -9,8 +9,8 @@ from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from cosim.interactive.draft import Draft
 from cosim.interactive.exploration import Ensemble, Exploration, explore_ensemble, run_of, why_not_exact
+from cosim.interactive.scenario_draft import Draft
 from cosim.interactive.scenario_guarantee import Guarantee, Margin, certify, margin_of, warning
 from cosim.output.figures.figure_description import (
     DASHED,

@@ -12,12 +12,12 @@ from urllib.parse import quote
 from nicegui import ui
 from nicegui.events import ValueChangeEventArguments
 
-from cosim.interactive.controls import controls_of
-from cosim.interactive.draft import Draft, DraftError
 from cosim.interactive.exploration import Exploration
+from cosim.interactive.scenario_draft import Draft, DraftError
+from cosim.interactive.sliders import controls_of
 from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.lab.live_run import MOST_LINES, LiveRun
-from cosim.lab.run_views import RunView, compared, recorded_view, replayed
+from cosim.lab.recorded_views import RunView, compared, recorded_view, replayed
 from cosim.output.run_verdict import DOUBTFUL, NEUTRAL, VerdictLine, transmission_line
 from noack.core.errors import NoackError
 from noack.core.number_format import number

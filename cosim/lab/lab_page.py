@@ -14,15 +14,15 @@ from typing import NamedTuple
 from nicegui import ui
 from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 
-from cosim.interactive.controls import Controls, chosen, controls_of, dragged
-from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration_figure import CERTIFICATE, ExploredRun, exploration_figure
-from cosim.interactive.form import by_field, filled, form_of
+from cosim.interactive.exploration_words import Reference, compare, verdict_of
+from cosim.interactive.scenario_draft import Draft, DraftError, draft_of_query, open_draft
+from cosim.interactive.settings_form import by_field, filled, form_of
+from cosim.interactive.sliders import Controls, chosen, controls_of, dragged
 from cosim.lab.figure_sources import LiveSource, RecordedSource, report_address
 from cosim.lab.file_menu import FileMenu
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.page_parts import PageParts, TextPanel, controls_part, figure_part, form_part, value_text
-from cosim.lab.run_views import Reference, compare, verdict_of
 from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, VerdictLine
 from noack.core.errors import NoackError
 

@@ -32,7 +32,7 @@ from starlette.websockets import WebSocketClose
 
 from cosim.lab.lab_page import show_page
 from cosim.lab.lab_services import LabServices, PageCalls
-from cosim.lab.run_views import report_page
+from cosim.lab.recorded_views import report_page
 from cosim.output.viewer.rerun_program import HOST, OWN_HOST, socket_user
 from noack.core.errors import MachineError, NoackError, one_line, printable, shortened
 

@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self, TypeVar, TypeVarTuple
 
-from cosim.interactive.draft import Draft, DraftError, Mistake, known_scenarios
 from cosim.interactive.exploration import Exploration, explore_ensemble, run_of, why_not_exact
 from cosim.interactive.exploration_figure import CERTIFICATE, ENSEMBLE, MARGIN, RUN, DraftResults
+from cosim.interactive.scenario_draft import Draft, DraftError, Mistake, known_scenarios
 from cosim.interactive.scenario_guarantee import certify, margin_of
 from cosim.lab.live_run import LiveRun
-from cosim.lab.run_views import live_view, recorded_view
+from cosim.lab.recorded_views import live_view, recorded_view
 from cosim.record.run_directory import SUMMARY_FILE
 from noack.core.errors import NoackError
 from noack.scenario.scenario import Scenario

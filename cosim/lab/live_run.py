@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cosim.interactive.draft import Draft
+from cosim.interactive.scenario_draft import Draft
 from cosim.live.launcher import launch
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.output.viewer.rerun_program import is_installed

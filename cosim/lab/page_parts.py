@@ -14,9 +14,9 @@ import numpy as np
 from nicegui import Client, ui
 from nicegui.events import ValueChangeEventArguments
 
-from cosim.interactive.controls import Controls
-from cosim.interactive.draft import Draft, Mistake
-from cosim.interactive.form import Field, FieldKind, Group
+from cosim.interactive.scenario_draft import Draft, Mistake
+from cosim.interactive.settings_form import Field, FieldKind, Group
+from cosim.interactive.sliders import Controls
 from cosim.output.figures.figure_description import (
     Band,
     FigureDescription,

@@ -10,17 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from cosim.measurement.certificate_time import CertificateTime, certificate_time
-from cosim.measurement.chain_fits import (
-    MOST_FITTED,
-    ChainFit,
-    ChainFits,
-    FitTest,
-    OutageFit,
-    OutageRule,
-    find_outages,
-    fit_outages,
-    outages_longer_than,
-)
+from cosim.measurement.chain_fits import MOST_FITTED, ChainFit, ChainFits, FitTest
 from cosim.measurement.interval_estimates import LEVEL, IntervalEstimate
 from cosim.measurement.loss_bursts import (
     WINDOWS,
@@ -34,6 +24,7 @@ from cosim.measurement.loss_bursts import (
     outcomes,
     quantile_m,
 )
+from cosim.measurement.outages import OutageFit, OutageRule, find_outages, fit_outages, outages_longer_than
 from noack.scenario.scenario import Scenario
 from noack.traces.packet_trace import PacketTrace
 

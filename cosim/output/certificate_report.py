@@ -15,7 +15,7 @@ from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, c
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.output.result_tables import ResultTable, terminal_table
-from cosim.output.run_verdict import print_assumptions
+from cosim.output.terminal_output import print_assumptions
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, at_least, at_most, duration_at_least, number
 from noack.scenario.resolution import loop_of, policy_of
@@ -24,7 +24,7 @@ from noack.theory.certificates.certified_bounds import envelope_formula
 from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
 from noack.theory.margins.loss_margin import Stability
-from noack.theory.random_losses.moments import UnlimitedLosses
+from noack.theory.random_losses.unlimited_losses import UnlimitedLosses
 
 
 def print_certificates(console: Console, results: Certificates, chosen: Certificates | None = None) -> None:

@@ -1,6 +1,6 @@
 """Tables of a run, as rows of text: of its network and loops, and of one loop in detail.
 
-The terminal (:mod:`cosim.output.run_verdict`), the report and the files of ``--tables`` show them.
+The terminal (:mod:`cosim.output.terminal_output`), the report and the files of ``--tables`` show them.
 """
 
 import math

@@ -40,7 +40,8 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.roles import GENERATION
-from noack.scenario.resolution import LoopMatrices, loop_of, policy_of, steady_state
+from noack.scenario.estimation import steady_state
+from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
 from noack.theory.paper import ErrorMonitor
 

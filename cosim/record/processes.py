@@ -18,11 +18,10 @@ from cosim.record.record_source import RecordSource, Rows, Slice
 from cosim.record.run_directory import REPORTS_FILE, read_object
 from noack.core.errors import PeerError
 from noack.core.file_access import write_whole
-from noack.protocol.record_tables import OWNER
+from noack.protocol.record_tables import OWNER, network_tables
 from noack.protocol.roles import GENERATION, LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
 from noack.runtime.spool import KEPT_REPORT, SPOOL, read_chunks
-from noack.scenario.resolution import network_tables
 
 _EARLIER = "earlier"
 Report = dict[str, Any]

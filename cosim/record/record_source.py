@@ -15,9 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import firsts_of_equal
-from noack.protocol.record_tables import CLOCK_TABLES, LOOP, NETEM_SETTING
+from noack.protocol.record_tables import (
+    CLOCK_TABLES,
+    LOOP,
+    NETEM_SETTING,
+    has_loop,
+    is_of_network,
+    network_tables,
+)
 from noack.protocol.roles import GENERATION
-from noack.scenario.resolution import has_loop, is_of_network, network_tables
 
 Rows = NDArray[np.void]
 Slice = Mapping[str, Rows]

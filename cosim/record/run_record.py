@@ -54,20 +54,13 @@ from noack.protocol.record_tables import (
     OWNER,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
+    has_loop,
+    is_of_network,
+    network_tables,
 )
 from noack.protocol.roles import LOOP_ROLES, RESTART
 from noack.runtime.control_messages import LogLine, parse_message
-from noack.scenario.resolution import (
-    LoopMatrices,
-    has_loop,
-    is_of_network,
-    loop_of,
-    network_tables,
-    resolve,
-    resolved_loops,
-    run_tables,
-    tables_of,
-)
+from noack.scenario.resolution import LoopMatrices, loop_of, resolve, resolved_loops, run_tables, tables_of
 from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, phases_ns
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 

@@ -39,11 +39,11 @@ from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
 from noack.core.linear_systems import firsts_of_equal
 from noack.core.process_limits import be_idle, cores
-from noack.protocol.record_tables import LOOP
+from noack.protocol.record_tables import LOOP, has_loop
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL, batch_bytes, batches_in, spool_files, stored_lines
-from noack.scenario.resolution import has_loop, run_tables
+from noack.scenario.resolution import run_tables
 from noack.scenario.scenario import loop_names
 
 with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it

@@ -18,7 +18,8 @@ from controller_node.controller import controllers_of
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.scenario.resolution import assumed_model, loop_of, rule_of
+from noack.scenario.estimation import assumed_model
+from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import network_delay_ns
 from plant_server.plant import disturbance_of, measurement_model_of, plants_of

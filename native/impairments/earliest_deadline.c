@@ -4,5 +4,5 @@
 
 void apply_earliest_deadline(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;
-    enter_queue(packet, flow_number(packet, stage), 1);
+    enter_queue(packet, flow_table_entry(packet, stage), 1);
 }

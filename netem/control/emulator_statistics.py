@@ -23,8 +23,8 @@ from typing import NamedTuple, Self, TypedDict, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.relay import Relay
-from netem.relay_links import (
+from netem.relay.relay import Relay
+from netem.relay.relay_links import (
     DIRECTIONS,
     Direction,
     DirectionReport,
@@ -223,7 +223,7 @@ class FlowStatistics(TypedDict):
 
 
 class DirectionStatistics(TypedDict):
-    """One direction of a link; see :class:`netem.relay_links.DirectionReport`.
+    """One direction of a link; see :class:`netem.relay.relay_links.DirectionReport`.
 
     The counts are those of :class:`noack.impairments.link_settings.Counters`.
     """
@@ -263,7 +263,7 @@ class DirectionStatistics(TypedDict):
 
 
 class LinkStatistics(TypedDict):
-    """One link; see :class:`netem.relay_links.LinkReport`."""
+    """One link; see :class:`netem.relay.relay_links.LinkReport`."""
 
     name: str
     listen: str
@@ -396,7 +396,7 @@ def _share(counters: Counters, lost: int) -> float | None:
 
 
 def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
-    """Return quantiles of a histogram of :mod:`netem.relay_links`."""
+    """Return quantiles of a histogram of :mod:`netem.relay.relay_links`."""
     if not counts.any():
         return {"p50": None, "p99": None, "p999": None, "max": None}
     p50, p99, p999, largest = (round(quantile_ns(counts, q)) for q in (0.5, 0.99, 0.999, 1.0))

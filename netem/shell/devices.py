@@ -22,7 +22,7 @@ from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address
 from pathlib import Path
 from typing import NoReturn
 
-from netem.relay_links import LinkSpec
+from netem.relay.relay_links import LinkSpec
 from netem.shell import process
 from noack.core.errors import CallerError
 from noack.core.process_limits import python_command
@@ -51,7 +51,7 @@ _RESTRICTIONS = {
 
 @dataclass(frozen=True)
 class DeviceLink:
-    """The link between the two devices, in the place of a :class:`netem.relay_links.OpenLink`."""
+    """The link between the two devices, in the place of a :class:`netem.relay.relay_links.OpenLink`."""
 
     spec: LinkSpec
     devices: tuple[int, int]

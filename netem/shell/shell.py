@@ -1,6 +1,6 @@
 """``noack netem shell``: a command whose IP packets all pass a link, as in mahimahi's shells.
 
-The command runs in a network namespace with one device. The relay of :mod:`netem.relay` reads its
+The command runs in a network namespace with one device. The relay of :mod:`netem.relay.relay` reads its
 packets there and writes them to a device outside, and the other way round.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from netem.emulator_options import parsed, shell_parser, shell_spec
-from netem.relay_links import report_line
+from netem.relay.relay_links import report_line
 from netem.shell import process
 from netem.shell.devices import DeviceLink, open_devices
 from netem.stand_alone import add_recording_options, check_options, relay, report_totals

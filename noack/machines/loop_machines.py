@@ -101,17 +101,17 @@ Part = TypeVar("Part", bound=MachinePart)
 
 
 def parts_of(
-    loops: Sequence[Scenario], part: Callable[[Scenario], Part], redrawn: Callable[[Part, Scenario], Part]
+    loops: Sequence[Scenario], part: Callable[[Scenario], Part], with_draws: Callable[[Part, Scenario], Part]
 ) -> tuple[list[Part], list[int]]:
     """Return each loop's part, and the first loop from which it differs in draws only.
 
-    ``part`` makes the part of such a first loop; ``redrawn`` changes it for the others.
+    ``part`` makes the part of such a first loop; ``with_draws`` makes those of the others of it.
     """
     firsts: dict[tuple[int, ...], int] = {}
     templates = [firsts.setdefault(settings_key(loop), number) for number, loop in enumerate(loops)]
     parts: list[Part] = []
     for number, (loop, first) in enumerate(zip(loops, templates, strict=True)):
-        parts.append(part(loop) if number == first else redrawn(parts[first], loop))
+        parts.append(part(loop) if number == first else with_draws(parts[first], loop))
     return parts, templates
 
 

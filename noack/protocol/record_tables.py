@@ -299,6 +299,21 @@ def _fields(columns: tuple[Column, ...], shape: RecordShape) -> list[tuple[objec
     return fields
 
 
+def network_tables() -> Mapping[str, np.dtype[np.void]]:
+    """Return the row types of the tables of the network, which do not depend on the scenario."""
+    return {table: dtype for table, dtype in tables(1, 1).items() if OWNER[table] == "netem"}
+
+
+def has_loop(table: str) -> bool:
+    """Whether each row of a table in the record of a run has the number of its loop."""
+    return OWNER[table] != "netem" and table not in CLOCK_TABLES
+
+
+def is_of_network(table: str) -> bool:
+    """Whether a table has the rows of the network, which its loops share."""
+    return OWNER[table] == "netem" and table not in CLOCK_TABLES
+
+
 UPDATES, ACKNOWLEDGEMENTS, ACTUATIONS = 0, 1, 1
 """The network emulator's directions: from the sensor; from the controller, which sends
 acknowledgements or actuations through the network, or neither."""

@@ -7,5 +7,6 @@
 3. ``scenario_checks.py``: tables that depend on each other; ``link_load.py`` and
    ``response_times.py``: whether a shared link can carry its loops.
 4. ``resolution.py``: names and random draws become numbers. Machines are made of the result.
+   ``estimation.py``: the model of its observer.
 5. ``runtime_parameters.py`` and ``parameter_changes.py``: changes during a run.
 """

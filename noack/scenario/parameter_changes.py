@@ -150,7 +150,7 @@ class ChangeSchedule(Generic[Prepared]):
         self._timeline = [AppliedParameters[Prepared](-(2**63), -1, {}, scenario, None)]
         self._taken = 1
 
-    def of_alike(self, scenario: Scenario) -> "ChangeSchedule[Prepared]":
+    def for_similar_loop(self, scenario: Scenario) -> "ChangeSchedule[Prepared]":
         """Return a schedule for a loop that differs in its draws only.
 
         What the same changes make of the scenario is computed once for both.

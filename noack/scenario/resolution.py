@@ -1,15 +1,14 @@
 """From a scenario to a run: named models become matrices, random draws become numbers.
 
 The result is again a scenario: the resolved scenario. Running it repeats the run's draws exactly.
-What follows from it is here, too: matrices, the trigger's policy, the tables of its record, and the
-noise of its plant and of its observer's model.
+What follows from it is here, too: matrices, the trigger's policy, and the tables of its record.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import cycle
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
-from noack.observers.observer_settings import EstimationModel, unobservable_mode
-from noack.protocol.record_tables import CLOCK_TABLES, LOOP, OWNER, RecordShape, entry_names, largest, tables
+from noack.observers.observer_settings import unobservable_mode
+from noack.protocol.record_tables import LOOP, RecordShape, entry_names, has_loop, largest, tables
 from noack.scenario.link_load import proven_delays
 from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, loops_by_entry
 from noack.scenario.scenario_checks import input_at
@@ -317,11 +316,6 @@ def shape_of(resolved: Scenario) -> RecordShape:
     )
 
 
-def network_tables() -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of the tables of the network, which do not depend on the scenario."""
-    return {table: dtype for table, dtype in tables(1, 1).items() if OWNER[table] == "netem"}
-
-
 def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
     """Return the row types of the tables of a run, as its processes send them.
 
@@ -333,70 +327,3 @@ def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
         table: np.dtype([(LOOP, "<u2"), *dtype.descr]) if has_loop(table) else dtype
         for table, dtype in tables(**vars(largest(shapes))).items()
     }
-
-
-def has_loop(table: str) -> bool:
-    """Whether each row of a table in the record of a run has the number of its loop."""
-    return OWNER[table] != "netem" and table not in CLOCK_TABLES
-
-
-def is_of_network(table: str) -> bool:
-    """Whether a table has the rows of the network, which its loops share."""
-    return OWNER[table] == "netem" and table not in CLOCK_TABLES
-
-
-class SteadyState(NamedTuple):
-    """The estimation error in the steady state, if the plant equals the model."""
-
-    gain: Matrix  # the observer's gain, (n, p)
-    radius: float
-    """Spectral radius of (I − L C)Â^(T), the factor by which the error shrinks per measurement;
-    infinite if no steady state is found."""
-    covariance: Matrix
-    """Covariance of x̂ − x right after a measurement, (n, n), caused by random disturbances and
-    noise only; infinite if the error does not decay."""
-
-
-def true_model(resolved: Scenario) -> EstimationModel:
-    """The model with the covariances of the scenario's disturbances and noise."""
-    loop, plant = loop_of(resolved), resolved.plant
-    noise = plant.noise_variances(loop.n, loop.m)
-    Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
-    _, Gd = discretise(loop.A_model, np.eye(loop.n), resolved.timing.plant_period_ns)
-    C = plant.measurement.matrix(loop.n)
-    model = EstimationModel(Ad, Bd, Gd, C, np.zeros_like(Ad), np.diag(noise.output), plant.measure_every)
-    return model._replace(Q=model.process_covariance(noise.at_state, noise.at_input))
-
-
-def assumed_model(resolved: Scenario) -> EstimationModel:
-    """The model with the covariances that the observer assumes."""
-    model, observer = true_model(resolved), resolved.observer
-    if observer is None:
-        return model
-    noise = resolved.plant.noise_variances(*resolved.model.dimensions)
-    return observer.assumed_model(model, noise)
-
-
-def steady_state(resolved: Scenario) -> SteadyState:
-    """Return the steady state of the estimation error of a resolved scenario.
-
-    The covariance P solves P = F P Fᵀ + (I − LC) Q (I − LC)ᵀ + L R Lᵀ with F = (I − LC)Â^(T). Q and
-    R are the scenario's own, even if the observer assumes others. Without an observer x̂ = y, L =
-    I.
-    """
-    # Imported here: a sensor without an observer does not need this large module.
-    from scipy.linalg import solve_discrete_lyapunov
-
-    true, observer = true_model(resolved), resolved.observer
-    A, Q = true.between_measurements()
-    n, C = len(A), true.C
-    L = np.eye(n) if observer is None else observer.steady_gain(assumed_model(resolved))
-    if L is None:
-        return SteadyState(np.full((n, len(C)), np.nan), np.inf, np.full((n, n), np.inf))
-    update_factor = np.eye(n) - L @ C
-    radius = float(np.abs(np.linalg.eigvals(update_factor @ A)).max())
-    if radius >= 1:
-        return SteadyState(L, radius, np.full((n, n), np.inf))
-    added = update_factor @ Q @ update_factor.T + L @ true.R @ L.T
-    covariance = np.asarray(solve_discrete_lyapunov(update_factor @ A, added), dtype=np.float64)
-    return SteadyState(L, radius, covariance)

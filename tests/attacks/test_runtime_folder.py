@@ -16,12 +16,12 @@ import rerun.blueprint as rrb
 import noack
 from cosim.doctor.machine_measures import _runtime_folder_problem
 from cosim.measurement.live_measurement import ProbeRows
-from cosim.output.viewer.recording import RecordingFile
+from cosim.output.viewer.loop_recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
 from netem.capture import CaptureWriter
 from netem.control import control_server as emulator_session
 from netem.fates import FateRecorder
-from netem.relay_links import LinkSpec
+from netem.relay.relay_links import LinkSpec
 from noack.core.errors import CallerError, NoackError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime import control_plane

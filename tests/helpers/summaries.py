@@ -33,3 +33,11 @@ def with_values(run: RunSummary, **more: Any) -> RunSummary:
     for part, model in ((loop, LoopSummary), (document, RunSummary)):
         part |= {key: value for key, value in more.items() if key in model.model_fields}
     return RunSummary.model_validate(document)
+
+
+def claim(verdict: str, **more: Any) -> dict[str, Any]:
+    """A claim about a loop, in the form of the summary."""
+    return {
+        "what": "a", "source": "certificate", "bound": "c", "ratio": 1.0, "since_s": 1.0, "why": "",
+        "verdict": verdict, "certified": 1.0, "observed": 1.0, "from_s": 0.0, "until_s": None, **more,
+    }  # fmt: skip

@@ -22,7 +22,8 @@ from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import MachineError
 from noack.protocol.roles import ROLES
 from tests.command_line import invoke
-from tests.cosim.output.viewer.test_viewer import is_left, read
+from tests.cosim.output.viewer.recordings import read
+from tests.helpers.waiting import is_left
 from tests.integration import conftest as live
 
 Start = Callable[..., live.Running]
@@ -328,7 +329,7 @@ WALL_CLOCK = {
     "cosim/live/coordinator.py": "when a change was requested",
     "cosim/live/remote_access.py": "the validity of an invitation",
     "noack/protocol/ros2_node.py": "the time stamps of messages of ROS 2",
-    "netem/relay.py": "the times of a capture",
+    "netem/relay/relay.py": "the times of a capture",
     "netem/control/emulator_statistics.py": "lines of statistics",
     "native/relay/loop.c": "time stamps of the kernel, compared with the monotonic clock",
     "noack/runtime/host_clocks/time_exchange.py": "the same",

@@ -34,7 +34,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.roles import LOOP_ROLES
 from tests.command_line import invoke
-from tests.cosim.output.viewer.test_viewer import read, series
+from tests.cosim.output.viewer.recordings import read, series
 from tests.integration.conftest import (
     AT_RATE,
     Finished,

@@ -2,7 +2,8 @@
 
 1. ``observed_conditions.py``: the conditions under which a run took place, and which assumptions
    they violate. ``condition_reader.py`` reads them from the rows of the record.
-2. ``run_evidence.py``: signals, conditions and certificates, against which claims are checked.
+2. ``run_evidence.py``: signals, conditions and certificates, against which claims are checked;
+   ``trajectory_delta.py``: Theorem 1's Δ from a trajectory.
 3. ``claim_definition.py``: the form of a claim; ``catalogue`` has the claims.
 4. ``claim_evaluation.py``: checks all of them, for each part of a run.
 """

@@ -23,7 +23,7 @@ with lazy_modules():
     from cosim.analysis import fidelity as fidelity_analysis
     from cosim.analysis.summary import run_summary
     from cosim.live import finalize
-    from cosim.output import result_tables, run_tables, run_verdict
+    from cosim.output import result_tables, run_tables, terminal_output
     from cosim.output.figures import figure_files, run_figures
     from cosim.output.viewer import live_viewer, rerun_program
     from cosim.record import collection, run_directory, run_record
@@ -49,7 +49,7 @@ def summary(
         noack summary runs/latest --json   all numbers, as JSON
     """
     outcome = run_summary.outcome_of_loop(reopened(run.path), run.loop)
-    cli.show(json, outcome.summary.to_json, run_verdict.print_outcome, outcome, verbose=verbose)
+    cli.show(json, outcome.summary.to_json, terminal_output.print_outcome, outcome, verbose=verbose)
     cli.write_tables(run_tables.summary_tables(outcome.summary), tables, json=json)
 
 
@@ -161,7 +161,7 @@ def fidelity(
         result = fidelity_analysis.compute_fidelity(run_record.load_record(run.path, run.loop))
         if out is not None:
             figure_files.save_figure(run_figures.fidelity_figure(result), out, width)
-    cli.show(json, result.as_json, run_verdict.print_fidelity, result)
+    cli.show(json, result.as_json, terminal_output.print_fidelity, result)
     return ExitStatus.OK if result.explained else ExitStatus.FAILED
 
 
@@ -307,7 +307,7 @@ def collect(
         merged, roles = collection.collect(run_dir, source, finalize.reopen)
         outcome = replace(merged, run_dir=run_dir)
         print_to_stderr(f"noack: {source}: took what {', '.join(roles) or 'no process'} kept")
-    cli.show(json, outcome.summary.to_json, run_verdict.print_outcome, outcome)
+    cli.show(json, outcome.summary.to_json, terminal_output.print_outcome, outcome)
 
 
 @cli.command(cli.RUNS, 80, takes="about a second")

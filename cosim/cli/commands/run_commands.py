@@ -17,11 +17,11 @@ from noack.core.number_format import number
 
 with lazy_modules():
     from cosim.analysis.summary import summary_model
-    from cosim.interactive import draft
+    from cosim.interactive import scenario_draft
     from cosim.lab import lab_server
     from cosim.live import remote_access
     from cosim.live.monitoring import progress, ros2_bridge
-    from cosim.output import result_tables, run_tables, run_verdict
+    from cosim.output import result_tables, run_tables, run_verdict, terminal_output
     from cosim.simulation import continuous, virtual_time
     from noack.runtime import control_messages, control_plane
     from noack.scenario import link_load, resolution, runtime_parameters, scenario, scenario_file
@@ -58,7 +58,7 @@ def lab(
         raise CallerError(
             "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the repository"
         )
-    edited = draft.open_draft(source.scenario)
+    edited = scenario_draft.open_draft(source.scenario)
     for key, value in map(scenario_file.setting_of, source.settings or ()):
         edited = edited.with_value(key, value)
     _ = edited.scenario  # report mistakes here
@@ -206,7 +206,7 @@ def _print_run(
         ("‖x‖ at the end", number(summary.final_state_norm)),
     )
     title = run_tables.title_of(summary.scenario, summary.mode, summary.mansd, (), "continuous")
-    run_verdict.print_numbers(console, title, rows)
+    terminal_output.print_numbers(console, title, rows)
     table = _event_table(run)
     console.print(result_tables.terminal_table(table, left=(), styles={"lost": "red"}))
     if len(run.before) > _EVENTS_SHOWN:

@@ -26,7 +26,7 @@ with lazy_modules():
     from cosim.doctor import findings, machine_measures
     from cosim.live import launcher
     from cosim.live.processes import child_processes
-    from cosim.output import run_verdict
+    from cosim.output import terminal_output
     from cosim.studies.campaign import campaign_file
     from cosim.studies.new_loop import linear_model, new_scenario
     from netem import tc_words
@@ -166,7 +166,7 @@ def check(source: opt.ScenarioOptions, *, json: opt.JsonOption = False) -> None:
     console.width -= len(_COMMENT)
     with console.capture() as captured:  # printed last: the plant may be rejected
         console.print("the paper's assumptions for this scenario:")
-        run_verdict.print_assumptions(console, assumptions.assumptions(resolved))
+        terminal_output.print_assumptions(console, assumptions.assumptions(resolved))
         _print_plant(console, resolved)
     if json:
         cli.print_json(resolved.model_dump(mode="json"))

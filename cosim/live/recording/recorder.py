@@ -50,12 +50,12 @@ from noack.scenario.scenario import Scenario, loop_names
 
 with lazy_modules():
     from cosim.live.recording import claim_monitor
-    from cosim.output.viewer import live_viewer, rerun_program, run_feed, run_recording
+    from cosim.output.viewer import live_feed, live_viewer, rerun_program, run_recording
 
 if TYPE_CHECKING:
     from cosim.live.recording.claim_monitor import ClaimMonitor, Finding
+    from cosim.output.viewer.live_feed import LiveFeed
     from cosim.output.viewer.live_viewer import LiveView
-    from cosim.output.viewer.run_feed import RunFeed
     from cosim.output.viewer.run_recording import RunRecording
 
 _DISCOVERY_S = 5.0
@@ -172,7 +172,7 @@ class Recorder:
         self._plane = plane
         self.store = TelemetryStore(scenario, run_dir, plane.instance, start)
         self._scenario = scenario
-        self._feed: RunFeed | None = None
+        self._feed: LiveFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
         self._blind_reported = self.is_stopping = False
@@ -214,7 +214,7 @@ class Recorder:
 
     def show_in(self, view: "RunRecording") -> None:
         """Show the telemetry in a view, from the first batch that is handled afterwards."""
-        self._feed = run_feed.RunFeed(self._scenario, view, self._progress.add_warning)
+        self._feed = live_feed.LiveFeed(self._scenario, view, self._progress.add_warning)
 
     def poll(self) -> bool:
         """Handle messages that have arrived; return whether there may be more.

@@ -46,10 +46,10 @@ from cosim.analysis.summary.summary_model import RunSummary
 from cosim.output.figures.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_viewer import LiveView
+from cosim.output.viewer.loop_feed import LoopFeed, log_level
+from cosim.output.viewer.loop_recording import LoopView, Nanoseconds, RecordingFile, ViewError, run_text
 from cosim.output.viewer.network_diagram import NetworkDiagram
 from cosim.output.viewer.pictures.picture import picture_of
-from cosim.output.viewer.recording import LoopView, Nanoseconds, RecordingFile, ViewError, run_text
-from cosim.output.viewer.table_feed import ViewFeed, log_level
 from cosim.record.decimation import Reals, is_long
 from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
@@ -340,7 +340,7 @@ def _write_network_view(
 def _feed_record(record: RunRecord, recording: RunRecording, number: int = 0) -> None:
     """Pass a loop's record to its view, part by part, while there is space in the folder."""
     columns = record.slice_columns if is_long(record.scenario) else None
-    feed = ViewFeed(record.scenario, recording.views[number], columns)
+    feed = LoopFeed(record.scenario, recording.views[number], columns)
     for i, part in enumerate(record.slices()):
         require_space(recording.path.parent)
         if i:

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, discretise
-from noack.scenario.resolution import assumed_model, loop_of
+from noack.scenario.estimation import assumed_model
+from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import EstimationBound
 from noack.theory.bounds.contraction import largest_gains, spectral_norm, times

@@ -13,7 +13,8 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.core.number_format import at_least
-from noack.scenario.resolution import LoopMatrices, SteadyState, loop_of, policy_of, steady_state
+from noack.scenario.estimation import SteadyState, steady_state
+from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.theory.bounds.certificate_terms import Constants, NetworkConditions

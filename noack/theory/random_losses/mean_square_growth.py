@@ -8,7 +8,7 @@ X_j = E[z zᵀ; state j] therefore follow
     X_j ← Σ_i (L_ij M₁ X_i M₁ᵀ + P_ij M₀ X_i M₀ᵀ),
 
 and E‖z‖² grows exactly like the powers of this operator's spectral radius. Almost surely, ‖z‖ grows
-per period by at most the root of that; :mod:`noack.theory.random_losses.random_growth` has a
+per period by at most the root of that; :mod:`noack.theory.random_losses.almost_sure_growth` has a
 smaller bound.
 
 The spectral radius is computed in double precision, in coordinates of the maps' common range. That

@@ -11,8 +11,8 @@ import noack
 from cosim.interactive import exploration
 from cosim.interactive import scenario_guarantee as guarantee
 from cosim.interactive.exploration_figure import ExploredRun, exploration_figure
+from cosim.interactive.exploration_words import Reference, compare, verdict_of
 from cosim.lab.page_parts import figure_part
-from cosim.lab.run_views import Reference, compare, verdict_of
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.core.errors import CallerError

@@ -19,8 +19,8 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
-from cosim.interactive.draft import open_draft
 from cosim.interactive.exploration_figure import CERTIFICATE
+from cosim.interactive.scenario_draft import open_draft
 from cosim.interactive.scenario_guarantee import Margin
 from cosim.lab import lab_server, lab_services, live_run
 from cosim.lab.lab_server import AddressGuard, LabOptions

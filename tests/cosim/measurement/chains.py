@@ -7,6 +7,8 @@ from cosim.measurement.chain_fits import ChainRates
 from noack.traces.packet_trace import PacketTrace, packet_trace
 
 PERIOD_NS = 20_000_000
+GILBERT = ChainRates(0.02, 0.2, 0.0, 1.0)
+ELLIOTT = ChainRates(0.02, 0.1, 0.01, 0.6)
 
 
 def chain_losses(count: int, rates: ChainRates, seed: int) -> NDArray[np.bool_]:

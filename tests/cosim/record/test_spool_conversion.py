@@ -17,10 +17,10 @@ from cosim.record.spool_conversion import Segment, finish_record, merged, write_
 from cosim.record.table_files import StoredTables, TableFile, write_table
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.errors import MachineError
-from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP
+from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP, network_tables
 from noack.protocol.roles import Notice
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL, SpoolWriter, notices_of
-from noack.scenario.resolution import network_tables, run_tables
+from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import validate
 
 LOOPS = 3

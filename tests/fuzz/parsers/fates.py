@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 
 from netem.fates import METADATA, SCHEMA, description, read_fates
-from netem.relay_links import LinkSpec
+from netem.relay.relay_links import LinkSpec
 from netem.tc_words import settings_of
 from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.edits import Choices, Vocabulary, edited, edited_table, written

@@ -10,7 +10,7 @@ from unittest.mock import patch
 import tomli_w
 
 from netem.control.control_server import ControlServer, SettingsChange
-from netem.relay_links import DIRECTIONS
+from netem.relay.relay_links import DIRECTIONS
 from netem.tc_words import EXAMPLES as ANY_WORD
 from netem.tc_words import json_schema, load_links, parse, settings_of, tc_command, words_of
 from noack.core.errors import CallerError

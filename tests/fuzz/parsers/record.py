@@ -20,7 +20,7 @@ from cosim.analysis.summary.run_summary import Outcome, summarise
 from cosim.analysis.summary.summary_model import ExitPart, LoopSummary
 from cosim.live.finalize import reopen
 from cosim.live.recording.recorder import Recorder
-from cosim.output.run_verdict import print_outcome
+from cosim.output.terminal_output import print_outcome
 from cosim.record.record_source import with_loop
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem import relay_links
 from netem.control.emulator_statistics import CommandQueue
-from netem.relay import Relay
-from netem.relay_links import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport, LinkSpec
+from netem.relay import relay_links
+from netem.relay.relay import Relay
+from netem.relay.relay_links import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport, LinkSpec
 from netem.stand_alone import _add_watching_options, check_watching_options
 from netem.tc_words import settings_of
 from noack.core.core_library import core

@@ -27,7 +27,7 @@ from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.conftest import Emulate
 from tests.netem.control import fake_relay as relays
 from tests.netem.control.fake_relay import FakeRelay, press_q, read_until, terminal
-from tests.netem.fates.links import spec_of
+from tests.netem.fate_links import spec_of
 from tests.netem.relay.relays import endpoints
 
 

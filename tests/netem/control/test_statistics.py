@@ -25,13 +25,13 @@ from netem.control.emulator_statistics import (
 )
 from netem.control.statistics_view import History, render
 from netem.fates import SCHEMA, FateRecorder
-from netem.relay_links import FlowReport
+from netem.relay.relay_links import FlowReport
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
 from tests.helpers.approved import compare_text
 from tests.netem.control.fake_relay import FakeRelay, running, times
-from tests.netem.fates.links import spec_of
+from tests.netem.fate_links import spec_of
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem import relay_memory
-from netem.relay_links import DirectionReport
+from netem.relay import relay_memory
+from netem.relay.relay_links import DirectionReport
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.runtime import udp_sockets

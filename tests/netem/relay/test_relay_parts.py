@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.client_table import LinkWarnings
-from netem.relay_links import (
+from netem.relay.client_table import LinkWarnings
+from netem.relay.relay_links import (
     BUCKETS,
     LinkSpec,
     bucket_start_ns,
@@ -21,7 +21,7 @@ from netem.relay_links import (
     socket_name,
     unpacked_address,
 )
-from netem.relay_memory import RelayMemory, name_array
+from netem.relay.relay_memory import RelayMemory, name_array
 from netem.tc_words import settings_of
 from noack.core.core_library import core, pointer_to
 from noack.core.errors import CallerError
@@ -148,7 +148,7 @@ def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
 ) -> None:
     """Half of the datagrams are delayed or copied; clients appear and expire."""
     rounds, size, most_clients = 8, 300, 5
-    monkeypatch.setattr("netem.relay._RARE_PERIOD_NS", 0)
+    monkeypatch.setattr("netem.relay.relay._RARE_PERIOD_NS", 0)
     harsh = settings_of("loss 30% duplicate 30% delay 1ms 1ms mansd 3")
     with (
         endpoints(HOSTS[4]) as (server,),

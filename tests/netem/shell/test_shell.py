@@ -18,7 +18,7 @@ import pytest
 
 from netem.__main__ import main
 from noack.protocol.record_tables import Fate
-from tests.netem.capture.reader import read
+from tests.netem.capture_reader import read
 
 ENDS = str(Path(__file__).with_name("ends.py"))
 SHELL = [sys.executable, "-m", "netem", "shell"]

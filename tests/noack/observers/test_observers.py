@@ -22,7 +22,8 @@ from noack.core.linear_systems import row_norms
 from noack.observers.observer_settings import observer_gain, unobservable_mode
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import GENERATION, RESTART, Start
-from noack.scenario.resolution import assumed_model, resolve, steady_state, true_model
+from noack.scenario.estimation import assumed_model, steady_state, true_model
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed

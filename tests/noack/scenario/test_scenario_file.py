@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 import tomli_w
 
-import noack
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from netem.tc_words import load_links
 from noack.core.errors import CallerError
@@ -21,7 +20,6 @@ from noack.scenario import toml_file
 from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import dumps, load, put, validate, value_of
 from noack.settings.section import ScenarioSection
-from noack.settings.user_files import NamedFile
 from tests.helpers.approved import compare_lines
 from tests.helpers.shipped import skip_without_plant
 
@@ -129,15 +127,6 @@ def test_a_setting_names_an_entry_of_a_list(tmp_path: Path) -> None:
     assert [(one.name, one.mode) for one in found.loops] == [("a", None), ("c", "zoh")]
     with pytest.raises(CallerError, match=r"^--set loops\.1\.name = .a.: the name a is already"):
         load(path, ["loops.1.name=a"])
-
-
-class Car:
-    """A user's plant class; only its name is used."""
-
-
-def test_a_class_is_given_by_its_file_and_name() -> None:
-    with pytest.raises(CallerError, match="Car: a class is given by its file and its name: "):
-        noack.load("double_integrator", {"plant.system": Car})
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -291,10 +280,3 @@ def test_a_missing_file_suggests_only_files_of_its_type(tmp_path: Path) -> None:
         toml_file.read(tmp_path / "none.toml", _Named)
     near = f"did you mean {tmp_path}/one.toml?"
     assert str(caught.value) == f"{tmp_path}/none.toml: no such file; {near}"
-
-
-def test_only_regular_files_are_read(tmp_path: Path) -> None:
-    file = NamedFile("/dev/zero", tmp_path, "run.toml: network.loss")
-    for read in (file.content, file.sha256):
-        with pytest.raises(CallerError, match=r"cannot be read: not a regular file$"):
-            read()

@@ -1,25 +1,20 @@
 """The JSON Schema of scenario files, and properties of every kind in the registries."""
 
-import inspect
 import json
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 
 from cosim.analysis.replay import replay
 from cosim.simulation.virtual_time import simulate
-from netem.tc_words import LinksFile
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import put, validate, value_of
 from noack.scenario.sections import DISTURBANCES, OBSERVERS, POLICIES
 from noack.scenario.toml_file import json_schema
-from noack.settings import section as section_module
-from noack.settings.section import ScenarioSection
 
 ROOT = Path(__file__).parents[3]
 SHIPPED = sorted((ROOT / "scenarios").glob("*.toml"))
@@ -70,32 +65,6 @@ def test_the_schema_refuses_mistakes(validator: Any, content: dict[str, Any], se
     key, _, value = settings.partition("=")
     put(content, key, value_of(value, key), key)
     assert not validator.is_valid(content)
-
-
-def real_numbers(schema: Any) -> Iterator[Any]:
-    if isinstance(schema, dict):
-        if schema.get("type") == "float":
-            yield schema
-        schema = list(schema.values())
-    if isinstance(schema, list | tuple):
-        for part in schema:
-            yield from real_numbers(part)
-
-
-@pytest.mark.parametrize("file", [Scenario, LinksFile])
-def test_no_setting_accepts_infinity_or_nan(file: type[ScenarioSection]) -> None:
-    """The JSON Schema cannot express it."""
-    file.model_rebuild()
-    found = list(real_numbers(file.__pydantic_core_schema__))
-    assert len(found) > 20
-    assert {one.get("allow_inf_nan") for one in found} == {False}
-
-
-def test_sections_without_their_source_have_no_descriptions(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(inspect, "getsource", Mock(side_effect=OSError("no source")))
-    assert section_module._docstrings.__wrapped__("noack.scenario.scenario") == {}
 
 
 # --- every kind -----------------------------------------------------------------------------------

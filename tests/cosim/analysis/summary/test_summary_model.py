@@ -19,13 +19,13 @@ from cosim.analysis.summary.run_summary import Outcome, summarise
 from cosim.analysis.summary.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.output.report_page import Report, page
 from cosim.output.run_tables import key_numbers
-from cosim.output.run_verdict import print_outcome
+from cosim.output.terminal_output import print_outcome
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
-from noack.protocol.record_tables import NETEM_PACKET, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import NETEM_PACKET, SENSOR_MEASUREMENT, network_tables
 from noack.protocol.roles import GENERATION, RESTART
-from noack.scenario.resolution import network_tables, resolve
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed as altered
 from tests.helpers.summaries import summary_of, with_values

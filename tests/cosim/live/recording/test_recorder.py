@@ -19,7 +19,7 @@ from cosim.analysis.summary.run_summary import summarise
 from cosim.live.monitoring.progress import progress_line
 from cosim.live.recording import recorder
 from cosim.live.recording.recorder import Recorder
-from cosim.output.viewer.recording import ViewError
+from cosim.output.viewer.loop_recording import ViewError
 from cosim.record.record_source import with_loop
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_record

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.recording import ViewError
+from cosim.output.viewer.loop_recording import ViewError
 from cosim.output.viewer.run_recording import write_loop_view
 from cosim.record import decimation, run_record
 from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environment, write_scenario
@@ -17,7 +17,7 @@ from cosim.record.run_record import RunRecord, write_run
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from tests.cosim.output.viewer.test_viewer import read, series
+from tests.cosim.output.viewer.recordings import read, series
 from tests.cosim.record.changed_records import changed, copied
 from tests.helpers.shipped import resolved
 from tests.helpers.summaries import alone

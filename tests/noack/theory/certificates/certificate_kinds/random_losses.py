@@ -16,8 +16,8 @@ from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.random_losses.fixed_times import mean_squares
-from noack.theory.random_losses.moments import BurstCertificate, moment_at_events, moments_of_runs
+from noack.theory.random_losses.mean_square_bounds import mean_squares
+from noack.theory.random_losses.unlimited_losses import BurstCertificate, moment_at_events, moments_of_runs
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.oracles.continuous_loops import simulate_continuous_time
 from tests.oracles.lossy_loops import DRIFTING, STEPS, Reals, System, random_system, simulate, times_s

@@ -1,0 +1,152 @@
+"""What is said of an explored run: its verdict, and what distinguishes it from another run."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.analysis.summary.summary_model import ExitPart
+from cosim.interactive.exploration import Exploration
+from cosim.interactive.scenario_draft import differences, leaf, value_text
+from cosim.interactive.scenario_guarantee import CERTIFIED, VOID, Guarantee
+from cosim.output.run_verdict import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    NEUTRAL,
+    VerdictLine,
+    ending_line,
+    state_text,
+    transmission_line,
+)
+from noack.core.errors import ExitStatus
+from noack.core.number_format import number, percent
+from noack.runtime.life_cycle import HORIZON
+
+_MOST_SETTINGS, _LONGEST = 4, 28
+_NEARLY = 1.001
+_END = "‖x‖ at the end"
+_NOT_COMPARED = ("name", "ports", "recovery", "realtime")
+"""Tables and keys that do not change what the loop does."""
+
+
+class Reference(NamedTuple):
+    """A run that others are compared with."""
+
+    name: str
+    """What it is, in words."""
+    run: Exploration
+
+
+class Comparison(NamedTuple):
+    """What distinguishes a run from a reference."""
+
+    title: str
+    settings: str
+    """The settings that differ, with both values."""
+    rows: tuple[tuple[str, str, str, str], ...]
+    """Quantity, its value in the reference and in the run, and the difference in words."""
+
+
+def compare(reference: Reference, run: Exploration) -> Comparison:
+    """Compare a run with a reference."""
+    last_s = [float(shown.t_s[-1]) for shown in (reference.run, run)]
+    until_s = min(last_s)
+    until = f", until {number(until_s, 3)} s" if max(last_s) > until_s * _NEARLY else ""
+    before, after = (_measured(shown, until_s) for shown in (reference.run, run))
+    rows = (
+        *(_counts(name, before[name], after[name]) for name in ("transmissions", "lost")),
+        *(_sizes(name, before[name], after[name]) for name in (_END, "largest ‖e_c‖")),
+    )
+    return Comparison(f"compared with {reference.name}{until}", _settings(reference.run, run), rows)
+
+
+def _measured(run: Exploration, until_s: float) -> dict[str, float]:
+    """Return the numbers of a run up to a time."""
+    sent, drawn = run.event_s <= until_s, run.t_s <= until_s
+    errors = run.e_c_norm[drawn & run.controller_knows & np.isfinite(run.e_c_norm)]
+    return {
+        "transmissions": int(sent.sum()),
+        "lost": int((sent & ~run.delivered).sum()),
+        _END: float(np.interp(until_s, run.t_s, run.x_norm)),
+        "largest ‖e_c‖": float(errors.max(initial=0.0)) if len(errors) else math.nan,
+    }
+
+
+def _settings(other: Exploration, run: Exploration) -> str:
+    """Return which settings differ; matrices by their names only."""
+    before, after = (shown.scenario.model_dump(mode="json", exclude_none=True) for shown in (other, run))
+    changed = []
+    for key, _ in differences(before, after):
+        old, new = (leaf(content, key) for content in (before, after))
+        if key.partition(".")[0] in _NOT_COMPARED:
+            continue
+        is_long = any(len(_text(value)) > _LONGEST for value in (old, new))
+        changed.append(key if is_long else f"{key} {_text(old)} → {_text(new)}")
+    if not changed:
+        return "The settings are the same."
+    more = f" and {len(changed) - _MOST_SETTINGS} more" if len(changed) > _MOST_SETTINGS else ""
+    return f"Settings that differ: {', '.join(changed[:_MOST_SETTINGS])}{more}."
+
+
+def _text(value: object) -> str:
+    return value_text(value) if isinstance(value, str | int | float | list | dict) else "–"
+
+
+def _counts(name: str, before: float, after: float) -> tuple[str, str, str, str]:
+    change = after - before
+    words = f"{abs(change):g} {'more' if change > 0 else 'fewer'}" if change else "the same"
+    return name, f"{before:g}", f"{after:g}", words
+
+
+def _sizes(name: str, before: float, after: float) -> tuple[str, str, str, str]:
+    texts = [number(value, 3) if math.isfinite(value) else "–" for value in (before, after)]
+    words = "–"
+    if texts[0] == texts[1]:
+        words = "the same" if math.isfinite(before) else "–"
+    elif math.isfinite(before) and math.isfinite(after) and before > 0:
+        ratio = number(after / before, 3)
+        words = "nearly the same" if ratio == "1" else f"{ratio} times as large"
+    return name, texts[0], texts[1], words
+
+
+def verdict_of(run: Exploration, guarantee: Guarantee | None) -> tuple[VerdictLine, ...]:
+    """Return the verdict of an explored run, in the three lines that a live run ends with.
+
+    Without ``guarantee`` the certificate is still being computed.
+    """
+    horizon_s, reached_s = run.scenario.horizon_s, float(run.t_s[-1])
+    status, reason = ExitStatus.OK, HORIZON
+    if run.diverged_at_s is not None:
+        status, reason = ExitStatus.FAILED, f"diverged at {number(run.diverged_at_s, 4)} s"
+    elif run.cut:
+        status, reason = ExitStatus.INTERRUPTED, run.cut
+    first, largest, last = run.x_norm[0], float(np.nanmax(run.x_norm)), float(run.x_norm[-1])
+    state = state_text(float(first), largest, last, None) if run.diverged_at_s is None else ""
+    events = len(run.event_s)
+    return (
+        ending_line(ExitPart(status=status, reason=reason), reached_s, horizon_s, state),
+        _guarantee_line(run, guarantee),
+        transmission_line(events, events - run.lost),
+    )
+
+
+def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLine:
+    if guarantee is None:
+        return VerdictLine("guarantee: being computed", NEUTRAL)
+    if guarantee.verdict != CERTIFIED:
+        why = guarantee.reason if guarantee.verdict != VOID else f"{VOID}: {guarantee.reason}"
+        return VerdictLine(f"guarantee not checkable: {why}", DOUBTFUL)
+    with np.errstate(all="ignore"):
+        used = [
+            values / np.exp(np.interp(run.t_s, guarantee.t_s, np.log(bound)))
+            for values, bound in (
+                (np.where(run.controller_knows, run.e_c_norm, 0.0), guarantee.e_c),
+                (run.x_norm, guarantee.x),
+            )
+        ]
+    above = np.nanmax(np.stack([*used, np.zeros_like(run.t_s)]), axis=0) > 1
+    if above.any():
+        return VerdictLine(f"guarantee broken since {run.t_s[above][0]:.3f} s", BAD)
+    share = percent(float(np.nanmax(np.append(used[0], 0.0))))
+    return VerdictLine(f"guarantee kept: ‖e_c‖ was at most {share} of its bound", GOOD)

@@ -1,0 +1,287 @@
+"""A relay's clients: a row in its memory and a return path for each; and a link's warnings.
+
+:class:`ClientTable` accepts, finds and forgets clients. :class:`LinkWarnings` and
+:class:`UnintendedLosses` report on standard error what goes wrong: refused clients, unreachable
+servers, unintended losses.
+"""
+
+import errno
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from netem.relay.relay_links import (
+    Direction,
+    Endpoint,
+    LinkSpec,
+    OpenLink,
+    has_data,
+    report_line,
+    return_path,
+    stamp_arrivals,
+)
+from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
+from netem.shell.devices import DeviceLink
+from noack.core.core_library import core
+from noack.runtime.address import address_text, packed_name
+from noack.runtime.udp_sockets import drops_of
+
+KERNEL = "lost_in_kernel"
+_CAUSES = {
+    KERNEL: "were lost in the kernel, as its receive buffer was full",
+    os.strerror(errno.ENOBUFS): "were lost, as a queue on the way out was full",
+    os.strerror(errno.ENOMEM): "were lost, as there was no memory to delay them",
+}
+
+
+class LinkWarnings:
+    """Refused clients and the unreachable server of a link; each reason is reported once."""
+
+    def __init__(self, spec: LinkSpec) -> None:
+        self._spec = spec
+        self._full = False
+        self._reported: set[str] = set()
+
+    def accepts_client(self, clients: int) -> bool:
+        """Whether a client is accepted in addition to ``clients`` present ones."""
+        if clients >= self._spec.most_clients:
+            self._full = True
+            self._report(f"no more than {self._spec.most_clients} clients at once are served")
+        return not self._full
+
+    def no_descriptor_left(self, error: int, clients: int) -> bool:
+        """Whether an errno means that no file descriptor is left; if so, refuse further clients."""
+        if error not in (errno.EMFILE, errno.ENFILE):
+            return False
+        self._full = clients > 0  # the end of one makes place
+        self._report(
+            f"no file descriptors are left for more than {clients} clients; raise the limit (ulimit -n)"
+        )
+        return True
+
+    def client_removed(self) -> None:
+        """Accept clients again."""
+        self._full = False
+
+    def port_unreachable(self, answers: int) -> None:
+        """Set the total number of ICMP port-unreachable messages from the server's host."""
+        if answers:
+            self._report(
+                f"nothing listens on {address_text(self._spec.to)} (ICMP port unreachable); "
+                "what is sent there is lost"
+            )
+
+    def _report(self, reason: str) -> None:
+        if reason not in self._reported:
+            self._reported.add(reason)
+            report_line(f"link {self._spec.name}: {reason}")
+
+
+class UnintendedLosses:
+    """Losses that no setting caused, in one direction of a link.
+
+    They void the guarantee and are always reported.
+    """
+
+    def __init__(self, link: str, direction: Direction) -> None:
+        self._where = f"link {link}, {direction}"
+        self._counts: Counter[str] = Counter({KERNEL: 0})
+        self._reported: Counter[str] = Counter()
+
+    def lost_in_kernel(self, datagrams: int) -> None:
+        """Set the total number of datagrams that the kernel has dropped."""
+        self._set(KERNEL, datagrams)
+
+    def not_sent(self, error: int, datagrams: int) -> None:
+        """Set the total number of datagrams that could not be sent or stored, for one errno."""
+        self._set(os.strerror(error), datagrams)
+
+    def counts(self) -> Mapping[str, int]:
+        """Return the number of losses by cause."""
+        return dict(self._counts)
+
+    def report(self) -> None:
+        """Report the totals that have changed since the last call on standard error."""
+        for cause, datagrams in self._counts.items():
+            if datagrams > self._reported[cause]:
+                self._reported[cause] = datagrams
+                text = _CAUSES.get(cause, f"could not be sent ({cause})")
+                report_line(f"{self._where}: {datagrams} datagrams {text}, against the guarantee")
+
+    def _set(self, cause: str, datagrams: int) -> None:
+        if datagrams > 0:
+            self._counts[cause] = datagrams
+            if not self._reported[cause]:
+                self.report()
+
+
+_QUERIED_AT_ONCE = 64
+_STALL_NS = 1_000_000_000
+"""A relay that has not checked for idle clients for this time was stopped, or got no CPU time."""
+
+
+class ClientTable:
+    """All clients of a relay."""
+
+    def __init__(
+        self,
+        links: Sequence[OpenLink | DeviceLink],
+        warnings: Sequence[LinkWarnings],
+        directions: Sequence[RelayDirection],
+        memory: RelayMemory,
+    ) -> None:
+        self._links, self._warnings, self._directions = links, warnings, directions
+        self._memory = memory
+        self._free_rows = list(reversed(range(len(memory.clients))))
+        self._free_places: list[list[int]] = [[] for _ in links]
+        self._places = [0] * len(links)
+        self.ever = [0] * len(links)
+        self.present = [0] * len(links)
+        self._paths: dict[int, Endpoint] = {}
+        self._drops: dict[int, int] = {}
+        self.drops = [0] * len(links)
+        """(links,) Datagrams dropped by the kernel at the return paths, when last queried."""
+        self._not_queried: Iterator[int] = iter(())
+        self._idle_ns = np.array([round(link.spec.idle_s * 1e9) for link in links], np.int64)
+        self._expired_ns = 0
+
+    def add(self, link: int, name: bytes) -> None:
+        """Add a client by its packed name; if that is impossible, mark the link as full."""
+        warnings, present, path, error = self._warnings[link], self.present[link], None, 0
+        if warnings.accepts_client(present) and self._links[link].has_paths:
+            path, error = return_path(self._links[link].server)
+        if not warnings.no_descriptor_left(error, present) and warnings.accepts_client(present):
+            self._accept(link, name, path, error)
+        else:
+            self._directions[2 * link].row.full = 1
+
+    def expire(self, now_ns: int) -> None:
+        """Remove the clients that have been idle and have no datagram in flight."""
+        clients = self._memory.clients
+        if now_ns - self._expired_ns > _STALL_NS:
+            # The relay was stopped: datagrams that arrived meanwhile have not been read yet.
+            clients["last_ns"] = now_ns
+        self._expired_ns = now_ns
+        since_ns = now_ns - self._idle_ns[clients["link"]]
+        idle = (clients["number"] >= 0) & (clients["last_ns"] < since_ns)
+        for row in np.flatnonzero(idle & (clients["in_flight"] == 0)).tolist():
+            path = self._paths.get(row)
+            if path is None or not has_data(path):
+                self._forget(row)
+
+    def reconnect(self) -> None:
+        """Open the return paths again that could not be opened before."""
+        sockets, first = self._memory.sockets, self._memory.first_path
+        clients = self._memory.clients
+        for row in np.flatnonzero(sockets["error"][first:]).tolist():
+            server = self._links[clients["link"][row]].server
+            path, sockets["error"][first + row] = return_path(server)
+            if path is not None:
+                self._set_path(row, path)
+
+    def query_some_drops(self) -> None:
+        """Query the kernel's drop counters of some return paths; successive calls cover all."""
+        for _ in range(_QUERIED_AT_ONCE):
+            row = next(self._not_queried, None)
+            if row is None:
+                self._not_queried = iter(tuple(self._paths))
+                return
+            if row in self._paths:
+                self._query_drops(row)
+
+    def query_all_drops(self) -> None:
+        """Query the kernel's drop counters of all return paths."""
+        for row in self._paths:
+            self._query_drops(row)
+
+    def rows_of(self, link: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """Return the rows of a link's clients."""
+        clients = self._memory.clients
+        return np.flatnonzero((clients["number"] >= 0) & (clients["link"] == link))
+
+    def text(self, row: int) -> str:
+        """Return a client's address, or its flow, as text."""
+        client = self._memory.clients[row]
+        return self._links[int(client["link"])].client_text(client["name"].tobytes())
+
+    def stamp_arrivals(self, link: int) -> None:
+        """Enable kernel timestamps for the answers to a link's clients."""
+        for row in self.rows_of(link).tolist():
+            if row in self._paths:
+                stamp_arrivals(self._paths[row])
+
+    def close(self) -> None:
+        """Close all return paths."""
+        for path in self._paths.values():
+            path.close()
+        self._paths.clear()
+
+    def _accept(self, link: int, name: bytes, path: Endpoint | None, error: int) -> None:
+        if not self._free_rows:
+            self._grow()
+        row = self._free_rows.pop()
+        free = self._free_places[link]
+        if free:
+            place = free.pop()
+        else:
+            place = self._places[link]
+            self._places[link] += 1
+        number = self.ever[link]
+        self.ever[link] += 1
+        self.present[link] += 1
+        for direction in self._directions[2 * link : 2 * link + 2]:
+            direction.start_flow(place, number)
+        memory = self._memory
+        _, name_bytes = packed_name(self._links[link].name)
+        local, _ = packed_name(self._links[link].local)
+        client = memory.clients[row]
+        client["last_ns"] = memory.core.now_ns
+        client["number"], client["link"], client["place"] = number, link, place
+        client["in_flight"] = 0
+        client["name_bytes"] = name_bytes
+        client["name"], client["local"] = name_array(name), name_array(local)
+        core.noack_client_insert(memory.core, row)
+        memory.sockets["error"][self._memory.first_path + row] = error
+        memory.sockets["fd"][self._memory.first_path + row] = -1
+        if path is not None:
+            self._set_path(row, path)
+
+    def _set_path(self, row: int, path: Endpoint) -> None:
+        memory, place = self._memory, self._memory.first_path + row
+        if self._directions[2 * int(memory.clients["link"][row]) + 1].tracks:
+            stamp_arrivals(path)
+        self._paths[row] = path
+        self._drops[row] = 0
+        local, _ = packed_name(path.getsockname())
+        memory.clients["local"][row] = name_array(local)
+        memory.watch(path.fileno(), place)
+
+    def _forget(self, row: int) -> None:
+        memory = self._memory
+        link, place = int(memory.clients["link"][row]), int(memory.clients["place"][row])
+        core.noack_client_remove(memory.core, row)
+        if row in self._paths:
+            self._query_drops(row)
+            del self._drops[row]
+            self._paths.pop(row).close()
+        memory.clients["number"][row] = -1
+        memory.sockets["fd"][self._memory.first_path + row] = -1
+        memory.sockets["error"][self._memory.first_path + row] = 0
+        self._free_rows.append(row)
+        self._free_places[link].append(place)
+        self.present[link] -= 1
+        self._directions[2 * link].row.full = 0
+        self._warnings[link].client_removed()
+
+    def _grow(self) -> None:
+        count = len(self._memory.clients)
+        self._memory.add_clients()
+        self._free_rows.extend(reversed(range(count, 2 * count)))
+
+    def _query_drops(self, row: int) -> None:
+        drops = drops_of(self._paths[row])
+        if drops is not None:
+            self.drops[int(self._memory.clients["link"][row])] += drops - self._drops[row]
+            self._drops[row] = drops

@@ -1,0 +1,283 @@
+"""The relay: one thread, which runs the core and returns to Python for rare events."""
+
+import ctypes
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from netem.relay.client_table import ClientTable, LinkWarnings, UnintendedLosses
+from netem.relay.relay_links import (
+    DIRECTIONS,
+    Direction,
+    DirectionReport,
+    FlowReport,
+    LinkReport,
+    LinkSpec,
+    OpenLink,
+    Tap,
+    open_links,
+    set_receive_timeout,
+    stamp_arrivals,
+)
+from netem.relay.relay_memory import RelayDirection, RelayMemory
+from netem.shell.devices import DeviceLink
+from noack.core.core_library import core, ffi
+from noack.core.errors import CallerError
+from noack.impairments.link_settings import LinkSettings
+from noack.runtime.address import Address, packed_name
+
+_PERIOD_NS = 40_000_000
+_RARE_PERIOD_NS = 250_000_000
+_REPORTED_FLOWS = 16
+_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
+
+
+class Relay:
+    """A relay with its links; all of it is called in one thread.
+
+    Directions are numbered: 2·link forward, 2·link + 1 reverse.
+
+    Args:
+        specs: the links, at least one.
+        segment: send successive datagrams of equal size as one message, which the kernel segments,
+            if the kernel supports it.
+        taps: receivers of all events.
+        spin_ns: busy-wait instead of sleeping for this time before a delayed datagram is due, to
+            avoid the delay of a wake-up.
+        devices: those of a shell, in the place of sockets; its link is the only one.
+
+    Raises:
+        CallerError: a socket cannot be bound, or a link is invalid.
+    """
+
+    began_unix_ns: int | None = None
+    """Unix time at which it started to run; the origin of its times, including blackouts."""
+
+    def __init__(
+        self,
+        specs: Sequence[LinkSpec],
+        segment: bool = False,
+        taps: Sequence[Tap] = (),
+        spin_ns: int = 0,
+        devices: DeviceLink | None = None,
+    ) -> None:
+        self.specs: Sequence[LinkSpec] = tuple(specs)
+        self._open_links: Sequence[OpenLink | DeviceLink] = (
+            open_links(self.specs) if devices is None else [devices]
+        )
+        self._warnings = [LinkWarnings(spec) for spec in self.specs]
+        self._losses = [UnintendedLosses(spec.name, side) for spec in specs for side in DIRECTIONS]
+        self._epoch_ns = self._rarely_ns = 0
+        self._taps = tuple(taps)
+        data = any(tap.wants_data for tap in self._taps)
+        self._memory = RelayMemory(len(self.specs), segment, 1 + data if self._taps else 0)
+        self._memory.core.spin_ns = spin_ns
+        self._directions = [
+            RelayDirection(
+                getattr(spec, side),
+                spec.seed,
+                (spec.name, side),
+                self._memory.directions[2 * number + reverse],
+                spec.decisions.get(side, ()),
+            )
+            for number, spec in enumerate(self.specs)
+            for reverse, side in enumerate(DIRECTIONS)
+        ]
+        for number in range(len(self.specs)):
+            self._listen(number)
+        self._clients = ClientTable(self._open_links, self._warnings, self._directions, self._memory)
+        for number in range(len(self._directions)):
+            self._stamp_arrivals(number)
+
+    def addresses(self) -> Mapping[str, Address]:
+        """Return the address at which each link listens."""
+        return {link.spec.name: link.address for link in self._open_links}
+
+    def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
+        """Relay until ``stop()``; both are called at least every 100 ms, in this thread.
+
+        Meanwhile, the thread's timer slack is 1 ns.
+        """
+        prctl = ctypes.CDLL(None).prctl
+        slack_ns = prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+        prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+        try:
+            self._run(stop, housekeeping)
+        finally:
+            prctl(_PR_SET_TIMERSLACK, slack_ns, 0, 0, 0)
+
+    def _run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
+        if self.began_unix_ns is None:
+            self._epoch_ns, self.began_unix_ns = time.monotonic_ns(), time.time_ns()
+        while not stop():
+            housekeeping()
+            now_ns = self._now_ns()
+            self._do_housekeeping(now_ns)
+            self._relay_until(now_ns + _PERIOD_NS)
+        self._end()
+
+    def change(self, link: str, direction: Direction, settings: LinkSettings) -> None:
+        """Change a direction's impairments between two datagrams.
+
+        Flows keep their numbers, the positions in their random streams, and their counters. Packets
+        in flight leave at their planned times.
+
+        Raises:
+            CallerError: there is no such link.
+        """
+        names = [spec.name for spec in self.specs]
+        if link not in names:
+            raise CallerError(f"link {link}: there is none of this name, but {', '.join(names)}")
+        number = 2 * names.index(link) + DIRECTIONS.index(direction)
+        relayed = self._directions[number]
+        relayed.change(settings, self._memory.latest_ns(number, relayed.rows))
+        self._stamp_arrivals(number)
+
+    def report(self) -> Sequence[LinkReport]:
+        """Return the counts so far."""
+        self._update_losses()
+        reports = []
+        for number, link in enumerate(self._open_links):
+            clients, clients_ever, refused, port_unreachable = self._link_counts(number)
+            reports.append(
+                LinkReport(
+                    link.spec.name, link.address, link.spec.to, clients, clients_ever, refused,
+                    link.discarded, port_unreachable,
+                    self._report_direction(2 * number), self._report_direction(2 * number + 1),
+                )
+            )  # fmt: skip
+        return reports
+
+    def close(self) -> None:
+        """Close all sockets."""
+        for link in self._open_links:
+            link.close()
+        self._clients.close()
+        self._memory.close()
+
+    def _now_ns(self) -> int:
+        return time.monotonic_ns() - self._epoch_ns
+
+    def _end(self) -> None:
+        self._clients.query_all_drops()
+        self._update_losses()
+        for losses in self._losses:
+            losses.report()
+
+    def _update_losses(self) -> None:
+        for number, link in enumerate(self._open_links):
+            *_, port_unreachable = self._link_counts(number)
+            self._warnings[number].port_unreachable(port_unreachable)
+            self._losses[2 * number].lost_in_kernel(link.drops(False))
+            lost = self._clients.drops[number] + link.drops(True)
+            self._losses[2 * number + 1].lost_in_kernel(lost)
+        for direction, error, datagrams in self._send_errors():
+            self._losses[direction].not_sent(error, datagrams)
+
+    def _relay_until(self, until_ns: int) -> None:
+        """Relay datagrams, and pass their events to the taps."""
+        relay = self._memory.core
+        relay.clock.epoch_ns, relay.unix_ns = self._epoch_ns, self.began_unix_ns
+        while (reason := core.noack_relay_run(relay, until_ns)) != core.NOACK_HOUSEKEEPING:
+            if reason == core.NOACK_NEW_CLIENT:
+                name = bytes(ffi.buffer(core.noack_relay_sender(relay), core.NOACK_NAME_BYTES))
+                self._clients.add(core.noack_relay_receiver(relay) % len(self.specs), name)
+            elif reason == core.NOACK_STORE_FULL:
+                self._memory.add_room()
+            elif reason == core.NOACK_EVENTS_FULL:
+                self._report_events()
+        self._report_events()
+
+    def _report_events(self) -> None:
+        events, data = self._memory.take_events()
+        if len(events):
+            for tap in self._taps:
+                tap.take(events, data)
+
+    def _do_housekeeping(self, now_ns: int) -> None:
+        """Remove idle clients, open return paths again, check for losses."""
+        self._memory.core.no_memory = 0  # check again
+        self._clients.query_some_drops()
+        if now_ns >= self._rarely_ns:
+            self._rarely_ns = now_ns + _RARE_PERIOD_NS
+            self._update_losses()
+            self._clients.expire(now_ns)
+            self._clients.reconnect()
+
+    def _link_counts(self, link: int) -> tuple[int, int, int, int]:
+        """Return present clients, all clients, refused datagrams, ICMP port-unreachable errors."""
+        row = self._directions[2 * link].row
+        present, ever = self._clients.present[link], self._clients.ever[link]
+        return present, ever, row.refused, row.port_unreachable
+
+    def _send_errors(self) -> Iterator[tuple[int, int, int]]:
+        """Yield direction, errno and number of datagrams that could not be sent or stored."""
+        for number, direction in enumerate(self._directions):
+            counts = direction.counts_of("errors")
+            for error in np.flatnonzero(counts).tolist():
+                yield number, error, int(counts[error])
+
+    def _report_direction(self, number: int) -> DirectionReport:
+        direction = self._directions[number]
+        return DirectionReport(
+            settings=direction.settings,
+            counters=direction.counters,
+            unintended=self._losses[number].counts(),
+            in_flight=direction.core.in_flight,
+            flows=self._report_flows(number),
+            delays=direction.counts_of("delays"),
+            lateness=direction.counts_of("lateness"),
+        )
+
+    def _report_flows(self, direction: int) -> Sequence[FlowReport]:
+        clients, flows = self._memory.clients, self._directions[direction].flows
+        rows = self._clients.rows_of(direction // 2)
+        packets = flows["packets"][clients["place"][rows]]
+        busiest = rows[np.argsort(-packets, kind="stable")[:_REPORTED_FLOWS]].tolist()
+        return [
+            FlowReport(
+                int(clients["number"][row]),
+                self._clients.text(row),
+                int(flow["packets"]),
+                int(flow["longest_loss_burst"]),
+            )
+            for row, flow in zip(busiest, flows[clients["place"][busiest]], strict=True)
+        ]
+
+    def _listen(self, number: int) -> None:
+        link = self._open_links[number]
+        forward, reverse = self._directions[2 * number : 2 * number + 2]
+        if isinstance(link, DeviceLink):
+            self._memory.core.devices = 1
+            for index, device in enumerate(link.devices):
+                self._memory.watch(device, index)
+            forward.row.sends = core.NOACK_LINK_SOCKET
+            reverse.row.sends = core.NOACK_LISTENING_SOCKET
+            return
+        if len(self.specs) == 1 and not link.spec.return_path:
+            self._memory.wait_for_only(link.endpoint.fileno(), number, set_receive_timeout(link.endpoint))
+        else:
+            self._memory.watch(link.endpoint.fileno(), number)
+        sends = core.NOACK_OWN_SOCKET
+        if link.path is not None:
+            self._memory.sockets["fd"][len(self.specs) + number] = link.path.fileno()
+            sends = core.NOACK_DESTINATION_NAME
+            with suppress(OSError):  # there is no route now; perhaps later
+                # For a connected socket, the kernel looks up the route once, not per datagram.
+                link.path.connect(link.server)
+                sends = core.NOACK_LINK_SOCKET
+        forward.set_server(link.server, sends)
+        reverse.set_server(link.server, core.NOACK_CLIENT_NAME)
+        forward.row.listen, _ = packed_name(link.name)
+
+    def _stamp_arrivals(self, direction: int) -> None:
+        """Enable arrival timestamps where datagrams are delayed: delays count from the arrival."""
+        link = self._open_links[direction // 2]
+        if self._directions[direction].tracks and not isinstance(link, DeviceLink):
+            core.noack_relay_read_stamps(self._memory.core)
+            if direction % 2 == 0:
+                stamp_arrivals(link.endpoint)
+            else:
+                self._clients.stamp_arrivals(direction // 2)

@@ -1,0 +1,67 @@
+"""The discrete-time model of an observer, with the noise of the scenario, and its steady state."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.linear_systems import Matrix, discretise
+from noack.observers.observer_settings import EstimationModel
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
+
+
+class SteadyState(NamedTuple):
+    """The estimation error in the steady state, if the plant equals the model."""
+
+    gain: Matrix  # the observer's gain, (n, p)
+    radius: float
+    """Spectral radius of (I − L C)Â^(T), the factor by which the error shrinks per measurement;
+    infinite if no steady state is found."""
+    covariance: Matrix
+    """Covariance of x̂ − x right after a measurement, (n, n), caused by random disturbances and
+    noise only; infinite if the error does not decay."""
+
+
+def true_model(resolved: Scenario) -> EstimationModel:
+    """The model with the covariances of the scenario's disturbances and noise."""
+    loop, plant = loop_of(resolved), resolved.plant
+    noise = plant.noise_variances(loop.n, loop.m)
+    Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
+    _, Gd = discretise(loop.A_model, np.eye(loop.n), resolved.timing.plant_period_ns)
+    C = plant.measurement.matrix(loop.n)
+    model = EstimationModel(Ad, Bd, Gd, C, np.zeros_like(Ad), np.diag(noise.output), plant.measure_every)
+    return model._replace(Q=model.process_covariance(noise.at_state, noise.at_input))
+
+
+def assumed_model(resolved: Scenario) -> EstimationModel:
+    """The model with the covariances that the observer assumes."""
+    model, observer = true_model(resolved), resolved.observer
+    if observer is None:
+        return model
+    noise = resolved.plant.noise_variances(*resolved.model.dimensions)
+    return observer.assumed_model(model, noise)
+
+
+def steady_state(resolved: Scenario) -> SteadyState:
+    """Return the steady state of the estimation error of a resolved scenario.
+
+    The covariance P solves P = F P Fᵀ + (I − LC) Q (I − LC)ᵀ + L R Lᵀ with F = (I − LC)Â^(T). Q and
+    R are the scenario's own, even if the observer assumes others. Without an observer x̂ = y, L =
+    I.
+    """
+    # Imported here: a sensor without an observer does not need this large module.
+    from scipy.linalg import solve_discrete_lyapunov
+
+    true, observer = true_model(resolved), resolved.observer
+    A, Q = true.between_measurements()
+    n, C = len(A), true.C
+    L = np.eye(n) if observer is None else observer.steady_gain(assumed_model(resolved))
+    if L is None:
+        return SteadyState(np.full((n, len(C)), np.nan), np.inf, np.full((n, n), np.inf))
+    update_factor = np.eye(n) - L @ C
+    radius = float(np.abs(np.linalg.eigvals(update_factor @ A)).max())
+    if radius >= 1:
+        return SteadyState(L, radius, np.full((n, n), np.inf))
+    added = update_factor @ Q @ update_factor.T + L @ true.R @ L.T
+    covariance = np.asarray(solve_discrete_lyapunov(update_factor @ A, added), dtype=np.float64)
+    return SteadyState(L, radius, covariance)

@@ -1,0 +1,96 @@
+"""The form: a field for every key, and mistakes at their fields."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.interactive.scenario_draft import DraftError, draft_of_query, open_draft
+from cosim.interactive.settings_form import Field, by_field, filled, form_of
+from cosim.interactive.sliders import chosen, controls_of, dragged
+from cosim.shipped_files import shipped_names
+
+SCHEMA = json.loads((Path(__file__).parents[3] / "docs/scenario.schema.json").read_text(encoding="utf-8"))
+
+
+def field(key: str, scenario: str = "lane_following") -> Field:
+    (found,) = [one for one in form_of(open_draft(scenario)).all_fields() if one.key == key]
+    return found
+
+
+def leaves(content: Any, key: str = "") -> Iterator[str]:
+    if isinstance(content, dict) and content:
+        for name, inner in content.items():
+            yield from leaves(inner, f"{key}.{name}".removeprefix("."))
+    else:
+        yield key
+
+
+def test_every_key_of_the_schema_has_a_field() -> None:
+    keys = {one.key for one in form_of(open_draft("lane_following")).all_fields()}
+    top = {key.partition(".")[0] for key in keys}
+    assert top == set(SCHEMA["properties"])
+    for section in ("NetworkSection", "PlantSection", "ModelSection", "DecayingSettings",
+                    "BernoulliLoss", "SeedsSection", "RealtimeSection"):  # fmt: skip
+        for name in SCHEMA["$defs"][section]["properties"]:
+            assert any(f".{name}" in key for key in keys), name
+
+
+@pytest.mark.parametrize("name", shipped_names("scenarios"))
+def test_every_value_of_a_shipped_scenario_is_in_its_form(name: str) -> None:
+    draft = open_draft(name)
+    form = form_of(draft)
+    shown = {one.key: one for one in form.all_fields()}
+    for key in leaves(draft.content):
+        parts = key.split(".")
+        known = [".".join(parts[:i]) for i in range(1, len(parts) + 1)]
+        assert set(known) & shown.keys(), key
+    for one in shown.values():
+        if text := one.text(draft):
+            assert one.value(text) == draft.value(one.key)
+            assert not one.options or text in one.options, one.key
+
+
+def test_a_wrong_text_stays_as_it_is_typed_and_is_named_at_its_field() -> None:
+    draft = filled(open_draft("lane_following"), field("trigger.beta"), "about 1: or 2")
+    assert field("trigger.beta").text(draft) == "about 1: or 2"
+    draft = filled(draft, field("plant.initial_state"), '[1.0, "a", 0, 0]')
+    draft = filled(draft, field("network.mansd"), "-3")
+    with pytest.raises(DraftError) as caught:
+        _ = draft.scenario
+    assert by_field(form_of(draft), caught.value.mistakes) == {
+        "trigger.beta": "expected a number",
+        "plant.initial_state": "expected a number",
+        "network.mansd": "expected at least 0",
+    }
+
+
+def test_every_choice_gives_a_valid_scenario() -> None:
+    draft = open_draft("lane_following")
+    for choice in controls_of(draft).choices:
+        for value in choice.options:
+            other = chosen(draft, choice.key, value)
+            assert {one.key: one.value for one in controls_of(other).choices}[choice.key] == value
+            assert (
+                draft_of_query(other.query(), "lane_following", {"lane_following": "lane_following"}).scenario
+                == other.scenario
+            )
+            for slider in controls_of(other).sliders:
+                for place in slider.ends:
+                    if slider.key != "network.loss.mean_loss":  # limited by the mean burst
+                        assert dragged(other, slider, slider.value_at(place)).scenario
+
+
+def test_another_kind_keeps_what_both_kinds_have() -> None:
+    draft, choice = open_draft("lane_following"), field("controller.kind")
+    python = filled(draft, choice, "python")
+    assert python.value("controller") == {"rate_hz": 500.0, "kind": "python"}
+    with pytest.raises(DraftError) as caught:
+        _ = python.scenario
+    assert by_field(form_of(python), caught.value.mistakes)["controller.name"]
+    assert filled(python, choice, "").value("controller") is None
+    policy = field("trigger.policy")
+    for kind in policy.options:
+        assert filled(draft, policy, kind).value("trigger.policy") in (kind, None)

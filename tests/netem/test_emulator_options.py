@@ -1,0 +1,177 @@
+"""A command line gives links; mistakes give error messages; ``--explain`` describes links."""
+
+import json
+import re
+import shlex
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from netem import stand_alone
+from netem.__main__ import main
+from netem.emulator_options import command_line_parser as parser
+from netem.emulator_options import parsed, specs_of
+from netem.relay.relay import Relay
+from netem.relay.relay_links import LinkSpec
+from netem.tc_words import EXAMPLES, KEYWORDS, load_links, parse, settings_of
+from noack.impairments.kinds.loss import LOSS_WORDS
+from tests.helpers.approved import compare_lines
+
+ADDRESSES = "--listen :9000 --to :9001"
+
+
+def specs(arguments: str) -> tuple[LinkSpec, ...]:
+    return specs_of(parsed(parser(), shlex.split(arguments)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "forward", "reverse", "more"),
+    [
+        ("", "", "", {}),
+        ("'loss 5%' 'mansd 4'", "loss 5% mansd 4", "", {}),
+        ("rate 1mbit -14 queue 5 --reverse loss 5%", "rate 1mbit -14 queue 5", "loss 5%", {}),
+        ("--reverse 'delay 3ms' --seed 3", "", "delay 3ms", {"seed": 3}),
+        ("--both loss 5%", "loss 5%", "loss 5%", {}),
+        ("loss 5% --seed 7 delay 1ms", "loss 5% delay 1ms", "", {"seed": 7}),
+        ("--one-way --idle 500ms", "", "", {"return_path": False, "idle_s": 0.5}),
+    ],
+)
+def test_a_command_line_describes_a_link(
+    arguments: str, forward: str, reverse: str, more: dict[str, Any]
+) -> None:
+    here, there = ("127.0.0.1", 9000), ("127.0.0.1", 9001)
+    link = LinkSpec("relay", here, there, settings_of(forward), settings_of(reverse), **more)
+    assert specs(f"{ADDRESSES} {arguments}") == (link,)
+
+
+_OF_THE_SYSTEM = re.compile(r"\((\[Errno|Name or service).*\)$")
+"""Texts that depend on the system, or on a library."""
+
+
+def test_a_mistake_ends_the_program_with_the_approved_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(Path(__file__).parents[2])
+
+    def mistake(arguments: str) -> list[str]:
+        assert main(shlex.split(arguments)) == 2
+        out, err = capsys.readouterr()
+        assert ("error" in json.loads(out)) if "--json" in arguments else out == ""
+        assert err.count("\n") == 1
+        return [_OF_THE_SYSTEM.sub("(…)", err.strip()).replace(str(Path.cwd()), "FOLDER")]
+
+    compare_lines(Path(__file__).with_name("option_mistakes.txt"), mistake)
+
+
+@pytest.mark.parametrize("columns", ["120", "60"])
+def test_the_examples_of_the_help_are_valid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, columns: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", columns)
+    Path("links.toml").write_text('[[link]]\nname = "a"\nlisten = ":1"\nto = ":2"\n')
+    text = parser().format_help().partition("examples:\n")[2]
+    examples = text.replace("\\\n", "").splitlines()
+    assert len(examples) == 5
+    for line in examples:
+        assert line.startswith("  noack netem ")
+        assert specs(line.removeprefix("  noack netem "))
+
+
+def test_every_word_is_in_the_help_and_has_an_example() -> None:
+    text = parser().format_help()
+    for word in (*KEYWORDS, *LOSS_WORDS):
+        # The documentation lists these synonyms.
+        assert word in ("latency", "drop", "random") or re.search(rf"\b{word}\b", text), word
+    synonyms = {"drop": "loss", "random": "loss", "latency": "delay", "jitter": "delay"}
+    for word, example in EXAMPLES.items():
+        assert parse(example)
+        assert synonyms.get(word, word) in example.split()
+    assert set(KEYWORDS) - EXAMPLES.keys() == {"seed"}
+
+
+class Explain:
+    """Runs the program and returns its output."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> None:
+        self._capsys, self._patch = capsys, patch
+
+    def __call__(self, *arguments: str, columns: int = 80) -> str:
+        self._patch.setenv("COLUMNS", str(columns))
+        assert main(["--explain", *arguments]) == 0
+        out, err = self._capsys.readouterr()
+        assert err == ""
+        return out
+
+
+@pytest.fixture
+def explain(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Explain:
+    return Explain(capsys, monkeypatch)
+
+
+LINKS = """
+[[link]]
+name = "uplink"
+listen = "127.0.0.1:9000"
+to = "[::1]:9001"
+words = "loss 50% mansd 4"
+reverse = "delay 10ms"
+seed = 7
+
+[[link]]
+name = "video"
+listen = "127.0.0.1:9002"
+to = "127.0.0.1:9003"
+return_path = false
+words = "loss 20%"
+"""
+
+
+def test_links_are_explained_by_the_approved_text(
+    explain: Explain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tables fit into a terminal of 80 columns, and the file of links has the same meaning."""
+    monkeypatch.chdir(tmp_path)
+    Path("links.toml").write_text(LINKS)
+
+    def explained(arguments: str) -> list[str]:
+        given = shlex.split(arguments)
+        text = explain(*given)
+        if "--json" in given:  # rates are compared without their rounding
+            text = json.dumps(json.loads(text, parse_float=lambda digits: round(float(digits), 9)), indent=2)
+        else:
+            tables, _, file = text.partition("(--links)\n")
+            assert max(map(len, tables.splitlines())) <= 80
+            Path("again.toml").write_text(file or LINKS)
+            assert load_links(Path("again.toml")) == specs_of(
+                parser().parse_intermixed_args(["--explain", *given])
+            )
+        return [line.rstrip() for line in text.splitlines() if line.strip()]
+
+    compare_lines(Path(__file__).with_name("explained.txt"), explained)
+
+
+def test_a_command_of_tc_is_complete_in_a_terminal_of_any_width(explain: Explain) -> None:
+    commands = set()
+    for columns in (200, 60, 30):
+        out = explain("delay 10ms 2ms distribution normal loss gemodel 1%", columns=columns)
+        command = out[out.index("tc qdisc") :].partition("\ndifference")[0]
+        commands.add(" ".join(command.replace("\\\n", "").split()))
+    assert commands == {
+        "tc qdisc add dev DEVICE root netem limit 16384 delay 10ms 2ms distribution normal "
+        "loss gemodel 1% 99% 100% 0%"
+    }
+
+
+def test_settings_that_are_not_permitted_are_reported(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = {"sched_fifo": "not permitted: why", "memory_lock": "applied"}
+    monkeypatch.setattr(stand_alone, "realtime", lambda *_: nullcontext(answers))
+    monkeypatch.setattr(Relay, "run", lambda *_: None)
+    assert main(["--listen", ":0", "--to", ":9001", "--realtime", "--json"]) == 0
+    reported = capsys.readouterr().err
+    assert "noack netem: sched_fifo not permitted: why\n" in reported
+    assert "memory_lock" not in reported

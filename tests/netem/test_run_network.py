@@ -1,0 +1,325 @@
+"""The network of a run, and the relay, do what the machine in Python does that replays them."""
+
+import socket
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from itertools import islice
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cosim.shipped_files import find_shipped
+from netem.relay.relay_links import LinkSpec
+from netem.run_network import NetworkChannel, RunNetwork
+from noack.core.clock import RunClock
+from noack.impairments.link_settings import LinkSettings
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
+from noack.protocol.roles import BEGINNING, Notice, Record, Start
+from noack.protocol.wire_format import Encoder, Flow, Message
+from noack.runtime.address import address_text
+from noack.runtime.real_time_loop import run_loop
+from noack.runtime.telemetry import TelemetryBuffer
+from noack.runtime.udp_sockets import bind
+from noack.scenario.resolution import resolve, tables_of
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
+from tests.helpers.machine_parts import Machine
+from tests.netem.relay.relays import PATIENCE_S, KeepAll, Received, drain, endpoints, name_of, relayed
+from tests.noack.impairments import any_link_settings as any_settings
+from tests.oracles.link import Datagram, Link, network_of
+
+NEVER_NS = 2**61
+Arrival = tuple[int, int, int]
+"""Time since the arrival before, size, and flow."""
+arrivals = st.lists(
+    st.tuples(
+        st.sampled_from([0, 1, 10_000, 1_000_000, 30_000_000]) | st.integers(0, 10**8),
+        st.sampled_from([32, 33, 72, 1472, 9000]),
+        st.integers(0, 1),
+    ),
+    min_size=1, max_size=60,
+)  # fmt: skip
+
+
+class Both:
+    """Both machines; each input is given to both."""
+
+    def __init__(self, resolved: Any, start: Start, sockets: list[socket.socket], loops: int) -> None:
+        self.loops = loops
+        self.plain: Machine[Datagram] = network_of(resolved, start, loops=self.loops)
+        self.compiled: Any = RunNetwork(resolved, start, self.loops)
+        sender, sensor, plant, self._controller, *receivers = sockets
+        peers = {name_of(sensor): receivers[0], name_of(self._controller): receivers[1]}
+        self._other = plant if Flow.ACTUATION in resolved.network.flows else sensor
+        # A clock that stays far behind the times that the test passes.
+        clock = RunClock(time.monotonic_ns() + NEVER_NS)
+        ends = name_of(self._controller), name_of(self._other)
+        sender.connect(ends[0])
+        self.compiled.open(clock, sender, peers, ends)
+        self._expected: dict[int, list[bytes]] = {0: [], 1: []}
+        self.rows: list[Record] = []
+
+    def arrive(self, data: bytes, flow: int, now_ns: int) -> None:
+        rows = self._release(now_ns)
+        rows += self._taken(self.plain.handle(Datagram(flow, data), now_ns))
+        self._compare(rows, self.compiled.handle(Datagram(flow, data), now_ns))
+
+    def let_out(self, now_ns: int) -> None:
+        self._compare(self._release(now_ns), self.compiled.on_timer(now_ns))
+
+    def received(self) -> tuple[list[bytes], list[bytes]]:
+        """Return what the two receivers should have received; check that they did."""
+        found = {0: drain(self._controller), 1: drain(self._other)}
+        assert {flow: [data for data, _ in found[flow]] for flow in found} == self._expected
+        return self._expected[0], self._expected[1]
+
+    def _release(self, now_ns: int) -> list[Any]:
+        rows = []
+        while (due_ns := self.plain.next_deadline_ns()) is not None and due_ns <= now_ns:
+            rows += self._taken(self.plain.on_timer(now_ns))
+        return rows
+
+    def _taken(self, outputs: Any) -> list[Any]:
+        for output in outputs:
+            if isinstance(output, Datagram):
+                self._expected[output.flow // self.loops].append(output.data)
+        return [output for output in outputs if not isinstance(output, Datagram)]
+
+    def _compare(self, expected: Any, found: Any) -> None:
+        assert list(found) == list(expected)
+        assert self.compiled.next_deadline_ns() == self.plain.next_deadline_ns()
+        self.rows += expected
+
+
+@contextmanager
+def both(resolved: Any, start: Start = BEGINNING, loops: int = 1) -> Iterator[Both]:
+    with endpoints(*["127.0.0.1"] * 6) as sockets:
+        machines = Both(resolved, start, sockets, loops)
+        with closing(machines.compiled):
+            yield machines
+
+
+def network(forward: LinkSettings, reverse: LinkSettings, *flows: Flow) -> SimpleNamespace:
+    """Return what the machines read of a scenario."""
+    links = (forward, reverse)
+    network = SimpleNamespace(link=forward, flows=flows, link_of=lambda flow: links[flows.index(flow)])
+    return SimpleNamespace(network=network, seeds=SimpleNamespace(loss=0))
+
+
+CROSSING = st.sampled_from([
+    (Flow.UPDATE,), (Flow.UPDATE, Flow.ACKNOWLEDGEMENT), (Flow.UPDATE, Flow.ACTUATION)
+])  # fmt: skip
+"""What crosses the network."""
+
+
+@settings(max_examples=40)
+@given(
+    any_settings.harsh, any_settings.harsh, CROSSING, arrivals, st.integers(0, 2),
+    st.sampled_from([1, 1, 2, 200]),
+)  # fmt: skip
+def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_the_plain_machine(
+    forward: LinkSettings,
+    reverse: LinkSettings,
+    crossing: tuple[Flow, ...],
+    steps: list[Arrival],
+    lives: int,
+    loops: int,
+) -> None:
+    """The two directions have 2 · ``loops`` flows in all, which the header tells apart."""
+    now_ns = 0
+    start = Start(generation=lives)
+    with both(network(forward, reverse, *crossing), start, loops) as machines:
+        for number, (gap_ns, size, direction) in enumerate(steps):
+            now_ns += gap_ns
+            if gap_ns % 3 == 1:
+                machines.let_out(now_ns - gap_ns // 2)
+            loop = number * 67 % loops
+            head = bytes(6) + loop.to_bytes(2, "little") + bytes(24)
+            data = (head + number.to_bytes(4, "big") * (size // 4))[:size]
+            machines.arrive(data, loop + loops * direction * (len(crossing) == 2), now_ns)
+        for data in (bytes(31), bytes(6) + loops.to_bytes(2, "little") + bytes(24)):
+            machines.compiled.handle(Datagram(0, data), now_ns)
+        machines.let_out(NEVER_NS)
+        machines.received()
+        assert machines.compiled.of_no_loop == 2
+    inputs = [record.row[0] for record in machines.rows]
+    assert inputs == list(range(inputs[0], inputs[0] + len(inputs)))
+
+
+class _Rows(list[Any]):
+    def extend_table(self, table: str, rows: Any) -> None:
+        self.extend(rows.tolist())
+
+
+def test_arrival_is_when_the_datagram_reached_the_socket() -> None:
+    """It is read later. The kernel's real-time clock may be adjusted by a millisecond meanwhile."""
+    clock = RunClock(time.monotonic_ns() - 10**9, 0.25)
+    resolved = network(LinkSettings(), LinkSettings(), Flow.UPDATE)
+    with endpoints(*["127.0.0.1"] * 5) as (sender, sensor, controller, *receivers):
+        peers = dict(zip((name_of(sensor), name_of(controller)), receivers, strict=True))
+        with closing(RunNetwork(cast(Scenario, resolved), BEGINNING)) as one:
+            sender.connect(name_of(controller))
+            one.open(clock, sender, peers, [name_of(controller)])
+            for _ in range(20):  # a process that is stalled meanwhile cannot compare its clocks
+                before_ns = clock.now_ns()
+                sensor.sendto(bytes(32), name_of(receivers[0]))
+                after_ns = clock.now_ns()
+                time.sleep(0.05)
+                rows, read_ns = _Rows(), clock.now_ns()
+                while not rows:  # a machine that stalls may end it before it reads
+                    one.drive(clock.now_ns() + 10**6, rows)
+                ((_, _, t_ns, now_ns, *_),) = rows
+                assert now_ns >= read_ns
+                if before_ns - 10**6 <= t_ns <= after_ns + 10**6:
+                    break
+            else:
+                pytest.fail("no arrival has the time at which it came")
+
+
+def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> None:
+    """By the channel of the network: it accepts the peers' datagrams only."""
+    early, later, foreign = 3, 700, 5
+    published: Counter[str] = Counter()
+    delay = 'network.impairments=[{kind="delay", delay_s=0.001}]'
+    lossless = 'network.loss={model="lossless"}'
+    scenario = resolve(load(find_shipped("lane_following", "scenarios"), ["speed=2.0", lossless, delay]))
+    tables = {table: of for table, of in tables_of(scenario).items() if OWNER[table] == "netem"}
+    telemetry = TelemetryBuffer(tables, lambda table, _, rows: published.update({table: len(rows)}))
+    updates = (Message(Flow.UPDATE, k, 0, np.zeros(2), 0) for k in range(early + later))
+    sent = [Encoder(1, bytes(32)).encode(update) for update in updates]
+    with (
+        endpoints(*["127.0.0.1"] * 3) as (sensor, controller, other),
+        closing(bind(0, "test")) as endpoint,
+    ):
+        here = endpoint.getsockname()
+        for data in sent[:early]:  # before there is a socket for the sensor
+            sensor.sendto(data, here)
+        for _ in range(foreign):
+            other.sendto(b"?", here)
+        clock = RunClock(time.monotonic_ns(), scenario.speed)
+        network = RunNetwork(scenario, BEGINNING)
+        ends = [(name_of(sensor), name_of(controller))]
+        received: Received = []
+        waiting = iter(sent[early:])
+
+        def news(now_ns: int) -> list[Notice]:
+            for data in islice(waiting, 100):
+                sensor.sendto(data, here)
+            return []
+
+        def stop() -> bool:
+            received.extend(drain(controller))
+            late = clock.now_ns() > PATIENCE_S * 1e9 * scenario.speed
+            return late or len(received) == len(sent)
+
+        channel = NetworkChannel(endpoint, ends, network=network, clock=clock, loops=1)
+        with closing(channel) as shell:
+            run_loop(network, shell, clock, telemetry, end_ns=None, stop=stop, external_inputs=news)
+            shell.finish(clock.now_ns(), telemetry)
+            telemetry.flush()
+            report = shell.report()
+        senders = {address_text(name_of(one)) for one in (sensor, other)}
+    assert [data for data, _ in received] == sent
+    assert {address_text(source) for _, source in received} == {report["local"]}
+    assert (report["sent"], report["send_errors"]) == (len(sent), {})
+    assert report["rejected"] == {"source": foreign}
+    assert report["received_from"].keys() == senders
+    for table in (NETEM_PACKET, NETEM_RELEASE):
+        assert published[table] == len(sent) * tables[table].itemsize
+
+
+CLIENTS = 3
+DECIDED = ("packet", "fate", "consecutive_losses", "hold_back_ns", "bit", "copy_bit")
+
+
+def replayed(
+    spec: LinkSpec, side: int, events: NDArray[Any], payloads: list[bytes], began_ns: int
+) -> dict[int, list[bytes]]:
+    """Pass the arrivals to the machine, check its decisions; return the departures by flow."""
+    own: LinkSettings = (spec.forward, spec.reverse)[side]
+    machine = Link(own, spec.seed, spec.name, ("forward", "reverse")[side])
+    left: dict[int, list[bytes]] = defaultdict(list)
+
+    def take(outputs: Any) -> None:
+        for output in outputs:
+            if isinstance(output, Datagram):
+                left[output.flow].append(output.data)
+
+    def let_out(now_ns: float) -> None:
+        while (due_ns := machine.next_deadline_ns()) is not None and due_ns <= now_ns:
+            take(machine.on_timer(due_ns))
+
+    for event, payload in zip(events, payloads, strict=True):
+        if event["direction"] != side or event["departure"]:
+            continue
+        now_ns = int(event["t_ns"]) - began_ns
+        let_out(now_ns)
+        take(machine.handle(Datagram(int(event["flow"]), payload), now_ns))
+        decision = machine.decision
+        assert [event[field] for field in DECIDED] == [getattr(decision, f) for f in DECIDED]
+        for field, t_ns in (("delay_ns", decision.release_ns), ("copy_delay_ns", decision.copy_ns)):
+            assert event[field] == (-1 if t_ns < 0 else t_ns - now_ns)
+    let_out(np.inf)
+    return left
+
+
+@settings(max_examples=15)
+@given(
+    forward=any_settings.harsh,
+    reverse=any_settings.harsh,
+    sizes=st.lists(st.sampled_from([0, 1, 8, 72, 1472, 9000]), min_size=20, max_size=60),
+    segment=st.booleans(),
+)
+def test_the_relay_gives_datagrams_the_fates_and_the_order_of_the_plain_machine(
+    forward: LinkSettings, reverse: LinkSettings, sizes: list[int], segment: bool
+) -> None:
+    tap = KeepAll()
+    parts = relayed(forward, reverse, clients=CLIENTS, taps=[tap], segment=segment)
+    with parts as (server, *clients, one):
+        for k, size in enumerate(sizes):
+            clients[k % CLIENTS].sendto(payload_of(k, size), one.address())
+        one.settle(len(sizes))
+        received = drain(server)
+        for data, source in received:
+            server.sendto(data, source)
+        one.settle(len(received), "reverse")
+        sides = one.report().forward, one.report().reverse
+        (spec,) = one.relay.specs
+        ports = [name_of(client)[1] for client in clients]
+        at_clients = [[data for data, _ in drain(client)] for client in clients]
+        events, began_ns = tap.events, one.relay.began_unix_ns
+        assert began_ns is not None
+    by_flow: dict[int, list[bytes]] = defaultdict(list)
+    flow_of = {
+        (bytes(event["source"][:4]), int(event["source_port"])): int(event["flow"])
+        for event in events
+        if event["departure"] and not event["direction"]
+    }
+    for data, (_, port) in received:
+        by_flow[flow_of[b"\x7f\0\0\1", port]].append(data)
+    assert by_flow == replayed(spec, 0, events, tap.payloads, began_ns)
+    flow_at = {
+        int(event["source_port"]): int(event["flow"])
+        for event in events
+        if not event["departure"] and not event["direction"]
+    }
+    expected = replayed(spec, 1, events, tap.payloads, began_ns)
+    for port, found in zip(ports, at_clients, strict=True):
+        assert found == expected.get(flow_at[port], [])
+    departures = events[events["departure"] == 1]
+    assert len(departures) == len(received) + sum(map(len, at_clients))
+    # A stale datagram counts once; a copy counts if the original is corrupted.
+    intact = departures[departures["bit"] < 0]
+    counted = sum(one.counters.delivered_out_of_order for one in sides)
+    assert intact["stale"][intact["copy"] == 0].sum() <= counted <= intact["stale"].sum()
+
+
+def payload_of(number: int, size: int) -> bytes:
+    return (number.to_bytes(8, "little") * (size // 8 + 1))[:size]

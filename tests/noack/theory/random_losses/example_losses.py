@@ -1,0 +1,32 @@
+"""Losses and a loop that several tests of random losses use."""
+
+import numpy as np
+
+from noack.impairments.loss_guarantee import LossGuarantee
+from noack.impairments.loss_prediction import LossProcess, OutcomeChain
+from noack.impairments.markov_chain import Array
+from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.margins.exact_matrices import exactly
+from noack.theory.random_losses import mean_square_growth as mean_square_module
+
+BURSTY = LossProcess(np.array([0.8, 0.2]), np.array([[0.9, 0.1], [0.4, 0.6]]), np.array([0.05, 0.8]))
+
+
+def independent(p: float) -> LossProcess:
+    return LossProcess(np.ones(1), np.ones((1, 1)), np.array([p]))
+
+
+def unlimited(process: LossProcess) -> OutcomeChain:
+    return process.outcomes(LossGuarantee())
+
+
+def scalar_loop(rate: float, gain: float, mismatch: float) -> PlantGains:
+    """x' = −(rate + mismatch) x + p, a model that decays at ``rate``, and u = −gain x_c."""
+    one = np.eye(1)
+    error = ErrorGains(-rate * one, -gain * one, one, 0.0)
+    return PlantGains(error, (gain - rate - mismatch) * one, one, one, 0.0)
+
+
+def mean_square_growth(maps: list[tuple[Array, Array]], chain: OutcomeChain) -> float:
+    exact = [(exactly(delivered), exactly(lost)) for delivered, lost in maps]
+    return mean_square_module.mean_square_growth(exact, chain)

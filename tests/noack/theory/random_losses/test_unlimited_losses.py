@@ -1,0 +1,41 @@
+"""Moments at events and of a run's largest values: closed forms, and sums by hand."""
+
+import pytest
+
+from noack.theory.random_losses import unlimited_losses
+from noack.theory.random_losses.unlimited_losses import BurstCertificate, moment_at_events, moments_of_runs
+from tests.noack.theory.random_losses.example_losses import BURSTY, independent, scalar_loop
+
+
+@pytest.mark.parametrize("p", [0.1, 0.5, 0.9])
+def test_in_a_contracting_norm_the_moments_at_events_are_those_of_the_geometric_law(p: float) -> None:
+    error = scalar_loop(2.0, 3.0, 0.0).error
+    for order, expected in (1, 1 / (1 - p)), (2, (1 + p) ** 0.5 / (1 - p)):
+        found = moment_at_events(error, independent(p), 0.0, order)
+        assert found == pytest.approx(expected, rel=1e-6)
+        assert moment_at_events(error, independent(p), 0.5, order) < found
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_moments_at_events_include_longer_bursts_than_are_counted(
+    order: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With three terms, the rest is bounded from above, and not far."""
+    error, process = scalar_loop(2.0, 3.0, 0.0).error, BURSTY
+    exact = moment_at_events(error, process, 0.0, order)
+    monkeypatch.setattr(unlimited_losses, "_TERMS", 3)
+    assert exact <= moment_at_events(error, process, 0.0, order) < 1.5 * exact
+
+
+def test_the_mean_of_the_largest_values_of_runs_by_hand() -> None:
+    """Runs whose longest burst is 0, 1 or 2 with probabilities 0.5, 0.3 and 0.2 keep 1, 3 and 4."""
+    bursts = [
+        BurstCertificate(most, probability, 9, 0.0, 0.5, bound, 10 * bound)
+        for most, probability, bound in [(0, 0.5, 1.0), (1, 0.8, 3.0), (2, 1.0, 4.0)]
+    ]
+    mean, root_mean_square = moments_of_runs(bursts)
+    assert mean.controller_error == pytest.approx(0.5 * 1 + 0.3 * 3 + 0.2 * 4)
+    assert root_mean_square.controller_error == pytest.approx((0.5 * 1 + 0.3 * 9 + 0.2 * 16) ** 0.5)
+    assert root_mean_square.state == pytest.approx(10 * root_mean_square.controller_error)
+    assert (mean.most, mean.probability, mean.rate_per_s) == (2, 1.0, 0.5)
+    assert moments_of_runs([]) == []
