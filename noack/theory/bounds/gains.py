@@ -213,7 +213,8 @@ class ErrorGains:
 
     def missing_until(self, output: Output, events: Counts, due_s: float) -> Vector:
         """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
-        return np.array([self._all_missing_until(N, due_s)[output] for N in events.tolist()])
+        gains = [self._all_missing_until(N, due_s)[output] for N in events.ravel().tolist()]
+        return np.reshape(gains, events.shape)
 
     @cached_method
     def _all_missing_until(self, events: int, due_s: float) -> Mapping[Output, float]:
