@@ -534,6 +534,24 @@ class PlantGains:
         return self.error.growths(self.columns, until_s, cells, self.error.stacked)
 
 
+def first_equal(plant: PlantGains) -> PlantGains:
+    """Return the first of several equal plants, which have no disturbances; the others use its gains."""
+    return _first_equal(_KnownPlant(plant.identity, plant))
+
+
+@dataclass(frozen=True)
+class _KnownPlant:
+    """A plant, which equals others of its identity."""
+
+    identity: Hashable
+    plant: PlantGains = field(compare=False)
+
+
+@lru_cache(maxsize=16)
+def _first_equal(known: _KnownPlant) -> PlantGains:
+    return known.plant
+
+
 def deviations(covariance: Matrix) -> Matrix:
     """Return S with S Sᵀ = the covariance, (n, n)."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
