@@ -331,11 +331,11 @@ class _Bends:
 
 def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Groups) -> _Bends:
     """Return the factors for the cells that start at the nodes, (…, n, r, k): Taylor's formula."""
-    exponents = np.maximum(logarithmic_norm(generator), 0.0)[..., None] * steps_s
+    powers, growth_per_s = _taylor(generator)
+    exponents = growth_per_s[..., None] * steps_s
     growth = np.where(exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf)
-    powers, scales = [generator @ generator], [np.ones_like(steps_s)]
+    scales = [np.ones_like(steps_s)]
     for order in range(1, _TAYLOR_TERMS + 1):
-        powers.append(generator @ powers[-1])
         scales.append(scales[-1] * (steps_s / order))
 
     def norms(matrix: Matrix) -> Stack:
@@ -346,18 +346,27 @@ def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None,
     rest_decaying = least = np.zeros(0)
     if decay is not None:
         exists = (decay.rate_per_s > 0)[..., None, None]
-        rest_decaying = np.where(exists, last * norms(decay.factor @ powers[-1]), math.inf)
-        least = np.where(exists, norms(decay.factor @ powers[0]), math.inf)
+        rest_decaying = np.where(exists, last * norms(decay.factor @ powers[..., -1, :, :]), math.inf)
+        least = np.where(exists, norms(decay.factor @ powers[..., 0, :, :]), math.inf)
     return _Bends(
         columns,
-        np.stack(powers[:-1], axis=-3),
+        powers[..., :-1, :, :],
         np.stack(scales[:-1], axis=-2),
         nodes,
-        growth[..., None, :] * last * norms(powers[-1]),
+        growth[..., None, :] * last * norms(powers[..., -1, :, :]),
         decay,
         rest_decaying,
         least,
     )
+
+
+@cached_function(8)
+def _taylor(generator: Matrix) -> tuple[Stack, Stack]:
+    """Return G^j of Taylor's terms and of the remainder, (…, 5, n, n), and max(μ, 0) of G, (…)."""
+    powers = [generator @ generator]
+    for _ in range(_TAYLOR_TERMS):
+        powers.append(generator @ powers[-1])
+    return np.stack(powers, axis=-3), np.maximum(logarithmic_norm(generator), 0.0)
 
 
 def _slices(*ends: int) -> Groups:
