@@ -1,8 +1,9 @@
-"""Methods whose results are kept in their object."""
+"""Methods and functions whose results are kept; their arguments may be arrays."""
 
-from collections.abc import Callable
-from functools import wraps
-from typing import Concatenate, ParamSpec, TypeVar
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from functools import lru_cache, wraps
+from typing import Concatenate, Generic, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -30,6 +31,37 @@ def cached_method(
         return known[key]
 
     return found
+
+
+def cached_function(
+    most: int,
+) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Keep the latest ``most`` results of a function, whose arguments are hashable or arrays.
+
+    Neither the arguments nor the results may be changed.
+    """
+
+    def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        @lru_cache(most)
+        def result_of(call: _Call[Result]) -> Result:
+            return call.compute()
+
+        @wraps(function)
+        def found(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+            key = *map(_key, args), *((name, _key(value)) for name, value in kwargs.items())
+            return result_of(_Call(key, lambda: function(*args, **kwargs)))
+
+        return found
+
+    return cached
+
+
+@dataclass(frozen=True)
+class _Call(Generic[Result]):
+    """A call of a function, which equals others with the same arguments."""
+
+    key: Hashable
+    compute: Callable[[], Result] = field(compare=False)
 
 
 def _key(argument: object) -> object:

@@ -229,27 +229,25 @@ def simulate(
     x_s, x_c = x.copy(), x.copy() if system.known_start else np.zeros_like(x)
     # An update in flight is its value on arrival; 0 in ``arrives``: no update.
     slots, every = system.delay_steps + 1, np.arange(runs)
-    arriving, arrives = np.zeros((runs, slots, n)), np.zeros((runs, slots), dtype=np.int64)
+    arriving, arrives = np.zeros((slots, runs, n)), np.zeros((slots, runs), dtype=np.int64)
     newest, events, last_event = (np.zeros(runs, dtype=np.int64) for _ in range(3))
-    synchronised, shortest = np.full(runs, system.known_start), 10**9
+    synchronised = np.full(runs, system.known_start)
     commands: list[tuple[Reals, Flags]] = []
     inputs = np.zeros((STEPS, runs, m))
-    sensor_error, states = np.zeros((STEPS, runs)), np.zeros((3, STEPS, runs, n))
+    xs, x_ss, x_cs = (np.empty((STEPS, runs, n)) for _ in range(3))
+    knowns = xs if estimate is exact_state else np.empty_like(xs)
     is_event, has_input, has_state = (np.zeros((STEPS, runs), bool) for _ in range(3))
     received = np.zeros((STEPS, runs), dtype=np.int64)
     for step in range(STEPS):
-        sensor_error[step], known = norms((x_s - x) @ W), x
+        x_ss[step], known = x_s, x
         if step % system.sample_steps == 0:
             since = max(step - system.sample_steps, 0)
             known = estimate(step, x, list(inputs[since:step]))
-            tested = norms((x_s - known) @ W)
-            sensor_error[step] = np.maximum(sensor_error[step], tested)
-            event = tested > threshold[step]
-            if rule is not None:
+            if rule is None:
+                event = norms((x_s - known) @ W) > threshold[step]
+            else:
                 event = rule(step, step - last_event, known, x_s - known)
             event = event | (step == 0 and not system.known_start)
-            again = event & (events > 0)
-            shortest = min(shortest, int((step - last_event)[again].min(initial=10**9)))
             x_s, last_event = (
                 np.where(event[:, None], known, x_s),
                 np.where(event, step, last_event),
@@ -257,32 +255,38 @@ def simulate(
             sent = np.flatnonzero(event & delivered[every, events])
             delay = delays[sent, events[sent]]
             slot = (step + delay) % slots
-            arriving[sent, slot] = np.einsum("ri,rij->rj", known[sent], steps[0].late[delay])
-            arrives[sent, slot] = events[sent] + 1
+            arriving[slot, sent] = np.einsum("ri,rij->rj", known[sent], steps[0].late[delay])
+            arrives[slot, sent] = events[sent] + 1
             events, is_event[step] = events + event, event
         now = step % slots
-        fresh = arrives[:, now] > newest
-        x_c = np.where(fresh[:, None], arriving[:, now], x_c)
-        newest, arrives[:, now] = np.where(fresh, arrives[:, now], newest), 0
+        fresh = arrives[now] > newest
+        x_c = np.where(fresh[:, None], arriving[now], x_c)
+        newest, arrives[now] = np.where(fresh, arrives[now], newest), 0
         synchronised = synchronised | fresh
         is_new = system.hold_steps == 0 or step % system.hold_steps == 0
         commands.append((x_c @ K, synchronised) if is_new else commands[-1])
         if step >= system.lag:
             u, has_input[step] = commands[step - system.lag]
             inputs[step] = u * has_input[step][:, None]
-        states[:, step], has_state[step], received[step] = (x, known, x_c), synchronised, newest
+        xs[step], knowns[step], x_cs[step] = x, known, x_c
+        has_state[step], received[step] = synchronised, newest
         push = None if pushes is None else pushes[:, step]
         following = [one.advance(x, x_c, inputs[step], has_input[step], push) for one in steps]
         x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
         x_s, x_c = x_s @ steps[0].model, x_c @ steps[0].model
-    xs, knowns, x_cs = states
-    controller_error = np.maximum(norms((x_cs - xs) @ W), norms((x_cs - knowns) @ W)) * has_state
+
+    def errors(estimates: Reals) -> Reals:
+        to_x = norms((estimates - xs) @ W)
+        return to_x if knowns is xs else np.maximum(to_x, norms((estimates - knowns) @ W))
+
     seen = (
-        sensor_error, controller_error, norms(xs), norms(xs @ W),
+        errors(x_ss), errors(x_cs) * has_state, norms(xs), norms(xs @ W),
         norms(inputs - xs @ K) * has_input,
     )  # fmt: skip
+    event_run, event_step = np.nonzero(is_event.T)
+    shortest = np.diff(event_step)[np.diff(event_run) == 0].min(initial=10**9)
     return Trace(
-        *(one.T for one in seen), shortest * system.step_s,
+        *(one.T for one in seen), float(shortest * system.step_s),
         xs.transpose(1, 0, 2), knowns.transpose(1, 0, 2), is_event.T, received.T,
     )  # fmt: skip
 
@@ -309,9 +313,9 @@ class _Propagators:
     def advance(self, x: Reals, x_c: Reals, u: Reals, has_input: Flags, push: Any) -> Reals:
         """x of all runs one step later; u = K x_c changes with x_c unless it is held."""
         if self.is_held:
-            following = np.hstack([x, u]) @ self.held
+            following = np.concatenate([x, u], axis=1) @ self.held
         else:
-            following = np.hstack([x, x_c]) @ self.both
+            following = np.concatenate([x, x_c], axis=1) @ self.both
             following = np.where(has_input[:, None], following, x @ self.free)
         return following if push is None else following + push @ self.pushed
 
@@ -329,18 +333,21 @@ def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
 
 def allowed(lost: Flags, system: System) -> Flags:
     """The losses (runs, events) without those that the guarantee does not allow."""
-    lost, (runs, events) = lost.copy(), lost.shape
+    runs, events = lost.shape
+    lost = lost.T.copy()  # what happens to one event in all runs is a row
     if not system.known_start:
-        lost[:, 0] = False
+        lost[0] = False
     burst, since = np.zeros(runs, dtype=np.int64), np.full(runs, system.recovery)
-    most, width = system.window if system.window[0] < system.window[1] else (1, 1)
+    most, width = system.window
     for event in range(events):
-        recent = lost[:, max(event - width + 1, 0) : event].sum(axis=1)
-        lost[:, event] &= (burst < system.mansd) & (recent < most)
-        lost[:, event] &= (burst > 0) | (since >= system.recovery)
-        burst = np.where(lost[:, event], burst + 1, 0)
-        since = np.where(lost[:, event], 0, since + 1)
-    return lost
+        lost[event] &= burst < system.mansd
+        if most < width:
+            lost[event] &= lost[max(event - width + 1, 0) : event].sum(axis=0) < most
+        if system.recovery:
+            lost[event] &= (burst > 0) | (since >= system.recovery)
+            since = np.where(lost[event], 0, since + 1)
+        burst = np.where(lost[event], burst + 1, 0)
+    return lost.T
 
 
 def systems(**fixed: Any) -> st.SearchStrategy[System]:

@@ -6,12 +6,12 @@ Lyapunov function. ν is computed from the final L, so rounding in the computati
 
 import contextlib
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.cached_method import cached_function
 from noack.core.linear_systems import Matrix, solve_lyapunov
 
 Stack = NDArray[np.float64]
@@ -49,19 +49,13 @@ class Decay(NamedTuple):
         return frobenius_norms(product(self.factor, states))
 
 
+@cached_function(8)
 def find_decay(generator: Matrix) -> Decay | None:
     """Return the better of two candidates for L, of each of a stack of generators, (…, n, n).
 
     A candidate must pass its check numerically. None: no L was found for any of them.
     """
-    generator = np.asarray(generator, dtype=np.float64)
-    return _find_decay(generator.tobytes(), generator.shape)
-
-
-@lru_cache(maxsize=8)
-def _find_decay(entries: bytes, shape: tuple[int, ...]) -> Decay | None:
-    generator = np.frombuffer(entries).reshape(shape)
-    rounding = EPSILON * shape[-1] * np.linalg.norm(generator, axis=(-2, -1))
+    rounding = EPSILON * generator.shape[-1] * np.linalg.norm(generator, axis=(-2, -1))
     slowest = abscissas(generator)
     candidates = (_lyapunov_factors(generator, slowest), _modal_factors(generator))
     by_first, by_second = (_checked(generator, factor, slowest < -rounding) for factor in candidates)

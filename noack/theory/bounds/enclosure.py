@@ -22,13 +22,14 @@ inflation of 1e-9.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.cached_method import cached_function, cached_method
 from noack.core.linear_systems import Matrix, exponential
 from noack.theory.bounds.contraction import (
     EPSILON,
@@ -88,7 +89,7 @@ class KernelBounds:
 
     def sup(self, after_s: float = 0.0) -> Stack:
         """Sup of k(τ) over τ ≥ ``after_s``, (…)."""
-        return self.sups(np.array([after_s]))[..., 0]
+        return self.sups(np.array([after_s]))[..., 0] if after_s else self._from_cell[..., 0]
 
     def sups(self, after_s: Stack) -> Stack:
         """Sup of k(τ) over τ ≥ a for each a, (…, j)."""
@@ -178,15 +179,11 @@ class Outputs(Generic[Name]):
 
     def each(self, norm: Callable[[Stack], Stack], values: Stack, columns: Groups) -> Stack:
         """Return a norm of each C Y, (…, rows, r, k) → (…, outputs, groups of columns, k)."""
-        stack: Stack | None = None
-        for index, rows in enumerate(self.rows):
+        *lead, _, _, cells = values.shape
+        stack = np.empty((*lead, len(self.rows), len(columns), cells))
+        for places, rows in self._alike:
             for number, group in enumerate(columns):
-                norms = norm(values[..., rows, group, :])
-                if stack is None:
-                    *lead, cells = norms.shape
-                    stack = np.empty((*lead, len(self.rows), len(columns), cells))
-                stack[..., index, number, :] = norms
-        assert stack is not None
+                stack[..., places, number, :] = norm(values[..., rows, group, :])
         return stack
 
 
@@ -241,6 +238,7 @@ class ResponseBounds:
         """Return bounds of ‖C e^{Gτ} D‖ for every output."""
         return {name: kernel for name, (kernel,) in self.through_groups(outputs).items()}
 
+    @cached_method
     def through_groups(self, outputs: Outputs[Name]) -> dict[Name, list[KernelBounds]]:
         """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
         columns, nodes = self._columns, self._nodes
@@ -321,12 +319,8 @@ class _Bends:
         *lead, terms, rows, n = turned.shape
         images = times(turned.reshape(*lead, terms * rows, n), self.nodes)
         images = images.reshape(*images.shape[:-3], terms, rows, *images.shape[-2:])
-
-        def total(values: Stack) -> Stack:
-            norms = np.sqrt(np.einsum("...jirk,...jirk->...jk", values, values))
-            return np.asarray((norms * self.scales).sum(axis=-2))
-
-        bound = outputs.each(total, images, self.columns)
+        terms_of_bound = outputs.each(sizes, images, self.columns) * self.scales[..., None, None, :]
+        bound = terms_of_bound.sum(axis=-4)
         remainder = outputs.norms[..., None, None] * self.rest[..., None, :, :]
         if self.decay is None:
             return np.asarray(bound + remainder)
@@ -337,11 +331,11 @@ class _Bends:
 
 def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Groups) -> _Bends:
     """Return the factors for the cells that start at the nodes, (…, n, r, k): Taylor's formula."""
-    exponents = np.maximum(logarithmic_norm(generator), 0.0)[..., None] * steps_s
+    powers, growth_per_s = _taylor(generator)
+    exponents = growth_per_s[..., None] * steps_s
     growth = np.where(exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf)
-    powers, scales = [generator @ generator], [np.ones_like(steps_s)]
+    scales = [np.ones_like(steps_s)]
     for order in range(1, _TAYLOR_TERMS + 1):
-        powers.append(generator @ powers[-1])
         scales.append(scales[-1] * (steps_s / order))
 
     def norms(matrix: Matrix) -> Stack:
@@ -352,24 +346,34 @@ def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None,
     rest_decaying = least = np.zeros(0)
     if decay is not None:
         exists = (decay.rate_per_s > 0)[..., None, None]
-        rest_decaying = np.where(exists, last * norms(decay.factor @ powers[-1]), math.inf)
-        least = np.where(exists, norms(decay.factor @ powers[0]), math.inf)
+        rest_decaying = np.where(exists, last * norms(decay.factor @ powers[..., -1, :, :]), math.inf)
+        least = np.where(exists, norms(decay.factor @ powers[..., 0, :, :]), math.inf)
     return _Bends(
         columns,
-        np.stack(powers[:-1], axis=-3),
+        powers[..., :-1, :, :],
         np.stack(scales[:-1], axis=-2),
         nodes,
-        growth[..., None, :] * last * norms(powers[-1]),
+        growth[..., None, :] * last * norms(powers[..., -1, :, :]),
         decay,
         rest_decaying,
         least,
     )
 
 
+@cached_function(8)
+def _taylor(generator: Matrix) -> tuple[Stack, Stack]:
+    """Return G^j of Taylor's terms and of the remainder, (…, 5, n, n), and max(μ, 0) of G, (…)."""
+    powers = [generator @ generator]
+    for _ in range(_TAYLOR_TERMS):
+        powers.append(generator @ powers[-1])
+    return np.stack(powers, axis=-3), np.maximum(logarithmic_norm(generator), 0.0)
+
+
 def _slices(*ends: int) -> Groups:
     return [slice(*pair) for pair in pairwise(ends)]
 
 
+@cached_function(8)
 def response(generator: Matrix, D: Matrix) -> ResponseBounds:
     """Compute e^{Gτ} D over all times, shapes (…, n, n) and (…, n, r).
 
@@ -391,6 +395,11 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
     most_cells = min(_MOST_CELLS, _MOST_ENTRIES // math.prod(D.shape[-2:]))
     usual_s = np.broadcast_to(_STEP / _fastest(generator), lead)
     step_s = usual_s * _FIRST_STEP / _STEP
+
+    def usable_step(step_s: Stack) -> NDArray[np.bool_]:
+        is_short = step_s <= usual_s
+        return is_short if is_short.all() else is_short | _straight(generator, state, step_s, decay)
+
     while True:
         states = _propagate(generator, state, step_s, _CELLS_PER_BLOCK)
         parts.append(states[..., :-1, :, :])
@@ -403,10 +412,9 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
         ends = ends | (remainder <= _TAIL_SHARE * area)
         if ends.all() or cells >= most_cells:
             break
-        while (bent := (step_s > usual_s) & ~_straight(generator, state, step_s, decay)).any():
-            step_s = np.where(bent, step_s / 2, step_s)
-        longer = (2 * step_s <= usual_s) | _straight(generator, state, 2 * step_s, decay)
-        step_s = np.where(ends, 0.0, np.where(longer, 2 * step_s, step_s))
+        while not (usable := usable_step(step_s)).all():
+            step_s = np.where(usable, step_s, step_s / 2)
+        step_s = np.where(ends, 0.0, np.where(usable_step(2 * step_s), 2 * step_s, step_s))
     states = np.concatenate([*parts, state[..., None, :, :]], axis=-3)
     return ResponseBounds(generator, np.concatenate(edges, axis=-1), states, decay, endless=True)
 
@@ -419,6 +427,7 @@ def _straight(generator: Matrix, state: Matrix, step_s: Stack, decay: Decay) -> 
     return np.asarray(step_s**2 / 8 * bends.over(everything)[..., 0, 0, 0] <= _SAG * size)
 
 
+@cached_function(32)
 def response_until(
     generator: Matrix, D: Matrix, until_s: float | Stack, cells: int = 64, groups: tuple[int, ...] = (0,)
 ) -> ResponseBounds:
@@ -461,10 +470,7 @@ def _ranks(singular: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np
 
 def _propagate(generator: Matrix, state: Matrix, step_s: Stack, cells: int) -> Stack:
     """Return e^{G k s} state for k = 0 … cells, (…, cells + 1, n, r), block by block."""
-    generator, step_s = np.asarray(generator, np.float64), np.asarray(step_s, np.float64)
-    powers, leap = _powers(
-        generator.tobytes(), generator.shape, step_s.tobytes(), step_s.shape, min(_BLOCK, cells)
-    )
+    powers, leap = _powers(generator, step_s, min(_BLOCK, cells))
     *lead, size, n, _ = powers.shape
     blocks, rows = [], powers.reshape(*lead, size * n, n)
     for _ in range(-(-(cells + 1) // size)):
@@ -474,20 +480,17 @@ def _propagate(generator: Matrix, state: Matrix, step_s: Stack, cells: int) -> S
     return np.concatenate(blocks, axis=-3)[..., : cells + 1, :, :]
 
 
-@lru_cache(maxsize=8)
-def _powers(
-    entries: bytes, shape: tuple[int, ...], steps: bytes, of_steps: tuple[int, ...], least: int
-) -> tuple[Stack, Matrix]:
+@cached_function(8)
+def _powers(generator: Matrix, step_s: Stack, least: int) -> tuple[Stack, Matrix]:
     """Return e^{G k s} for k < 2^j, at least so many, and e^{G 2^j s}.
 
-    G and s are given by their entries; several responses follow each other with the same steps.
+    Several responses follow each other with the same steps.
     """
-    generator = np.frombuffer(entries).reshape(shape)
-    exponents = generator * np.frombuffer(steps).reshape(of_steps)[..., None, None]
+    exponents = generator * step_s[..., None, None]
     leap = np.empty(exponents.shape)
     for index in np.ndindex(exponents.shape[:-2]):
         leap[index] = exponential(exponents[index])
-    n = shape[-1]
+    n = generator.shape[-1]
     powers = np.broadcast_to(np.eye(n), (*leap.shape[:-2], 1, n, n))
     while (size := powers.shape[-3]) < least:
         later = (powers.reshape(*leap.shape[:-2], size * n, n) @ leap).reshape(powers.shape)

@@ -213,7 +213,8 @@ class ErrorGains:
 
     def missing_until(self, output: Output, events: Counts, due_s: float) -> Vector:
         """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
-        return np.array([self._all_missing_until(N, due_s)[output] for N in events.tolist()])
+        gains = [self._all_missing_until(N, due_s)[output] for N in events.ravel().tolist()]
+        return np.reshape(gains, events.shape)
 
     @cached_method
     def _all_missing_until(self, events: int, due_s: float) -> Mapping[Output, float]:
@@ -531,6 +532,24 @@ class PlantGains:
     def growths(self, until_s: float, cells: int) -> Mapping[Output, Growth]:
         """Return the growth of every output C e_s over ``until_s``, on a grid."""
         return self.error.growths(self.columns, until_s, cells, self.error.stacked)
+
+
+def first_equal(plant: PlantGains) -> PlantGains:
+    """Return the first of several equal plants, which have no disturbances; the others use its gains."""
+    return _first_equal(_KnownPlant(plant.identity, plant))
+
+
+@dataclass(frozen=True)
+class _KnownPlant:
+    """A plant, which equals others of its identity."""
+
+    identity: Hashable
+    plant: PlantGains = field(compare=False)
+
+
+@lru_cache(maxsize=16)
+def _first_equal(known: _KnownPlant) -> PlantGains:
+    return known.plant
 
 
 def deviations(covariance: Matrix) -> Matrix:

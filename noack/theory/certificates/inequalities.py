@@ -35,6 +35,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.certificate_terms import CertificatePart, Constants, NetworkConditions
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
@@ -172,6 +173,7 @@ class ErrorInequalities:
             return [BoundMethod.DRIFTING, BoundMethod.MISSING]
         return [BoundMethod.MISSING]
 
+    @cached_method
     def constants(self, spacing_s: Vector, method: BoundMethod) -> LoopConstants:
         """Return all constants but δ, given inter-event times of at least ``spacing_s``, (loops,).
 
@@ -366,14 +368,14 @@ class ErrorInequalities:
         shape = len(spacing_s), _SIGNALS
         late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own_growth.longest_s)
         highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
+        counts = np.arange(count)[:, None] + np.zeros_like(events)
+        rows = _HELD + self._with_missing(Output.GAIN, present, counts, spacing_s, own_growth)
+        late = np.minimum(present[..., 3], highest * (delay_s - counts * spacing_s).clip(min=0.0))
+        rows[..., 3] = late
+        shares_left = 1 - (present[..., 3] - late)[..., None]
         stages = _Stages(np.zeros((0, *shape)), late_s)
-        for number in range(count):
-            counts = np.full_like(events, number)
-            row = _HELD + self._with_missing(Output.GAIN, present, counts, spacing_s, own_growth)
-            late = np.minimum(present[..., 3], highest * (delay_s - number * spacing_s).clip(min=0.0))
-            row[..., 3] = late
-            row = row + stages.entered(sizes, sups, counts)
-            share_left = 1 - (present[..., 3] - late)[..., None]
+        for row, share_left, number in zip(rows, shares_left, counts, strict=True):
+            row = row + stages.entered(sizes, sups, number)
             row = np.where(share_left > 0, row / np.where(share_left > 0, share_left, 1.0), _INPUT)
             stages = stages._replace(inputs=np.concatenate([stages.inputs, row[None]]))
         return stages

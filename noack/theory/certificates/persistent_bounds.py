@@ -29,7 +29,7 @@ from noack.theory.bounds.certificate_terms import (
 )
 from noack.theory.bounds.disturbances import EstimationError, bound_forcing
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains
+from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains, first_equal
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.solution import Problem, Search, sharpened
 
@@ -176,25 +176,31 @@ class DisturbedCertificate:
 
     @cached_property
     def _persistent(self) -> CertificatePart:
-        plant = self._plant(0.0)
-        at_rest = replace(plant, start=np.zeros_like(plant.start), forcing=self._forcing(plant))
+        plant = self._pushed_plant
+        at_rest = replace(plant, start=np.zeros_like(plant.start))
         bound = TriggerBound(self.trigger.floor, None, unit=1.0)
         return CertificatePart(plant.error, at_rest, bound, self._estimation.persistent())
 
     @cached_property
     def _together(self) -> CertificatePart:
         """Everything without decay; the trigger's bound depends on the conditions."""
-        plant = self._plant(0.0)
-        pushed = replace(plant, forcing=self._forcing(plant))
         decaying, persistent = self._estimation.decaying(0.0), self._estimation.persistent()
         estimation = persistent._replace(fixed=persistent.fixed + decaying.fixed)
-        return CertificatePart(plant.error, pushed, TriggerBound(0.0, None), estimation)
+        plant = self._pushed_plant
+        return CertificatePart(plant.error, plant, TriggerBound(0.0, None), estimation)
+
+    @cached_property
+    def _pushed_plant(self) -> PlantGains:
+        """The plant without decay, with its disturbances if it has any."""
+        plant = self._plant(0.0)
+        forcing = self._forcing(plant)
+        return plant if forcing is None else replace(plant, forcing=forcing)
 
     def _plant(self, alpha_per_s: float) -> PlantGains:
         loop = loop_of(self.resolved)
         plant = self.plant_at(error_gains(loop, alpha_per_s), loop.x0[:, None], alpha_per_s)
         outputs = {**self._estimation.further_outputs, **self.trigger.outputs}
-        return replace(plant, further_outputs=outputs)
+        return first_equal(replace(plant, further_outputs=outputs))
 
     def _forcing(self, plant: PlantGains) -> Forcing | None:
         return bound_forcing(self.resolved, plant.B)

@@ -6,9 +6,9 @@ searches for the largest sampling period, delay and age of inputs for which a ce
 
 import contextlib
 import math
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from noack.theory.bounds.certificate_terms import (
     NoCertificateError,
 )
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains, first_equal
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -386,7 +386,7 @@ class CertificateScope:
             error = error_gains(self._loop, alpha_per_s)
             plant = self._plant_at(error, self._start, alpha_per_s)
             plant = replace(plant, further_outputs=self._trigger.outputs)
-            self._plants[alpha_per_s] = _first_equal(_KnownPlant(plant.identity, plant))
+            self._plants[alpha_per_s] = first_equal(plant)
         plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
@@ -396,20 +396,6 @@ class CertificateScope:
                 Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
             )
         )
-
-
-@dataclass(frozen=True)
-class _KnownPlant:
-    """A plant, which equals others of its identity."""
-
-    identity: Hashable
-    plant: PlantGains = field(compare=False)
-
-
-@lru_cache(maxsize=16)
-def _first_equal(known: _KnownPlant) -> PlantGains:
-    """Return the first of several equal plants, whose gains the others use."""
-    return known.plant
 
 
 _BOUNDS = ("input_error", "state", "state_weighted", "mismatch", "received_input_error")

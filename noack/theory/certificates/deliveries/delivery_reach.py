@@ -21,10 +21,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, exponential
 from noack.theory.bounds.contraction import (
     Stack,
@@ -78,6 +80,22 @@ _CONDITION = 1e-10
 """Smallest over largest eigenvalue of a sum of forms that is used."""
 
 
+class _Window(NamedTuple):
+    """The flow from a node T' ago until now, in (x_c, e_c) T' ago."""
+
+    node: int
+    cells: NDArray[np.intp]
+    """The cells of the times since the node, from 0 to T', (k + 1,)."""
+    moved: Stack
+    """z at these times, (k + 1, 2n, 2n)."""
+    model: Matrix
+    """x_c at the node from ξ, (n, n)."""
+    model_norm: float
+    """‖x_c‖ for ‖ξ‖ ≤ 1."""
+    largest_model: float
+    """‖x_c‖ for ‖Λξ‖ ≤ 1."""
+
+
 @dataclass(frozen=True)
 class DeliveryEllipsoid:
     """The states ξ at a delivery with ‖Λ W ξ‖ ≤ 1."""
@@ -113,6 +131,24 @@ class DeliveryEllipsoid:
     def state_bounds(self) -> "_CellBounds":
         """Bounds of Λx."""
         return _CellBounds(self, np.hstack([self.shape, np.zeros_like(self.shape)]))
+
+    @cached_method
+    def windows(self, last_node: int) -> list[_Window]:
+        """Return the windows before a node, for each T'."""
+        flow, identity, windows = self.flow, np.eye(self.flow.n), []
+        last_s = float(flow.edges_s[last_node])
+        for share in _WINDOWS:
+            node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
+            since_s = last_s - float(flow.edges_s[node])
+            moved = [np.block([[identity, -identity], [np.zeros_like(identity), identity]])]
+            step = exponential(flow.generator * (since_s / _EARLIER))
+            for _ in range(_EARLIER):
+                moved.append(step @ moved[-1])
+            cells = [flow.cell_at(number * since_s / _EARLIER) for number in range(_EARLIER + 1)]
+            model = flow.states[node, : flow.n] + flow.states[node, flow.n :]
+            norm, largest = (float(np.linalg.norm(M, 2)) for M in (model, model @ self.inverse))
+            windows.append(_Window(node, np.array(cells), np.array(moved), model, norm, largest))
+        return windows
 
     @cached_property
     def model_sups(self) -> Mapping[Output, float]:
@@ -252,43 +288,35 @@ class Reach:
         T' as a cell, the flow in it, forms that are at most 1, all for c = 1 and in (x_c, e_c):
         ‖x_c‖ ≤ h, and ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1 at several times; semi-axes for some of their sums.
         """
-        flow, n, shape, windows = self.ellipsoid.flow, self.ellipsoid.flow.n, self.ellipsoid.shape, []
-        last_s, limit, identity = float(flow.edges_s[self._followed_cells]), self.limit / self.size, np.eye(n)
+        ellipsoid, flow, n = self.ellipsoid, self.ellipsoid.flow, self.ellipsoid.flow.n
+        limit, windows = self.limit / self.size, ellipsoid.windows(self._followed_cells)
         # By how much held inputs change ‖e_c‖, and the bound of ‖Λx‖, over each cell.
         age_input = self.effects.age_input / self.size
         errors = age_input * flow.error_effects[1]
-        levels = age_input * self.ellipsoid.state_bounds.unit_effects[1]
-        for share in _WINDOWS:
+        levels = age_input * ellipsoid.state_bounds.unit_effects[1]
+        rows = np.zeros((len(windows), 2 * _EARLIER + 2, n, 2 * n))
+        for row, window in zip(rows, windows, strict=True):
             # h bounds x_c = x + e_c, which follows the model, at the node T' ago.
-            node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
-            since_s = last_s - float(flow.edges_s[node])
-            x_c = flow.states[node, :n] + flow.states[node, n:]
-            h = float(np.linalg.norm(x_c @ self.ellipsoid.inverse, 2))
-            h = h + float(np.linalg.norm(x_c, 2)) * self.effects.first_error / self.size
+            h = window.largest_model + window.model_norm * self.effects.first_error / self.size
             if self.first_cell:
-                h = max(h, float(np.linalg.norm(x_c @ flow.start)) / self.size)
+                h = max(h, float(np.linalg.norm(window.model @ flow.start)) / self.size)
             # The conditions at times from T' ago until now, as rows for (x_c, e_c) T' ago.
-            level = 1.0 if node >= self.first_cell else self.largest_state() / self.size
-            rows = [np.hstack([identity, np.zeros((n, n))]) / (flow.stretch * h)]
-            moved = np.block([[identity, -identity], [np.zeros((n, n)), identity]])
-            step = exponential(flow.generator * (since_s / _EARLIER))
-            for number in range(_EARLIER + 1):
-                cell = flow.cell_at(number * since_s / _EARLIER) if number else 0
-                added = (errors[cell], levels[cell]) if number else (0.0, 0.0)
-                rows.append(moved[n:] / (limit + added[0]))
-                if number < _EARLIER:
-                    rows.append(shape @ moved[:n] / (level + added[1]))
-                    moved = step @ moved
-            # Semi-axes of the ellipsoids of the first weights, in balanced coordinates.
-            turn = _balancing_coordinates(np.array(rows)[None])[0]
-            balanced = np.array(rows) @ turn
-            forms = balanced.swapaxes(-1, -2) @ balanced
-            values, V = np.linalg.eigh(np.tensordot(_SHARES, forms[_FOUR], axes=1))
-            usable = values[:, :1] > _CONDITION * values[:, -1:]  # others are too flat
-            roots = V / np.sqrt(np.where(usable, values, _CONDITION))[:, None]
-            windows.append((flow.cell_at(since_s), moved @ turn, forms, roots))
-        cells, moves, forms_of, roots_of = zip(*windows, strict=True)
-        return np.array(cells), np.array(moves), np.array(forms_of), np.array(roots_of)
+            level = 1.0 if window.node >= self.first_cell else self.largest_state() / self.size
+            added = np.array([errors[window.cells], levels[window.cells]])
+            added[:, 0] = 0.0
+            row[0, :, :n] = np.eye(n) / (flow.stretch * h)
+            row[1::2] = window.moved[:, n:] / (limit + added[0])[:, None, None]
+            row[2::2] = (ellipsoid.shape @ window.moved[:-1, :n]) / (level + added[1, :-1])[:, None, None]
+        # Semi-axes of the ellipsoids of the first weights, in balanced coordinates.
+        turns = _balancing_coordinates(rows)
+        balanced = rows @ turns[:, None]
+        forms = balanced.swapaxes(-1, -2) @ balanced
+        first_forms = _SHARES @ forms[:, _FOUR].reshape(len(windows), len(_FOUR), -1)
+        values, V = np.linalg.eigh(first_forms.reshape(len(windows), -1, 2 * n, 2 * n))
+        usable = values[..., :1] > _CONDITION * values[..., -1:]  # others are too flat
+        roots = V / np.sqrt(np.where(usable, values, _CONDITION))[..., None, :]
+        cells = np.array([window.cells[-1] for window in windows])
+        return cells, np.array([window.moved[-1] for window in windows]) @ turns, forms, roots
 
 
 class _CellBounds:

@@ -36,6 +36,7 @@ from tests.oracles.lossy_loops import (
     Steps,
     System,
     Trace,
+    norms,
     random_system,
     simulate,
     times_s,
@@ -52,9 +53,10 @@ class Compare:
     decay: float = 0.0
 
     def __call__(self, step: int, since: Steps, x: Reals, e_s: Reals) -> Flags:
-        size, error = (np.linalg.norm(v @ self.weight.T, axis=1) for v in (x, e_s))
         threshold = self.threshold * np.exp(-self.decay * step)
-        return np.asarray(error > np.hypot(self.share * size, threshold))
+        if self.share:
+            threshold = np.hypot(self.share * norms(x @ self.weight.T), threshold)
+        return np.asarray(norms(e_s @ self.weight.T) > threshold)
 
 
 @dataclass
@@ -84,7 +86,7 @@ class Area:
     _before: Reals = field(default_factory=lambda: np.zeros(1))
 
     def __call__(self, step: int, since: Steps, x: Reals, e_s: Reals) -> Flags:
-        error, is_fresh = np.linalg.norm(e_s @ self.weight.T, axis=1), since <= self.every
+        error, is_fresh = norms(e_s @ self.weight.T), since <= self.every
         before = np.where(is_fresh, 0.0, self._before if step else 0.0)
         added = self.every * self.step_s * (before + error) / 2
         self._area = np.where(is_fresh, 0.0, self._area if step else 0.0) + added * (step > 0)
