@@ -79,8 +79,9 @@ class MomentStep(NamedTuple):
 
     def of_states(self, states: Sequence[int]) -> "MomentStep":
         """Leave out all but some states, which do not depend on the others after the interval."""
-        block = np.ix_(states, states)
-        return MomentStep(self.matrix[block], self.noise[block], self.costs[:, *block], self.constants)
+        rows, columns = np.ix_(states, states)
+        M, W, C = self.matrix[rows, columns], self.noise[rows, columns], self.costs[:, rows, columns]
+        return MomentStep(M, W, C, self.constants)
 
 
 def flow(generator: Matrix, intensity: Matrix, forms: Stack, duration_s: float) -> MomentStep:
@@ -254,7 +255,8 @@ class LoopMoments:
         """Return the costs of all periods from a start of z without noise; None: infinite."""
         if self.growth >= 1:
             return None
-        moments = start.moments[:, *np.ix_(self.states, self.states)]
+        rows, columns = np.ix_(self.states, self.states)
+        moments = start.moments[:, rows, columns]
         all_cycles = from_triangles(self._sum(triangles(moments)), len(self.states))
         return self._cycle(SecondMoments(all_cycles, 0 * start.shares))[1]
 
