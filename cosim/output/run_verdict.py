@@ -56,6 +56,7 @@ _ASSUMPTION_STYLES: dict[str, str] = {
     AssumptionStatus.VIOLATED: "bold yellow",
     AssumptionStatus.IDEALISED: "dim",
     AssumptionStatus.NOT_NEEDED: "dim",
+    AssumptionStatus.NOT_CHECKED: "yellow",
     AssumptionStatus.ASSUMED: "cyan",
 }
 _NAMED = 3
