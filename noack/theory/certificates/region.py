@@ -23,11 +23,20 @@ import numpy as np
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import PlantStart, SystemFailedError
-from noack.plants.systems.jacobian_enclosure import EnclosedMotion, Inclusion, NotEnclosedError, NotInstalledError
+from noack.plants.systems.jacobian_enclosure import (
+    EnclosedMotion,
+    Inclusion,
+    NotEnclosedError,
+    NotInstalledError,
+)
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.box import BoxGains
-from noack.theory.bounds.certificate_terms import CertificateNotCheckedError, NetworkConditions, NoCertificateError
+from noack.theory.bounds.certificate_terms import (
+    CertificateNotCheckedError,
+    NetworkConditions,
+    NoCertificateError,
+)
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
