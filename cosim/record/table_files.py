@@ -238,8 +238,10 @@ class TableFile:
 
     @contextmanager
     def _open(self) -> Iterator[pq.ParquetFile]:
-        options: dict[str, Any] = {"metadata": self._metadata, "page_checksum_verification": True}
-        with _readable(self._path), pq.ParquetFile(self._path, **options) as file:
+        with (
+            _readable(self._path),
+            pq.ParquetFile(self._path, metadata=self._metadata, page_checksum_verification=True) as file,
+        ):
             _require_columns(self._path, file.schema_arrow, self._dtype)
             yield file
 
