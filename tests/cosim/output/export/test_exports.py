@@ -117,13 +117,16 @@ def test_an_mcap_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
         assert content["e_c_norm"] == (None if np.isnan(row["e_c_norm"]) else row["e_c_norm"])
 
 
-def test_an_mcap_file_has_no_times_before_0(run: noack.Run, tmp_path: Path) -> None:
+def test_impossible_times_of_a_damaged_record_do_not_prevent_an_mcap_file(
+    run: noack.Run, tmp_path: Path
+) -> None:
     damaged = tmp_path / "damaged"
     shutil.copytree(run.directory, damaged)
-    path = damaged / "record" / "sensor_measurement.parquet"
-    table = pq.read_table(path)
-    times = pa.array(np.full(len(table), -1))
-    pq.write_table(table.set_column(table.column_names.index("t_ns"), "t_ns", times), path)
+    for name, t_ns in (("sensor_measurement", -1), ("plant_step", 2**62)):
+        path = damaged / "record" / f"{name}.parquet"
+        table = pq.read_table(path)
+        times = pa.array(np.full(len(table), t_ns))
+        pq.write_table(table.set_column(table.column_names.index("t_ns"), "t_ns", times), path)
     export_run(damaged, tmp_path / "run.mcap")
     assert {at_ns for at_ns, _, _ in messages(tmp_path / "run.mcap")["/loop/errors"]} == {0}
 
