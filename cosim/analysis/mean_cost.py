@@ -1,5 +1,8 @@
 """The mean cost of a time-triggered loop under random losses, with and without its guarantee."""
 
+import math
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -8,6 +11,7 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
+from noack.core.number_format import number
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import loss_process
@@ -18,14 +22,17 @@ from noack.theory.random_losses.exact_moments import LoopMoments, LoopPeriods, p
 
 
 class Stationary(NamedTuple):
-    """What the loop tends to, whatever its start; root mean squares in the model's units."""
+    """What the loop tends to, whatever its start; root mean squares in the model's units.
 
-    state_rms: tuple[float, ...]
+    None: it depends on second moments that grow without a bound.
+    """
+
+    state_rms: tuple[float | None, ...]
     """Of each entry of x, over time."""
-    state_rms_at_transmissions: tuple[float, ...]
-    input_rms: tuple[float, ...]
+    state_rms_at_transmissions: tuple[float | None, ...]
+    input_rms: tuple[float | None, ...]
     """Of each entry of u, without disturbances at the input."""
-    cost_per_s: float
+    cost_per_s: float | None
     """Mean of xᵀQx + uᵀRu over time."""
 
 
@@ -36,12 +43,20 @@ class CostUnder:
     guarantee: str
     growth: float
     """Of √E‖z‖² per period; z is the state of plant, model and inputs."""
-    stationary: Stationary | None
-    """None: the second moments grow without a bound."""
-    horizon_cost: float
-    """Mean of ∫ xᵀQx + uᵀRu dt from x(0) until the horizon, with disturbances and noise."""
+    stationary: Stationary
+    horizon_cost: float | None
+    """Mean of ∫ xᵀQx + uᵀRu dt from x(0) until the horizon, with disturbances and noise.
+
+    None: not known, since there are too many periods until the horizon."""
     transient_cost: float | None
-    """The same from x(0) for all time, without disturbances and noise; None: infinite."""
+    """The same from x(0) for all time, without disturbances and noise.
+
+    None: it depends on second moments that grow without a bound."""
+
+    @property
+    def grows(self) -> bool:
+        """Whether the second moments grow without a bound."""
+        return self.growth >= 1
 
 
 @dataclass(frozen=True)
@@ -64,8 +79,7 @@ class MeanCost:
         for name in ("with_guarantee", "without_guarantee"):
             cost = getattr(self, name)
             if isinstance(cost, CostUnder):
-                stationary = cost.stationary and cost.stationary._asdict()
-                document[name] = vars(cost) | {"stationary": stationary}
+                document[name] = vars(cost) | {"stationary": cost.stationary._asdict()}
         return document
 
     def __repr__(self) -> str:
@@ -73,10 +87,12 @@ class MeanCost:
         cost = self.with_guarantee
         if isinstance(cost, str):
             return cost
-        text = f"mean cost until {self.horizon_s:g} s: {cost.horizon_cost:.6g}"
-        if cost.stationary is None:
-            return f"{text}; the second moments grow by {cost.growth:.6g} per period"
-        return f"{text}; stationary: {cost.stationary.cost_per_s:.6g} /s"
+        text = f"mean cost until {self.horizon_s:g} s: {number(cost.horizon_cost, 6)}"
+        if cost.grows:
+            text += f"; the second moments grow by {cost.growth:.6g} per period"
+        if (per_s := cost.stationary.cost_per_s) is not None:
+            text += f"; stationary: {per_s:.6g} /s"
+        return text
 
 
 def require_weight(name: str, weight: Matrix, *, definite: bool = False) -> None:
@@ -111,6 +127,8 @@ def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None
         if weight.shape != (width, width):
             raise CallerError(f"{name}: expected {width} x {width} numbers")
         require_weight(name, weight)
+    if not (Q.any() or R.any()):
+        raise CallerError("Q, R: all weights are 0")
     forms[size, :n, :n], forms[size, n:, n:] = Q, R
     periods = periods_of(resolved, forms)
 
@@ -137,18 +155,32 @@ def _cost_under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarant
     if resolved.network.initial_sync == "known_state":  # nothing is sent at t = 0
         outcomes = outcomes.after_pause()
     moments, start = LoopMoments(periods, outcomes), start_of(resolved, outcomes)
-    fixed_point, n = moments.stationary(), loop_of(resolved).n
-    stationary = None
-    if fixed_point is not None:
-        means, second_moments = fixed_point[1], np.diag(fixed_point[0].moments.sum(axis=0))
-        roots = np.sqrt(np.maximum(np.concatenate([means[:-1], second_moments[:n]]), 0.0)).tolist()
-        stationary = Stationary(tuple(roots[:n]), tuple(roots[-n:]), tuple(roots[n:-n]), float(means[-1]))
-    _, horizon_costs = moments.until(start, resolved.timing.horizon_ns)
-    transient = moments.transient(start)
+    n, m = resolved.model.dimensions[:2]
+    whole_cost = n + m  # the number of the last form
+
+    def over_time(form: int) -> float | None:
+        fixed_point = moments.of_cost(form).stationary()
+        return None if fixed_point is None else float(fixed_point[1][form])
+
+    def at_transmissions(state: int) -> float | None:
+        part = moments.of_cost(state)
+        fixed_point, place = part.stationary(), part.states.index(state)
+        return None if fixed_point is None else float(fixed_point[0].moments[:, place, place].sum())
+
+    rms = _roots(map(over_time, range(n + m)))
+    horizon_cost: float | None = None
+    with suppress(NotPredictableError):  # there are too many periods
+        horizon_cost = float(moments.until(start, resolved.timing.horizon_ns)[1][whole_cost])
+    transient = moments.of_cost(whole_cost).transient(start)
     return CostUnder(
         guarantee.meaning,
         moments.growth,
-        stationary,
-        float(horizon_costs[-1]),
-        None if transient is None else float(transient[-1]),
+        Stationary(rms[:n], _roots(map(at_transmissions, range(n))), rms[n:], over_time(whole_cost)),
+        horizon_cost,
+        None if transient is None else float(transient[whole_cost]),
     )
+
+
+def _roots(squares: Iterable[float | None]) -> tuple[float | None, ...]:
+    """Return the roots of mean squares, of which rounding may leave a small negative one."""
+    return tuple(None if square is None else math.sqrt(max(square, 0.0)) for square in squares)

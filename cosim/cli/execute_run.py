@@ -47,7 +47,7 @@ class OutputOptions:
     """What a command prints and writes at the end of a run.
 
     Options:
-        report: Write report.html, which takes some seconds; `noack report` writes it later.
+        report: Write report.html, which takes about 2 s; `noack report` writes it later.
     """
 
     report: bool = True

@@ -184,18 +184,23 @@ function labField(field) {
   const input = labNode(field.options ? 'select' : 'input', {
     id: name, title: field.help, placeholder: field.default, autocomplete: 'off',
     'aria-describedby': `${name}-error`});
+  const say = () => {
+    clearTimeout(input.labUnsaid);
+    input.labUnsaid = null;
+    labSay('fill', {key: field.key, text: input.value});
+  };
   input.addEventListener(field.options ? 'change' : 'input', () => {
-    clearTimeout(input.labRest);
-    input.labRest = setTimeout(() => labSay('fill', {key: field.key, text: input.value}),
-      field.options ? 0 : 400);
+    clearTimeout(input.labUnsaid);
+    input.labUnsaid = setTimeout(say, field.options ? 0 : 400);
   });
-  input.addEventListener('blur', () => labFillForm(LAB.form));
+  input.addEventListener('blur', () => input.labUnsaid ? say() : labFillForm(LAB.form));
   LAB.fields.set(field.key, input);
   return labNode('div', {class: 'lab-choice'}, labNode('label', {for: name}, field.label), input,
     labNode('p', {id: `${name}-error`, class: 'lab-bad', role: 'status'}));
 }
 
-/* Show values and mistakes; what is being typed stays. Return whether there is a mistake. */
+/* Show values and mistakes. What is being typed stays, and what the server does not know yet.
+   Return whether there is a mistake. */
 function labFillForm(group) {
   let wrong = false;
   for (const field of group.fields) {
@@ -206,7 +211,7 @@ function labFillForm(group) {
       const known = field.options.some(([value]) => value === field.text);
       labFill(input, known ? field.options : [...field.options, [field.text, field.text]],
         field.text);
-    } else if (input !== document.activeElement && input.value !== field.text) {
+    } else if (input !== document.activeElement && !input.labUnsaid && input.value !== field.text) {
       input.value = field.text;
     }
     input.ariaInvalid = String(Boolean(field.error));

@@ -300,10 +300,11 @@ def mean_cost_tables(costs: MeanCost) -> Iterator[ResultTable]:
         ("input_rms", costs.input_names, ""),
     ):
         for i, name in enumerate(names):
-            found = (cost.stationary and getattr(cost.stationary, rms)[i] for cost in known)
-            add(f"rms of {name}{where}", found)
-    add("mean cost, stationary", (cost.stationary and cost.stationary.cost_per_s for cost in known), " /s")
-    add(f"mean cost from x(0) until {costs.horizon_s:g} s", (cost.horizon_cost for cost in known))
+            add(f"rms of {name}{where}", (getattr(cost.stationary, rms)[i] for cost in known))
+    add("mean cost, stationary", (cost.stationary.cost_per_s for cost in known), " /s")
+    costs_until = [cost.horizon_cost for cost in known]
+    until = ["not known: too many periods" if cost is None else number(cost, 6) for cost in costs_until]
+    rows.append((f"mean cost from x(0) until {costs.horizon_s:g} s", *until))
     transients = (cost.transient_cost for cost in known)
     add("mean cost from x(0), without disturbances and noise", transients)
     yield ResultTable("cost", title, headings, rows)

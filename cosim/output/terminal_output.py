@@ -40,6 +40,7 @@ _ASSUMPTION_STYLES: dict[str, str] = {
     AssumptionStatus.VIOLATED: "bold yellow",
     AssumptionStatus.IDEALISED: "dim",
     AssumptionStatus.NOT_NEEDED: "dim",
+    AssumptionStatus.NOT_CHECKED: "yellow",
     AssumptionStatus.ASSUMED: "cyan",
 }
 _MOST_LOOPS, _MOST_REASONS = 12, 3

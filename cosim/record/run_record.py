@@ -41,7 +41,7 @@ from cosim.record.record_source import (
     with_loop,
 )
 from cosim.record.record_source import Rows as Rows
-from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, Kind, kind_of
+from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE, Kind, kind_of
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
@@ -445,7 +445,9 @@ def load_run(run_dir: Path) -> RecordedRun:
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
     if not folder.is_dir():
-        raise CallerError(f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run")
+        ended = (run_dir / SUMMARY_FILE).is_file()
+        hint = "" if ended else "; `noack summary` finalises an interrupted run"
+        raise CallerError(f"{run_dir}: has no numeric record{hint}")
     scenario, loops = scenarios_of(run_dir)
     most_rows = _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS
     stored = table_files.StoredTables(folder, run_tables(scenario), most_rows)

@@ -83,14 +83,15 @@ def write_archive(run_dir: Path, path: Path) -> Manifest:
     """Write the archive of a run, which is finalised first if necessary.
 
     Raises:
-        CallerError: it is not a run directory, the run is active, or its scenario names files
-            elsewhere.
+        CallerError: it is not a run directory, the run is active, its scenario names files
+            elsewhere, or a table of its record is missing or cannot be opened.
         MachineError: a file cannot be read, or the archive cannot be written.
     """
     reopen(run_dir)
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     if (outside := outside_files(scenario, run_dir)) is not None:
         raise CallerError(f"{run_dir}: its scenario names {outside}, outside the run directory")
+    load_run(run_dir)  # refuses a damaged record
     try:
         names = sorted(_names(run_dir))
         files = {name: _entry(run_dir / name) for name in names}

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Msg, Typestore
 
 JOINT_STATE, LOG = "sensor_msgs/msg/JointState", "rcl_interfaces/msg/Log"
+_LATEST_NS = (2**31 - 1) * NS_PER_S
 DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
 """Where the router of rmw_zenoh listens by default, as zenoh writes it."""
 TOPICS = {
@@ -126,7 +127,8 @@ def read_joint_state(data: bytes) -> Entries:
 
 
 def _time(t_ns: int) -> "Msg":
-    seconds, nanoseconds = divmod(max(t_ns, 0), NS_PER_S)
+    """Return a time, or the nearest one that the message can have."""
+    seconds, nanoseconds = divmod(min(max(t_ns, 0), _LATEST_NS), NS_PER_S)
     return _store().types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
 
 

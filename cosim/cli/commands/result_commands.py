@@ -13,7 +13,7 @@ from cosim.cli.execute_run import reopened
 from cosim.lazy_modules import lazy_modules
 from cosim.output.export import FORMATS, export_run, export_scenario, export_suffix, needs_run
 from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
-from noack.core.errors import CallerError, ExitStatus
+from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
@@ -37,10 +37,11 @@ def summary(
     verbose: opt.VerboseOption = False,
     tables: opt.TablesOption = None,
     json: opt.JsonOption = False,
-) -> None:
+) -> int:
     """Show a run's summary; finalise an interrupted run first.
 
-    Exit status 0: the summary was shown, also that of a failed run.
+    Exit status 0: the summary was shown, also that of a failed run; 2: a table of the run's record
+    is missing or cannot be opened.
 
     Examples:
         noack summary   the last run
@@ -51,6 +52,17 @@ def summary(
     outcome = run_summary.outcome_of_loop(reopened(run.path), run.loop)
     cli.show(json, outcome.summary.to_json, terminal_output.print_outcome, outcome, verbose=verbose)
     cli.write_tables(run_tables.summary_tables(outcome.summary), tables, json=json)
+    return _record_status(run.path)
+
+
+def _record_status(run_dir: Path) -> int:
+    """Open the tables of a run; if one cannot be opened, print why and return the exit status."""
+    try:
+        run_record.load_run(run_dir)
+    except NoackError as error:
+        print_to_stderr(f"noack: {error}")
+        return error.exit_status
+    return ExitStatus.OK
 
 
 @cli.command(cli.RUNS, 40)

@@ -174,7 +174,7 @@ def _write_errors(writer: "Writer", run: ExportedRun) -> None:
         for t_ns, *norms in zip(aligned.t_ns.tolist(), *(c.tolist() for c in columns), strict=True):
             keys = ("t_ns", "e_s_norm", "threshold", "e_c_norm")
             content = to_json(dict(zip(keys, (t_ns, *norms), strict=True)), inf_nan_mode="null")
-            at_ns = t_ns + run.phase_ns
+            at_ns = max(t_ns + run.phase_ns, 0)  # damaged records have others
             writer.add_message(channel, at_ns, content, at_ns, number & 0xFFFF_FFFF)
             number += 1
 

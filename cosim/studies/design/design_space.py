@@ -6,6 +6,7 @@ The gains and norms among which a design chooses are at the end.
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -28,6 +29,8 @@ LEVELS = np.geomspace(0.01, 3.0, 8)
 LEVEL_STEP = float(LEVELS[1] / LEVELS[0])
 _WIDEST = 3.0
 """Factor by which the search may exceed the grid's range of β."""
+_MOST_DIGITS_APART = 12
+"""Of the largest weights of Q and R; further apart, a Riccati equation without a solution is theirs."""
 
 
 class TriggerCandidate(NamedTuple):
@@ -184,18 +187,26 @@ def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
     """Return K of u = K x, (m, n): K = −R⁻¹BᵀP, AᵀP + PA − PBR⁻¹BᵀP + Q = 0.
 
     Raises:
-        CallerError: Q or R is not a valid weight, or no P makes the loop stable.
+        CallerError: Q or R is not a valid weight, the sizes of both are too different, or no P makes
+            the loop stable.
     """
     require_weight("--Q", Q)
     require_weight("--R", R, definite=True)
-    try:
+    with suppress(np.linalg.LinAlgError):
         P = solve_continuous_are(A, B, Q, R)
-    except np.linalg.LinAlgError:
+        K = np.asarray(-np.linalg.solve(R, B.T @ P), dtype=np.float64)
+        if spectral_abscissa(A + B @ K) < 0:
+            return K
+    sizes = np.log10([np.abs(weight).max() or 1.0 for weight in (Q, R)])
+    if abs(sizes[1] - sizes[0]) > _MOST_DIGITS_APART:
         raise CallerError(
-            "model: its Riccati equation has no stabilising solution; "
-            "every unstable mode must be within the inputs' reach and weighed by Q"
-        ) from None
-    return np.asarray(-np.linalg.solve(R, B.T @ P), dtype=np.float64)
+            "--R: its weights and those of --Q are too different in size: the Riccati equation has no "
+            "stabilising solution in double precision"
+        )
+    raise CallerError(
+        "model: its Riccati equation has no stabilising solution; "
+        "every unstable mode must be within the inputs' reach and weighed by Q"
+    )
 
 
 def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) -> Scenario:

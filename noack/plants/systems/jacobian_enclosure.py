@@ -41,11 +41,15 @@ _LONGEST_S = 1e9
 _AT_REST = 1e-9
 """The plant rests if |f(0, 0)| is at most this share of the largest entry of A and B in its row."""
 _UNDECIDED = "its equations distinguish cases, and the region contains more than one of them"
-NOT_INSTALLED = "its equations cannot be enclosed without python-flint: pip install 'noack[regions]'"
+_NOT_INSTALLED = "its equations cannot be enclosed without python-flint: pip install 'noack[regions]'"
 
 
 class NotEnclosedError(NoackError):
     """The derivatives have no enclosure over the region; the message is the reason."""
+
+
+class NotInstalledError(NotEnclosedError):
+    """The package that encloses derivatives is not installed."""
 
 
 class Inclusion(NamedTuple):
@@ -225,6 +229,7 @@ class EnclosedMotion:
 
     Raises:
         NotEnclosedError: it has no equations that can be enclosed.
+        NotInstalledError: the package that encloses them is missing.
     """
 
     system: PlantSystem
@@ -235,7 +240,7 @@ class EnclosedMotion:
         if not hasattr(self.system, "expressions"):
             raise NotEnclosedError("it has no equations that can be enclosed: it moves by itself")
         if find_spec("flint") is None:
-            raise NotEnclosedError(NOT_INSTALLED)
+            raise NotInstalledError(_NOT_INSTALLED)
 
     def over(self, halfwidths: Vector) -> Inclusion:
         """Enclose the equations over the region |(x, u)_j| ≤ ``halfwidths``, (n + m,).

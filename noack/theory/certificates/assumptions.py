@@ -17,7 +17,7 @@ from noack.scenario.estimation import SteadyState, steady_state
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
-from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
+from noack.theory.bounds.certificate_terms import CertificateNotCheckedError, Constants, NetworkConditions
 from noack.theory.bounds.disturbances import normal_bounds
 from noack.theory.certificates.conditions import network_delay_texts
 
@@ -34,6 +34,8 @@ class AssumptionStatus(StrEnum):
     """No sampled loop meets it; certificates allow for the difference."""
     NOT_NEEDED = "not needed"
     """It does not hold, or is not checked; no computed bound depends on it."""
+    NOT_CHECKED = "not checked"
+    """An optional package that the check needs is not installed."""
     ASSUMED = "assumed"
     """It is not proven; what depends on the run is checked in each run."""
 
@@ -241,7 +243,7 @@ def certificate_assumptions(
     conditions: NetworkConditions,
     decay: dict[str, float],
     constants: Constants | None,
-    void: str | None,
+    void: ArithmeticError | None,
     loop_gain: float,
     promise: str,
     probability: float | None,
@@ -270,7 +272,9 @@ def certificate_assumptions(
     checked += _conditions(conditions, resolved, probability)
     checked += _bounded_causes(resolved)
     if constants is None:
-        checked.append(_violated("there is a certificate", "certificate", void or ""))
+        is_unchecked = isinstance(void, CertificateNotCheckedError)
+        status = AssumptionStatus.NOT_CHECKED if is_unchecked else AssumptionStatus.VIOLATED
+        checked.append(Assumption("there is a certificate", "certificate", status, str(void)))
     else:
         why = f"the loop gain of the errors is {loop_gain:.3g}, below 1"
         checked.append(_checked("small-gain condition", "certificate", True, why))

@@ -23,11 +23,20 @@ import numpy as np
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import PlantStart, SystemFailedError
-from noack.plants.systems.jacobian_enclosure import EnclosedMotion, Inclusion, NotEnclosedError
+from noack.plants.systems.jacobian_enclosure import (
+    EnclosedMotion,
+    Inclusion,
+    NotEnclosedError,
+    NotInstalledError,
+)
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.box import BoxGains
-from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
+from noack.theory.bounds.certificate_terms import (
+    CertificateNotCheckedError,
+    NetworkConditions,
+    NoCertificateError,
+)
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
@@ -165,6 +174,8 @@ class RegionScope(_Box):
                 box = _Box(self._resolved, inclusion, self._start_error, self._other_start)
                 phases, reached = yield from box.bounded(conditions)
             except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
+                if isinstance(error, NotInstalledError):
+                    raise CertificateNotCheckedError(str(error)) from None
                 why = f"{where}: {error}" if widths.any() else str(error)
                 raise NoCertificateError(why) from None
             except NoCertificateError as error:
@@ -211,6 +222,7 @@ class RegionScope(_Box):
             raise NotEnclosedError(f'a plant of kind "{plant.kind}" has no equations to enclose')
         start = PlantStart(np.zeros(loop.n), loop.A_model, loop.B_model, timing.plant_period_ns)
         try:
-            return EnclosedMotion(plant.system(start), loop.n, loop.m)
+            system = plant.system(start)
         except NoackError as error:  # a user's class that does not accept x = 0, for example
             raise NotEnclosedError(str(error)) from None
+        return EnclosedMotion(system, loop.n, loop.m)

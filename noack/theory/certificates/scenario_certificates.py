@@ -170,12 +170,14 @@ class CertificateScope:
 
     def search(self, conditions: NetworkConditions) -> Search[ScenarioCertificate]:
         """Search for the certificate under some conditions, perhaps together with others."""
-        trigger, void = self._trigger, None
+        trigger = self._trigger
+        void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
             phases = yield from self._constants(conditions)
         except (NotDecayingError, NoCertificateError) as error:
-            void = str(error)
+            void = error
+        reason = None if void is None else str(void)
 
         def certificate(
             phase: tuple[Constants | None, ...], *other_phases: tuple[Constants | None, ...]
@@ -183,7 +185,7 @@ class CertificateScope:
             main, floor, persistent = phase
             return ScenarioCertificate(
                 self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-                self._loop.weight is not None, conditions, (), main, floor, void, persistent,
+                self._loop.weight is not None, conditions, (), main, floor, reason, persistent,
                 certificate(*other_phases) if other_phases else None,
             )  # fmt: skip
 

@@ -25,6 +25,7 @@ _ENLARGED = 1 + 2.0**-40
 _UNDERFLOW = 1e-290
 _DIGITS = 384
 _ONE = 1 << _DIGITS
+_LARGEST = int(np.finfo(np.float64).max)
 _TERMS = 60
 """Of Taylor's series of an exponential with a norm up to 1/16: the remainder is below 2⁻⁵⁰⁰."""
 
@@ -147,7 +148,11 @@ def stacked(*parts: FixedPointMatrix) -> FixedPointMatrix:
 
 
 def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
-    """Return e^{G dt}, with G per second, by Taylor's series and repeated squaring."""
+    """Return e^{G dt}, with G per second, by Taylor's series and repeated squaring.
+
+    Raises:
+        OverflowError: an entry, or its error, is beyond double precision.
+    """
     whole = fixed(generator)
     scaled = [value * dt_ns // NS_PER_S for value in whole.entries.ravel()]
     norm = sum(abs(value) for value in scaled) or 1
@@ -163,4 +168,6 @@ def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
     total = FixedPointMatrix(total.entries, total.error + 1)
     for _ in range(halvings):
         total = total @ total
+        if max(int(abs(total.entries).max()), total.error) >> _DIGITS > _LARGEST:
+            raise OverflowError  # further squares would take more and more memory
     return total

@@ -272,7 +272,8 @@ class LossMargin:
                 stability = self._bounded(bursts, accuracy, decide=decide, effort=effort)
         except (OverflowError, FloatingPointError):
             raise CallerError(
-                "the loop grows beyond 1e308 within some deliveries; reduce mansd or the period"
+                "the loop grows beyond 1e308 within some deliveries, or the units of its states and "
+                "inputs are too different; reduce mansd or the period, or use other units"
             ) from None
         return stability._replace(took_s=time.process_time() - begun_s)
 

@@ -24,11 +24,13 @@ is composed of its halves. Whatever the units of the states, e^{Gt} is computed 
 """
 
 import math
+from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 
+from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, balancing_exponents, exponential
@@ -75,10 +77,10 @@ class MomentStep(NamedTuple):
             self.constants + later.constants + np.einsum("kij,ij->k", later.costs, self.noise),
         )
 
-    def of_first(self, states: int) -> "MomentStep":
-        """Leave out all but the first states, of which nothing after the interval depends."""
-        rows = slice(states)
-        M, W, C = self.matrix[rows, rows], self.noise[rows, rows], self.costs[:, rows, rows]
+    def of_states(self, states: Sequence[int]) -> "MomentStep":
+        """Leave out all but some states, which do not depend on the others after the interval."""
+        rows, columns = np.ix_(states, states)
+        M, W, C = self.matrix[rows, columns], self.noise[rows, columns], self.costs[:, rows, columns]
         return MomentStep(M, W, C, self.constants)
 
 
@@ -169,29 +171,55 @@ class LoopPeriods:
         from_ns, duration = slot * self.times.period_ns, duration_ns or self.times.period_ns
         until_ns, arrival_ns = from_ns + duration, from_ns + self.times.delay_ns
         if not delivered or arrival_ns > until_ns:
-            return self._fresh.then(self._between(from_ns, until_ns)).of_first(self.size)
+            return self._fresh.then(self._between(from_ns, until_ns)).of_states(range(self.size))
         sent = self._fresh.then(self._send).then(self._between(from_ns, arrival_ns))
         received = sent.then(self._receive).then(self._between(arrival_ns, until_ns))
-        return received.of_first(self.size)
+        return received.of_states(range(self.size))
 
 
 class LoopMoments:
     """Moments of the loop of some periods under random outcomes.
 
+    Args:
+        periods: the periods.
+        outcomes: the outcomes.
+        states: components of z, which do not depend on the others; None: all.
+
     Raises:
         NotPredictableError: loop and losses have too many states.
     """
 
-    def __init__(self, periods: LoopPeriods, outcomes: OutcomeChain) -> None:
+    def __init__(
+        self, periods: LoopPeriods, outcomes: OutcomeChain, states: Sequence[int] | None = None
+    ) -> None:
         require_few_slots(periods.times)
         self._periods, self._outcomes = periods, outcomes
+        self.states = [*range(periods.size)] if states is None else [*states]
         self._slots = [
-            (periods.step(slot, delivered=True), periods.step(slot, delivered=False))
+            (self._step(slot, delivered=True), self._step(slot, delivered=False))
             for slot in range(periods.times.slots)
         ]
         maps = [(exactly(delivered.matrix), exactly(lost.matrix)) for delivered, lost in self._slots]
         self.growth = mean_square_growth(maps, outcomes)
         """Of √E‖z‖² per period."""
+
+    def _step(self, slot: int, *, delivered: bool, duration_ns: int | None = None) -> MomentStep:
+        return self._periods.step(slot, delivered, duration_ns).of_states(self.states)
+
+    @cached_method
+    def of_cost(self, number: int) -> "LoopMoments":
+        """Return the moments of the components of z on which a cost depends, now or later.
+
+        If all moments are bounded, they are returned.
+        """
+        steps = [step for slot in self._slots for step in slot]
+        acts_on = np.any([step.matrix != 0 for step in steps], axis=0)
+        matters = np.any([step.costs[number] != 0 for step in steps], axis=(0, 1))
+        for _ in self.states:  # each round has the components that act on those before
+            matters = matters | acts_on[matters].any(axis=0)
+        if self.growth < 1 or matters.all():
+            return self
+        return LoopMoments(self._periods, self._outcomes, np.compress(matters, self.states).tolist())
 
     def _sum(self, entries: Vector) -> Vector:
         """Return the sum of what becomes of moments over all cycles of the slots.
@@ -200,13 +228,14 @@ class LoopMoments:
         """
         maps = [(delivered.matrix, lost.matrix) for delivered, lost in self._slots]
         exponents = balancing_exponents(np.abs(maps).max(axis=(0, 1)))
-        i, j = np.triu_indices(self._periods.size)
+        i, j = np.triu_indices(len(self.states))
         units = np.tile(exponents[i] + exponents[j], len(self._outcomes.lost))
         scaled = np.ldexp(maps, exponents[:, None] - exponents)
         steps = [second_moments(delivered, lost, self._outcomes) for delivered, lost in scaled]
         cycle = reduce(lambda before, step: step @ before, steps)
         return np.ldexp(resolved_by(cycle, 1.0, np.ldexp(entries, units)), -units)
 
+    @cached_method
     def stationary(self) -> tuple[SecondMoments, Vector] | None:
         """Return the moments at the transmissions of slot 0, and the mean costs per second.
 
@@ -215,7 +244,7 @@ class LoopMoments:
         if self.growth >= 1:
             return None
         shares = self._outcomes.distribution(len(self._slots))
-        size = self._periods.size
+        size = len(self.states)
         added, _ = self._cycle(SecondMoments(np.zeros((len(shares), size, size)), shares))
         entries = self._sum(triangles(added.moments))
         start = SecondMoments(from_triangles(entries, size), shares)
@@ -223,11 +252,12 @@ class LoopMoments:
         return start, self._cycle(start)[1] / cycle_s
 
     def transient(self, start: SecondMoments) -> Vector | None:
-        """Return the costs of all periods from a start on without noise; None: infinite."""
+        """Return the costs of all periods from a start of z without noise; None: infinite."""
         if self.growth >= 1:
             return None
-        entries = self._sum(triangles(start.moments))
-        all_cycles = from_triangles(entries, self._periods.size)
+        rows, columns = np.ix_(self.states, self.states)
+        moments = start.moments[:, rows, columns]
+        all_cycles = from_triangles(self._sum(triangles(moments)), len(self.states))
         return self._cycle(SecondMoments(all_cycles, 0 * start.shares))[1]
 
     def until(self, start: SecondMoments, horizon_ns: int) -> tuple[SecondMoments, Vector]:
@@ -245,7 +275,10 @@ class LoopMoments:
             costs = costs + added
         if rest_ns:
             slot = number % len(self._slots)
-            last = tuple(self._periods.step(slot, is_delivered, rest_ns) for is_delivered in (True, False))
+            last = tuple(
+                self._step(slot, delivered=is_delivered, duration_ns=rest_ns)
+                for is_delivered in (True, False)
+            )
             current, added = self._advance(current, last)
             costs = costs + added
         return current, costs

@@ -92,6 +92,20 @@ def test_a_mistake_in_the_form_is_shown_at_its_field(browser: Browser, address: 
     page.wait("document.getElementById('lab-field-trigger.beta').value === '5.0'")
 
 
+def test_what_is_typed_stays_when_the_field_is_left_or_the_form_shown_again(
+    browser: Browser, address: str
+) -> None:
+    page = Page(browser, address)
+    page.unfold("all settings (form)")
+    page.unfold("trigger")
+    field = "document.getElementById('lab-field-trigger.beta')"
+    page.js(f"{field}.focus()")
+    for value, event in (("0.25", f"{field}.blur()"), ("0.35", "labShowForm(LAB.form)")):
+        page.js(f"{field}.value = '{value}', {field}.dispatchEvent(new Event('input')), {event}")
+        assert page.js(f"{field}.value") == value
+        page.wait(f"location.search.includes('trigger.beta={value}')")
+
+
 SOURCES = ("explore", "live", "recorded")
 WIDTHS = {"light": (390, 600, 801, 1000, 1400), "dark": (390,)}
 """The layout does not depend on the colours."""

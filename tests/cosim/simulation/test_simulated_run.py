@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -92,6 +93,36 @@ def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> No
     refused = invoke("summary", run_dir, "--loop", "x")
     assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
     assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
+
+
+def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.copytree(run_dir, damaged)
+    table = damaged / "record" / "sensor_measurement.parquet"
+    whole = table.read_bytes()
+
+    def refused(*command: str) -> str:
+        done = invoke(command[0], damaged, *command[1:])
+        assert (done.exit_code, done.stderr.count("\n")) == (2, 1), done.output
+        assert done.stderr.startswith(f"noack: {table}: cannot be read: ")
+        return done.stdout
+
+    middle = len(whole) // 2
+    table.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    for command in (["replay"], ["report"], ["fidelity", "--loop", "periodic"]):
+        refused(*command)
+    for kind, name in (("csv", "tables"), ("mat", "run.mat"), ("mcap", "run.mcap")):
+        refused("export", "--format", kind, "--out", str(tmp_path / name))
+    for content in (whole[:middle], None):
+        table.unlink()
+        if content is not None:
+            table.write_bytes(content)
+        assert "bottleneck" in refused("summary")
+        assert json.loads(refused("summary", "--json"))["exit"]["status"] == 0
+        refused("archive", "--out", str(tmp_path / "damaged.zip"))
+    assert invoke("replay", damaged).stderr == f"noack: {table}: cannot be read: No such file or directory\n"
+    shutil.rmtree(table.parent)
+    assert invoke("summary", damaged).stderr == f"noack: {damaged}: has no numeric record\n"
 
 
 @pytest.mark.usefixtures("no_drawing")

@@ -1,6 +1,7 @@
 """Exports of a run, read back by the readers of other programs and compared with the record."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -8,12 +9,14 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from pyarrow import csv
 from scipy.io import loadmat
 
 import noack
+from cosim.output.export import export_run
 from cosim.output.export.mat_export import save_mat
 from cosim.output.viewer.rerun_program import start_rerun
 from noack.core.errors import CallerError
@@ -112,6 +115,20 @@ def test_an_mcap_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
     for (log_ns, _, content), row in zip(found["/loop/errors"], samples, strict=True):
         assert (log_ns, content["e_s_norm"]) == (row["t_ns"], row["e_s_norm"])
         assert content["e_c_norm"] == (None if np.isnan(row["e_c_norm"]) else row["e_c_norm"])
+
+
+def test_impossible_times_of_a_damaged_record_do_not_prevent_an_mcap_file(
+    run: noack.Run, tmp_path: Path
+) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.copytree(run.directory, damaged)
+    for name, t_ns in (("sensor_measurement", -1), ("plant_step", 2**62)):
+        path = damaged / "record" / f"{name}.parquet"
+        table = pq.read_table(path)
+        times = pa.array(np.full(len(table), t_ns))
+        pq.write_table(table.set_column(table.column_names.index("t_ns"), "t_ns", times), path)
+    export_run(damaged, tmp_path / "run.mcap")
+    assert {at_ns for at_ns, _, _ in messages(tmp_path / "run.mcap")["/loop/errors"]} == {0}
 
 
 def test_rerun_finds_no_fault_in_an_mcap_file(run: noack.Run, tmp_path: Path) -> None:

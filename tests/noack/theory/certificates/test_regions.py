@@ -16,6 +16,7 @@ from noack.plants.systems.jacobian_enclosure import Enclosed, EnclosedMotion, In
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
+from noack.theory.certificates.assumptions import AssumptionStatus
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.region import RegionScope
@@ -177,3 +178,11 @@ def test_what_persists_is_bounded_on_a_region(setting: str) -> None:
         claim for claim in RunClaims(simulate(resolved)).judge() if claim.source == "region certificate"
     ]
     assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}
+
+
+def test_without_its_package_a_certificate_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jacobian_enclosure, "find_spec", lambda name: None)
+    found = certificate_of(CASES["pendulum"].resolved(), CASES["pendulum"].semi_axes)
+    assert "noack[regions]" in (found.void or "")
+    (assumption,) = (a for a in found.assumptions if a.what == "there is a certificate")
+    assert assumption.verdict == AssumptionStatus.NOT_CHECKED

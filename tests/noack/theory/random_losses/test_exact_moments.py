@@ -128,7 +128,6 @@ def test_a_held_integrator_with_independent_losses_by_hand() -> None:
     matrix = np.array([[0.0, 2 * T, T**2], [q * K, q * K * T + p - 1, p * T], [q * K**2, 0, p - 1]])
     a, b, c = np.linalg.solve(matrix, [-(T**2) * sigma**2, 0.0, 0.0])
     assert isinstance(found, CostUnder)
-    assert found.stationary is not None
     assert found.stationary.state_rms_at_transmissions == pytest.approx([a**0.5], rel=1e-9)
     assert found.stationary.input_rms == pytest.approx([c**0.5], rel=1e-9)
     over_time = a + T * b + (T**2) * (c + sigma**2) / 3
@@ -236,8 +235,33 @@ def test_the_transient_and_the_stationary_part_are_limits() -> None:
     early, late = noisy
     assert isinstance(early, CostUnder)
     assert isinstance(late, CostUnder)
-    assert late.stationary is not None
+    assert late.horizon_cost is not None
+    assert early.horizon_cost is not None
     assert late.horizon_cost - early.horizon_cost == pytest.approx(late.stationary.cost_per_s)
+
+
+def test_costs_that_do_not_depend_on_what_grows_are_those_of_the_loop_without_it() -> None:
+    """x_2 drives itself only, and nothing but the weight Q_22 depends on it."""
+
+    def found(states: int, *weights: float) -> CostUnder:
+        A, B, gain = np.diag([-1.0, 0.5]), np.array([[1.0], [0.0]]), np.array([[-2.0, 0.0]])
+        model = {"A": A[:states, :states], "B": B[:states], "gain": gain[:, :states], "allow_unstable": True}
+        plant = {"initial_state": [1.0, 0.3][:states], "rate_hz": 40.0,
+                 "disturbances": [{"kind": "gaussian", "std": [0.1]}]}  # fmt: skip
+        given = scenario(model={key: np.array(value).tolist() for key, value in model.items()}, plant=plant)
+        cost = find_mean_cost(given, np.diag(weights)).with_guarantee
+        assert isinstance(cost, CostUnder)
+        return cost
+
+    alone, beside, weighed = found(1, 1.0), found(2, 1.0, 0.0), found(2, 1.0, 1e-12)
+    assert not alone.grows
+    assert beside.growth == pytest.approx(np.exp(0.5 * 0.25))
+    assert beside.stationary.state_rms == (pytest.approx(alone.stationary.state_rms[0]), None)
+    assert beside.stationary.state_rms_at_transmissions[1] is None
+    assert beside.stationary.input_rms == pytest.approx(alone.stationary.input_rms)
+    assert beside.stationary.cost_per_s == pytest.approx(alone.stationary.cost_per_s)
+    assert beside.transient_cost == pytest.approx(alone.transient_cost)
+    assert (weighed.stationary.cost_per_s, weighed.transient_cost) == (None, None)
 
 
 @pytest.mark.filterwarnings("error")
@@ -246,6 +270,8 @@ def test_the_transient_and_the_stationary_part_are_limits() -> None:
     [
         (["lane_periodic"], 0, "0.862511"),
         (["lane_periodic", "--set", "network.mansd=20"], 1, "∞"),
+        (["lane_periodic", "--set", "horizon_s=1e6"], 0, "not known"),
+        (["lane_periodic", "--Q", "[0, 0, 0, 0]", "--R", "[0, 0]"], 2, "Q, R: all weights are 0"),
         (["lane_periodic", "--Q", "[1, 1]"], 2, "--Q [1, 1]: expected 4 x 4 numbers"),
         (["lane_periodic", "--Q", "[1, 1, 1, -1]"], 2, "Q: must be positive semidefinite"),
         (["lane_periodic", "--R", "[[1, 1], [0, 1]]"], 2, "R: must be symmetric"),
