@@ -175,7 +175,11 @@ function labGroup(group, open) {
   details.labKey = group.key;
   details.open = open.includes(group.key);
   if (details.open) build();
-  details.addEventListener('toggle', () => { build(); labFillForm(LAB.form); });
+  details.addEventListener('toggle', () => {
+    if (!details.isConnected) return; // the form was made anew since
+    build();
+    labFillForm(LAB.form);
+  });
   return details;
 }
 

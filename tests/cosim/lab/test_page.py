@@ -92,6 +92,17 @@ def test_a_mistake_in_the_form_is_shown_at_its_field(browser: Browser, address: 
     page.wait("document.getElementById('lab-field-trigger.beta').value === '5.0'")
 
 
+def test_fields_opened_while_the_form_is_made_anew_show_mistakes(browser: Browser, address: str) -> None:
+    page = Page(browser, address)
+    page.unfold("all settings (form)")
+    page.js(  # the event of a group that opens comes after the new form
+        "[...document.querySelectorAll('#lab-form details')].find(e => e.labKey === 'trigger').open = true, "
+        "LAB.formShape = '', labShowForm(LAB.form), null"
+    )
+    page.fill("trigger.beta", "abc")
+    page.wait("document.getElementById('lab-field-trigger.beta').ariaInvalid === 'true'")
+
+
 def test_what_is_typed_stays_when_the_field_is_left_or_the_form_shown_again(
     browser: Browser, address: str
 ) -> None:
