@@ -177,8 +177,9 @@ class Deliveries:
         J = float(np.nanmax(history.J[last]))
         weighted_sum = float(np.nanmax(_lengths(history.centres[last]) + history.weighted_sums[last]))
         tail = self._later_outputs(weighted_sum, J)
-        if (tail > highest).any() and (found := history.last_return(last)) is not None:
-            kappa, of_rest = found.kappa, self._later_outputs(found.rest, J)
+        if (tail > highest).any() and (last_return := history.last_return(last)) is not None:
+            kappa, rest = last_return
+            of_rest = self._later_outputs(rest, J)
             tail = np.minimum(tail, np.maximum(kappa * highest + of_rest, of_rest / (1 - kappa)))
         return tail
 
@@ -341,15 +342,6 @@ class _Ball(NamedTuple):
         return np.array([[rho, rho_at_J], [J_at_rho, J]]) * ROUNDING
 
 
-class _Return(NamedTuple):
-    """ξ(t) = κ c(t − m) + r at the last times t."""
-
-    kappa: float
-    """|κ|"""
-    rest: float
-    """Bound of ‖r‖ + θJ."""
-
-
 class _BallHistory(NamedTuple):
     """The balls of all times; NaN where there is none."""
 
@@ -367,10 +359,10 @@ class _BallHistory(NamedTuple):
             self.centres[ball.time], self.J[ball.time] = ball.centre, ball.J
             self.weighted_sums[ball.time] = ball.weighted_sum
 
-    def last_return(self, last: slice) -> _Return | None:
-        """Return κ and the rest at the last times.
+    def last_return(self, last: slice) -> tuple[float, float] | None:
+        """Return |κ|, and ‖r‖ + ρ + θJ at most, of ξ(t) = κ c(t − m) + r at the last times t.
 
-        Of the m that are tried, it is that with the smallest (‖r‖ + θJ)/(1 − |κ|); None if there is none.
+        Of the m that are tried, it is that with the smallest (‖r‖ + ρ + θJ)/(1 − |κ|); None if there is none.
         """
         times = np.arange(last.start, last.stop)[~np.isnan(self.J[last])]
         delays = np.unique(np.linspace(len(self.J[last]), last.start - 1, _DELAYS).astype(int))
@@ -382,7 +374,7 @@ class _BallHistory(NamedTuple):
         if np.isnan(bounds).all():
             return None
         best = int(np.nanargmin(bounds))
-        return _Return(float(kappas[best]), float(rests[best]))
+        return float(kappas[best]), float(rests[best])
 
 
 class _Balls(NamedTuple):
