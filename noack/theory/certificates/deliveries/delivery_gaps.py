@@ -287,9 +287,9 @@ class GapLoop:
         """
         s, G, F, n = self.conditions.hold_s, self.scaled_H, self.F, self.n
         cells, cell_s, until_s = self.grid.cells, self.grid.cell_s, self.grid.until_s
-        moved = shape @ self.flows[self.grid.ends, :n] @ inverse
+        without_ages = shape @ self.flows[self.grid.ends, :n] @ inverse
         if s == 0 or not self.H.any():
-            return _norms(moved) * ROUNDING
+            return _norms(without_ages) * ROUNDING
         # By how much the products at the nodes may differ from those between them.
         input_rate = self.BK @ self.H
         row = np.hstack([shape, 0 * shape])
@@ -299,12 +299,12 @@ class GapLoop:
         sag = cell_s**2 / 8 * float(bend) * float(models)
         left, right = row @ self._powers(F) @ input_rate, self._powers(G) @ inverse
         gains = list[float]()
-        for end, without_ages in zip(self.grid.ends.tolist(), moved, strict=True):
+        for end, map_without_ages in zip(self.grid.ends.tolist(), without_ages, strict=True):
             products = left[end::-1] @ right[: end + 1]
-            gains.append(self._gain_with_mean_ages(without_ages, products, sag))
+            gains.append(self._gain_with_mean_ages(map_without_ages, products, sag))
             if gains[-1] >= 1:  # of no use: the other gaps do not matter
                 break
-        return np.array(gains + gains[-1:] * (len(moved) - len(gains)))
+        return np.array(gains + gains[-1:] * (len(without_ages) - len(gains)))
 
     def _gain_with_mean_ages(self, without_ages: Matrix, products: Stack, sag: float) -> float:
         """Bound ‖Λξ‖ after one gap by the products at its nodes: by their means, and what differs."""

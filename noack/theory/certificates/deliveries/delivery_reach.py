@@ -87,7 +87,7 @@ class _Window(NamedTuple):
     node: int
     cells: NDArray[np.intp]
     """The cells of the times since the node, from 0 to T', (k + 1,)."""
-    moved: Stack
+    flows: Stack
     """z at these times, (k + 1, 2n, 2n)."""
     model: Matrix
     """x_c at the node from ξ, (n, n)."""
@@ -141,14 +141,14 @@ class DeliveryEllipsoid:
         for share in _WINDOWS:
             node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
             since_s = last_s - float(flow.edges_s[node])
-            moved = [np.block([[identity, -identity], [np.zeros_like(identity), identity]])]
+            flows = [np.block([[identity, -identity], [np.zeros_like(identity), identity]])]
             step = exponential(flow.generator * (since_s / _EARLIER_TIMES))
             for _ in range(_EARLIER_TIMES):
-                moved.append(step @ moved[-1])
+                flows.append(step @ flows[-1])
             cells = [flow.cell_at(number * since_s / _EARLIER_TIMES) for number in range(_EARLIER_TIMES + 1)]
             model = flow.states[node, : flow.n] + flow.states[node, flow.n :]
             norm, largest = (float(np.linalg.norm(M, 2)) for M in (model, model @ self.inverse))
-            windows.append(_Window(node, np.array(cells), np.array(moved), model, norm, largest))
+            windows.append(_Window(node, np.array(cells), np.array(flows), model, norm, largest))
         return windows
 
     @cached_property
@@ -174,8 +174,8 @@ class DeliveryEllipsoid:
             low, high = np.zeros(len(gamma)), -2 * logarithmic_norm(S).clip(max=0.0) / gamma
             for _ in range(_HALVINGS):
                 middle = (low + high) / 2
-                moved = S + (middle / gamma)[:, None, None] * squares
-                grows = logarithmic_norm(moved) + middle * gamma / 2 >= 0
+                driven = S + (middle / gamma)[:, None, None] * squares
+                grows = logarithmic_norm(driven) + middle * gamma / 2 >= 0
                 low, high = np.where(grows, low, middle), np.where(grows, middle, high)
             largest = float(low.max())
         bounds = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
@@ -267,8 +267,8 @@ class Reach:
         A bound of at most ``enough`` is not improved, nor one that cannot become at most ``most``.
         """
         changes = self.effects.age_input * bounds.unit_effects[1]
-        cells, moved, forms, semi_axes = self._last_windows
-        Y = bounds.C @ moved
+        cells, flows, forms, semi_axes = self._last_windows
+        Y = bounds.C @ flows
         images = Y[:, None] @ semi_axes
         norms = spectral_norms(images.reshape(-1, *images.shape[2:])).reshape(images.shape[:2])
         added = changes[cells] / self.scale
@@ -308,8 +308,8 @@ class Reach:
             added[:, 0] = 0.0
             errors, states = error_bound + added[0], state_bound + added[1, :-1]
             row[0, :, :n] = np.eye(n) / (flow.model_growth * h)
-            row[1::2] = window.moved[:, n:] / errors[:, None, None]
-            row[2::2] = (ellipsoid.shape @ window.moved[:-1, :n]) / states[:, None, None]
+            row[1::2] = window.flows[:, n:] / errors[:, None, None]
+            row[2::2] = (ellipsoid.shape @ window.flows[:-1, :n]) / states[:, None, None]
         # Semi-axes of the ellipsoids of the first weights, in balanced coordinates.
         coordinates = _balancing_coordinates(rows)
         balanced = rows @ coordinates[:, None]
@@ -320,8 +320,8 @@ class Reach:
         usable = values[..., :1] > _LEAST_CONDITION * values[..., -1:]  # others are too flat
         semi_axes = V / np.sqrt(np.where(usable, values, _LEAST_CONDITION))[..., None, :]
         cells = np.array([window.cells[-1] for window in windows])
-        moved = np.array([window.moved[-1] for window in windows]) @ coordinates
-        return cells, moved, forms, semi_axes
+        flows = np.array([window.flows[-1] for window in windows]) @ coordinates
+        return cells, flows, forms, semi_axes
 
 
 class _CellBounds:

@@ -72,7 +72,7 @@ class Deliveries:
         if loop.starts_late:
             responses = response_until(loop.scaled_H, plant.start, conditions.start_s)
             self._start_input = float(responses.through(loop.R).sup_on_grid()) * ROUNDING
-        inverse = np.linalg.inv(gains.shape)
+        inverse = np.asarray(np.linalg.inv(gains.shape))
         # The outputs until the next delivery, for ‖Λξ‖ ≤ 1 and for S = 1, (outputs, cells).
         self._flows = loop.flows @ inverse
         self._feedthrough = np.array([[float(name == INPUT)] for name in loop.outputs])
@@ -253,18 +253,18 @@ class Deliveries:
         """Bound all outputs until the next delivery after t = 0, (outputs,)."""
         loop, T, F, first = self._loop, self._loop.conditions.start_s, self._loop.F, start.first_node
         BK, cells, cell_s = loop.BK, loop.grid.cells, loop.grid.cell_s
-        with_input = start.nodes[first:] + start.added
+        with_input = start.free[first:] + start.added
         highest = []
         for number, C in enumerate(loop.outputs.values()):
-            sizes = of_cells(np.linalg.norm(start.nodes @ C.T, axis=-1))
+            bounds = of_cells(np.linalg.norm(start.free @ C.T, axis=-1))
             later = np.linalg.norm(with_input @ C.T, axis=-1)
-            sizes[first:] = np.maximum(sizes[first:], of_cells(later))
-            sizes[first:] += T**2 / 8 * self._start_response(C, self._start_bend, cells)
-            sizes[first:] += cell_s**2 / 8 * T * self._start_response(C @ F @ F, BK, cells)
-            sizes[:first] += T * self._start_response(C, BK, max(first, 1))
-            sizes += self._output_sags[number] * np.linalg.norm(self._gains.shape @ self._x0)
-            sizes += loop.input_responses[number] @ start.age_input
-            highest.append((sizes + self._feedthrough[number] * start.age_input).max())
+            bounds[first:] = np.maximum(bounds[first:], of_cells(later))
+            bounds[first:] += T**2 / 8 * self._start_response(C, self._start_bend, cells)
+            bounds[first:] += cell_s**2 / 8 * T * self._start_response(C @ F @ F, BK, cells)
+            bounds[:first] += T * self._start_response(C, BK, max(first, 1))
+            bounds += self._output_sags[number] * np.linalg.norm(self._gains.shape @ self._x0)
+            bounds += loop.input_responses[number] @ start.age_input
+            highest.append((bounds + self._feedthrough[number] * start.age_input).max())
         return np.array(highest)
 
     def _balls_from_start(self, start: "_Start") -> "_Balls":
@@ -272,16 +272,16 @@ class Deliveries:
         loop, gains, T, n = self._loop, self._gains, self._loop.conditions.start_s, self._loop.n
         cells, bend = loop.grid.cells, self._start_bend
         added = start.added[loop.grid.ends - start.first_node]
-        moved = start.nodes[loop.grid.ends]
+        at_ends = start.free[loop.grid.ends]
         sag = T**2 / 8 * self._start_response(np.hstack([gains.shape, 0 * gains.shape]), bend, cells)
         half = np.linalg.norm(added[:, :n] @ gains.shape.T, axis=-1) / 2
         rho = half * ROUNDING + sag + gains.state_from_input @ start.age_input
         *J_sags, weighted = (
             T**2 / 8 * self._start_response(C, bend, cells) for C in loop.removal_outputs.values()
         )
-        J = np.maximum(loop.removals(moved[:, n:]), loop.removals((moved + added)[:, n:]))
+        J = np.maximum(loop.removals(at_ends[:, n:]), loop.removals((at_ends + added)[:, n:]))
         J = J + max(J_sags) + weighted + gains.removal_from_input @ start.age_input
-        centres = (moved[:, :n] + added[:, :n] / 2) @ gains.shape.T
+        centres = (at_ends[:, :n] + added[:, :n] / 2) @ gains.shape.T
         extents = np.stack([rho, J, rho + gains.theta * J], axis=-1)
         return _Balls(centres[None], extents[None])
 
@@ -311,7 +311,7 @@ class _Start(NamedTuple):
     What w adds to z, as a function of this time, is close to a line from 0 to ``added``.
     """
 
-    nodes: Matrix
+    free: Matrix
     """z without w at the nodes, (cells + 1, 2n)."""
     added: Matrix
     """What a w that ends at T has added, at the nodes from ``first_node`` on."""
