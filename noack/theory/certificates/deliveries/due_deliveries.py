@@ -246,10 +246,10 @@ class Deliveries:
         for _ in range(loop.grid.cells - first_node):
             added.append(step @ added[-1])
         age_input = self._age_inputs(x0[None] @ self._gains.shape.T)[0]
-        start = _Start(loop.flows @ x0, np.array(added), first_node, age_input)
+        start = _StartFlow(loop.flows @ x0, np.array(added), first_node, age_input)
         return self._outputs_from_start(start), self._balls_from_start(start)
 
-    def _outputs_from_start(self, start: "_Start") -> Vector:
+    def _outputs_from_start(self, start: "_StartFlow") -> Vector:
         """Bound all outputs until the next delivery after t = 0, (outputs,)."""
         loop, T, F, first = self._loop, self._loop.conditions.start_s, self._loop.F, start.first_node
         BK, cells, cell_s = loop.BK, loop.grid.cells, loop.grid.cell_s
@@ -267,7 +267,7 @@ class Deliveries:
             highest.append((bounds + self._feedthrough[number] * start.age_input).max())
         return np.array(highest)
 
-    def _balls_from_start(self, start: "_Start") -> "_Balls":
+    def _balls_from_start(self, start: "_StartFlow") -> "_Balls":
         """Return the balls after each gap from t = 0; the middle of the line is their centre."""
         loop, gains, T, n = self._loop, self._gains, self._loop.conditions.start_s, self._loop.n
         cells, bend = loop.grid.cells, self._start_bend
@@ -305,7 +305,7 @@ class Deliveries:
         return (largest + T**2 / 8 * float(model_bend) * float(gain)) * ROUNDING
 
 
-class _Start(NamedTuple):
+class _StartFlow(NamedTuple):
     """z after t = 0, if the input is 0 until some time of at most T: w = −K e^{Hr} x(0) until then.
 
     What w adds to z, as a function of this time, is close to a line from 0 to ``added``.

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 from noack.theory.bounds.certificate_terms import Constants, NetworkConditions, TriggerBound
-from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
 from noack.theory.certificates.deliveries import due_deliveries
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries, _Ball, _BallHistory
 
@@ -69,6 +69,35 @@ def test_the_balls_of_a_late_scalar_loop_follow_the_recursion_by_hand() -> None:
         assert abs(ball.centre[0]) / unit == pytest.approx(abs(centre))
         assert rho <= ball.rho / unit <= 1.02 * rho + 1e-9
         assert J <= ball.J <= 1.02 * J
+
+
+def test_the_outputs_of_a_ball_are_those_of_its_largest_state_and_late_update() -> None:
+    loop, rho, J = scalar_loop(DELAY_S), 1.0, 0.5
+    unit, theta = float(abs(loop._gains.shape[0, 0])), loop._gains.theta
+    ball = _Ball(np.zeros(1), unit * rho, J, unit * rho + theta * J, theta)
+    bound = loop._until_next_delivery([ball])[[*loop._loop.outputs].index(Output.STATE)]
+    r_s, rate = np.linspace(0.0, STEP_S + DELAY_S, 2001), a + ALPHA
+    by_late_input = b * (np.exp(rate * r_s) - np.exp(rate * (r_s - DELAY_S).clip(min=0.0))) / rate
+    largest = float((rho * np.abs(np.exp(ALPHA * r_s) * state_after(r_s)) + J * by_late_input).max())
+    # A late input is counted for up to one cell longer.
+    by_one_cell = J * b * loop._loop.grid.cell_s * math.exp(rate * (STEP_S + DELAY_S))
+    assert largest <= bound <= 1.02 * (largest + by_one_cell)
+
+
+@pytest.mark.parametrize("largest_before", [0.1, 10.0])
+def test_the_bound_of_the_rest_is_that_of_all_later_outputs_of_the_recursion(largest_before: float) -> None:
+    """Later outputs are at most κ times an earlier one, plus what the rest causes."""
+    loop, history = scalar_loop(0.0), _BallHistory.without_balls(30, 1)
+    history.add([_Ball(np.full(1, 1e3), 0.0, 0.0, 0.0, 1.0, time) for time in range(30)])
+    kappa, rest = 0.8, 0.2
+    output, of_rest = np.full(5, largest_before), loop._later_outputs(rest, 0.0)
+    with patch.object(_BallHistory, "last_return", lambda history, last: (kappa, rest)):
+        bound = loop._tail(history, 29, output)
+    later = []
+    for _ in range(300):
+        output = kappa * output + of_rest
+        later.append(output)
+    assert bound == pytest.approx(np.max(later, axis=0))
 
 
 def test_the_return_of_a_decaying_rotation_is_the_best_one_by_hand() -> None:
