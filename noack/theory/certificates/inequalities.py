@@ -42,7 +42,7 @@ from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 
 _SIGNALS = 6
-_HELD, _INPUT, _ONE = (np.eye(_SIGNALS)[index] for index in (0, 3, 5))
+_AGE_INPUT, _INPUT_ERROR, _ONE = (np.eye(_SIGNALS)[index] for index in (0, 3, 5))
 MOST_STAGES = 16
 """With more missing events π is used for all of them."""
 _EPSILON = float(np.finfo(float).eps)
@@ -64,9 +64,9 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     # A signal that is 0 affects nothing.
     F = np.where((F.any(axis=-1) | (g > 0))[..., None, :], F, 0.0)
     # A right side of the size of x makes w/x dimensionless.
-    sizes = g + _applied(F, g + _applied(F, g))
-    least = np.where(sizes > 0, sizes, np.inf).min(axis=-1, keepdims=True)
-    right = np.where(sizes > 0, sizes, np.where(np.isfinite(least), least, 1.0))
+    scales = g + _applied(F, g + _applied(F, g))
+    least = np.where(scales > 0, scales, np.inf).min(axis=-1, keepdims=True)
+    right = np.where(scales > 0, scales, np.where(np.isfinite(least), least, 1.0))
     remainder = np.eye(size) - F
     minor, x, w = _eliminated(remainder, g, right)
     loop_gain = np.asarray(1 - minor)
@@ -77,13 +77,13 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
             minors = [np.linalg.det(remainder[large][..., :k, :k]) for k in range(1, size + 1)]
         diagonal = np.diagonal(F[large], axis1=-2, axis2=-1)
         gains = np.concatenate([1 - np.min(minors, axis=0)[..., None], diagonal], axis=-1)
-        known = np.isfinite(gains).all(axis=-1)
-        loop_gain[large] = np.where(known, np.maximum(gains.max(axis=-1), 1.0), np.inf)
+        is_finite = np.isfinite(gains).all(axis=-1)
+        loop_gain[large] = np.where(is_finite, np.maximum(gains.max(axis=-1), 1.0), np.inf)
     rounding = (size + 4) * _EPSILON
-    moved_x, moved_w = _applied(F, x), _applied(F, w)
-    slack = w - moved_w - rounding * (w + moved_w)
-    missing = moved_x + g - x + rounding * (moved_x + g + x)
-    largest = np.maximum((missing / slack).max(axis=-1, keepdims=True), 0.0)
+    F_x, F_w = _applied(F, x), _applied(F, w)
+    slack = w - F_w - rounding * (w + F_w)
+    shortfall = F_x + g - x + rounding * (F_x + g + x)
+    largest = np.maximum((shortfall / slack).max(axis=-1, keepdims=True), 0.0)
     bound = np.where(F.any(axis=-1), x + w * largest * (1 + rounding), g)
     confirmed = is_small & (w > 0).all(axis=-1) & (slack > 0).all(axis=-1)
     return Solution(loop_gain, np.where(confirmed[..., None], bound, np.inf))
@@ -203,7 +203,7 @@ class ErrorInequalities:
         for growths in self._growths:  # all bounds of e_s hold; of each, one growth applies
             own_growth = growths[0] if len(growths) == 1 and self._error.decays else None
             signals = self._signals(method, events, spacing_s, own_growth)
-            solutions = [self._solved(signals, growth, own_growth) for growth in growths]
+            solutions = [self._solve_for_growth(signals, growth, own_growth) for growth in growths]
             gain = np.max([solution.loop_gain for solution in solutions], axis=0)
             solved.append((signals, gain, np.max([solution.bound for solution in solutions], axis=0)))
         return solved
@@ -275,10 +275,10 @@ class ErrorInequalities:
         received = with_missing(Output.GAIN, at_present[Output.GAIN], 0 * events)
         return _Signals(errors, sensor, received, earlier)
 
-    def _through(self, signals: "_Signals", gains: Mapping[str, Vector | float]) -> tuple[Matrix, Vector]:
-        """Return Σ_C gain_C sup‖C x‖ by its linear, (…, 6), and its constant part, (…)."""
+    def _by_state(self, signals: "_Signals", shares: Mapping[str, Vector | float]) -> tuple[Matrix, Vector]:
+        """Return Σ_C share_C sup‖C x‖ as a row of the signals, (…, 6), and a constant, (…)."""
         free, gain = np.zeros(()), np.zeros(())
-        for C, share in gains.items():
+        for C, share in shares.items():
             free = free + share * self._states[C].free
             gain = gain + share * self._states[C].gain
         return gain[..., None] * signals.input_error, free
@@ -330,8 +330,8 @@ class ErrorInequalities:
 
         ``highest`` bounds what a p of 1 adds in a unit of time.
         """
-        begun = np.fmin(row[..., 3], self._begin_s * highest)
-        return np.asarray(row + (self._first_input_error * begun)[..., None] * _ONE)
+        by_first_input = np.fmin(row[..., 3], self._begin_s * highest)
+        return np.asarray(row + (self._first_input_error * by_first_input)[..., None] * _ONE)
 
     def _input_effects(
         self, output: Output, count: int, spacing_s: Vector, own_growth: ErrorGrowth
@@ -369,39 +369,41 @@ class ErrorInequalities:
         late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own_growth.longest_s)
         highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
         counts = np.arange(count)[:, None] + np.zeros_like(events)
-        rows = _HELD + self._with_missing(Output.GAIN, present, counts, spacing_s, own_growth)
+        rows = _AGE_INPUT + self._with_missing(Output.GAIN, present, counts, spacing_s, own_growth)
         late = np.minimum(present[..., 3], highest * (delay_s - counts * spacing_s).clip(min=0.0))
         rows[..., 3] = late
         shares_left = 1 - (present[..., 3] - late)[..., None]
         stages = _Stages(np.zeros((0, *shape)), late_s)
         for row, share_left, number in zip(rows, shares_left, counts, strict=True):
             row = row + stages.entered(sizes, sups, number)
-            row = np.where(share_left > 0, row / np.where(share_left > 0, share_left, 1.0), _INPUT)
+            row = np.where(share_left > 0, row / np.where(share_left > 0, share_left, 1.0), _INPUT_ERROR)
             stages = stages._replace(inputs=np.concatenate([stages.inputs, row[None]]))
         return stages
 
-    def _solved(self, signals: "_Signals", growing: ErrorGrowth, own_growth: ErrorGrowth | None) -> Solution:
-        """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
-        errors, beyond, held = signals.errors, self._first_input_error, self.age_gains
-        estimated, input_error = np.eye(_SIGNALS)[2], signals.input_error
+    def _solve_for_growth(
+        self, signals: "_Signals", growth: ErrorGrowth, own_growth: ErrorGrowth | None
+    ) -> Solution:
+        """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6).
 
-        through, free = self._through(signals, {str(C): gain for C, gain in held.items()})
-        from_errors = sum(gain * errors[output] for output, gain in held.items())
-        of_age = (through + from_errors, free)
-        estimation = self._estimation
-        through, free = self._through(signals, estimation.shares)
-        of_estimate = (
-            through + estimation.from_input * input_error,
-            estimation.fixed + free + estimation.from_input * beyond,
+        Each inequality of (q, b, η, π, sup‖R_E x‖, 1) is a row of the signals and a constant.
+        """
+        input_error, estimation = signals.input_error, self._estimation
+        row, constant = self._by_state(signals, {str(C): gain for C, gain in self.age_gains.items()})
+        by_errors = sum(gain * signals.errors[output] for output, gain in self.age_gains.items())
+        age_input = (row + by_errors, constant)
+        row, constant = self._by_state(signals, estimation.shares)
+        estimation_error = (
+            row + estimation.from_input * input_error,
+            estimation.fixed + constant + estimation.from_input * self._first_input_error,
         )
-        of_mismatch = self._through(signals, {Output.MISMATCH: 1.0})
-        through, free = self._through(signals, growing.shares)
-        of_test = (through + growing.estimation * estimated, growing.fixed + free)
+        mismatch = self._by_state(signals, {Output.MISMATCH: 1.0})
+        row, constant = self._by_state(signals, growth.shares)
+        after_test = (row + growth.estimation * np.eye(_SIGNALS)[2], growth.fixed + constant)
         if own_growth is None:
-            driven = self._with_start(_columns(0.0, 0.0, 0.0, *growing.driven), growing.highest)
-            of_test = growing.stretch * of_test[0] + driven, growing.stretch * of_test[1]
-        other_rows = ((input_error, 0.0), of_mismatch, (0.0 * input_error, 1.0))
-        all_rows = (of_age, of_test, of_estimate, *other_rows)
+            driven = self._with_start(_columns(0.0, 0.0, 0.0, *growth.driven), growth.highest)
+            after_test = growth.stretch * after_test[0] + driven, growth.stretch * after_test[1]
+        one = (0.0 * input_error, 1.0)
+        all_rows = (age_input, after_test, estimation_error, (input_error, 0.0), mismatch, one)
         rows = _rows(*(row for row, _ in all_rows))
         right = _columns(*(right for _, right in all_rows))
         return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
@@ -440,11 +442,11 @@ class ErrorInequalities:
             error_gain,
             estimation,
         )
-        found_s = np.minimum(passed_s, most_s).max(axis=0)
-        found_s = np.maximum(np.minimum(found_s, self._bound.forced_s), self._bound.apart_s)
+        next_event_s = np.minimum(passed_s, most_s).max(axis=0)
+        next_event_s = np.maximum(np.minimum(next_event_s, self._bound.forced_s), self._bound.apart_s)
         if (grid_s := self._conditions.spacing_s) == 0:
-            return np.asarray(found_s)
-        return np.asarray(grid_s * np.maximum(np.ceil(found_s / grid_s - 1e-9), 1.0))
+            return np.asarray(next_event_s)
+        return np.asarray(grid_s * np.maximum(np.ceil(next_event_s / grid_s - 1e-9), 1.0))
 
 
 class _Stages(NamedTuple):
@@ -488,7 +490,7 @@ class _Signals(NamedTuple):
     @property
     def input_error(self) -> Vector:
         """(…, 6) of π."""
-        return np.asarray(self.errors[Output.GAIN] + _HELD)
+        return np.asarray(self.errors[Output.GAIN] + _AGE_INPUT)
 
 
 def _product(row: Vector, column: Vector) -> Vector:

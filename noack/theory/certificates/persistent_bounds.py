@@ -35,15 +35,15 @@ from noack.theory.certificates.solution import Problem, Search, sharpened
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
-_CHORDS = 2
+_CHORD_ROUNDS = 2
 """So often the chord of a threshold is shortened by the bound of x that it has given."""
 Added = tuple[Constants, Constants | None]
 """Constants whose bounds are added."""
-_RATES = (0.7, 0.4, 0.2, 0.05)
+_RATE_SHARES = (0.7, 0.4, 0.2, 0.05)
 """Rates that are tried, as shares of the loop's decay rate."""
 SHARES = (0.5, 0.2, 0.8)
 """Values of λ that are tried."""
-Some = TypeVar("Some", bound=Sequence[Constants])
+ConstantsOfParts = TypeVar("ConstantsOfParts", bound=Sequence[Constants])
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,9 @@ class DisturbedCertificate:
                 return [parts]
             except NotDecayingError:
                 pass
-        pairs = yield from self._of_other_thresholds(conditions, decays=decays, longest=longest)
-        for _ in range(_CHORDS if longest and self.trigger.has_chord else 0):
-            sizes = [
+        pairs = yield from self._without_decay(conditions, decays=decays, longest=longest)
+        for _ in range(_CHORD_ROUNDS if longest and self.trigger.has_chord else 0):
+            state_bounds = [
                 sum(
                     constants.state_weighted + constants.estimation_error
                     for constants in pair
@@ -100,11 +100,12 @@ class DisturbedCertificate:
                 )
                 for pair in pairs
             ]
-            known = replace(self, trigger=replace(self.trigger, largest=min(sizes)))
-            pairs = yield from known._of_other_thresholds(conditions, decays=decays, longest=longest)
+            shorter_chord = replace(self.trigger, largest=min(state_bounds))
+            sharper = replace(self, trigger=shorter_chord)
+            pairs = yield from sharper._without_decay(conditions, decays=decays, longest=longest)
         return pairs
 
-    def _of_other_thresholds(
+    def _without_decay(
         self, conditions: NetworkConditions, *, decays: bool, longest: bool
     ) -> Search[list[Added]]:
         """Search for the constants of a threshold that does not decay, or more slowly than the loop.
@@ -142,27 +143,29 @@ class DisturbedCertificate:
         lower bound of the inter-event time, certified without dividing into parts.
         """
         pairs: list[Added] = []
-        for of_start, of_rest in self.trigger.divided(conditions, apart_s):
+        for start_bound, persistent_bound in self.trigger.divided(conditions, apart_s):
             with contextlib.suppress(NoCertificateError, NotDecayingError):
-                pairs.append((yield from self._divided(of_start, of_rest, conditions)))
+                pairs.append((yield from self._divided(start_bound, persistent_bound, conditions)))
         return sorted(pairs, key=lambda pair: 0.0 if pair[1] is None else pair[1].state)
 
     def _divided(
-        self, of_start: TriggerBound, of_rest: TriggerBound, conditions: NetworkConditions
+        self, start_bound: TriggerBound, persistent_bound: TriggerBound, conditions: NetworkConditions
     ) -> Search[Added]:
-        """Search for the constants that one bound of e_s gives.
+        """Search for the constants that one bound of e_s gives, divided into those of both parts.
 
         Raises: as :func:`choose_rate`.
         """
-        persistent = self._persistent._replace(bound=of_rest)
-        persists = of_rest.beta or persistent.plant.forcing is not None or persistent.estimation.fixed
+        persistent = self._persistent._replace(bound=persistent_bound)
+        persists = (
+            persistent_bound.beta or persistent.plant.forcing is not None or persistent.estimation.fixed
+        )
         persistent_parts = [persistent] if persists else []
 
-        def solved(rate_per_s: float) -> Search[list[Constants]]:
-            return (yield Problem((self._at_rate(rate_per_s, of_start), *persistent_parts), conditions))
+        def solve_at(rate_per_s: float) -> Search[list[Constants]]:
+            return (yield Problem((self._at_rate(rate_per_s, start_bound), *persistent_parts), conditions))
 
         x0 = loop_of(self.resolved).x0
-        decaying, *added = yield from choose_rate(solved, self.slowest_per_s, x0, x0)
+        decaying, *added = yield from choose_rate(solve_at, self.slowest_per_s, x0, x0)
         return decaying, added[0] if added else None
 
     @cached_property
@@ -176,7 +179,7 @@ class DisturbedCertificate:
 
     @cached_property
     def _persistent(self) -> CertificatePart:
-        plant = self._pushed_plant
+        plant = self._disturbed_plant
         at_rest = replace(plant, start=np.zeros_like(plant.start))
         bound = TriggerBound(self.trigger.floor, None, unit=1.0)
         return CertificatePart(plant.error, at_rest, bound, self._estimation.persistent())
@@ -186,11 +189,11 @@ class DisturbedCertificate:
         """Everything without decay; the trigger's bound depends on the conditions."""
         decaying, persistent = self._estimation.decaying(0.0), self._estimation.persistent()
         estimation = persistent._replace(fixed=persistent.fixed + decaying.fixed)
-        plant = self._pushed_plant
+        plant = self._disturbed_plant
         return CertificatePart(plant.error, plant, TriggerBound(0.0, None), estimation)
 
     @cached_property
-    def _pushed_plant(self) -> PlantGains:
+    def _disturbed_plant(self) -> PlantGains:
         """The plant without decay, with its disturbances if it has any."""
         plant = self._plant(0.0)
         forcing = self._forcing(plant)
@@ -239,7 +242,7 @@ def solve_two_parts(
     """
     beta, floor = decaying.bound.beta, persistent.bound.beta
 
-    def solved(share: float | None) -> Search[tuple[Constants, Constants]]:
+    def solve_with(share: float | None) -> Search[tuple[Constants, Constants]]:
         reached = (None, None) if share is None else (share * beta, (1 - share) * floor)
         parts = [
             part._replace(bound=part.bound._replace(reached=level))
@@ -249,13 +252,13 @@ def solve_two_parts(
         return first_constants, second_constants
 
     if floor == 0:
-        return (yield from solved(None))
+        return (yield from solve_with(None))
     if not shares:
         with contextlib.suppress(NoCertificateError):
-            return (yield from solved(None))
+            return (yield from solve_with(None))
     best: tuple[Constants, Constants] | None = None
     for share in shares or SHARES[:1]:
-        pair = yield from solved(share)
+        pair = yield from solve_with(share)
         if best is None or (pair[0].inter_event_s or 0.0) > (best[0].inter_event_s or 0.0):
             best = pair
     assert best is not None
@@ -263,31 +266,31 @@ def solve_two_parts(
 
 
 def choose_rate(
-    solved: Callable[[float], Search[Some]], decay_per_s: float, start: Vector, starts: Matrix
-) -> Search[Some]:
+    solve_at: Callable[[float], Search[ConstantsOfParts]], decay_per_s: float, start: Vector, starts: Matrix
+) -> Search[ConstantsOfParts]:
     """Search for the constants for a rate, where none is given.
 
     It is the rate at which the first constants' bound of ‖x‖ falls to ‖x(0)‖/10 first.
 
     Args:
-        solved: searches for constants for a rate in 1/s.
+        solve_at: searches for constants for a rate in 1/s.
         decay_per_s: the decay rate of the loop.
         start: x(0), (n,).
         starts: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k), that is bounded.
 
-    Raises: what ``solved`` raises at the smallest rate.
+    Raises: what ``solve_at`` raises at the smallest rate.
     """
-    at_first = float(np.linalg.norm(starts, 2))
+    largest_start = float(np.linalg.norm(starts, 2))
     best, best_s = None, math.inf
-    for share in _RATES:
+    for share in _RATE_SHARES:
         rate_per_s = share * decay_per_s
         # No bound of ‖x‖ is below its first value, so a small rate is often not worth trying.
-        if best is not None and tenth_s(at_first, rate_per_s, start) > best_s:
+        if best is not None and tenth_s(largest_start, rate_per_s, start) > best_s:
             break
         try:
-            constants = yield from solved(rate_per_s)
+            constants = yield from solve_at(rate_per_s)
         except (NotDecayingError, NoCertificateError):
-            if best is None and share == _RATES[-1]:
+            if best is None and share == _RATE_SHARES[-1]:
                 raise
             continue  # smaller rates have smaller gains
         if best is None or tenth_s(constants[0].state, rate_per_s, start) <= best_s:
@@ -298,5 +301,5 @@ def choose_rate(
 
 def tenth_s(state: float, rate_per_s: float, start: Vector) -> float:
     """Return when a bound of ‖x‖, ``state`` at first, falls to ‖x(0)‖/10."""
-    size = float(np.linalg.norm(start)) or 1.0
-    return math.log(max(10 * state / size, 1.0)) / rate_per_s
+    start_norm = float(np.linalg.norm(start)) or 1.0
+    return math.log(max(10 * state / start_norm, 1.0)) / rate_per_s

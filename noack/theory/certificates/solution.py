@@ -32,8 +32,8 @@ from noack.theory.bounds.trigger_bounds import LONGEST_S
 from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 
-_SETTLED = 1e-3
-_ATTEMPTS = 200
+_SPACING_SETTLED = 1e-3
+_MOST_ROUNDS = 200
 
 
 class Problem(NamedTuple):
@@ -65,24 +65,24 @@ class Problem(NamedTuple):
         return repr((*self[1:], *terms)), *plants
 
 
-Found = TypeVar("Found")
-Search = Generator[Problem, list[Constants], Found]
+Result = TypeVar("Result")
+Search = Generator[Problem, list[Constants], Result]
 """A search for a certificate: it yields problems, and receives the constants of their parts.
 
 An error of a problem is raised where it was yielded.
 """
-_TOGETHER = 256
+_MOST_TOGETHER = 256
 """So many problems of one state are solved together: the memory grows with the squared states."""
-_UNSOLVED = (NotDecayingError, np.linalg.LinAlgError, OverflowError)
+_UNSOLVED_ERRORS = (NotDecayingError, np.linalg.LinAlgError, OverflowError)
 
 
-def completed(searches: Sequence[Search[Found]]) -> list[Found]:
+def completed(searches: Sequence[Search[Result]]) -> list[Result]:
     """Return the results of searches; their like problems are solved together.
 
     Raises:
         NoCertificateError, NotDecayingError: a search does not handle this error of its problem.
     """
-    results: dict[int, Found] = {}
+    results: dict[int, Result] = {}
     answers: dict[int, list[Constants] | Exception | None] = dict.fromkeys(range(len(searches)))
     with np.errstate(all="ignore"):
         while answers:
@@ -100,7 +100,7 @@ def completed(searches: Sequence[Search[Found]]) -> list[Found]:
     return [results[number] for number in range(len(searches))]
 
 
-def completed_alone(search: Search[Found]) -> Found:
+def completed_alone(search: Search[Result]) -> Result:
     """Return the result of one search; see :func:`completed`."""
     (answer,) = completed([search])
     return answer
@@ -113,20 +113,20 @@ def _answers(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
         likeness = problem.likeness if len(problems) > 1 else None
         alike[("alone", index) if likeness is None else likeness].append(index)
     groups: list[list[int]] = []
-    for places in alike.values():
-        states = len(problems[places[0]].parts[0].error.H)
-        width = max(_TOGETHER // states**2, 1)
-        groups += (places[begin : begin + width] for begin in range(0, len(places), width))
+    for indices in alike.values():
+        states = len(problems[indices[0]].parts[0].error.H)
+        width = max(_MOST_TOGETHER // states**2, 1)
+        groups += (indices[begin : begin + width] for begin in range(0, len(indices), width))
     answers: dict[int, list[Constants] | Exception] = {}
-    for places in groups:
+    for indices in groups:
         try:
-            solved = _solved([problems[index] for index in places])
-            answers.update(zip(places, solved, strict=True))
-        except _UNSOLVED as error:
-            if len(places) == 1:
-                answers[places[0]] = error
+            solved = _solve_together([problems[index] for index in indices])
+            answers.update(zip(indices, solved, strict=True))
+        except _UNSOLVED_ERRORS as error:
+            if len(indices) == 1:
+                answers[indices[0]] = error
             else:  # of one of them
-                answers.update((index, _answers([problems[index]])[0]) for index in places)
+                answers.update((index, _answers([problems[index]])[0]) for index in indices)
     return [answers[index] for index in range(len(problems))]
 
 
@@ -159,12 +159,12 @@ def sharpened(problem: Problem) -> Search[Constants]:
     if problem.longest and is_plain and can_be_sharpened(part):
         key = id(part.plant), constants, repr((part.bound, conditions))
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
-            return sharpened_once(_Sharpening(key, constants, part, conditions))
+            return sharpened_once(_SharpeningTask(key, constants, part, conditions))
     return constants
 
 
 @dataclass(frozen=True)
-class _Sharpening:
+class _SharpeningTask:
     """What :func:`sharpened_constants` needs. The key has the plant's id: the part keeps the plant."""
 
     key: Hashable
@@ -174,12 +174,12 @@ class _Sharpening:
 
 
 @lru_cache(maxsize=32)
-def sharpened_once(known: _Sharpening) -> Constants:
+def sharpened_once(task: _SharpeningTask) -> Constants:
     """Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
-    return sharpened_constants(known.constants, known.part, known.conditions)
+    return sharpened_constants(task.constants, task.part, task.conditions)
 
 
-def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
+def _solve_together(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
     """Return the constants of like problems, or the reason why there is no certificate.
 
     Raises:
@@ -187,54 +187,56 @@ def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
     """
     example = problems[0]
     conditions, count = example.conditions, len(problems)
-    steps = []
+    inequalities = []
     for index, part in enumerate(example.parts):
         plants = [problem.parts[index].plant for problem in problems]
         together = part._replace(plant=part.plant.together(plants))
         earlier = example.earlier_error if index == 0 else 0.0
-        steps.append(ErrorInequalities(together, conditions, earlier))
+        inequalities.append(ErrorInequalities(together, conditions, earlier))
     apart_s = max(part.bound.apart_s for part in example.parts)
     least_s = max(conditions.spacing_s, apart_s)
     is_separated = all(any(bound.reached is not None for bound in part.bound.every) for part in example.parts)
     searched = np.full(count, is_separated)
     if is_separated and not example.longest:
-        searched = ~_smallest(steps, np.full(count, least_s)).exists
-    spacing_s = _longest_s(steps, searched, least_s)
-    smallest = _smallest(steps, spacing_s)
+        searched = ~_smallest_constants(inequalities, np.full(count, least_s)).exists
+    spacing_s = _longest_spacing_s(inequalities, searched, least_s)
+    smallest = _smallest_constants(inequalities, spacing_s)
     rates = [part.error.alpha_per_s for part in example.parts]
     shortest_s = least_s if is_separated else apart_s
     between_s = np.where(spacing_s > least_s, spacing_s, shortest_s).tolist()
     return [smallest.of_loop(loop, rates, between_s[loop] or None) for loop in range(count)]
 
 
-def _longest_s(steps: Sequence[ErrorInequalities], searched: NDArray[np.bool_], least_s: float) -> Vector:
+def _longest_spacing_s(
+    inequalities: Sequence[ErrorInequalities], searched: NDArray[np.bool_], least_s: float
+) -> Vector:
     """Return the largest spacing of each loop that is consistent with itself, or ``least_s``.
 
     It is ``least_s`` where the loop is not searched, or has no certificate.
     """
     spacing_s = np.where(searched, LONGEST_S, least_s)
     is_open = searched & (spacing_s > least_s)
-    for _ in range(_ATTEMPTS):
+    for _ in range(_MOST_ROUNDS):
         if not is_open.any():
             break
-        smallest = _smallest(steps, spacing_s)
-        is_open, found_s = is_open & smallest.exists, np.full(len(spacing_s), np.inf)
+        smallest = _smallest_constants(inequalities, spacing_s)
+        is_open, implied_s = is_open & smallest.exists, np.full(len(spacing_s), np.inf)
         spacing_s = np.where(smallest.exists, spacing_s, least_s)
-        for step, constants in zip(reversed(steps), reversed(smallest.parts), strict=True):
+        for part, constants in zip(reversed(inequalities), reversed(smallest.parts), strict=True):
             # Often what persists, which is the last part, gives a time of at most the least one.
-            loops = is_open & (found_s > least_s)
-            passed_s = step.inter_event_s(constants, smallest.drifts, loops)
-            found_s = np.where(loops, np.minimum(found_s, passed_s), found_s)
-        is_open &= found_s < spacing_s
+            loops = is_open & (implied_s > least_s)
+            passed_s = part.inter_event_s(constants, smallest.drifts, loops)
+            implied_s = np.where(loops, np.minimum(implied_s, passed_s), implied_s)
+        is_open &= implied_s < spacing_s
         # Iterate from above.
-        shorter = found_s < (1 - _SETTLED) * spacing_s
-        next_s = np.where(shorter, found_s, (1 - _SETTLED) * found_s)
+        shorter = implied_s < (1 - _SPACING_SETTLED) * spacing_s
+        next_s = np.where(shorter, implied_s, (1 - _SPACING_SETTLED) * implied_s)
         spacing_s = np.where(is_open, np.maximum(next_s, least_s), spacing_s)
         is_open &= spacing_s > least_s
     return np.where(is_open, least_s, spacing_s)
 
 
-class _Smallest(NamedTuple):
+class _SmallestConstants(NamedTuple):
     """The constants of all parts of several loops, with the first method that has a certificate."""
 
     parts: Sequence[LoopConstants]
@@ -261,27 +263,27 @@ class _Smallest(NamedTuple):
         return NoCertificateError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
 
 
-def _smallest(steps: Sequence[ErrorInequalities], spacing_s: Vector) -> _Smallest:
+def _smallest_constants(inequalities: Sequence[ErrorInequalities], spacing_s: Vector) -> _SmallestConstants:
     """Return the constants of all parts with the first method for e_c that has a certificate."""
     infinite = np.full(len(spacing_s), np.inf)
-    best = _Smallest((), infinite > 0, infinite < 0, infinite, spacing_s > 0)
-    for method in steps[0].methods:
-        if not all(method in step.methods for step in steps):
+    best = _SmallestConstants((), infinite > 0, infinite < 0, infinite, spacing_s > 0)
+    for method in inequalities[0].methods:
+        if not all(method in part.methods for part in inequalities):
             continue
-        by_step = [step.constants(spacing_s, method) for step in steps]
+        parts = [part.constants(spacing_s, method) for part in inequalities]
         exists, gain = np.ones(len(infinite), dtype=bool), infinite
-        for part in by_step:
+        for part in parts:
             gain = np.where(exists & ~part.exists, part.loop_gain, gain)
             exists = exists & part.exists
         is_new = exists & ~best.exists
         drifts = np.where(is_new, method is BoundMethod.DRIFTING, best.drifts)
         if best.parts:
-            by_step = [
+            parts = [
                 LoopConstants(*(np.where(is_new, *pair) for pair in zip(new, old, strict=True)))
-                for new, old in zip(by_step, best.parts, strict=True)
+                for new, old in zip(parts, best.parts, strict=True)
             ]
         gain = np.where(is_new | best.exists, best.loop_gain, np.minimum(gain, best.loop_gain))
-        best = best._replace(parts=by_step, drifts=drifts, exists=best.exists | exists, loop_gain=gain)
+        best = best._replace(parts=parts, drifts=drifts, exists=best.exists | exists, loop_gain=gain)
         if best.exists.all():
             break
     return best

@@ -27,14 +27,16 @@ Words of names and fields, and their symbols in the docstrings:
   ‖·‖_W is ‖·‖. ``states`` is e^{Fτ} (I, 0) at the nodes, ``edges_s``, of a grid; between two nodes
   is a ``cell``.
 * ``ellipsoid``, ``shape``: ‖Λξ‖ ≤ 1, and Λ. A ``reach`` is what z can be if ‖Λξ‖ ≤ c at the delivery
-  (``size`` is c) and ‖e_c‖_W ≤ D since then (``limit`` is D).
+  (``scale`` is c) and ‖e_c‖_W ≤ D since then (``error_bound`` is D).
 * ``effects``: what delay and hold change of the flow. ``age_input`` bounds ‖q‖, the part of the
   input that its age adds; ``first_error`` bounds ‖e_c‖_W when an update acts.
 * ``bend`` and ``sag``: as in ``noack/theory/bounds``. ``forms``: matrices Q with zᵀQz ≤ 1. ``level``:
   the least ‖e_s‖_W at an event.
-* ``known``: the bounds that hold already (``KnownBounds``). ``after_losses`` has one for each number
-  of events that have been lost since a delivery.
+* ``KnownBounds``: the bounds that hold already. ``after_losses`` has one for each number of events
+  that have been lost since a delivery.
 * ``gap``: the time g between two delivered events. ``removal``: J, what the next update removes from
-  the input's error; ``pulse``: what J of earlier events adds to ‖Λξ‖. ``ages``: ‖w‖ from the age of
-  the input, in each cell.
+  the input's error; ``removals``: S, the J of all updates in flight. ``gains``: what follows from
+  what after a gap; ``state_from_state`` is γ_g, by which a gap multiplies ‖Λξ‖.
+* A ball: ‖ξ − ``centre``‖ ≤ ``rho`` in coordinates Λξ. ``weighted_sum``: ρ + θJ. ``extent``: ρ, J, and
+  this sum. A ``return``: ξ(t) = κ c(t − m) + r.
 """

@@ -49,8 +49,8 @@ class InputEffects(NamedTuple):
         """Whether they change nothing."""
         return self.age_input == 0 and self.first_error == 0
 
-    def sizes(self, unit_effects: tuple[Vector, Vector]) -> Vector:
-        """Return by how much an output can differ, over each cell, (k,)."""
+    def changes(self, unit_effects: tuple[Vector, Vector]) -> Vector:
+        """Return by how much an output can differ, over each cell, (k,), given its unit effects."""
         by_error, by_input = unit_effects
         return self.first_error * by_error + self.age_input * by_input
 
@@ -72,7 +72,8 @@ class DeliveryFlow:
         self.mismatch = E = self.closed_loop - self.H
         self.generator = np.block([[self.closed_loop, self.BK], [-E, self.H - self.BK]])
         self.start = self.weight @ plant.start
-        self.stretch = float(error.kernels[Output.WEIGHTED].sup())
+        self.model_growth = float(error.kernels[Output.WEIGHTED].sup())
+        """sup ‖e^{(H+αI)τ}‖_W"""
         self.input_error = self.weight @ plant.input_matrix
         self.gain = error.split_K[1] @ self.inverse
         self.edges_s, self._propagators = self._grid()
@@ -92,8 +93,8 @@ class DeliveryFlow:
             t_s, state = t_s + step_s, propagator @ state
             edges.append(t_s)
             states.append(state)
-            size = np.linalg.norm(state[:, : self.n])
-            if size > _MOST_GROWTH or math.exp(-slowest * t_s) < _SETTLED:
+            growth = np.linalg.norm(state[:, : self.n])
+            if growth > _MOST_GROWTH or math.exp(-slowest * t_s) < _SETTLED:
                 break
             if cell % _CELLS_PER_STEP == 0 and 2 * step_s * unstable < _MOST_STEP:
                 step_s, propagator = 2 * step_s, propagator @ propagator
@@ -107,24 +108,25 @@ class DeliveryFlow:
         bends = sum(np.linalg.norm(term[..., 0], axis=1) for term in terms)
         return z, np.asarray(bends + np.linalg.norm(remainder[..., 0], axis=1))
 
-    def from_start(self, C: Matrix, limit: float, first_cell: int = 0) -> float:
+    def from_start(self, C: Matrix, error_bound: float, first_cell: int = 0) -> float:
         """Bound ‖C z‖ from a cell after the start on, until the first delivery, if ‖e_c‖_W ≤ D.
 
-        z is at most as large as that of x(0), and small enough for D at all earlier times.
+        z is at most as large as that of x(0), and small enough for D at all earlier times: it is
+        that of x(0) times at most ``shares``. ``error_bound`` is D.
         """
         z, bends = self.start_response
         errors = np.maximum.accumulate(np.linalg.norm(z[:-1, self.n :], axis=1))
-        shares = limit / np.maximum(errors, limit)
-        sizes = np.linalg.norm(z @ C.T, axis=1)
+        shares = error_bound / np.maximum(errors, error_bound)
+        at_nodes = np.linalg.norm(z @ C.T, axis=1)
         sags = np.diff(self.edges_s) ** 2 / 8 * bends * float(np.linalg.norm(C, 2))
-        cells = shares * (np.maximum(sizes[1:], sizes[:-1]) + sags)
+        cells = shares * (np.maximum(at_nodes[1:], at_nodes[:-1]) + sags)
         return float(cells[first_cell:].max()) * ROUNDING
 
     def first_event(self, level: float) -> int:
         """Return the first cell in which ‖e_s‖_W can reach a level after the start."""
         z, bends = self.start_response
-        sizes = np.linalg.norm(z[:, self.n :], axis=1)
-        highest = np.maximum(sizes[1:], sizes[:-1]) + np.diff(self.edges_s) ** 2 / 8 * bends
+        errors = np.linalg.norm(z[:, self.n :], axis=1)
+        highest = np.maximum(errors[1:], errors[:-1]) + np.diff(self.edges_s) ** 2 / 8 * bends
         return int(np.argmax(np.append(highest[:-1] * ROUNDING >= level, True)))
 
     def cell_at(self, time_s: float) -> int:
@@ -135,18 +137,18 @@ class DeliveryFlow:
     def _unit_responses(self) -> tuple[Stack, Stack, Vector]:
         """e^{Fτ} (0, I) and e^{Fτ} (BU, −BU) at the nodes, and step²/8 · ‖F‖² e^{‖F‖ step}."""
         by_input = self._propagators @ np.vstack([self.input_error, -self.input_error])
-        turns = np.diff(self.edges_s) * float(np.linalg.norm(self.generator, 2))
-        return self._propagators[:, :, self.n :], by_input, turns**2 / 8 * np.exp(turns)
+        exponents = np.diff(self.edges_s) * float(np.linalg.norm(self.generator, 2))
+        return self._propagators[:, :, self.n :], by_input, exponents**2 / 8 * np.exp(exponents)
 
     def unit_effects(self, C: Matrix) -> tuple[Vector, Vector]:
         """Bound sup ‖C e^{Fτ} (0, I)‖ over each cell, and ∫₀^τ ‖C e^{Fs} (BU, −BU)‖ ds, (k,)."""
-        by_error, by_input, bends = self._unit_responses
-        size, sizes = float(np.linalg.norm(C, 2)), []
-        for stack in (by_error, by_input):
-            ends = spectral_norms(C @ stack)
-            sags = bends * size * np.linalg.norm(stack[:-1], axis=(1, 2))
-            sizes.append((np.maximum(ends[1:], ends[:-1]) + sags) * ROUNDING)
-        return sizes[0], np.cumsum(sizes[1] * np.diff(self.edges_s))
+        by_error, by_input, sag_factors = self._unit_responses
+        norm, sups = float(np.linalg.norm(C, 2)), []
+        for responses in (by_error, by_input):
+            at_nodes = spectral_norms(C @ responses)
+            sags = sag_factors * norm * np.linalg.norm(responses[:-1], axis=(1, 2))
+            sups.append((np.maximum(at_nodes[1:], at_nodes[:-1]) + sags) * ROUNDING)
+        return sups[0], np.cumsum(sups[1] * np.diff(self.edges_s))
 
     @cached_property
     def error_effects(self) -> tuple[Vector, Vector]:

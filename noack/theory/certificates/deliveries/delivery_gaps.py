@@ -7,8 +7,9 @@ a time g later, and scaled by e^{αt},
 
 If events are due, g is one of finitely many times. w is only what lateness adds: the age of the
 applied input, ‖w‖ ≤ sup_{|τ|≤σ} ‖K(e^{−Hτ} − I)e^{Hr}ξ‖, and for a time d after the event the error
-e⁻ that the update removes, ‖w‖ ≤ J = sup ‖K e^{H(r−τ)} e⁻‖ more. All norms over cells of time are
-enclosed (:mod:`noack.theory.bounds.enclosure`).
+e⁻ that the update removes, ‖w‖ ≤ J = sup ‖K e^{H(r−τ)} e⁻‖ more. S is the sum of the J of all
+updates in flight, each counted by the share μ of its time that is left. All norms over cells of
+time are enclosed (:mod:`noack.theory.bounds.enclosure`).
 """
 
 import itertools
@@ -31,10 +32,12 @@ _CELL = 0.04
 """Length of a cell, in time constants of the flow."""
 _PIECES = 4
 """In so many pieces of a gap the ages of the input are averaged."""
+_SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=_PIECES)))
+"""All signs of the mean ages in the pieces."""
 _AGES = 4
 """Cells into which ages of an input from 0 to σ are divided."""
-_LEAST, _THETAS = 1e-6, 2.0 ** np.arange(0, 7)
-"""θ that are tried, in units of the smallest one that may suit, which is at least ``_LEAST``."""
+_LEAST_THETA, _THETAS = 1e-6, 2.0 ** np.arange(0, 7)
+"""θ that are tried, in units of the smallest one that may suit, which is at least ``_LEAST_THETA``."""
 ERROR, INPUT = "e_c in W", "e_c in K"
 """Names of outputs of z."""
 
@@ -45,7 +48,7 @@ class Gaps(NamedTuple):
     step_s: float
     """All of them are multiples of it."""
     counts: NDArray[np.int64]
-    """(k,)"""
+    """The gaps in steps, ascending, (gaps,)."""
     least_s: float
     """The shortest one."""
 
@@ -69,32 +72,88 @@ class Gaps(NamedTuple):
         return cls(step_s, np.array(sorted(counts)), fewest_steps * step_s)
 
 
-class GapNorm(NamedTuple):
-    """What one gap makes of ‖Λξ‖ ≤ 1: arrays of (gaps,), (cells,) or (gaps, cells)."""
+class GapGrid(NamedTuple):
+    """Cells of the time r since a delivery, from 0 until d after the longest gap."""
+
+    cell_s: float
+    cells: int
+    late_cells: int
+    """The cells up to d, while an update may be in flight."""
+    ends: NDArray[np.int64]
+    """The node at the end of each gap, (gaps,)."""
+    windows: NDArray[np.int64]
+    """Cells for which updates may still be in flight, by times at which their events can have been."""
+
+    @classmethod
+    def of(cls, gaps: Gaps, delay_s: float, fastest_per_s: float) -> "GapGrid":
+        """Return cells that are short for the fastest mode: as many in each step of the gaps."""
+        longest = int(gaps.counts[-1])
+        per_step = math.ceil(gaps.step_s / min(_CELL / fastest_per_s, delay_s or math.inf) - 1e-9)
+        per_step = max(min(per_step, _MOST_CELLS // (longest + 1)), 1)
+        cell_s = gaps.step_s / per_step
+        late_cells = math.ceil(delay_s / cell_s - 1e-9)
+        event_cells = np.arange(0, late_cells or 1, per_step)
+        event_cells = event_cells[(event_cells == 0) | (event_cells >= gaps.least_s / cell_s - 1e-9)]
+        cells = longest * per_step + late_cells
+        return cls(cell_s, cells, late_cells, gaps.counts * per_step, late_cells - event_cells)
+
+    @property
+    def until_s(self) -> float:
+        """The end of the last cell."""
+        return self.cells * self.cell_s
+
+    @property
+    def shares(self) -> Vector:
+        """μ, by which J of the event of each window counts in S, (windows,)."""
+        return self.windows / self.late_cells if self.late_cells else np.ones(1)
+
+    @property
+    def shares_left(self) -> Matrix:
+        """μ of the same update after each gap, as a share of that before it, (gaps, windows)."""
+        left = (self.windows - self.ends[:, None]).clip(min=0)
+        return np.asarray(left / (self.late_cells or 1) / self.shares)
+
+    def until_ends(self, areas: Vector) -> Matrix:
+        """Return ∫k(g − r) over each cell of r, for each gap g, (gaps, cells); ``areas`` is ∫k."""
+        distances = self.ends[:, None] - 1 - np.arange(self.cells)
+        return np.asarray(np.where(distances >= 0, areas[distances.clip(min=0)], 0.0))
+
+    def within_windows(self, areas: Stack) -> Stack:
+        """Sum (…, cells) over the cells of each window, and divide by μ, (…, windows)."""
+        sums = np.cumsum(areas, axis=-1)
+        return np.asarray(np.where(self.windows > 0, sums[..., self.windows - 1], 0.0) / self.shares)
+
+
+class GapGains(NamedTuple):
+    """What one gap makes of ‖Λξ‖ ≤ 1 and of S = 1: arrays of (gaps,), (cells,) or (gaps, cells).
+
+    ``removal`` is J of the next event, ``removals`` is S, ``input`` a ‖w‖ of 1 in each cell.
+    """
 
     shape: Matrix
     """Λ"""
-    age_bends: Vector
+    age_sags: Vector
     """How far ‖w‖ may lie above its values at nodes, from the age of the input."""
-    ages: Vector
+    age_input: Vector
     """‖w‖ in each cell from the age of the input."""
-    stretch: Vector
-    """γ_g, with the age of the input."""
-    aged: Matrix
+    state_from_state: Vector
+    """γ_g: ‖Λξ‖ after the gap, with the age of the input."""
+    state_from_input: Matrix
     """∫‖ΛΨ‖ over each cell."""
-    removal: Vector
-    """J of the next event, with the age of the input."""
-    removal_aged: Matrix
-    """The part of J of the next event that a w of 1 in each cell causes."""
-    pulse: Vector
-    """‖Λξ‖ after a gap, J of the next event, and what is left of S, for S = 1."""
-    removal_pulse: Vector
-    remaining: Vector
-    weighted_sum: Vector
-    """‖Λξ‖/θ + S after a gap for S = 1."""
+    state_from_removals: Vector
+    """k_g"""
+    removal_from_state: Vector
+    """j_g, with the age of the input."""
+    removal_from_input: Matrix
+    removal_from_removals: Vector
+    """l_g without what is left of S."""
+    removals_left: Vector
+    """What is left of S."""
+    sum_from_removals: Vector
+    """‖Λξ‖/θ + S"""
     theta: float
     """θ"""
-    gain: float
+    largest: float
     """‖Λξ‖ + θS after a gap, at most, if it was 1."""
 
 
@@ -108,83 +167,68 @@ class GapLoop:
         M, BK = plant.closed_loop, plant.B @ plant.error.K
         self.F = np.block([[M, BK], [self.scaled_H - M, self.scaled_H - BK]])
         self.BK = np.vstack([BK, -BK])
-        # An update may be in flight for d.
-        d = conditions.delay_s
         self.starts_late = conditions.start_s > gaps.least_s * ROUNDING
-        if self.starts_late:  # what is delivered before the first input stays in flight until then
-            d = max(d, conditions.start_s)
-        self.delay_s = d
-        # Cells: as many in each step of the gaps, from r = 0 until d after the longest gap.
-        fastest, longest = float(np.abs(np.linalg.eigvals(self.F)).max()), int(gaps.counts[-1])
-        per_step = math.ceil(gaps.step_s / min(_CELL / fastest, d or math.inf) - 1e-9)
-        per_step = max(min(per_step, _MOST_CELLS // (longest + 1)), 1)
-        self.cell_s = gaps.step_s / per_step
-        self.late_cells = math.ceil(d / self.cell_s - 1e-9)
-        self.ends = gaps.counts * per_step
-        self.cells = longest * per_step + self.late_cells
-        self.until_s = self.cells * self.cell_s
+        # An update may be in flight for d; what is delivered before the first input, until then.
+        d = conditions.delay_s
+        self.delay_s = max(d, conditions.start_s) if self.starts_late else d
+        self.grid = GapGrid.of(gaps, self.delay_s, float(np.abs(np.linalg.eigvals(self.F)).max()))
         self.flows = self._powers(self.F)[:, :, : self.n]
         """e^{Fr} (I; 0) at all nodes, (cells + 1, 2n, n)."""
-        event_cells = np.arange(0, self.late_cells or 1, per_step)
-        event_cells = event_cells[(event_cells == 0) | (event_cells >= gaps.least_s / self.cell_s - 1e-9)]
-        self.windows = self.late_cells - event_cells
-        """Cells for which updates may still be in flight, by times at which their events can have been."""
-        self.shares = self.windows / self.late_cells if self.late_cells else np.ones(1)
-        """What J of these events counts in S."""
-        # The outputs of z that are bounded.
         no_state, no_input = np.zeros((self.n, self.n)), np.zeros_like(self.R)
         self.outputs = {
             ERROR: np.hstack([no_state, plant.error.weight]),
             INPUT: np.hstack([no_input, self.R]),
         }
+        """C of the outputs C z that are bounded."""
         for name in (Output.STATE, Output.WEIGHTED, Output.MISMATCH):
             self.outputs[name] = np.hstack([plant.outputs[name], 0 * plant.outputs[name]])
         # What drives z: a w at any time, and the age of the input for each τ from −σ to σ.
         BU = plant.input_matrix
-        self._response = response_until(self.F, np.vstack([BU, -BU]), self.until_s, self.cells)
+        self._response = response_until(self.F, np.vstack([BU, -BU]), self.grid.until_s, self.grid.cells)
         s = conditions.hold_s
-        of_age = [
+        at_event = [
             self.R @ (exponential(-self.H * (s * k / _AGES)) - np.eye(self.n))
             for k in range(-_AGES, _AGES + 1)
         ]
-        self.aged = np.array(of_age) @ self._powers(self.scaled_H)[:, None]
+        self.input_by_age = np.array(at_event) @ self._powers(self.scaled_H)[:, None]
         """R(e^{−Hτ} − I)e^{Hr} at nodes of r and τ, (cells + 1, ages, q, n)."""
 
     def _powers(self, generator: Matrix) -> Stack:
-        step, powers = exponential(generator * self.cell_s), [np.eye(len(generator))]
-        for _ in range(self.cells):
+        """Return the exponentials at all nodes, (cells + 1, …)."""
+        step, powers = exponential(generator * self.grid.cell_s), [np.eye(len(generator))]
+        for _ in range(self.grid.cells):
             powers.append(step @ powers[-1])
         return np.array(powers)
 
     @cached_property
-    def removal(self) -> tuple[Matrix, float]:
+    def removal_rows(self) -> tuple[Stack, float]:
         """C and b with J ≤ max_i ‖C_i e⁻‖ + b ‖e⁻‖_W, C of shape (nodes, q, n).
 
-        C_i = e^{αd} R e^{Hu} at nodes of u from −σ to d + σ.
+        C_i = e^{αd} R e^{Hu} at nodes of u from −σ to d + σ; b is for u between two nodes.
         """
         d, s, H = self.delay_s, self.conditions.hold_s, self.H
         grown = math.exp(self.plant.alpha_per_s * d)
         nodes_s = np.linspace(-s, d + s, 4 * _AGES + 1)
-        curvature = 0.0
+        bend = 0.0
         for G, until_s in ((H, d + s), (-H, s)):
             response = response_until(G, self.plant.error.inverse_weight, until_s or 1e-9)
-            curvature = max(curvature, float(response.through(self.R @ H @ H).sup_on_grid()))
-        bend = grown * float(nodes_s[1] - nodes_s[0]) ** 2 / 8 * curvature
+            bend = max(bend, float(response.through(self.R @ H @ H).sup_on_grid()))
+        sag = grown * float(nodes_s[1] - nodes_s[0]) ** 2 / 8 * bend
         nodes = [grown * self.R @ exponential(H * u_s) for u_s in nodes_s.tolist()]
-        return np.array(nodes), bend * ROUNDING
+        return np.array(nodes), sag * ROUNDING
 
-    def removal_sizes(self, errors: Matrix) -> Vector:
+    def removals(self, errors: Matrix) -> Vector:
         """Bound J for errors e⁻, (k, n)."""
-        nodes, bend = self.removal
-        sizes = np.linalg.norm(np.einsum("iqn,kn->kiq", nodes, errors), axis=-1).max(axis=-1)
+        nodes, sag = self.removal_rows
+        at_nodes = np.linalg.norm(np.einsum("iqn,kn->kiq", nodes, errors), axis=-1).max(axis=-1)
         weighted = np.linalg.norm(errors @ self.plant.error.weight.T, axis=-1)
-        return np.asarray((sizes + bend * weighted) * ROUNDING)
+        return np.asarray((at_nodes + sag * weighted) * ROUNDING)
 
     @cached_property
     def removal_outputs(self) -> dict[str, Matrix]:
-        """C of the outputs whose largest one bounds J."""
-        nodes, bend = self.removal
-        rows = [*nodes, bend * self.plant.error.weight]
+        """C of outputs of z; J is at most the largest of all but the last one, plus the last one."""
+        nodes, sag = self.removal_rows
+        rows = [*nodes, sag * self.plant.error.weight]
         return {f"{number}": np.hstack([0 * C, C]) for number, C in enumerate(rows)}
 
     @cached_property
@@ -194,109 +238,121 @@ class GapLoop:
         *nodes, weighted = (kernel.area for kernel in kernels.values())
         return np.asarray(np.max(nodes, axis=0) + weighted)
 
-    def at_ends(self, areas: Vector) -> Matrix:
-        """Return ∫k(g − r) over each cell of r, for each gap g, (gaps, cells)."""
-        distances = self.ends[:, None] - 1 - np.arange(self.cells)
-        return np.asarray(np.where(distances >= 0, areas[distances.clip(min=0)], 0.0))
-
-    def within_windows(self, areas: Stack) -> Stack:
-        """Sum (…, cells) over the cells of each window, (…, windows)."""
-        sums = np.cumsum(areas, axis=-1)
-        return np.where(self.windows > 0, sums[..., self.windows - 1], 0.0)
-
     @cached_property
     def input_responses(self) -> Stack:
         """∫‖C e^{F(s−r)} (B; −B) U‖ over r in each cell, for s in each, (outputs, s, r)."""
-        distances = np.subtract.outer(np.arange(self.cells), np.arange(self.cells))
+        distances = np.subtract.outer(np.arange(self.grid.cells), np.arange(self.grid.cells))
         areas = []
         for kernel in self._response.through_each(Outputs(self.outputs)).values():
             previous = np.append(kernel.highest[:1], kernel.highest[:-1])
-            largest = np.maximum(kernel.highest, previous) * self.cell_s * ROUNDING
+            largest = np.maximum(kernel.highest, previous) * self.grid.cell_s * ROUNDING
             areas.append(np.where(distances >= 0, largest[distances.clip(min=0)], 0.0))
         return np.array(areas)
 
-    def norm(self, shape: Matrix) -> GapNorm:
-        """Return what one gap makes of ‖Λξ‖ ≤ 1."""
-        # ‖w‖ over each cell, from the age of the input.
-        inverse = np.asarray(np.linalg.inv(shape))
-        bends, curved = self._age_bends(shape, inverse)
-        ages = of_cells(_norms(self.aged @ inverse).max(axis=1)) + bends
-        ages = ages * ROUNDING
-        # J of the next event: the error that its update removes, from ξ and from w.
-        lost = self.flows[self.ends, self.n :] @ inverse
-        nodes, bend = self.removal
-        removal = _norms(nodes @ lost[:, None]).max(axis=1)
-        removal = removal + bend * _norms(self.plant.error.weight @ lost)
-        removal_aged = self.at_ends(self.removal_areas)
-        removal = removal * ROUNDING + removal_aged @ ages
-        # ‖Λξ‖ after the gap.
-        aged = self.at_ends(self._response.through(np.hstack([shape, 0 * shape])).area)
-        stretch = self._stretch(shape, inverse) + aged @ curved
-        # The same for S = 1: what the updates in flight add, and what of S remains.
-        pulses, removal_pulses = (self.within_windows(areas) / self.shares for areas in (aged, removal_aged))
-        remaining = (self.windows - self.ends[:, None]).clip(min=0) / (self.late_cells or 1) / self.shares
-        # The θ that lets ‖Λξ‖ + θS grow least.
-        least = pulses / (1 - removal_pulses - remaining).clip(min=1e-9)
-        thetas = (float(least.max()) * ROUNDING or _LEAST) * _THETAS[:, None]
-        weighted_sum = (pulses / thetas[..., None] + removal_pulses + remaining).max(axis=-1)
-        gains = np.maximum(stretch + thetas * removal, weighted_sum).max(axis=1)
-        best = int(gains.argmin())
-        return GapNorm(
-            shape, bends, ages, stretch, aged, removal, removal_aged,
-            pulses.max(axis=1), removal_pulses.max(axis=1), remaining.max(axis=1), weighted_sum[best],
-            float(thetas[best, 0]), float(gains[best]),
+    def gains(self, shape: Matrix) -> GapGains:
+        """Return what one gap makes of ‖Λξ‖ ≤ 1 and of S = 1."""
+        grid, inverse = self.grid, np.asarray(np.linalg.inv(shape))
+        age_sags, second_order = self._age_sags(shape, inverse)
+        age_input = (of_cells(_norms(self.input_by_age @ inverse).max(axis=1)) + age_sags) * ROUNDING
+        # From w.
+        state_from_input = grid.until_ends(self._response.through(np.hstack([shape, 0 * shape])).area)
+        removal_from_input = grid.until_ends(self.removal_areas)
+        # From ξ: J is that of the error at the end of the gap, which the next update removes.
+        state_from_state = self._state_gains(shape, inverse) + state_from_input @ second_order
+        errors = self.flows[grid.ends, self.n :] @ inverse
+        nodes, sag = self.removal_rows
+        removal = _norms(nodes @ errors[:, None]).max(axis=1)
+        removal = removal + sag * _norms(self.plant.error.weight @ errors)
+        removal_from_state = removal * ROUNDING + removal_from_input @ age_input
+        # From the updates in flight, (gaps, windows), of which the largest counts.
+        from_removals = (
+            grid.within_windows(state_from_input),
+            grid.within_windows(removal_from_input),
+            grid.shares_left,
+        )
+        state_from_removals, removal_from_removals, left = (part.max(axis=1) for part in from_removals)
+        theta, largest, sums = _best_theta(state_from_state, removal_from_state, *from_removals)
+        return GapGains(
+            shape, age_sags, age_input,
+            state_from_state, state_from_input, state_from_removals,
+            removal_from_state, removal_from_input, removal_from_removals,
+            left, sums, theta, largest,
         )  # fmt: skip
 
-    def _stretch(self, shape: Matrix, inverse: Matrix) -> Vector:
+    def _state_gains(self, shape: Matrix, inverse: Matrix) -> Vector:
         """Bound ‖Λξ‖ after each gap with ages to first order, (gaps,).
 
         w = −τ KHe^{Hr}ξ. In a few pieces of a gap, Ψ(g − r) KHe^{Hr} is replaced by its mean; then
         only the mean of τ counts, and a norm is largest for means of ±σ.
         """
         s, G, F, n = self.conditions.hold_s, self.scaled_H, self.F, self.n
-        moved = shape @ self.flows[self.ends, :n] @ inverse
+        cells, cell_s, until_s = self.grid.cells, self.grid.cell_s, self.grid.until_s
+        without_ages = shape @ self.flows[self.grid.ends, :n] @ inverse
         if s == 0 or not self.H.any():
-            return _norms(moved) * ROUNDING
+            return _norms(without_ages) * ROUNDING
         # By how much the products at the nodes may differ from those between them.
-        pushed = self.BK @ self.H
+        input_rate = self.BK @ self.H
         row = np.hstack([shape, 0 * shape])
-        Y = F @ F @ pushed - 2 * F @ pushed @ G + pushed @ G @ G
-        bend = response_until(F, Y @ inverse, self.until_s, self.cells).through(row).sup_on_grid()
-        models = response_until(G, inverse, self.until_s, self.cells).through(shape).sup_on_grid()
-        sag = self.cell_s**2 / 8 * float(bend) * float(models)
-        left, right = row @ self._powers(F) @ pushed, self._powers(G) @ inverse
-        # For each gap the largest norm over the signs of the means, and the deviations from them.
-        signs = np.array(list(itertools.product((-s, s), repeat=_PIECES)))
-        stretches = []
-        for end, undriven in zip(self.ends.tolist(), moved, strict=True):
+        Y = F @ F @ input_rate - 2 * F @ input_rate @ G + input_rate @ G @ G
+        bend = response_until(F, Y @ inverse, until_s, cells).through(row).sup_on_grid()
+        models = response_until(G, inverse, until_s, cells).through(shape).sup_on_grid()
+        sag = cell_s**2 / 8 * float(bend) * float(models)
+        left, right = row @ self._powers(F) @ input_rate, self._powers(G) @ inverse
+        gains = list[float]()
+        for end, map_without_ages in zip(self.grid.ends.tolist(), without_ages, strict=True):
             products = left[end::-1] @ right[: end + 1]
-            deviation, means = 0.0, np.zeros((_PIECES, n, n))
-            for number, piece in enumerate(np.array_split(np.arange(end), _PIECES)):
-                if len(piece):
-                    nodes = products[piece[0] : piece[-1] + 2]
-                    mean = nodes.mean(axis=0)
-                    deviations = of_cells(np.linalg.norm(nodes - mean, axis=(1, 2))) + sag
-                    deviation += s * self.cell_s * float(deviations.sum())
-                    means[number] = mean * self.cell_s * len(piece)
-            ends = undriven + np.einsum("sp,pij->sij", signs, means)
-            stretches.append((float(_norms(ends).max()) + deviation) * ROUNDING)
-            if stretches[-1] >= 1:  # of no use: the other gaps do not matter
+            gains.append(self._gain_with_mean_ages(map_without_ages, products, sag))
+            if gains[-1] >= 1:  # of no use: the other gaps do not matter
                 break
-        return np.array(stretches + stretches[-1:] * (len(moved) - len(stretches)))
+        return np.array(gains + gains[-1:] * (len(without_ages) - len(gains)))
 
-    def _age_bends(self, shape: Matrix, inverse: Matrix) -> tuple[Vector, Vector]:
+    def _gain_with_mean_ages(self, without_ages: Matrix, products: Stack, sag: float) -> float:
+        """Bound ‖Λξ‖ after one gap by the products at its nodes: by their means, and what differs."""
+        s, cell_s, n = self.conditions.hold_s, self.grid.cell_s, self.n
+        deviation, means = 0.0, np.zeros((_PIECES, n, n))
+        for number, piece in enumerate(np.array_split(np.arange(len(products) - 1), _PIECES)):
+            if len(piece):
+                nodes = products[piece[0] : piece[-1] + 2]
+                mean = nodes.mean(axis=0)
+                deviations = of_cells(np.linalg.norm(nodes - mean, axis=(1, 2))) + sag
+                deviation += s * cell_s * float(deviations.sum())
+                means[number] = mean * cell_s * len(piece)
+        ends = without_ages + np.einsum("sp,pij->sij", s * _SIGNS, means)
+        return (float(_norms(ends).max()) + deviation) * ROUNDING
+
+    def _age_sags(self, shape: Matrix, inverse: Matrix) -> tuple[Vector, Vector]:
         """Bound, over each cell, how far ‖w‖ may lie above its nodes, and from the first order."""
-        s, H, G = self.conditions.hold_s, self.H, self.scaled_H
+        s, H, G, grid = self.conditions.hold_s, self.H, self.scaled_H, self.grid
         if s == 0:
-            return np.zeros(self.cells), np.zeros(self.cells)
+            return np.zeros(grid.cells), np.zeros(grid.cells)
         outputs = Outputs({"τ": self.R @ H @ H, "r": self.R @ H @ G @ G})
-        kernels = response_until(G, inverse, self.until_s, self.cells).through_each(outputs)
+        kernels = response_until(G, inverse, grid.until_s, grid.cells).through_each(outputs)
         # e^{−Hτ} commutes with e^{Hr}.
         models = [response_until(generator, inverse, s).through(shape).sup_on_grid() for generator in (H, -H)]
-        second = max(map(float, models)) * kernels["τ"].highest
-        turned = max(map(float, models)) * kernels["r"].highest
-        bends = (s / _AGES) ** 2 / 8 * second + self.cell_s**2 / 8 * s * turned
-        return np.asarray(bends), np.asarray(s**2 / 2 * second)
+        bend_by_age = max(map(float, models)) * kernels["τ"].highest
+        bend_by_time = max(map(float, models)) * kernels["r"].highest
+        sags = (s / _AGES) ** 2 / 8 * bend_by_age + grid.cell_s**2 / 8 * s * bend_by_time
+        return np.asarray(sags), np.asarray(s**2 / 2 * bend_by_age)
+
+
+def _best_theta(
+    state_from_state: Vector,
+    removal_from_state: Vector,
+    state_from_removals: Matrix,
+    removal_from_removals: Matrix,
+    removals_left: Matrix,
+) -> tuple[float, float, Vector]:
+    """Return the θ that lets ‖Λξ‖ + θS grow least, by how much, and ‖Λξ‖/θ + S for S = 1, (gaps,).
+
+    The gains from ξ are (gaps,), those from S (gaps, windows).
+    """
+    least = state_from_removals / (1 - removal_from_removals - removals_left).clip(min=1e-9)
+    thetas = (float(least.max()) * ROUNDING or _LEAST_THETA) * _THETAS[:, None]
+    from_removals = state_from_removals / thetas[..., None] + removal_from_removals + removals_left
+    sums = from_removals.max(axis=-1)
+    gains = np.maximum(state_from_state + thetas * removal_from_state, sums).max(axis=1)
+    best = int(gains.argmin())
+    return float(thetas[best, 0]), float(gains[best]), sums[best]
 
 
 def _norms(matrices: Stack) -> Stack:

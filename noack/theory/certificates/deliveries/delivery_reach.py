@@ -46,11 +46,11 @@ from noack.theory.certificates.deliveries.delivery_flow import (
 )
 
 _LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), 40.0)
-_ALONE = 40.0
+_ONLY_LAST_DELIVERY = 40.0
 """λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
 _NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
 _AT_ONCE, _MOST_JOINT = 16, 3
-_SHARES = np.array(
+_FIRST_WEIGHTS = np.array(
     [
         (first, (1 - first) * (1 - last), (1 - first) * last, 0.0)
         for first in (0.01, 0.03, 0.1, 0.3)
@@ -62,21 +62,22 @@ _SHARES = np.array(
         for last in (0.4, 0.55, 0.7)
     ]
 )
-"""Of ‖x_c‖, of ‖e_c‖ at both ends, and of ‖Λx‖, after the last node: the first to be tried."""
+"""Weights of ‖x_c‖, of ‖e_c‖ at both ends, and of ‖Λx‖, after the last node: the first to be tried."""
 _WINDOWS = (1 / 6, 1 / 3, 2 / 3, 0.9, 1.0)
 """T' as shares of the last node."""
-_EARLIER = 8
+_EARLIER_TIMES = 8
 """Earlier times whose conditions are used together."""
-_FOUR = [0, 1, 2 * _EARLIER + 1, 2]
-_OTHERS = 0.1
-"""Their share at first, beside the best two."""
+_WEIGHTED_FORMS = [0, 1, 2 * _EARLIER_TIMES + 1, 2]
+"""The forms to which ``_FIRST_WEIGHTS`` belong."""
+_WEIGHT_OF_OTHERS = 0.1
+"""Sum of the first weights of all other forms."""
 _HALVINGS = 12
-_ROUNDS, _POWER, _LEAST_WEIGHT, _NEARLY = 40, 0.3, 1e-9, 0.97
-_CLEARLY = 0.98
+_ROUNDS, _POWER, _LEAST_WEIGHT, _NEARLY_LARGEST = 40, 0.3, 1e-9, 0.97
+_CLEARLY_ENOUGH = 0.98
 """Share of a sufficient bound from which on a bound at one end of a cell is not improved."""
-_BEST = 1 + 1e-5
+_NEARLY_OPTIMAL = 1 + 1e-5
 """A bound is not improved further if no weights make it smaller by more than this factor."""
-_CONDITION = 1e-10
+_LEAST_CONDITION = 1e-10
 """Smallest over largest eigenvalue of a sum of forms that is used."""
 
 
@@ -86,7 +87,7 @@ class _Window(NamedTuple):
     node: int
     cells: NDArray[np.intp]
     """The cells of the times since the node, from 0 to T', (k + 1,)."""
-    moved: Stack
+    flows: Stack
     """z at these times, (k + 1, 2n, 2n)."""
     model: Matrix
     """x_c at the node from ξ, (n, n)."""
@@ -140,14 +141,14 @@ class DeliveryEllipsoid:
         for share in _WINDOWS:
             node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
             since_s = last_s - float(flow.edges_s[node])
-            moved = [np.block([[identity, -identity], [np.zeros_like(identity), identity]])]
-            step = exponential(flow.generator * (since_s / _EARLIER))
-            for _ in range(_EARLIER):
-                moved.append(step @ moved[-1])
-            cells = [flow.cell_at(number * since_s / _EARLIER) for number in range(_EARLIER + 1)]
+            flows = [np.block([[identity, -identity], [np.zeros_like(identity), identity]])]
+            step = exponential(flow.generator * (since_s / _EARLIER_TIMES))
+            for _ in range(_EARLIER_TIMES):
+                flows.append(step @ flows[-1])
+            cells = [flow.cell_at(number * since_s / _EARLIER_TIMES) for number in range(_EARLIER_TIMES + 1)]
             model = flow.states[node, : flow.n] + flow.states[node, flow.n :]
             norm, largest = (float(np.linalg.norm(M, 2)) for M in (model, model @ self.inverse))
-            windows.append(_Window(node, np.array(cells), np.array(moved), model, norm, largest))
+            windows.append(_Window(node, np.array(cells), np.array(flows), model, norm, largest))
         return windows
 
     @cached_property
@@ -167,18 +168,18 @@ class DeliveryEllipsoid:
         S = self.shape @ flow.closed_loop @ self.inverse
         by_input = self.shape @ flow.input_error
         squares, largest = by_input @ by_input.T / 2, 0.0
-        size = float(np.linalg.norm(by_input, 2))
-        if size:
-            gamma = size * np.exp(np.linspace(-4.0, 0.0, 17))
+        gain = float(np.linalg.norm(by_input, 2))
+        if gain:
+            gamma = gain * np.exp(np.linspace(-4.0, 0.0, 17))
             low, high = np.zeros(len(gamma)), -2 * logarithmic_norm(S).clip(max=0.0) / gamma
             for _ in range(_HALVINGS):
                 middle = (low + high) / 2
-                moved = S + (middle / gamma)[:, None, None] * squares
-                grows = logarithmic_norm(moved) + middle * gamma / 2 >= 0
+                driven = S + (middle / gamma)[:, None, None] * squares
+                grows = logarithmic_norm(driven) + middle * gamma / 2 >= 0
                 low, high = np.where(grows, low, middle), np.where(grows, middle, high)
             largest = float(low.max())
         bounds = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
-        return largest, bounds.frobenius_bounds(np.ones(1), np.array([_ALONE]))[:, 0], bounds
+        return largest, bounds.frobenius_bounds(np.ones(1), np.array([_ONLY_LAST_DELIVERY]))[:, 0], bounds
 
 
 @dataclass(frozen=True)
@@ -186,10 +187,10 @@ class Reach:
     """What z can be at some time after a delivery: ‖ΛWξ‖ ≤ c at the delivery, ‖e_c‖_W ≤ D since."""
 
     ellipsoid: DeliveryEllipsoid
-    size: float
-    """c."""
-    limit: float
-    """D."""
+    scale: float
+    """c"""
+    error_bound: float
+    """D"""
     effects: InputEffects = NO_EFFECTS
     followed_share: float = 1.0
     """e_c is followed until delay and hold may have changed it by this share of D."""
@@ -205,22 +206,22 @@ class Reach:
         if after > followed:
             after = self._sup_after_last_node(bounds, followed)
             followed = self._sup_followed(bounds, after)
-        return max(self.size * max(followed, after), self._from_start(C))
+        return max(self.scale * max(followed, after), self._from_start(C))
 
     def sup_state(self, C: Matrix) -> float:
         """Bound ‖C W x‖ at all times, for C of shape (q, n)."""
-        size = self.size * float(spectral_norm(C @ self.ellipsoid.inverse)) * ROUNDING
-        return max(size, self._from_start(np.hstack([C, np.zeros_like(C)])))
+        in_ellipsoid = self.scale * float(spectral_norm(C @ self.ellipsoid.inverse)) * ROUNDING
+        return max(in_ellipsoid, self._from_start(np.hstack([C, np.zeros_like(C)])))
 
     def _from_start(self, C: Matrix) -> float:
-        return self.ellipsoid.flow.from_start(C, self.limit) if self.first_cell else 0.0
+        return self.ellipsoid.flow.from_start(C, self.error_bound) if self.first_cell else 0.0
 
     def largest_state(self, since_s: float = 0.0) -> float:
         """Bound ‖ΛWx‖ from a time after the start on."""
         if not self.first_cell:
-            return self.size
+            return self.scale
         flow, C = self.ellipsoid.flow, self.ellipsoid.state_bounds.C
-        return max(self.size, flow.from_start(C, self.limit, flow.cell_at(since_s)))
+        return max(self.scale, flow.from_start(C, self.error_bound, flow.cell_at(since_s)))
 
     def is_invariant(self) -> bool:
         """Return whether ‖Λx‖ ≤ c at a delivery implies the same at all times until the next.
@@ -228,7 +229,7 @@ class Reach:
         It cannot be left while ‖K e_c + q‖ is below :attr:`DeliveryEllipsoid.drive_limit`.
         """
         largest, input_errors, bounds = self.ellipsoid.drive_limit
-        input_errors = input_errors + (self._changes(bounds) + self.effects.age_input) / self.size
+        input_errors = input_errors + (self._changes(bounds) + self.effects.age_input) / self.scale
         first_cell = int(np.argmax(np.append(input_errors, np.inf) * ROUNDING >= largest))
         states = self.ellipsoid.state_bounds
         is_inside = self._sup_after_last_node(states, 1.0, most=1.0) <= 1
@@ -236,29 +237,29 @@ class Reach:
 
     def _changes(self, bounds: "_CellBounds") -> Vector:
         """Bound what delay and hold change of C z over the cells, (k,)."""
-        return self.effects.sizes(bounds.unit_effects)
+        return self.effects.changes(bounds.unit_effects)
 
     @cached_property
     def _error_changes(self) -> Vector:
         """The same of e_c."""
-        return self.effects.sizes(self.ellipsoid.flow.error_effects)
+        return self.effects.changes(self.ellipsoid.flow.error_effects)
 
     @cached_property
-    def _state_levels(self) -> Vector:
+    def _state_bounds(self) -> Vector:
         """Bounds of ‖ΛWx‖ over the cells, for c = 1."""
-        return 1 + self._changes(self.ellipsoid.state_bounds) / self.size
+        return 1 + self._changes(self.ellipsoid.state_bounds) / self.scale
 
     @cached_property
     def _followed_cells(self) -> int:
         """The cells that are followed."""
-        return int(np.argmax(np.append(self._error_changes, np.inf) > self.followed_share * self.limit))
+        return int(np.argmax(np.append(self._error_changes, np.inf) > self.followed_share * self.error_bound))
 
     def _sup_followed(self, bounds: "_CellBounds", enough: float, first_cell: int = 0) -> float:
         """Bound ‖C z‖ over the cells that are followed, for c = 1; see :meth:`_CellBounds.sup`."""
         # All is in proportion to c, for D/c.
-        limits, changes = self.limit + self._error_changes, self._changes(bounds)
+        errors, changes = self.error_bound + self._error_changes, self._changes(bounds)
         cells = slice(first_cell, self._followed_cells)
-        return bounds.sup(limits / self.size, self._state_levels, changes / self.size, cells, enough)
+        return bounds.sup(errors / self.scale, self._state_bounds, changes / self.scale, cells, enough)
 
     def _sup_after_last_node(self, bounds: "_CellBounds", enough: float, *, most: float = math.inf) -> float:
         """Bound ‖C z‖ after the last node that is followed, for c = 1.
@@ -266,16 +267,16 @@ class Reach:
         A bound of at most ``enough`` is not improved, nor one that cannot become at most ``most``.
         """
         changes = self.effects.age_input * bounds.unit_effects[1]
-        cells, moved, forms, roots = self._last_windows
-        Y = bounds.C @ moved
-        images = Y[:, None] @ roots
-        sizes = spectral_norms(images.reshape(-1, *images.shape[2:])).reshape(images.shape[:2])
-        added = changes[cells] / self.size
-        smallest = float((sizes.min(axis=1) * ROUNDING + added).min())
+        cells, flows, forms, semi_axes = self._last_windows
+        Y = bounds.C @ flows
+        images = Y[:, None] @ semi_axes
+        norms = spectral_norms(images.reshape(-1, *images.shape[2:])).reshape(images.shape[:2])
+        added = changes[cells] / self.scale
+        smallest = float((norms.min(axis=1) * ROUNDING + added).min())
         if smallest <= enough:
             return smallest
-        first_weights = np.full(forms.shape[:2], _OTHERS / forms.shape[1])
-        first_weights[:, _FOUR] += (1 - _OTHERS) * _SHARES[sizes.argmin(axis=1)]
+        first_weights = np.full(forms.shape[:2], _WEIGHT_OF_OTHERS / forms.shape[1])
+        first_weights[:, _WEIGHTED_FORMS] += (1 - _WEIGHT_OF_OTHERS) * _FIRST_WEIGHTS[norms.argmin(axis=1)]
         largest, _ = largest_outputs(
             forms, Y, enough, first_weights, wanted=Wanted.SMALLEST, added=added, most=min(smallest, most)
         )
@@ -286,51 +287,50 @@ class Reach:
         """What holds of z a time T' ago, after the last node that is followed, for each T'.
 
         T' as a cell, the flow in it, forms that are at most 1, all for c = 1 and in (x_c, e_c):
-        ‖x_c‖ ≤ h, and ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1 at several times; semi-axes for some of their sums.
+        ‖x_c‖ ≤ h, and ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1 at several times; and the semi-axes of the ellipsoids
+        of ``_FIRST_WEIGHTS``.
         """
         ellipsoid, flow, n = self.ellipsoid, self.ellipsoid.flow, self.ellipsoid.flow.n
-        limit, windows = self.limit / self.size, ellipsoid.windows(self._followed_cells)
+        error_bound, windows = self.error_bound / self.scale, ellipsoid.windows(self._followed_cells)
         # By how much held inputs change ‖e_c‖, and the bound of ‖Λx‖, over each cell.
-        age_input = self.effects.age_input / self.size
-        errors = age_input * flow.error_effects[1]
-        levels = age_input * ellipsoid.state_bounds.unit_effects[1]
-        rows = np.zeros((len(windows), 2 * _EARLIER + 2, n, 2 * n))
+        age_input = self.effects.age_input / self.scale
+        error_changes = age_input * flow.error_effects[1]
+        state_changes = age_input * ellipsoid.state_bounds.unit_effects[1]
+        rows = np.zeros((len(windows), 2 * _EARLIER_TIMES + 2, n, 2 * n))
         for row, window in zip(rows, windows, strict=True):
             # h bounds x_c = x + e_c, which follows the model, at the node T' ago.
-            h = window.largest_model + window.model_norm * self.effects.first_error / self.size
+            h = window.largest_model + window.model_norm * self.effects.first_error / self.scale
             if self.first_cell:
-                h = max(h, float(np.linalg.norm(window.model @ flow.start)) / self.size)
+                h = max(h, float(np.linalg.norm(window.model @ flow.start)) / self.scale)
             # The conditions at times from T' ago until now, as rows for (x_c, e_c) T' ago.
-            level = 1.0 if window.node >= self.first_cell else self.largest_state() / self.size
-            added = np.array([errors[window.cells], levels[window.cells]])
+            state_bound = 1.0 if window.node >= self.first_cell else self.largest_state() / self.scale
+            added = np.array([error_changes[window.cells], state_changes[window.cells]])
             added[:, 0] = 0.0
-            row[0, :, :n] = np.eye(n) / (flow.stretch * h)
-            row[1::2] = window.moved[:, n:] / (limit + added[0])[:, None, None]
-            row[2::2] = (ellipsoid.shape @ window.moved[:-1, :n]) / (level + added[1, :-1])[:, None, None]
+            errors, states = error_bound + added[0], state_bound + added[1, :-1]
+            row[0, :, :n] = np.eye(n) / (flow.model_growth * h)
+            row[1::2] = window.flows[:, n:] / errors[:, None, None]
+            row[2::2] = (ellipsoid.shape @ window.flows[:-1, :n]) / states[:, None, None]
         # Semi-axes of the ellipsoids of the first weights, in balanced coordinates.
-        turns = _balancing_coordinates(rows)
-        balanced = rows @ turns[:, None]
+        coordinates = _balancing_coordinates(rows)
+        balanced = rows @ coordinates[:, None]
         forms = balanced.swapaxes(-1, -2) @ balanced
-        first_forms = _SHARES @ forms[:, _FOUR].reshape(len(windows), len(_FOUR), -1)
+        weighted = forms[:, _WEIGHTED_FORMS].reshape(len(windows), len(_WEIGHTED_FORMS), -1)
+        first_forms = _FIRST_WEIGHTS @ weighted
         values, V = np.linalg.eigh(first_forms.reshape(len(windows), -1, 2 * n, 2 * n))
-        usable = values[..., :1] > _CONDITION * values[..., -1:]  # others are too flat
-        roots = V / np.sqrt(np.where(usable, values, _CONDITION))[..., None, :]
+        usable = values[..., :1] > _LEAST_CONDITION * values[..., -1:]  # others are too flat
+        semi_axes = V / np.sqrt(np.where(usable, values, _LEAST_CONDITION))[..., None, :]
         cells = np.array([window.cells[-1] for window in windows])
-        return cells, np.array([window.moved[-1] for window in windows]) @ turns, forms, roots
+        flows = np.array([window.flows[-1] for window in windows]) @ coordinates
+        return cells, flows, forms, semi_axes
 
 
 class _CellBounds:
     """Bounds of ‖C z‖ over each cell, for ‖Λξ‖ ≤ 1."""
 
     def __init__(self, ellipsoid: DeliveryEllipsoid, C: Matrix) -> None:
-        self.C, self._singular, self._flow, self._shape = (
-            C,
-            ellipsoid.axes[0],
-            ellipsoid.flow,
-            ellipsoid.shape,
-        )
-        self.cells, n = self._singular.shape
-        cells = self.cells
+        self.C, self._flow, self._shape = C, ellipsoid.flow, ellipsoid.shape
+        self._singular = ellipsoid.axes[0]
+        cells, n = self._singular.shape
         ends, terms, remainder = ellipsoid.cell_terms
         self._ends = (C @ ends).reshape(len(C), 2, cells, n)
         bends = (C @ terms).reshape(len(C), -1, cells, n)
@@ -343,7 +343,7 @@ class _CellBounds:
             axis=2,
         )
         """(k, n, 7): of both ends, and of the terms that bound ‖C F² e^{Fτ}‖, for each axis."""
-        self._sags_s2 = np.diff(ellipsoid.flow.edges_s) ** 2 / 8
+        self._sag_factors_s2 = np.diff(ellipsoid.flow.edges_s) ** 2 / 8
 
     @cached_property
     def unit_effects(self) -> tuple[Vector, Vector]:
@@ -351,13 +351,13 @@ class _CellBounds:
         return self._flow.unit_effects(self.C)
 
     def sup(
-        self, limits: Vector, levels: Vector, added: Vector, followed_cells: slice, enough: float
+        self, errors: Vector, states: Vector, added: Vector, followed_cells: slice, enough: float
     ) -> float:
         """Bound ‖C z‖ over some cells, given D and ‖Λx‖ for each, with what is added to each, (k,).
 
         A bound below ``enough`` is not improved.
         """
-        bounds = self.frobenius_bounds(limits, _LOGITS)
+        bounds = self.frobenius_bounds(errors, _LOGITS)
         if not np.isfinite(bounds).all():
             return math.inf
         highest, logits = bounds.min(axis=1) + added, _LOGITS[bounds.argmin(axis=1)]
@@ -372,69 +372,70 @@ class _CellBounds:
             settled = cells[rounds[cells] == len(_WIDTHS)]
             if len(settled):
                 wanted = (enough - added[settled]).clip(min=0.0)
-                values = self._joint_bounds(limits, levels, settled, logits[settled, None], wanted)
+                values = self._joint_bounds(errors, states, settled, logits[settled, None], wanted)
                 highest[settled] = np.minimum(highest[settled], values + added[settled])
                 rounds[settled], joint = rounds[settled] + 1, joint + 1
                 continue
             cells = cells[rounds[cells] < len(_WIDTHS)]
             candidates = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
-            values = self._spectral_bounds(limits, cells, candidates)
+            values = self._spectral_bounds(errors, cells, candidates)
             index = values.argmin(axis=1)
             logits[cells] = candidates[np.arange(len(cells)), index]
             highest[cells] = np.minimum(highest[cells], values.min(axis=1) + added[cells])
             rounds[cells] += 1
 
-    def frobenius_bounds(self, limits: Vector, logits: Vector) -> Stack:
-        """Return bounds in the Frobenius norm, for every λ, (k, j)."""
-        singular = self._singular / limits[:, None]
-        sizes = np.sqrt(_semi_axes(singular, logits) ** 2 @ self._squares)
-        return np.asarray(sizes[..., :2].max(axis=2) + self._sags_s2[:, None] * sizes[..., 2:].sum(axis=2))
+    def frobenius_bounds(self, errors: Vector, logits: Vector) -> Stack:
+        """Return bounds in the Frobenius norm, for every λ, (k, j), given D for each cell."""
+        singular = self._singular / errors[:, None]
+        norms = np.sqrt(_semi_axes(singular, logits) ** 2 @ self._squares)
+        ends, bends = norms[..., :2].max(axis=2), norms[..., 2:].sum(axis=2)
+        return np.asarray(ends + self._sag_factors_s2[:, None] * bends)
 
-    def _spectral_bounds(self, limits: Vector, cells: NDArray[np.int64], logits: Stack) -> Stack:
+    def _spectral_bounds(self, errors: Vector, cells: NDArray[np.int64], logits: Stack) -> Stack:
         """Return bounds in the spectral norm for some cells, each with its own λ, (k, j)."""
         ends = self._ends[:, :, cells]
-        d = _semi_axes(self._singular[cells] / limits[cells, None], logits)
+        semi_axes = _semi_axes(self._singular[cells] / errors[cells, None], logits)
         grams = np.einsum("qoki,qokj->koij", ends, ends)[:, None]
-        scaled = grams * d[:, :, None, :, None] * d[:, :, None, None, :]
-        sizes = largest_eigenvalues(scaled.reshape(-1, *scaled.shape[-2:])).clip(min=0.0)
-        bends = np.sqrt(d**2 @ self._squares[cells, :, 2:]).sum(axis=2)
-        ends = np.sqrt(sizes.reshape(scaled.shape[:-2])).max(axis=2)
-        return np.asarray(ends + self._sags_s2[cells, None] * bends)
+        scaled = grams * semi_axes[:, :, None, :, None] * semi_axes[:, :, None, None, :]
+        squares = largest_eigenvalues(scaled.reshape(-1, *scaled.shape[-2:])).clip(min=0.0)
+        bends = np.sqrt(semi_axes**2 @ self._squares[cells, :, 2:]).sum(axis=2)
+        at_ends = np.sqrt(squares.reshape(scaled.shape[:-2])).max(axis=2)
+        return np.asarray(at_ends + self._sag_factors_s2[cells, None] * bends)
 
     def _joint_bounds(
-        self, limits: Vector, levels: Vector, cells: NDArray[np.int64], logits: Stack, enough: Vector
+        self, errors: Vector, states: Vector, cells: NDArray[np.int64], logits: Stack, enough: Vector
     ) -> Vector:
         """Return bounds by all conditions at several earlier nodes, (k,); the bends are as above.
 
         One that is clearly below ``enough`` is not improved.
         """
         flow, n = self._flow, self._flow.n
-        times_s = flow.edges_s[cells, None] * (np.arange(1, _EARLIER + 1) / _EARLIER)
+        times_s = flow.edges_s[cells, None] * (np.arange(1, _EARLIER_TIMES + 1) / _EARLIER_TIMES)
         nodes = np.minimum(flow.edges_s.searchsorted(times_s, side="right") - 1, cells[:, None])
-        states, shape = flow.states[nodes], self._shape
+        flows, shape = flow.states[nodes], self._shape
         rows = np.concatenate(
             [
                 np.broadcast_to(shape, (len(cells), 1, n, n)),
-                states[:, :, n:] / limits[nodes][..., None, None],
-                shape @ states[:, :, :n] / levels[nodes][..., None, None],
+                flows[:, :, n:] / errors[nodes][..., None, None],
+                shape @ flows[:, :, :n] / states[nodes][..., None, None],
             ],
             axis=1,
         )
         share = 1 / (1 + np.exp(-logits[:, 0]))
-        first_weights = np.full(rows.shape[:2], _OTHERS / rows.shape[1])
-        first_weights[:, 0] += (1 - _OTHERS) * share
-        first_weights[:, _EARLIER] += (1 - _OTHERS) * (1 - share)
-        turn = _balancing_coordinates(rows * np.sqrt(first_weights)[..., None, None])
-        rows = rows @ turn[:, None]
+        first_weights = np.full(rows.shape[:2], _WEIGHT_OF_OTHERS / rows.shape[1])
+        first_weights[:, 0] += (1 - _WEIGHT_OF_OTHERS) * share
+        first_weights[:, _EARLIER_TIMES] += (1 - _WEIGHT_OF_OTHERS) * (1 - share)
+        coordinates = _balancing_coordinates(rows * np.sqrt(first_weights)[..., None, None])
+        rows = rows @ coordinates[:, None]
         forms = rows.swapaxes(-1, -2) @ rows
-        ends = self.C @ np.array([flow.states[cells], flow.states[cells + 1]]) @ turn
-        bounds, weights = largest_outputs(forms, ends[1], _CLEARLY * enough, first_weights)
+        ends = self.C @ np.array([flow.states[cells], flow.states[cells + 1]]) @ coordinates
+        bounds, weights = largest_outputs(forms, ends[1], _CLEARLY_ENOUGH * enough, first_weights)
         inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
-        sizes = np.linalg.eigvalsh(ends @ inverse @ ends.swapaxes(-1, -2))[..., -1].max(axis=0)
-        sizes = np.where(np.isfinite(bounds), sizes.clip(min=0.0), np.inf)
-        d = _semi_axes(self._singular[cells] / limits[cells, None], logits)
-        bends = np.sqrt(d**2 @ self._squares[cells, :, 2:]).sum(axis=2)[:, 0]
-        return np.asarray(np.sqrt(sizes) + self._sags_s2[cells] * bends)
+        squares = np.linalg.eigvalsh(ends @ inverse @ ends.swapaxes(-1, -2))[..., -1].max(axis=0)
+        squares = np.where(np.isfinite(bounds), squares.clip(min=0.0), np.inf)
+        semi_axes = _semi_axes(self._singular[cells] / errors[cells, None], logits)
+        bends = np.sqrt(semi_axes**2 @ self._squares[cells, :, 2:]).sum(axis=2)[:, 0]
+        return np.asarray(np.sqrt(squares) + self._sag_factors_s2[cells] * bends)
 
 
 def _semi_axes(singular: Vector, logits: Vector) -> Stack:
@@ -476,10 +477,11 @@ def largest_outputs(
     added: Vector | float = 0.0,
     most: float = math.inf,
 ) -> tuple[Vector, Stack]:
-    """Bound ‖Y z‖ for all z with forms of at most 1, (j,), by weights, (j, i), from some on.
+    """Bound ‖Y z‖, (j,), for all z with forms of at most 1, (j, i, m, m); return the weights, too, (j, i).
 
-    No bound below ``enough`` is improved, and none that cannot become at most ``most``. Bounds above
-    ``cap`` count as that, and all of them with what is ``added``.
+    Weights are improved from the first ones on. No bound below ``enough`` is improved, and none
+    that cannot become at most ``most``. Bounds above ``cap`` count as that, and all of them with
+    what is ``added``.
     """
     bounds, possible = np.full(len(forms), np.inf), np.zeros(len(forms))
     weights = np.full(forms.shape[:2], 1 / forms.shape[1]) if first_weights is None else first_weights
@@ -488,10 +490,10 @@ def largest_outputs(
         chosen = forms[active]
         Z = np.linalg.solve(np.einsum("ji,jiab->jab", weights[active], chosen), Y[active].swapaxes(1, 2))
         values, vectors = np.linalg.eigh(Y[active] @ Z)
-        sizes = np.sqrt(values[:, -1].clip(min=0.0)) * ROUNDING
-        better = sizes < bounds[active]
+        norms = np.sqrt(values[:, -1].clip(min=0.0)) * ROUNDING
+        better = norms < bounds[active]
         best[active[better]] = weights[active[better]]
-        bounds[active] = np.minimum(bounds[active], sizes)
+        bounds[active] = np.minimum(bounds[active], norms)
         # The forms of the z with the largest ‖Y z‖: those above the mean need more weight.
         z = (Z @ vectors[:, :, -1:])[..., 0]
         of_z = np.einsum("ja,jiab,jb->ji", z, chosen, z).clip(min=0.0)
@@ -501,17 +503,17 @@ def largest_outputs(
         weights[active] *= (of_z / largest[:, None]) ** _POWER
         weights = weights.clip(min=_LEAST_WEIGHT)
         weights /= weights.sum(axis=1, keepdims=True)
-        sizes, least = np.minimum(bounds, cap) + added, enough
+        totals, least = np.minimum(bounds, cap) + added, enough
         if wanted is Wanted.LARGEST:
-            least = np.maximum(enough, _NEARLY * float(sizes.max()))
+            least = np.maximum(enough, _NEARLY_LARGEST * float(totals.max()))
         elif wanted is Wanted.SMALLEST:
-            if (sizes <= enough).any():
+            if (totals <= enough).any():
                 break
-            most = min(most, float(sizes.min()))
-        may_become_smaller = (bounds > _BEST * possible) & (possible + added <= most)
-        active = np.flatnonzero((sizes > least) & may_become_smaller)
+            most = min(most, float(totals.min()))
+        may_become_smaller = (bounds > _NEARLY_OPTIMAL * possible) & (possible + added <= most)
+        active = np.flatnonzero((totals > least) & may_become_smaller)
         if not len(active):
             break
     sums = np.linalg.eigvalsh(np.einsum("ji,jiab->jab", best, forms))
-    bounds[~(sums[:, 0] > _CONDITION * sums[:, -1])] = np.inf
+    bounds[~(sums[:, 0] > _LEAST_CONDITION * sums[:, -1])] = np.inf
     return bounds, best

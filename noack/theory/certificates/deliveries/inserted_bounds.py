@@ -96,8 +96,8 @@ class _SumOfErrors:
 
     def _parts(self, b: Vector, mismatch: float, inputs: Vector) -> Stack:
         """Bound each error's part of ‖C e_c‖ for each bound of ‖p‖, (o, i, j)."""
-        known = self._gains * b[:, None] + self._by_mismatch * mismatch
-        return _smallest(known[..., None] + self._by_input[..., None] * inputs, self._growths)
+        without_input = self._gains * b[:, None] + self._by_mismatch * mismatch
+        return _smallest(without_input[..., None] + self._by_input[..., None] * inputs, self._growths)
 
     def _start_effects(self, late_s: float) -> Matrix:
         """Bound what enters within a time at first, into the first i errors together, by a p of 1, (o, i)."""
@@ -143,12 +143,13 @@ class _OpenLoopGains:
     def after(self, later_s: float, apart_s: float) -> Stack:
         """Return the gains of b, of a lost error, and of q and R_E x, then without means, (6, o, g)."""
         error = self._plant.error
-        stay, *entered_by = self._without_losses(later_s)
+        kept, *entered_by = self._without_losses(later_s)
         # A lost error has been followed by its model since, and by the open loop from then on.
         remaining_s = np.array([max(apart_s - growth.longest_s, 0.0) for growth in self._growths])
         remaining = {C: error.kernels[C].sups(remaining_s) for C in error.outputs}
-        redirected = np.array([*remaining.values()]) + entered_by[2] * remaining[Output.GAIN]
-        return np.array([stay, np.minimum(stay * remaining[Output.WEIGHTED], redirected), *entered_by])
+        with_own_direction = np.array([*remaining.values()]) + entered_by[2] * remaining[Output.GAIN]
+        of_lost = np.minimum(kept * remaining[Output.WEIGHTED], with_own_direction)
+        return np.array([kept, of_lost, *entered_by])
 
 
 class _OpenLoopErrors:
@@ -163,30 +164,35 @@ class _OpenLoopErrors:
         spacing_s: float,
     ) -> None:
         self._growths, self._lost = growths, conditions.dropouts
-        self._step, self._between = gains.after(0.0, spacing_s)[:, :1], gains.after(0.0, 0.0)[:, :1]
-        self._whole = gains.after(conditions.delay_s, 0.0)
+        self._at_next_event = gains.after(0.0, spacing_s)[:, :1]
+        self._until_next_event = gains.after(0.0, 0.0)[:, :1]
+        self._until_update_acts = gains.after(conditions.delay_s, 0.0)
         until_s = max(conditions.delay_s, conditions.start_s)
-        self._late = plant.growth(until_s, COARSE_CELLS).totals[:2] if until_s else (0.0, 0.0)
+        self._entered_late = plant.growth(until_s, COARSE_CELLS).totals[:2] if until_s else (0.0, 0.0)
 
-    def bound(self, b: Vector, held: float, input_error: float, mismatch: float) -> tuple[Vector, Matrix]:
+    def bound(
+        self, b: Vector, age_input: float, input_error: float, mismatch: float
+    ) -> tuple[Vector, Matrix]:
         """Bound ‖e_c‖_W after at most 0, 1, … lost events until the next event, (j,).
 
         The other result is sup‖C e_c‖ without a lost event, and after as many as there may be, (o, 2).
-        ``input_error`` bounds π before the first input, too.
+        ``age_input`` is q, and ``input_error`` bounds π before the first input, too.
         """
-        late = float(self._late[0] * input_error + self._late[1] * mismatch)
+        by_input, by_mismatch = self._entered_late
+        late = float(by_input * input_error + by_mismatch * mismatch)
 
         def open_loop_errors(gains: Stack, lost: float) -> Vector:
-            kept, remaining, by_input, by_mismatch, *totals = gains
-            tested = kept * b + remaining * lost + by_input * held + by_mismatch * mismatch
-            values = np.maximum(tested, kept * late + totals[0] * held + totals[1] * mismatch)
-            return _smallest(values, self._growths)
+            kept, of_lost, by_input, by_mismatch, *totals = gains
+            since_test = kept * b + of_lost * lost + by_input * age_input + by_mismatch * mismatch
+            since_update = kept * late + totals[0] * age_input + totals[1] * mismatch
+            return _smallest(np.maximum(since_test, since_update), self._growths)
 
         lost = [0.0]
         for _ in range(self._lost):
-            lost.append(max(float(open_loop_errors(self._step, lost[-1])[0]), lost[-1]))
-        between = np.array([open_loop_errors(self._between, error)[0] for error in lost])
-        return between, np.array([open_loop_errors(self._whole, error) for error in (0.0, lost[-1])]).T
+            lost.append(max(float(open_loop_errors(self._at_next_event, lost[-1])[0]), lost[-1]))
+        between = np.array([open_loop_errors(self._until_next_event, error)[0] for error in lost])
+        whole = [open_loop_errors(self._until_update_acts, error) for error in (0.0, lost[-1])]
+        return between, np.array(whole).T
 
 
 @dataclass
@@ -214,10 +220,10 @@ class KnownBounds:
     tested_sensor_error: float = math.inf
     """Of ‖e_s‖_W after a test."""
 
-    def reduce_errors(self, sizes: Vector) -> None:
+    def reduce_errors(self, bounds: Vector) -> None:
         """Take smaller bounds of sup‖C e_c‖, (o,)."""
-        for output, size in zip(self.errors, sizes.tolist(), strict=True):
-            self.errors[output] = min(self.errors[output], size)
+        for output, bound in zip(self.errors, bounds.tolist(), strict=True):
+            self.errors[output] = min(self.errors[output], bound)
 
     @property
     def input_error(self) -> float:
@@ -237,65 +243,65 @@ class InsertedInequalities(ErrorInequalities):
         infinite = dict.fromkeys(self._states, math.inf), dict.fromkeys(self._error.outputs, math.inf)
         return KnownBounds(np.min(solved, axis=0), *infinite)
 
-    def insert(self, known: KnownBounds, spacing_s: float) -> None:
+    def insert(self, bounds: KnownBounds, spacing_s: float) -> None:
         """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
-        v, states, errors = known.signals, known.states, known.errors
+        signals, states, errors = bounds.signals, bounds.states, bounds.errors
         # x from the start on.
         for name, (free, forced) in self._timed_states.items():
-            states[name] = min(states[name], float((free + forced * known.signals[3]).max()))
+            states[name] = min(states[name], float((free + forced * bounds.signals[3]).max()))
         # e_s after a test, for each way in which it may grow from there.
         growths = [growth for row in self._growths for growth in row]
         b = np.array([growth.after_test(states) for growth in growths])
         is_last = [growth.longest_s == self._conditions.sampling_s for growth in growths]
-        known.tested_sensor_error = min([known.tested_sensor_error, *b[is_last].tolist()])
-        self._insert_errors(known, b, spacing_s)
+        bounds.tested_sensor_error = min([bounds.tested_sensor_error, *b[is_last].tolist()])
+        self._insert_errors(bounds, b, spacing_s)
         if spacing_s >= self.acts_within_s:
-            self._insert_lost(known, b, spacing_s)
-        self._insert_sensor(known, b)
+            self._insert_lost(bounds, b, spacing_s)
+        self._insert_sensor(bounds, b)
         age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
-        new_signals = [age, v[1], 0.0, known.input_error, states[Output.MISMATCH], 1.0]
-        known.signals = np.minimum(v, np.array(new_signals, dtype=np.float64))
+        new_signals = [age, signals[1], 0.0, bounds.input_error, states[Output.MISMATCH], 1.0]
+        bounds.signals = np.minimum(signals, np.array(new_signals, dtype=np.float64))
 
-    def _insert_errors(self, known: KnownBounds, b: Vector, spacing_s: float) -> None:
+    def _insert_errors(self, bounds: KnownBounds, b: Vector, spacing_s: float) -> None:
         """Insert bounds of e_c, given those of e_s after a test: as a sum, and in open loop."""
-        age_input, input_error, mismatch = known.signals[[0, 3, 4]].tolist()
+        age_input, input_error, mismatch = bounds.signals[[0, 3, 4]].tolist()
         weighted, gain = self._rows
         for method, sums in self._error_sums(spacing_s).items():
             parts, at_start = sums.bound(b, input_error, mismatch, self.start_error)
             whole = parts.cumsum(axis=1) + at_start
             if method is BoundMethod.MISSING:
-                known.earlier_input_error = min(
-                    known.earlier_input_error, float(whole[gain, -1] - parts[gain, 0]) + age_input
+                bounds.earlier_input_error = min(
+                    bounds.earlier_input_error, float(whole[gain, -1] - parts[gain, 0]) + age_input
                 )
-                known.received_input_error = min(
-                    known.received_input_error, float(whole[gain, 0]) + age_input
+                bounds.received_input_error = min(
+                    bounds.received_input_error, float(whole[gain, 0]) + age_input
                 )
-                known.after_losses = np.minimum(
-                    known.after_losses, whole[weighted, : self._conditions.dropouts + 1]
+                bounds.after_losses = np.minimum(
+                    bounds.after_losses, whole[weighted, : self._conditions.dropouts + 1]
                 )
-            known.reduce_errors(whole[:, -1])
+            bounds.reduce_errors(whole[:, -1])
         start_error = max(input_error, self.start_error)
         between_events, whole = self._open_loop_errors(spacing_s).bound(b, age_input, start_error, mismatch)
-        known.reduce_errors(whole[:, -1])
-        known.received_input_error = min(known.received_input_error, float(whole[gain, 0]) + age_input)
-        known.after_losses = np.minimum(known.after_losses, between_events)
+        bounds.reduce_errors(whole[:, -1])
+        bounds.received_input_error = min(bounds.received_input_error, float(whole[gain, 0]) + age_input)
+        bounds.after_losses = np.minimum(bounds.after_losses, between_events)
 
-    def _insert_lost(self, known: KnownBounds, b: Vector, spacing_s: float) -> None:
+    def _insert_lost(self, bounds: KnownBounds, b: Vector, spacing_s: float) -> None:
         """Insert bounds of e_c after 0, 1, … lost events, if an update acts before the next event."""
-        age_input, input_error, mismatch = known.signals[[0, 3, 4]].tolist()
+        age_input, input_error, mismatch = bounds.signals[[0, 3, 4]].tolist()
         weighted, gain = self._rows
         inputs = np.minimum(
-            known.inputs_after_losses, self._error.now(Output.GAIN) * known.after_losses + age_input
+            bounds.inputs_after_losses, self._error.now(Output.GAIN) * bounds.after_losses + age_input
         )
-        inputs[0] = min(inputs[0], known.received_input_error)
+        inputs[0] = min(inputs[0], bounds.received_input_error)
         # While one more event is in flight, π bounds the input that drives the present error.
         stages = np.append(inputs, input_error)[: self._missing_events(spacing_s) + 1]
         start_error = max(input_error, self.start_error)
         sums = self._error_sums(spacing_s)[BoundMethod.MISSING]
         summed = sums.after_losses(b, stages, mismatch, self.acts_within_s, start_error)
-        known.reduce_errors(summed[:, -1])
-        known.after_losses = np.minimum(known.after_losses, summed[weighted, : len(inputs)])
-        known.inputs_after_losses = np.minimum(inputs, summed[gain, : len(inputs)] + age_input)
+        bounds.reduce_errors(summed[:, -1])
+        bounds.after_losses = np.minimum(bounds.after_losses, summed[weighted, : len(inputs)])
+        bounds.inputs_after_losses = np.minimum(inputs, summed[gain, : len(inputs)] + age_input)
 
     @property
     def _rows(self) -> tuple[int, int]:
@@ -303,28 +309,28 @@ class InsertedInequalities(ErrorInequalities):
         outputs = [*self._error.outputs]
         return outputs.index(Output.WEIGHTED), outputs.index(Output.GAIN)
 
-    def _insert_sensor(self, known: KnownBounds, b: Vector) -> None:
+    def _insert_sensor(self, bounds: KnownBounds, b: Vector) -> None:
         """Insert bounds of e_s, given those after a test."""
-        input_error, mismatch = known.signals[3:5].tolist()
-        inputs = np.minimum(known.inputs_after_losses + np.zeros_like(known.after_losses), input_error)
-        received = inputs[0] = min(float(inputs[0]), known.received_input_error)
+        input_error, mismatch = bounds.signals[3:5].tolist()
+        inputs = np.minimum(bounds.inputs_after_losses + np.zeros_like(bounds.after_losses), input_error)
+        received = inputs[0] = min(float(inputs[0]), bounds.received_input_error)
         inputs = np.append(input_error, inputs)
         late = self.entered(self.acts_within_s, max(input_error, self.start_error), mismatch)
-        ends, by_bound = iter(b.tolist()), []
+        after_test, by_bound = iter(b.tolist()), []
         for row in self._growths:
-            sizes = np.max(
-                [self._largest_errors(growth, next(ends), inputs, mismatch) for growth in row], axis=0
+            errors = np.max(
+                [self._largest_errors(growth, next(after_test), inputs, mismatch) for growth in row], axis=0
             )
             until_s = max(growth.longest_s for growth in row)
             # In this time after an update acts, e_s is what was there and what has entered since.
             after_update = self._error.stretch(until_s) * late + self.entered(until_s, received, mismatch)
-            by_bound.append([sizes[0], max(float(sizes[1]), after_update), *sizes[2:]])
+            by_bound.append([errors[0], max(float(errors[1]), after_update), *errors[2:]])
         smallest = np.min(by_bound, axis=0)
-        known.sensor_error = min(known.sensor_error, float(smallest[0]))
-        known.sensor_after_losses = np.minimum(
-            known.sensor_after_losses, np.minimum(smallest[1:], known.sensor_error)
+        bounds.sensor_error = min(bounds.sensor_error, float(smallest[0]))
+        bounds.sensor_after_losses = np.minimum(
+            bounds.sensor_after_losses, np.minimum(smallest[1:], bounds.sensor_error)
         )
-        known.after_losses[0] = min(known.after_losses[0], known.sensor_after_losses[0])
+        bounds.after_losses[0] = min(bounds.after_losses[0], bounds.sensor_after_losses[0])
 
     def entered(self, until_s: float, input_error: float, mismatch: float) -> float:
         """Bound the e_s that enters within some time."""
@@ -354,9 +360,9 @@ class InsertedInequalities(ErrorInequalities):
         """Return how large e_s may become under one bound, given those of ‖p‖; the start is in the first."""
         by_input, by_mismatch, _ = growth.driven
         at_start = np.fmin(by_input, self._begin_s * growth.highest)
-        sizes = growth.stretch * b + by_input * inputs + by_mismatch * mismatch
-        sizes[0] += at_start * max(self.start_error - float(inputs[0]), 0.0)
-        return np.asarray(sizes)
+        errors = growth.stretch * b + by_input * inputs + by_mismatch * mismatch
+        errors[0] += at_start * max(self.start_error - float(inputs[0]), 0.0)
+        return np.asarray(errors)
 
     @cached_method
     def _error_sums(self, spacing_s: float) -> Mapping[BoundMethod, _SumOfErrors]:
@@ -390,13 +396,13 @@ class InsertedInequalities(ErrorInequalities):
         """sup‖u − Kx‖ of one loop before the first input."""
         return float(self._first_input_error)
 
-    def next_event_s(self, known: KnownBounds) -> float:
+    def next_event_s(self, bounds: KnownBounds) -> float:
         """Return the time between two events that follows from bounds; 0 if there is none."""
         if all(bound.reached is None for bound in self._bound.every):
             return 0.0
         zero, never = np.zeros(1), np.zeros(1, dtype=bool)
         events = np.zeros(1, dtype=np.int64)
-        mismatch, earlier = known.signals[4:5], zero + known.earlier_input_error
+        mismatch, earlier = bounds.signals[4:5], zero + bounds.earlier_input_error
         before, after = (zero,) * 6, (zero,) * 3
         constants = LoopConstants(events, *before, mismatch, *after, earlier, ~never)
         return float(self.inter_event_s(constants, never, ~never)[0])

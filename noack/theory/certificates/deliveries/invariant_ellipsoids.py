@@ -29,16 +29,17 @@ from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoi
 
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 _WIDE_MARGINS = (1.0, 1.15, 1.4, 1.8, 2.5, 3.5)
-_FOLLOWED = (0.1, 0.3, 1.0)
-"""Factors of the ellipsoid's computed size that are tried."""
-_STARTS = [(-1.5, -2.0, -7.0), (0.0, -7.0, -7.0), (-1.5, 0.0, -1.0), (-1.5, -7.0, -1.0)]
+"""Factors of the ellipsoid's computed scale that are tried; the wide ones with delay and hold."""
+_FOLLOWED_SHARES = (0.1, 0.3, 1.0)
+"""Shares of D up to which e_c is followed, if delay and hold change it: those that are tried."""
+_FIRST_PARAMETERS = [(-1.5, -2.0, -7.0), (0.0, -7.0, -7.0), (-1.5, 0.0, -1.0), (-1.5, -7.0, -1.0)]
 """Parameters of the ellipsoid that are tried first."""
 _DIRECTIONS = np.vstack([np.eye(3), -np.eye(3)])
 _WIDTHS = (1.5, 1.5, 1.5, 0.8, 0.8, 0.4, 0.4, 0.2)
 """Changes of one parameter in each round of the search."""
 _COARSE, _FINE = np.exp(np.arange(-9.0, 13.0, 3.0)), np.exp(np.linspace(-2.0, 2.0, 9))
 """Multipliers μ: all of them, and around the best one."""
-_NODES, _CRITICAL = 16, 4
+_NODES, _CRITICAL_NODES = 16, 4
 _ILL_CONDITIONED = 1e8
 
 
@@ -47,7 +48,7 @@ class InvariantEllipsoids:
     """The ellipsoids ‖Λx‖ ≤ 1 that x does not leave under bounds of e_c."""
 
     plant: PlantGains
-    largest: float
+    largest_error_bound: float
     """The largest D, for which Λ is chosen."""
     age_gains: Mapping[Output, float] = field(default_factory=dict)
     """gain_C with ‖q‖ ≤ Σ gain_C sup‖C x_c‖, for which Λ is chosen; none if no input is held."""
@@ -57,34 +58,35 @@ class InvariantEllipsoids:
 
     def reach_within(
         self,
-        limit: float,
+        error_bound: float,
         effects_of: Callable[[DeliveryEllipsoid, float], InputEffects] | None = None,
         start_s: float = 0.0,
     ) -> Reach | None:
         """Return the flow from an ellipsoid for these bounds; None if none is found.
 
         Args:
-            limit: D.
+            error_bound: D.
             effects_of: returns how much delay and hold change the flow as long as ‖ΛWx‖ ≤ c.
             start_s: until then the input is 0.
         """
         ellipsoid = self._best_ellipsoid
         if ellipsoid is None or np.linalg.cond(ellipsoid.shape) > _ILL_CONDITIONED:
             return None
-        (size,) = self._invariant_sizes(ellipsoid.inverse[None], limit)
+        (scale,) = self._invariant_scales(ellipsoid.inverse[None], error_bound)
         if start_s > 0:
             drift = self.plant.A + self.plant.alpha_per_s * np.eye(self.flow.n)
             responses = response_until(drift, self.plant.start, start_s)
-            size = max(size, float(responses.through(ellipsoid.shape @ self.flow.weight).sup_on_grid()))
+            scale = max(scale, float(responses.through(ellipsoid.shape @ self.flow.weight).sup_on_grid()))
         if self._first_event_cell:  # the first delivery
             Y = np.hstack([ellipsoid.shape, np.zeros_like(ellipsoid.shape)])
-            size = max(size, self.flow.from_start(Y, limit, self._first_event_cell))
-        if not 0 < size < math.inf:
+            scale = max(scale, self.flow.from_start(Y, error_bound, self._first_event_cell))
+        if not 0 < scale < math.inf:
             return None
         for margin in _MARGINS if effects_of is None else _WIDE_MARGINS:
-            effects = NO_EFFECTS if effects_of is None else effects_of(ellipsoid, float(size * margin))
-            for share in (1.0,) if effects_of is None else _FOLLOWED:
-                reach = Reach(ellipsoid, float(size * margin), limit, effects, share, self._first_event_cell)
+            larger = float(scale * margin)
+            effects = NO_EFFECTS if effects_of is None else effects_of(ellipsoid, larger)
+            for share in (1.0,) if effects_of is None else _FOLLOWED_SHARES:
+                reach = Reach(ellipsoid, larger, error_bound, effects, share, self._first_event_cell)
                 if reach.is_invariant():
                     return reach
         return None
@@ -103,7 +105,7 @@ class InvariantEllipsoids:
     def _best_ellipsoid(self) -> DeliveryEllipsoid | None:
         """Λ for a small bound of ‖x‖: a pattern search over its three parameters."""
         with np.errstate(all="ignore"):
-            candidates = np.array(_STARTS)
+            candidates = np.array(_FIRST_PARAMETERS)
             merits = self._merits(candidates)
             best, merit = candidates[merits.argmin()], merits.min()
             for width in _WIDTHS:
@@ -111,48 +113,49 @@ class InvariantEllipsoids:
                 merits = self._merits(candidates)
                 if merits.min() < merit:
                     best, merit = candidates[merits.argmin()], merits.min()
-            (factor,) = self._factors(best[None])
-        return DeliveryEllipsoid(self.flow, np.linalg.inv(factor)) if math.isfinite(merit) else None
+            (inverse,) = self._inverse_shapes(best[None])
+        return DeliveryEllipsoid(self.flow, np.linalg.inv(inverse)) if math.isfinite(merit) else None
 
     def _merits(self, parameters: Matrix) -> Vector:
         """Return the bounds of ‖x‖ that some parameters give, (c,)."""
-        factors = self._factors(parameters)
-        usable = np.isfinite(factors).all(axis=(1, 2))
+        inverses = self._inverse_shapes(parameters)
+        usable = np.isfinite(inverses).all(axis=(1, 2))
         merits = np.full(len(parameters), np.inf)
         if usable.any():
-            factors = factors[usable]
-            sizes = self._invariant_sizes(factors, self.largest)
-            sizes = sizes + self._sizes_by_age_input(factors, sizes)
-            merits[usable] = sizes * np.linalg.norm(self.flow.inverse @ factors, 2, axis=(1, 2))
+            inverses = inverses[usable]
+            scales = self._invariant_scales(inverses, self.largest_error_bound)
+            scales = scales + self._scales_by_age_input(inverses, scales)
+            merits[usable] = scales * np.linalg.norm(self.flow.inverse @ inverses, 2, axis=(1, 2))
         return merits
 
-    def _sizes_by_age_input(self, factors: Stack, sizes: Vector) -> Vector:
-        """Return about the ‖Λx‖ to which q drives x, (c,)."""
+    def _scales_by_age_input(self, inverses: Stack, scales: Vector) -> Vector:
+        """Return about the ‖Λx‖ to which q drives x, (c,), from these Λ⁻¹ and c."""
         if not any(self.age_gains.values()):
-            return np.zeros(len(sizes))
-        shapes = np.linalg.inv(factors)
-        turned = shapes @ self.flow.closed_loop @ factors
-        rates = -np.linalg.eigvalsh(turned + turned.swapaxes(-1, -2))[:, -1] / 2
-        gains = np.linalg.norm(shapes @ self.flow.input_error, 2, axis=(1, 2)) / rates
-        outputs, shares = self.plant.error.outputs, np.zeros(len(sizes))
+            return np.zeros(len(scales))
+        shapes = np.linalg.inv(inverses)
+        closed_loops = shapes @ self.flow.closed_loop @ inverses
+        decay_rates = -np.linalg.eigvalsh(closed_loops + closed_loops.swapaxes(-1, -2))[:, -1] / 2
+        gains = np.linalg.norm(shapes @ self.flow.input_error, 2, axis=(1, 2)) / decay_rates
+        outputs, loop_gains = self.plant.error.outputs, np.zeros(len(scales))
         for output, gain in self.age_gains.items():
-            C = outputs[output] @ self.flow.inverse @ factors
-            shares = shares + gains * gain * np.linalg.norm(C, 2, axis=(1, 2))
-        return np.where((rates > 0) & (shares < 1), shares * sizes / (1 - shares), np.inf)
+            C = outputs[output] @ self.flow.inverse @ inverses
+            loop_gains = loop_gains + gains * gain * np.linalg.norm(C, 2, axis=(1, 2))
+        is_stable = (decay_rates > 0) & (loop_gains < 1)
+        return np.where(is_stable, loop_gains * scales / (1 - loop_gains), np.inf)
 
-    def _factors(self, parameters: Matrix) -> Stack:
+    def _inverse_shapes(self, parameters: Matrix) -> Stack:
         """Return Λ⁻¹ with Λ⁻¹Λ⁻ᵀ = X, (M + νI)X + X(M + νI)ᵀ = −Q, (c, n, n); not finite if none.
 
         M = A + BK, and Q is BK Kᵀ Bᵀ with shares of the identity and of x(0) x(0)ᵀ. Its scale is
         arbitrary.
         """
-        factors = np.full((len(parameters), self.flow.n, self.flow.n), np.nan)
+        inverses = np.full((len(parameters), self.flow.n, self.flow.n), np.nan)
         for index, (logit, all_x, x0) in enumerate(parameters.clip(-15.0, 15.0)):
             by_input, by_all, by_start = self._lyapunov_solutions(float(logit))
             X = by_input + math.exp(all_x) * by_all + math.exp(x0) * by_start
             with contextlib.suppress(np.linalg.LinAlgError):
-                factors[index] = np.linalg.cholesky(X)
-        return factors
+                inverses[index] = np.linalg.cholesky(X)
+        return inverses
 
     @cached_method
     def _lyapunov_solutions(self, logit: float) -> list[Matrix]:
@@ -160,13 +163,13 @@ class InvariantEllipsoids:
         flow, n = self.flow, self.flow.n
         share = 0.1 + 0.85 / (1 + math.exp(-logit))
         rate = share * -spectral_abscissa(flow.closed_loop)
-        moved = flow.closed_loop + rate * np.eye(n)
+        shifted = flow.closed_loop + rate * np.eye(n)
         solutions = []
         for columns in (flow.BK, np.eye(n), flow.start):
             Q = columns @ columns.T / max(float((columns**2).sum()), 1e-300)
             if not np.isfinite(Q).all():
                 raise np.linalg.LinAlgError("the squares of the entries overflow")
-            X = solve_lyapunov(moved, -Q)
+            X = solve_lyapunov(shifted, -Q)
             solutions.append(np.asarray(0.5 * (X + X.T)))
         return solutions
 
@@ -179,18 +182,18 @@ class InvariantEllipsoids:
         even = np.linspace(1, count, _NODES).astype(int)
         return np.asarray(states[sorted({*late.clip(1, count), *even})])
 
-    def _invariant_sizes(self, factors: Stack, limit: float) -> Vector:
+    def _invariant_scales(self, inverses: Stack, error_bound: float) -> Vector:
         """Return about the smallest c for which ‖Λx‖ ≤ c is invariant and contains x(0), (c,).
 
         At a node it does not exceed c if c² ≥ μ/(1 − λ) for some μ, λ the largest eigenvalue of
         ‖ΛΦξ‖² − μ‖Nξ‖²/D² on ‖Λξ‖ = 1, (Φ, N) ξ = e^{Fτ} (ξ, 0).
         """
-        n, shapes = self.flow.n, np.linalg.inv(factors)
-        image, error = (
+        n, shapes = self.flow.n, np.linalg.inv(inverses)
+        state, error = (
             np.asarray(Y.swapaxes(-1, -2) @ Y)
             for Y in (
-                shapes[:, None] @ self._nodes[:, :n] @ factors[:, None],
-                self._nodes[:, n:] @ factors[:, None] / limit,
+                shapes[:, None] @ self._nodes[:, :n] @ inverses[:, None],
+                self._nodes[:, n:] @ inverses[:, None] / error_bound,
             )
         )
         first_state = (
@@ -199,21 +202,24 @@ class InvariantEllipsoids:
             else self.flow.start_response[0][self._first_event_cell, :n]
         )
         largest = np.linalg.norm(shapes @ first_state, axis=1) ** 2 * ROUNDING
-        candidates, nodes = np.nonzero(np.linalg.eigvalsh(image)[..., -1] >= 1)
+        candidates, nodes = np.nonzero(np.linalg.eigvalsh(state)[..., -1] >= 1)
         if len(candidates):
-            image, error = image[candidates, nodes], error[candidates, nodes]
-            squares, best = _squares(image, error, np.tile(_COARSE, (len(candidates), 1)))
+            state, error = state[candidates, nodes], error[candidates, nodes]
+            squares, best = _squared_scales(state, error, np.tile(_COARSE, (len(candidates), 1)))
             order = np.lexsort((-squares, candidates))  # the largest of each candidate first
             rank = np.arange(len(candidates)) - np.searchsorted(candidates[order], candidates[order])
-            last = order[rank < _CRITICAL]
-            squares, _ = _squares(image[last], error[last], best[last, None] * _FINE)
-            np.maximum.at(largest, candidates[last], squares)
+            critical = order[rank < _CRITICAL_NODES]
+            squares, _ = _squared_scales(state[critical], error[critical], best[critical, None] * _FINE)
+            np.maximum.at(largest, candidates[critical], squares)
         return np.asarray(np.sqrt(largest))
 
 
-def _squares(image: Stack, error: Stack, multipliers: Matrix) -> tuple[Vector, Vector]:
-    """Return the smallest c² over the multipliers, (k, j), and its multiplier, for k nodes."""
-    forms = image[:, None] - multipliers[..., None, None] * error[:, None]
+def _squared_scales(state: Stack, error: Stack, multipliers: Matrix) -> tuple[Vector, Vector]:
+    """Return the smallest c² over the multipliers, (k, j), and its multiplier, for k nodes.
+
+    ``state`` and ``error`` are the forms ‖ΛΦξ‖² and ‖Nξ‖²/D² at the nodes.
+    """
+    forms = state[:, None] - multipliers[..., None, None] * error[:, None]
     largest_values = np.linalg.eigvalsh(forms)[..., -1]
     squares = np.where(largest_values < 1, multipliers / (1 - largest_values.clip(min=0.0)), np.inf)
     best = squares.argmin(axis=1)

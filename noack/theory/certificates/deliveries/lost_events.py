@@ -29,11 +29,11 @@ _NEAR, _RATIO, _MOST_NODES = np.linspace(0.0, 1.0, 20).tolist(), 1.03, 300
 """First nodes of r in units of δ; then the ratio from node to node."""
 _LATEST = 6.0
 """Largest r in units of δ at which events are looked for."""
-_SOUGHT = 0.6
+_DECAYED = 0.6
 """‖e^{(H+αI)r}‖_W at the last r, if possible."""
-_NEARLY_PLAIN = 0.999
+_NEARLY_SUMMED = 0.999
 """Share of the bound without the flow from which on nothing is gained."""
-_NOTHING = 1e-3
+_ERROR_AT_DELIVERY = 1e-3
 """Bound of ‖e_c‖ at a delivery, where it is 0, in β."""
 _LATE_TERMS = 8
 
@@ -41,11 +41,11 @@ _LATE_TERMS = 8
 class SensorErrors(NamedTuple):
     """What is known of ‖e_s‖_W between two events."""
 
-    sizes: Vector
+    after_losses: Vector
     """Its bounds, while 0, 1, … events have been lost since the delivery."""
-    tested: float
+    after_test: float
     """Its bound after a test; infinite if there is none."""
-    begin_s: float
+    first_test_s: float
     """The first test is that long after an event."""
     grid_s: float
     """Tests are multiples of this after an event; 0 if the trigger is tested at all times."""
@@ -87,28 +87,30 @@ def errors_after_losses(
     # The nodes r after an event, e^{Fr}, and ‖e_s‖_W at them after a test.
     r_s = _nodes_s(spacing_s, kernel, 2 * most_s, sensor.grid_s)
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
-    tested = np.where(r_s * ROUNDING >= sensor.begin_s, sensor.tested, math.inf)
-    first_s = float(flow.edges_s[reach.first_cell]) if reach.first_cell else math.inf
-    since_s, apart_s, size_of_x = -reach.effects.acts_within_s, math.inf, reach.size
-    for lost, size in enumerate(sensor.sizes.tolist()):
-        earlier = float(errors[lost - 1]) if lost else max(_NOTHING * size, reach.effects.first_error)
-        window_s = min(max(since_s, 0.0), most_s)
-        event = _LostEvent(reach, window_s, earlier, size_of_x, outputs, r_s, flows)
+    tested = np.where(r_s * ROUNDING >= sensor.first_test_s, sensor.after_test, math.inf)
+    first_event_s = float(flow.edges_s[reach.first_cell]) if reach.first_cell else math.inf
+    since_delivery_s, apart_s, state_bound = -reach.effects.acts_within_s, math.inf, reach.scale
+    for lost, sensor_error in enumerate(sensor.after_losses.tolist()):
+        at_delivery = max(_ERROR_AT_DELIVERY * sensor_error, reach.effects.first_error)
+        error_before = float(errors[lost - 1]) if lost else at_delivery
+        window_s = min(max(since_delivery_s, 0.0), most_s)
+        event = _LostEvent(reach, window_s, error_before, state_bound, outputs, r_s, flows)
         # e_c until the next delivery, if at most so many events are lost.
         if lost:
-            added = size + kernel.sups(r_s) * earlier
-            largest = event.largest_error(np.minimum(tested, size), added)
-            errors[lost] = min(without_flow[lost], max(largest, float(added[-1]), earlier))
-            if lost > 1 and errors[lost] > _NEARLY_PLAIN * float(added[0]):
+            summed = sensor_error + kernel.sups(r_s) * error_before
+            largest = event.largest_error(np.minimum(tested, sensor_error), summed)
+            errors[lost] = min(without_flow[lost], max(largest, float(summed[-1]), error_before))
+            if lost > 1 and errors[lost] > _NEARLY_SUMMED * float(summed[0]):
                 return errors, spacing_s  # later stages gain nothing, either
-        # The time until the next event. After a delivery e_s is at most ‖e^{(H+αI)r}‖ · late larger
-        # than C_r z.
-        first_part = 0.0 if lost else flow.stretch * reach.effects.first_error
-        later_s = event.next_event_s(sensor, first_part, bend, min(_LATEST * spacing_s, sensor.forced_s))
-        since_s += max(spacing_s, later_s)
+        # The time until the next event. After a delivery e_s is at most ‖e^{(H+αI)r}‖ · first_error
+        # larger than C_r z.
+        late_error = 0.0 if lost else flow.model_growth * reach.effects.first_error
+        most_later_s = min(_LATEST * spacing_s, sensor.forced_s)
+        later_s = event.next_event_s(sensor, late_error, bend, most_later_s)
+        since_delivery_s += max(spacing_s, later_s)
         if not lost:  # x(0) itself may be outside the ellipsoid
-            since_s, later_s = min(since_s, first_s), min(later_s, first_s)
-            size_of_x = reach.largest_state(first_s - since_s)
+            since_delivery_s, later_s = min(since_delivery_s, first_event_s), min(later_s, first_event_s)
+            state_bound = reach.largest_state(first_event_s - since_delivery_s)
         apart_s = min(apart_s, max(spacing_s, later_s))
     return errors, apart_s
 
@@ -122,7 +124,7 @@ def bend_of_error(reach: Reach, level: float) -> float:
 def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float, grid_s: float) -> Vector:
     """Return times r, if possible up to one at which ‖e^{(H+αI)r}‖_W has fallen below a value."""
     nodes_s = [spacing_s * share for share in _NEAR]
-    while len(nodes_s) < _MOST_NODES and kernel.sup(nodes_s[-1]) > _SOUGHT:
+    while len(nodes_s) < _MOST_NODES and kernel.sup(nodes_s[-1]) > _DECAYED:
         nodes_s.append(nodes_s[-1] * _RATIO)
     r_s = np.array([time_s for time_s in nodes_s if time_s <= most_s])
     return grid_s * np.unique(np.rint(r_s / grid_s)) if grid_s else r_s
@@ -132,19 +134,20 @@ class _LostEvent:
     """What follows an event, a time w or more after the delivery, for times r since it.
 
     z is e^{Fw} ζ at the event. What q has changed since some time before is bounded with e^{−Fs} (BU, −BU).
+    Up to the event ‖e_c‖_W ≤ ``error_before`` and ‖Λx‖ ≤ ``state_bound``. ``flows`` are e^{Fr}.
     """
 
     def __init__(
         self,
         reach: Reach,
         window_s: float,
-        earlier: float,
-        size_of_x: float,
+        error_before: float,
+        state_bound: float,
         outputs: Sequence[Matrix],
         r_s: Vector,
         flows: Stack,
     ) -> None:
-        self._flow, self._r_s, self._error_before = reach.ellipsoid.flow, r_s, earlier
+        self._flow, self._r_s, self._error_before = reach.ellipsoid.flow, r_s, error_before
         self._age_input, self._acts_within_s = reach.effects.age_input, reach.effects.acts_within_s
         n, shape, identity = self._flow.n, reach.ellipsoid.shape, np.eye(2 * self._flow.n)
         event = exponential(self._flow.generator * window_s)
@@ -154,10 +157,10 @@ class _LostEvent:
             self._age_input * self._input_response_before(C, window_s) for C in (identity[n:, n:], shape)
         )
         rows = [
-            identity[n:] / (earlier + error_change),
-            shape @ identity[:n] / (size_of_x + state_change),
-            event[n:] / earlier,
-            shape @ event[:n] / size_of_x,
+            identity[n:] / (error_before + error_change),
+            shape @ identity[:n] / (state_bound + state_change),
+            event[n:] / error_before,
+            shape @ event[:n] / state_bound,
             *(Y @ event for Y in outputs),
         ]
         forms = np.array([row.T @ row for row in rows])
@@ -175,15 +178,15 @@ class _LostEvent:
         responses = response_until(flow.BK - flow.closed_loop, flow.input_error, ago_s)
         return float(responses.through(C).integral_on_grid())
 
-    def largest_error(self, sizes: Vector, added: Vector) -> float:
-        """Bound ‖e_c‖_W up to the last r, given those of e_s, and bounds without the flow."""
-        n, sizes = self._flow.n, (sizes + self._input_changes)[:-1, None, None] ** 2
-        events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1] / sizes
-        forms = np.concatenate([self._forms[:-1], events[:, None]], axis=1)
-        cap = added[:-1] - self._input_changes[1:]
-        ends, weights = largest_outputs(forms, self._z[1:, n:], float(added[-1]), cap=cap)
+    def largest_error(self, sensor_errors: Vector, summed: Vector) -> float:
+        """Bound ‖e_c‖_W up to the last r, given bounds of e_s, and of e_c without the flow, at each r."""
+        n, squares = self._flow.n, (sensor_errors + self._input_changes)[:-1, None, None] ** 2
+        no_events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1] / squares
+        forms = np.concatenate([self._forms[:-1], no_events[:, None]], axis=1)
+        cap = summed[:-1] - self._input_changes[1:]
+        ends, weights = largest_outputs(forms, self._z[1:, n:], float(summed[-1]), cap=cap)
         cells = np.maximum(ends, np.append(self._error_before, ends[:-1])) + self._sags(forms, weights)
-        return float(np.minimum(cells + self._input_changes[1:], added[:-1]).max())
+        return float(np.minimum(cells + self._input_changes[1:], summed[:-1]).max())
 
     def _sags(self, forms: Stack, weights: Stack) -> Vector:
         """Bound how much e_c differs from its chord in each cell of r."""
@@ -196,10 +199,10 @@ class _LostEvent:
             bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", rows, inverse, rows)))
         return np.asarray(steps_s**2 / 8 * bends * ROUNDING)
 
-    def next_event_s(self, sensor: SensorErrors, first_part: float, bend: float, most_s: float) -> float:
-        """Return a time before which there is no event; e_s may be larger than C_r z by ``first_part``."""
+    def next_event_s(self, sensor: SensorErrors, late_error: float, bend: float, most_s: float) -> float:
+        """Return a time before which there is no event; e_s may be larger than C_r z by ``late_error``."""
         is_near, flow, level = self._r_s <= most_s, self._flow, sensor.level
-        level -= first_part * self._acts_within_s if sensor.integrates else first_part
+        level -= late_error * self._acts_within_s if sensor.integrates else late_error
         if level <= 0:
             return 0.0
         if self._age_input:  # what is followed differs from e_s
@@ -212,7 +215,7 @@ class _LostEvent:
         steps_s = np.diff(self._r_s[is_near])
         cells = np.maximum(ends[1:], ends[:-1]) + steps_s**2 / 8 * bend + self._input_changes[1:][is_near[1:]]
         if sensor.integrates:
-            cells = np.cumsum(steps_s * (np.maximum.accumulate(cells) + first_part))
-        found_s = float(self._r_s[np.append(cells >= level, True).argmax()])
+            cells = np.cumsum(steps_s * (np.maximum.accumulate(cells) + late_error))
+        reached_s = float(self._r_s[np.append(cells >= level, True).argmax()])
         # Tests may lie beside the nodes if times are not those since an event.
-        return max(found_s - sensor.grid_s, 0.0) if first_part and sensor.integrates else found_s
+        return max(reached_s - sensor.grid_s, 0.0) if late_error and sensor.integrates else reached_s

@@ -31,9 +31,10 @@ from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantE
 from noack.theory.certificates.deliveries.lost_events import SensorErrors, bend_of_error, errors_after_losses
 
 _ROUNDS, _SETTLED = 20, 0.99
-_MOST_INSERTED, _NEARLY = 60, 0.9999
-_SHORTEST_S, _LEAST_SHARE, _LEAST = 1e-9, 1e-6, 1e-200
-_SHORT, _MOST_STEPS = 0.005, 16
+_MOST_INSERTIONS, _INSERTIONS_SETTLED = 60, 0.9999
+_SHORTEST_S, _LEAST_SHARE, _LEAST_BOUND = 1e-9, 1e-6, 1e-200
+_SHORTEST_STEP, _MOST_STEPS = 0.005, 16
+"""Of the search for the next event: the shortest step as a share of the time, and the most steps."""
 
 
 def can_be_sharpened(part: CertificatePart) -> bool:
@@ -55,30 +56,30 @@ def sharpened_constants(
     spacing_s = constants.inter_event_s or conditions.spacing_s
     if spacing_s == 0 and conditions.delay_s > 0:
         return constants
-    bounds = _SharpenedBounds(part, conditions, spacing_s)
-    known = bounds.known
-    if not np.isfinite(known.signals).all():
+    sharpening = _SharpenedBounds(part, conditions, spacing_s)
+    bounds = sharpening.bounds
+    if not np.isfinite(bounds.signals).all():
         return constants
-    bounds.insert()
+    sharpening.insert()
     for _ in range(_ROUNDS):
-        earlier = known.errors[Output.WEIGHTED], known.states[Output.WEIGHTED]
-        if not bounds.sharpen_by_flow():
+        earlier = bounds.errors[Output.WEIGHTED], bounds.states[Output.WEIGHTED]
+        if not sharpening.sharpen_by_flow():
             break
-        later = known.errors[Output.WEIGHTED], known.states[Output.WEIGHTED]
+        later = bounds.errors[Output.WEIGHTED], bounds.states[Output.WEIGHTED]
         if all(new > _SETTLED * old for new, old in zip(later, earlier, strict=True)):
             break
     unit = part.bound.beta if part.bound.unit is None else part.bound.unit
     sharpened = {
-        "delta": known.errors[Output.WEIGHTED] / unit,
-        "overshoot": known.sensor_error / unit,
-        "input_error": known.input_error,
-        "state": known.states[Output.STATE],
-        "state_weighted": known.states[Output.WEIGHTED],
-        "mismatch": known.states[Output.MISMATCH],
-        "received_input_error": known.received_input_error,
+        "delta": bounds.errors[Output.WEIGHTED] / unit,
+        "overshoot": bounds.sensor_error / unit,
+        "input_error": bounds.input_error,
+        "state": bounds.states[Output.STATE],
+        "state_weighted": bounds.states[Output.WEIGHTED],
+        "mismatch": bounds.states[Output.MISMATCH],
+        "received_input_error": bounds.received_input_error,
     }
     smaller = {name: min(value, getattr(constants, name)) for name, value in sharpened.items()}
-    later_s = constants.inter_event_s and max(bounds.spacing_s, constants.inter_event_s)
+    later_s = constants.inter_event_s and max(sharpening.spacing_s, constants.inter_event_s)
     return constants._replace(**smaller, inter_event_s=later_s)
 
 
@@ -88,17 +89,16 @@ class _SharpenedBounds:
     def __init__(self, part: CertificatePart, conditions: NetworkConditions, spacing_s: float) -> None:
         self._part, self._conditions, self.spacing_s = part, conditions, spacing_s
         self._inequalities = InsertedInequalities(part, conditions, 0.0)
-        self.known = self._inequalities.solved_bounds(spacing_s)
+        self.bounds = self._inequalities.solved_bounds(spacing_s)
         self._acts_within_s = self._inequalities.acts_within_s
 
     @cached_property
     def _ellipsoids(self) -> InvariantEllipsoids:
-        largest = self.known.errors[Output.WEIGHTED]
-        bound = self._part.bound
+        error_bound, bound = self.bounds.errors[Output.WEIGHTED], self._part.bound
         # An event that is due to an integral, or to a deadline, does not need this ‖e_s‖_W.
         needs_level = bound.ago_s == 0 and math.isinf(bound.forced_s)
         level = bound.reached or 0.0 if self._is_ideal and needs_level else 0.0
-        return InvariantEllipsoids(self._part.plant, largest, self._inequalities.age_gains, level)
+        return InvariantEllipsoids(self._part.plant, error_bound, self._inequalities.age_gains, level)
 
     @property
     def _is_ideal(self) -> bool:
@@ -106,50 +106,50 @@ class _SharpenedBounds:
 
     def insert(self) -> None:
         """Insert bounds into the inequalities until they have settled."""
-        for _ in range(_MOST_INSERTED):
-            previous = self.known.signals
-            self._inequalities.insert(self.known, self.spacing_s)
-            if (self.known.signals >= _NEARLY * previous).all():
+        for _ in range(_MOST_INSERTIONS):
+            previous = self.bounds.signals
+            self._inequalities.insert(self.bounds, self.spacing_s)
+            if (self.bounds.signals >= _INSERTIONS_SETTLED * previous).all():
                 break
 
     def sharpen_by_flow(self) -> bool:
         """Make bounds smaller by the flow; return whether there is an ellipsoid."""
-        known, conditions = self.known, self._conditions
-        limit = known.errors[Output.WEIGHTED]
+        bounds, conditions = self.bounds, self._conditions
+        error_bound = bounds.errors[Output.WEIGHTED]
         effects_of = None if self._is_ideal else self._input_effects
-        reach = self._ellipsoids.reach_within(limit, effects_of, conditions.start_s)
+        reach = self._ellipsoids.reach_within(error_bound, effects_of, conditions.start_s)
         if reach is None:
             return False
-        known.signals[0] = min(known.signals[0], reach.effects.age_input)
+        bounds.signals[0] = min(bounds.signals[0], reach.effects.age_input)
         inverse = self._part.plant.error.inverse_weight
         for name, C in self._part.plant.outputs.items():
-            known.states[name] = min(known.states[name], reach.sup_state(C @ inverse))
+            bounds.states[name] = min(bounds.states[name], reach.sup_state(C @ inverse))
         gain = reach.ellipsoid.flow.gain
         at_first = float(spectral_norm(gain)) * reach.effects.first_error
-        size = max(reach.sup(np.hstack([0 * gain, gain])), at_first)
-        known.errors[Output.GAIN] = min(known.errors[Output.GAIN], size)
+        input_error = max(reach.sup(np.hstack([0 * gain, gain])), at_first)
+        bounds.errors[Output.GAIN] = min(bounds.errors[Output.GAIN], input_error)
         if self.spacing_s >= max(self._acts_within_s, _SHORTEST_S):  # before, the last update has acted
-            size = max(self._after_losses(reach), reach.effects.first_error)
-            for output, bound in known.errors.items():
-                known.errors[output] = min(bound, size * self._part.plant.error.now(output))
+            error = max(self._after_losses(reach), reach.effects.first_error)
+            for output, bound in bounds.errors.items():
+                bounds.errors[output] = min(bound, error * self._part.plant.error.now(output))
         self.insert()
-        self.spacing_s = max(self.spacing_s, self._inequalities.next_event_s(known))
+        self.spacing_s = max(self.spacing_s, self._inequalities.next_event_s(bounds))
         self.insert()
         return True
 
-    def _input_effects(self, ellipsoid: DeliveryEllipsoid, size: float) -> InputEffects:
-        """Return what delay and hold change as long as ‖ΛWx‖ ≤ c, ``size``.
+    def _input_effects(self, ellipsoid: DeliveryEllipsoid, scale: float) -> InputEffects:
+        """Return what delay and hold change as long as ‖ΛWx‖ ≤ c, ``scale``.
 
         x_c, from which the input is computed, is e^{(H+αI)τ} x of the event of the last update.
         """
-        known, plant = self.known, self._part.plant
+        bounds, plant = self.bounds, self._part.plant
         gains = self._inequalities.age_gains.items()
-        age_input = sum(gain * ellipsoid.model_sups[C] for C, gain in gains) * size
-        age_input = min(float(known.signals[0]), age_input)
-        input_error = max(known.errors[Output.GAIN] + age_input, self._inequalities.start_error)
+        age_input = sum(gain * ellipsoid.model_sups[C] for C, gain in gains) * scale
+        age_input = min(float(bounds.signals[0]), age_input)
+        input_error = max(bounds.errors[Output.GAIN] + age_input, self._inequalities.start_error)
         R_E = plant.outputs[Output.MISMATCH] @ plant.error.inverse_weight
-        mismatch_in_ellipsoid = size * float(spectral_norm(R_E @ ellipsoid.inverse)) * ROUNDING
-        mismatch = min(float(known.signals[4]), mismatch_in_ellipsoid)
+        mismatch_in_ellipsoid = scale * float(spectral_norm(R_E @ ellipsoid.inverse)) * ROUNDING
+        mismatch = min(float(bounds.signals[4]), mismatch_in_ellipsoid)
         return InputEffects(
             age_input,
             self._inequalities.entered(self._acts_within_s, input_error, mismatch),
@@ -158,49 +158,50 @@ class _SharpenedBounds:
 
     def _after_losses(self, reach: Reach) -> float:
         """Bound ‖e_c‖_W after as many losses as there may be, until the next update acts."""
-        known, error, conditions = self.known, self._part.plant.error, self._conditions
+        bounds, error, conditions = self.bounds, self._part.plant.error, self._conditions
         sensor = self._sensor_errors
         level = 0.0 if sensor.integrates else sensor.level
-        bend = bend_of_error(reach, level or float(sensor.sizes.max())) if sensor.level else 0.0
+        bend = bend_of_error(reach, level or float(sensor.after_losses.max())) if sensor.level else 0.0
         if level and reach.effects.is_none:
-            at_event = max(float(errors_at_events(known.after_losses)[-1]), _LEAST_SHARE * reach.limit)
-            at_events = replace(reach, limit=at_event)
+            at_event = max(float(errors_at_events(bounds.after_losses)[-1]), _LEAST_SHARE * reach.error_bound)
+            at_events = replace(reach, error_bound=at_event)
             later_s = _next_event_s(at_events, level, self.spacing_s, bend)
             later_s = min(later_s, self._part.bound.forced_s)
             self.spacing_s = max(self.spacing_s, self._next_test_s(later_s))
         kernel = error.kernels[Output.WEIGHTED]
-        known.after_losses, apart_s = errors_after_losses(
-            reach, known.after_losses, sensor, self._unit_outputs, self.spacing_s, kernel, bend
+        bounds.after_losses, apart_s = errors_after_losses(
+            reach, bounds.after_losses, sensor, self._unit_outputs, self.spacing_s, kernel, bend
         )
         self.spacing_s = self._next_test_s(apart_s)
         # An event comes after the first input has been applied.
-        entered = self._inequalities.entered(conditions.delay_s, *known.signals[3:5].tolist())
-        return error.stretch(conditions.delay_s) * float(known.after_losses[-1]) + entered
+        entered = self._inequalities.entered(conditions.delay_s, *bounds.signals[3:5].tolist())
+        return error.stretch(conditions.delay_s) * float(bounds.after_losses[-1]) + entered
 
     @property
     def _unit_outputs(self) -> list[Matrix]:
         """Matrices Y with ‖Y z‖ ≤ 1 at all times: the bounds of W x, E x and K e_c."""
-        plant, known = self._part.plant, self.known
+        plant, bounds = self._part.plant, self.bounds
         gain, inverse = plant.error.split_K[1], plant.error.inverse_weight
-        of_x = [plant.outputs[C] / max(known.states[C], _LEAST) for C in (Output.WEIGHTED, Output.MISMATCH)]
+        names = Output.WEIGHTED, Output.MISMATCH
+        of_x = [plant.outputs[name] / max(bounds.states[name], _LEAST_BOUND) for name in names]
         rows = [np.hstack([C @ inverse, np.zeros((len(C), len(inverse)))]) for C in of_x]
-        gain = gain @ inverse / max(known.errors[Output.GAIN], _LEAST)
+        gain = gain @ inverse / max(bounds.errors[Output.GAIN], _LEAST_BOUND)
         return [*rows, np.hstack([np.zeros_like(gain), gain])]
 
     @property
     def _sensor_errors(self) -> SensorErrors:
         """What is known of e_s between two events."""
-        known, bound, conditions = self.known, self._part.bound, self._conditions
+        bounds, bound, conditions = self.bounds, self._part.bound, self._conditions
         level, h_s = bound.reached or 0.0, conditions.sampling_s
         if bound.is_mean:  # of an integral, over any time
             level *= bound.ago_s
         if bound.ago_s and not bound.is_mean:
             level = 0.0  # an event may need no e_s
-        tested = known.tested_sensor_error if h_s == conditions.spacing_s else math.inf
-        begin_s = bound.untested_s + h_s if bound.untested_s else 0.0
+        tested = bounds.tested_sensor_error if h_s == conditions.spacing_s else math.inf
+        first_test_s = bound.untested_s + h_s if bound.untested_s else 0.0
         test_s, forced_s = conditions.spacing_s, bound.forced_s
         return SensorErrors(
-            known.sensor_after_losses, tested, begin_s, test_s, level, bound.is_mean, forced_s
+            bounds.sensor_after_losses, tested, first_test_s, test_s, level, bound.is_mean, forced_s
         )
 
     def _next_test_s(self, time_s: float) -> float:
@@ -214,28 +215,29 @@ def errors_at_events(errors: Vector) -> Vector:
     return np.append(0.0, errors[:-1])
 
 
-def _next_event_s(at_events: Reach, level: float, known_s: float, bend: float) -> float:
+def _next_event_s(at_events: Reach, level: float, least_s: float, bend: float) -> float:
     """Return a time before which ‖e_s‖_W cannot reach ``level`` after an event.
 
-    It is at least the known one. Over a step s, e_s differs from its chord by at most s²/8 times a
-    bound of its second derivative, which holds as long as ‖e_s‖_W is below the level.
+    It is at least ``least_s``, a time that is known already. Over a step s, e_s differs from its
+    chord by at most s²/8 times a bound of its second derivative, ``bend``, which holds as long as
+    ‖e_s‖_W is below the level.
     """
-    flow, reached_s = at_events.ellipsoid.flow, known_s
-    if not (0 < known_s < math.inf and 0 < bend < math.inf):
-        return known_s
-    size, evaluations = at_events.sup(error_since_event(flow, reached_s)), 0
-    slope = size / reached_s
-    while size < level:
-        step_s = min(math.sqrt(4 * (level - size) / bend), reached_s)
-        if slope * step_s > 0.99 * (level - size):
-            step_s = 0.99 * (level - size) / slope
-        while evaluations < _MOST_STEPS and step_s > _SHORT * reached_s:
+    flow, reached_s = at_events.ellipsoid.flow, least_s
+    if not (0 < least_s < math.inf and 0 < bend < math.inf):
+        return least_s
+    error, evaluations = at_events.sup(error_since_event(flow, reached_s)), 0
+    slope = error / reached_s
+    while error < level:
+        step_s = min(math.sqrt(4 * (level - error) / bend), reached_s)
+        if slope * step_s > 0.99 * (level - error):
+            step_s = 0.99 * (level - error) / slope
+        while evaluations < _MOST_STEPS and step_s > _SHORTEST_STEP * reached_s:
             later, evaluations = at_events.sup(error_since_event(flow, reached_s + step_s)), evaluations + 1
-            if max(size, later) + step_s**2 / 8 * bend < level:
+            if max(error, later) + step_s**2 / 8 * bend < level:
                 break
             step_s *= 0.6
         else:
             return reached_s
-        slope = (later - size) / step_s
-        reached_s, size = reached_s + step_s, later
+        slope = (later - error) / step_s
+        reached_s, error = reached_s + step_s, later
     return reached_s

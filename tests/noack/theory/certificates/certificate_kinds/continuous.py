@@ -38,14 +38,14 @@ def only_the_start() -> AbstractContextManager[Any]:
     """The ellipsoid need not contain what errors drive x to."""
 
     def reach_within(
-        ellipsoids: InvariantEllipsoids, limit: float, effects_of: Any = None, _: float = 0.0
+        ellipsoids: InvariantEllipsoids, error_bound: float, effects_of: Any = None, _: float = 0.0
     ) -> Reach | None:
         ellipsoid = ellipsoids._best_ellipsoid
         if ellipsoid is None:
             return None
-        size = float(np.linalg.norm(ellipsoid.shape @ ellipsoids.flow.start))
-        effects = NO_EFFECTS if effects_of is None else effects_of(ellipsoid, size)
-        return Reach(ellipsoid, size, limit, effects)
+        scale = float(np.linalg.norm(ellipsoid.shape @ ellipsoids.flow.start))
+        effects = NO_EFFECTS if effects_of is None else effects_of(ellipsoid, scale)
+        return Reach(ellipsoid, scale, error_bound, effects)
 
     return patch.object(InvariantEllipsoids, "reach_within", reach_within)
 

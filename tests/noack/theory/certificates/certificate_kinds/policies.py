@@ -410,7 +410,7 @@ def without(name: str) -> Callable[[Scenario, Conditions], Any]:
 def without_later_times(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
     """The certificate if nothing followed from what is left of the first return."""
     with (
-        patch.object(due_deliveries._Course, "returned", lambda course, last: (0.0, 0.0)),
+        patch.object(due_deliveries._BallHistory, "last_return", lambda history, last: (0.0, 0.0)),
         patch.object(due_deliveries, "_AT_ONCE", 1),
     ):
         return certify(resolved, conditions)
