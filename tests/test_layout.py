@@ -32,7 +32,7 @@ LINES = {
     "noack/protocol": 1255,
     "noack/runtime": 5695,
     "noack/settings": 600,
-    "noack/theory": 12320,
+    "noack/theory": 12480,
     "noack/traces": 1320,
     "noack/trigger": 1060,
     "netem": 6515,
@@ -53,7 +53,7 @@ LINES = {
     "controller_node": 425,
     "benchmarks": 3695,
     "native": 11145,
-    "tests": 48560,
+    "tests": 48820,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
