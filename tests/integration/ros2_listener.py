@@ -40,9 +40,17 @@ def on_sample(sample) -> None:  # type: ignore[no-untyped-def]
     attachments.append((attached.sequence_id, len(attached.gid)))
 
 
+def on_token(token) -> None:  # type: ignore[no-untyped-def]
+    tokens.append(str(token.key_expr))
+    if "/MP/" in tokens[-1]:  # of a publisher
+        joined.set()
+
+
 raw = session.session.declare_subscriber("0/noack/state/**", on_sample)
-tokens = []
-while not last.wait(0.5):
-    tokens += [str(r.ok.key_expr) for r in session.liveliness.get("@ros2_lv/**", timeout=2.0) if r.ok]
+tokens: list[str] = []
+joined = threading.Event()
+graph = session.liveliness.declare_subscriber("@ros2_lv/**", on_token, history=True)
+last.wait()
+joined.wait()
 print(json.dumps({"messages": found, "tokens": tokens, "attachments": attachments}), flush=True)
 threading.Event().wait()
