@@ -53,7 +53,7 @@ LINES = {
     "controller_node": 425,
     "benchmarks": 3695,
     "native": 11145,
-    "tests": 48820,
+    "tests": 48825,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
