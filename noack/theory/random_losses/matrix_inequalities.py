@@ -11,6 +11,7 @@ leaves. That its result is inside is checked with a margin for rounding.
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
 
@@ -36,6 +37,7 @@ class MatrixInequalities:
             np.stack(parts, axis=-1) - c[..., None] for parts, c in zip(units, self._constants, strict=True)
         ]
         """What each value adds, (k, size) and (n, n, size)."""
+        self._triangles = [_triangle(len(matrix)) for matrix in self._constants[1:]]
 
     def _at(self, values: Vector) -> list[Matrix]:
         return [c + slopes @ values for c, slopes in zip(self._constants, self._slopes, strict=True)]
@@ -81,12 +83,11 @@ class MatrixInequalities:
         parts = [of_numbers / numbers[:, None]]
         gradient = parts[0].sum(axis=0)
         gradient[-1] += weight
-        for matrix, slopes in zip(matrices, of_matrices, strict=True):
-            undone = np.linalg.inv(np.linalg.cholesky(matrix))
-            turned = undone @ np.moveaxis(slopes, -1, 0) @ undone.T
-            gradient += np.trace(turned, axis1=1, axis2=2)
-            rows, columns = np.tril_indices(len(matrix))
-            parts.append(turned[:, rows, columns].T * np.where(rows > columns, np.sqrt(2), 1.0)[:, None])
+        for matrix, slopes, (entries, weights) in zip(matrices, of_matrices, self._triangles, strict=True):
+            inverse_root = np.linalg.inv(np.linalg.cholesky(matrix))
+            transformed = inverse_root @ np.moveaxis(slopes, -1, 0) @ inverse_root.T
+            gradient += np.trace(transformed, axis1=1, axis2=2)
+            parts.append(transformed.reshape(len(values), -1)[:, entries].T * weights)
         A = np.vstack(parts)
         scales = 1 / np.linalg.norm(A, axis=0)
         R = np.asarray(np.linalg.qr(A * scales, mode="r"))
@@ -114,6 +115,15 @@ class MatrixInequalities:
             return -np.inf
         logarithms = np.log(numbers).sum() + 2 * sum(np.log(np.diagonal(root)).sum() for root in roots)
         return float(weight * values[-1] + logarithms)
+
+
+def _triangle(n: int) -> tuple[NDArray[np.intp], Matrix]:
+    """Return the lower triangle's places in a flat matrix, (k,), and its weights w, (k, 1).
+
+    The Frobenius norm of a symmetric matrix is that of its entries there times w.
+    """
+    rows, columns = np.tril_indices(n)
+    return rows * n + columns, np.where(rows > columns, np.sqrt(2), 1.0)[:, None]
 
 
 def is_positive(block: Matrix) -> bool:

@@ -144,9 +144,9 @@ def test_limits_that_cannot_be_met_give_a_page_and_one_line(
     result = run_design(mass, *words, "--out", str(out))
     assert result.exit_code == 1
     assert not out.exists()
-    *progress, message = result.stderr.splitlines()  # there is progress on a slow machine
+    message = result.stderr.splitlines()[-1]  # there is progress on a slow machine
     assert message.startswith("noack: no design meets the limits; the closest has a settling")
-    assert not any(line.startswith("noack: ") for line in progress)
+    assert result.stderr.count("no design meets") == 1
     assert ("trade-off" in result.stdout) == table
     html = (tmp_path / "p.html").read_text()
     assert "<svg" in html
