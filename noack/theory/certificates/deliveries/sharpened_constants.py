@@ -29,6 +29,7 @@ from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoi
 from noack.theory.certificates.deliveries.inserted_bounds import InsertedInequalities
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
 from noack.theory.certificates.deliveries.lost_events import SensorErrors, bend_of_error, errors_after_losses
+from noack.theory.certificates.inequalities import Signal
 
 _ROUNDS, _SETTLED = 20, 0.99
 _MOST_INSERTIONS, _INSERTIONS_SETTLED = 60, 0.9999
@@ -120,7 +121,7 @@ class _SharpenedBounds:
         reach = self._ellipsoids.reach_within(error_bound, effects_of, conditions.start_s)
         if reach is None:
             return False
-        bounds.signals[0] = min(bounds.signals[0], reach.effects.age_input)
+        bounds.signals[Signal.AGE_INPUT] = min(bounds.signals[Signal.AGE_INPUT], reach.effects.age_input)
         inverse = self._part.plant.error.inverse_weight
         for name, C in self._part.plant.outputs.items():
             bounds.states[name] = min(bounds.states[name], reach.sup_state(C @ inverse))
@@ -143,13 +144,14 @@ class _SharpenedBounds:
         x_c, from which the input is computed, is e^{(H+αI)τ} x of the event of the last update.
         """
         bounds, plant = self.bounds, self._part.plant
+        known_age_input, _, known_mismatch = bounds.driving
         gains = self._inequalities.age_gains.items()
         age_input = sum(gain * ellipsoid.model_sups[C] for C, gain in gains) * scale
-        age_input = min(float(bounds.signals[0]), age_input)
+        age_input = min(known_age_input, age_input)
         input_error = max(bounds.errors[Output.GAIN] + age_input, self._inequalities.start_error)
         R_E = plant.outputs[Output.MISMATCH] @ plant.error.inverse_weight
         mismatch_in_ellipsoid = scale * float(spectral_norm(R_E @ ellipsoid.inverse)) * ROUNDING
-        mismatch = min(float(bounds.signals[4]), mismatch_in_ellipsoid)
+        mismatch = min(known_mismatch, mismatch_in_ellipsoid)
         return InputEffects(
             age_input,
             self._inequalities.entered(self._acts_within_s, input_error, mismatch),
@@ -174,7 +176,8 @@ class _SharpenedBounds:
         )
         self.spacing_s = self._next_test_s(apart_s)
         # An event comes after the first input has been applied.
-        entered = self._inequalities.entered(conditions.delay_s, *bounds.signals[3:5].tolist())
+        _, input_error, mismatch = bounds.driving
+        entered = self._inequalities.entered(conditions.delay_s, input_error, mismatch)
         return error.stretch(conditions.delay_s) * float(bounds.after_losses[-1]) + entered
 
     @property
