@@ -238,21 +238,22 @@ class ErrorInequalities:
         age_input, estimation = solved[..., Signal.AGE_INPUT], solved[..., Signal.ESTIMATION_ERROR]
         input_error = _product(signals.input_error, solved)
         state = {C: free + gain * input_error for C, (free, gain) in self._states.items()}
-        fields = (
-            (_product(signals.errors[Output.WEIGHTED], solved) + estimation) / self.unit,
-            (_product(signals.sensor, solved) + estimation) / self.unit,
-            input_error,
-            self._start_error,
-            state[Output.STATE],
-            state[Output.WEIGHTED],
-            state[Output.MISMATCH],
-            loop_gain,
-            estimation,
-            _product(signals.received, solved) + age_input,
-            _product(signals.earlier, solved) + age_input,
-            np.isfinite(solved).all(axis=-1) & is_counted,
+        constants = LoopConstants(
+            missing_events=events,
+            delta=(_product(signals.errors[Output.WEIGHTED], solved) + estimation) / self.unit,
+            overshoot=(_product(signals.sensor, solved) + estimation) / self.unit,
+            input_error=input_error,
+            start_error=self._start_error,
+            state=state[Output.STATE],
+            state_weighted=state[Output.WEIGHTED],
+            mismatch=state[Output.MISMATCH],
+            loop_gain=loop_gain,
+            estimation_error=estimation,
+            received_input_error=_product(signals.received, solved) + age_input,
+            earlier_input_error=_product(signals.earlier, solved) + age_input,
+            exists=np.isfinite(solved).all(axis=-1) & is_counted,
         )
-        return LoopConstants._make([events, *(np.broadcast_to(values, events.shape) for values in fields)])
+        return LoopConstants._make(np.broadcast_to(values, events.shape) for values in constants)
 
     @property
     def unit(self) -> float:
@@ -441,19 +442,27 @@ class ErrorInequalities:
         return self._error.missing_until(output, events, self._bound.due_s)
 
     def inter_event_s(
-        self, constants: LoopConstants, drifts: NDArray[np.bool_], searched: NDArray[np.bool_]
+        self,
+        *,
+        mismatch: Vector,
+        earlier_input_error: Vector,
+        estimation_error: Vector,
+        drifts: NDArray[np.bool_],
+        searched: NDArray[np.bool_],
     ) -> Vector:
-        """Return the times that ‖e_s‖_W needs to the next event, given the constants until then.
+        """Return the times that ‖e_s‖_W needs to the next event, (loops,).
 
         Args:
-            constants: of all loops.
+            mismatch: bounds of ‖E x‖_W until then, (loops,).
+            earlier_input_error: those of the input error without the part of the present e_s.
+            estimation_error: those of ‖x̂ − x‖_W at the measurements.
             drifts: where the method is ``DRIFTING``, (loops,).
             searched: the loops whose times are needed, (loops,); the others are of no use.
         """
         # The part of D_K that is the e_s of now.
         error_gain = np.where(drifts, 0.0, self._error.now(Output.GAIN))
-        other_input_error = constants.earlier_input_error
-        estimation = np.where(searched, constants.estimation_error, 0.0)
+        input_error = np.maximum(earlier_input_error, self._first_input_error)
+        estimation = np.where(searched, estimation_error, 0.0)
         # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
         reached = [
             (bound.reached, bound.ago_s or math.inf)
@@ -464,8 +473,8 @@ class ErrorInequalities:
         passed_s = first_passage_s(
             self._plant,
             np.where(searched, levels - estimation, 0.0),
-            np.where(searched, constants.mismatch, 0.0),
-            np.where(searched, np.maximum(other_input_error, self._first_input_error), 0.0),
+            np.where(searched, mismatch, 0.0),
+            np.where(searched, input_error, 0.0),
             error_gain,
             estimation,
         )

@@ -184,10 +184,19 @@ class CertificateScope:
         ) -> ScenarioCertificate:
             main, floor, persistent = phase
             return ScenarioCertificate(
-                self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-                self._loop.weight is not None, conditions, (), main, floor, reason, persistent,
-                certificate(*other_phases) if other_phases else None,
-            )  # fmt: skip
+                scope=self.name,
+                beta=trigger.beta,
+                alpha_per_s=trigger.alpha_per_s,
+                floor=trigger.floor,
+                weighted=self._loop.weight is not None,
+                conditions=conditions,
+                assumptions=(),
+                constants=main,
+                floor_constants=floor,
+                void=reason,
+                persistent_constants=persistent,
+                other=certificate(*other_phases) if other_phases else None,
+            )
 
         unchecked = certificate(*phases)
         main, persistent = unchecked.constants, unchecked.persistent_constants

@@ -225,7 +225,13 @@ def _longest_spacing_s(
         for part, constants in zip(reversed(inequalities), reversed(smallest.parts), strict=True):
             # Often what persists, which is the last part, gives a time of at most the least one.
             loops = is_open & (implied_s > least_s)
-            passed_s = part.inter_event_s(constants, smallest.drifts, loops)
+            passed_s = part.inter_event_s(
+                mismatch=constants.mismatch,
+                earlier_input_error=constants.earlier_input_error,
+                estimation_error=constants.estimation_error,
+                drifts=smallest.drifts,
+                searched=loops,
+            )
             implied_s = np.where(loops, np.minimum(implied_s, passed_s), implied_s)
         is_open &= implied_s < spacing_s
         # Iterate from above.

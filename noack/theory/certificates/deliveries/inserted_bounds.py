@@ -21,7 +21,7 @@ from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.gains import Growth, Output, PlantGains
 from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth
-from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants, Signal
+from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, Signal
 
 Growths = Sequence[Sequence[ErrorGrowth]]
 """How e_s may grow under each bound of it. All bounds hold, and of each one growth applies."""
@@ -413,9 +413,11 @@ class InsertedInequalities(ErrorInequalities):
         """Return the time between two events that follows from bounds; 0 if there is none."""
         if all(bound.reached is None for bound in self._bound.every):
             return 0.0
-        zero, never = np.zeros(1), np.zeros(1, dtype=bool)
-        events = np.zeros(1, dtype=np.int64)
-        mismatch, earlier = zero + bounds.signals[Signal.MISMATCH], zero + bounds.earlier_input_error
-        before, after = (zero,) * 6, (zero,) * 3
-        constants = LoopConstants(events, *before, mismatch, *after, earlier, ~never)
-        return float(self.inter_event_s(constants, never, ~never)[0])
+        times_s = self.inter_event_s(
+            mismatch=np.array([bounds.signals[Signal.MISMATCH]]),
+            earlier_input_error=np.array([bounds.earlier_input_error]),
+            estimation_error=np.zeros(1),
+            drifts=np.array([False]),
+            searched=np.array([True]),
+        )
+        return float(times_s[0])

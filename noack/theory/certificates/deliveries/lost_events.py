@@ -39,7 +39,7 @@ _LATE_TERMS = 8
 
 
 class SensorErrors(NamedTuple):
-    """What is known of ‖e_s‖_W between two events."""
+    """Known bounds of ‖e_s‖_W between two events."""
 
     after_losses: Vector
     """Its bounds, while 0, 1, … events have been lost since the delivery."""

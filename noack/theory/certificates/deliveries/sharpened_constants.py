@@ -193,18 +193,21 @@ class _SharpenedBounds:
 
     @property
     def _sensor_errors(self) -> SensorErrors:
-        """What is known of e_s between two events."""
-        bounds, bound, conditions = self.bounds, self._part.bound, self._conditions
-        level, h_s = bound.reached or 0.0, conditions.sampling_s
+        """Known bounds of e_s between two events."""
+        bound, h_s = self._part.bound, self._conditions.sampling_s
+        level, grid_s = bound.reached or 0.0, self._conditions.spacing_s
         if bound.is_mean:  # of an integral, over any time
             level *= bound.ago_s
         if bound.ago_s and not bound.is_mean:
             level = 0.0  # an event may need no e_s
-        tested = bounds.tested_sensor_error if h_s == conditions.spacing_s else math.inf
-        first_test_s = bound.untested_s + h_s if bound.untested_s else 0.0
-        test_s, forced_s = conditions.spacing_s, bound.forced_s
         return SensorErrors(
-            bounds.sensor_after_losses, tested, first_test_s, test_s, level, bound.is_mean, forced_s
+            after_losses=self.bounds.sensor_after_losses,
+            after_test=self.bounds.tested_sensor_error if h_s == grid_s else math.inf,
+            first_test_s=bound.untested_s + h_s if bound.untested_s else 0.0,
+            grid_s=grid_s,
+            level=level,
+            integrates=bound.is_mean,
+            forced_s=bound.forced_s,
         )
 
     def _next_test_s(self, time_s: float) -> float:
