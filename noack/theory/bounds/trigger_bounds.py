@@ -22,7 +22,12 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
-from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
+from noack.theory.bounds.certificate_terms import (
+    EventTimes,
+    NetworkConditions,
+    NoCertificateError,
+    TriggerBound,
+)
 from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.gains import Columns, Growth, Output, PlantGains
 from noack.trigger.trigger_rule import QuadraticForm, TriggerRule
@@ -190,46 +195,52 @@ class TriggerBounds:
             spacing_s = step_s or math.gcd(round(self.rule.grid_ns), round(due_ns)) / NS_PER_S
         return conditions._replace(sampling_s=grid_s, spacing_s=spacing_s)
 
-    def bound(self, conditions: NetworkConditions, level: float, reached: float | None) -> TriggerBound:
+    def bound(self, conditions: NetworkConditions, level: float, least_level: float | None) -> TriggerBound:
         """Return all bounds; their unit is the level, or 1 without one.
 
         Args:
             conditions: as :meth:`tested` returns them.
             level: the largest threshold, scaled.
-            reached: the smallest threshold; None if it may be arbitrarily small.
+            least_level: the smallest threshold; None if it may be arbitrarily small.
 
         Raises:
             NoCertificateError: nothing bounds e_s, or nothing separates events.
         """
-        due_s, forced_s, apart_s = self._between_events(conditions)
-        h_s = conditions.sampling_s
+        times, h_s = self._between_events(conditions), conditions.sampling_s
         idle_s = self._longest_until_test(self.rule.idle_ns, conditions)
         untested_s = max(idle_s - h_s, 0.0) if math.isfinite(idle_s) else 0.0
         bounds: list[TriggerBound] = []
         if self.comparison is not None:
-            if reached is not None:
-                reached = reached * self.comparison.least / self.comparison.size or None
+            least_error: float | None = None
+            if least_level is not None:
+                least_error = least_level * self.comparison.least / self.comparison.size or None
             shares = {**dict.fromkeys(self.outputs, 1.0), **self._slope(level)}
             # Of the trapezoids of tests that may be missing, the oldest may count most.
             is_mean = self.area > 0 and h_s == conditions.spacing_s
-            for ago_s, beta, least in self._levels(conditions, level, reached):
-                root = next(iter(shares)) if self.comparison.has_root else ""
-                bound = TriggerBound(beta, least, shares, untested_s, ago_s=ago_s, is_mean=is_mean, root=root)
+            for window_s, beta, least in self._levels(conditions, level, least_error):
+                bound = TriggerBound(
+                    beta=beta,
+                    least_event_error=least,
+                    shares=shares,
+                    untested_s=untested_s,
+                    window_s=window_s,
+                    is_mean=is_mean,
+                    root_output=next(iter(shares)) if self.comparison.has_root else "",
+                )
                 # What enters is followed if there is one growth; two growths are smaller.
-                bounds += [bound._replace(is_one_growth=True), bound] if untested_s else [bound]
-        if math.isfinite(due_s):
-            bounds.append(TriggerBound(0.0, None, {}, due_s - h_s, is_tested=False))
+                bounds += [bound._replace(merges_growths=True), bound] if untested_s else [bound]
+        if math.isfinite(times.longest_s):
+            bounds.append(TriggerBound(0.0, None, untested_s=times.longest_s - h_s, is_tested=False))
         if not bounds:
             raise NoCertificateError(_NONE)
-        is_separated = apart_s or conditions.spacing_s or any(bound.reached for bound in bounds)
+        # Events are apart by times, or because e_s has to grow.
+        is_separated = times.shortest_s or conditions.spacing_s or any(b.least_event_error for b in bounds)
         grows_first = level > 0 and self.comparison is not None and self.comparison.least > 0
         if not is_separated and not grows_first:
             raise NoCertificateError(_ACCUMULATE)
         if self.is_homogeneous:
-            apart_s = max(apart_s, conditions.spacing_s)
-        return bounds[0]._replace(
-            unit=level or 1.0, apart_s=apart_s, due_s=due_s, forced_s=forced_s, also=tuple(bounds[1:])
-        )
+            times = times._replace(shortest_s=max(times.shortest_s, conditions.spacing_s))
+        return bounds[0]._replace(unit=level or 1.0, times=times, further=tuple(bounds[1:]))
 
     def divided(
         self, conditions: NetworkConditions, apart_s: float
@@ -242,11 +253,10 @@ class TriggerBounds:
         Raises: as :meth:`bound`.
         """
         whole = self.bound(conditions, self.floor, self.floor or None)
+        times = whole.times._replace(shortest_s=apart_s)
         alone = [
-            bound._replace(
-                apart_s=apart_s, due_s=whole.due_s, forced_s=whole.forced_s, unit=1.0, reached=None, also=()
-            )
-            for bound in whole.every
+            bound._replace(times=times, unit=1.0, least_event_error=None, further=())
+            for bound in whole.all_bounds
         ]
         return [(bound._replace(beta=0.0), bound) for bound in alone]
 
@@ -281,11 +291,11 @@ class TriggerBounds:
         return {name: (math.hypot(level, largest_norm) - level) / largest_norm * _ROUNDING}
 
     def _levels(
-        self, conditions: NetworkConditions, level: float, reached: float | None
+        self, conditions: NetworkConditions, level: float, least_error: float | None
     ) -> list[tuple[float, float, float | None]]:
         """Return (T, β, least ‖e_s‖_W at an event): ‖e_s‖_W ≤ β at some time of the last T."""
         if not self.area:
-            return [(0.0, level, reached)]
+            return [(0.0, level, least_error)]
         assert self.comparison is not None
         least = self.comparison.least * self.rule.floor
         test_s, longest_s = conditions.spacing_s, conditions.sampling_s
@@ -295,21 +305,17 @@ class TriggerBounds:
             return [(k * longest_s, self.area / (k * test_s), least / (k * longest_s)) for k in tests]
         return [(t_s, self.area / t_s, least / t_s) for t_s in times_s.tolist()]
 
-    def _between_events(self, conditions: NetworkConditions) -> tuple[float, float, float]:
-        """Return times between two events, whatever e_s does.
-
-        Returns:
-            The longest; the shortest after which an event is due; the shortest.
-        """
+    def _between_events(self, conditions: NetworkConditions) -> EventTimes:
         rule = self.rule
-        due_s = self._longest_until_test(rule.longest_ns, conditions)
         earliest_ns = max(rule.idle_ns, 0.0)
         if not len(rule.form.up):  # nothing is compared
             earliest_ns = rule.longest_ns if rule.forecast is None else rule.shortest_ns
         step_s = conditions.spacing_s
-        apart_s = _rounded_up(min(earliest_ns, rule.longest_ns) / NS_PER_S, step_s)
-        forced_s = _rounded_up(rule.longest_ns / NS_PER_S, step_s)
-        return due_s, forced_s, apart_s
+        return EventTimes(
+            shortest_s=_rounded_up(min(earliest_ns, rule.longest_ns) / NS_PER_S, step_s),
+            longest_s=self._longest_until_test(rule.longest_ns, conditions),
+            earliest_due_s=_rounded_up(rule.longest_ns / NS_PER_S, step_s),
+        )
 
     def _longest_until_test(self, time_ns: float, conditions: NetworkConditions) -> float:
         """Return the longest time from an event to the first test a time after it."""
@@ -341,7 +347,7 @@ class ErrorGrowth:
         self.ages_s = np.array([longest_s]) if ages_s is None else ages_s
         self.mean_s, self.highest = float(self.ages_s.mean()), np.zeros(())
         self.longest_s, self.stretch = longest_s, plant.error.stretch(longest_s)
-        self.fixed, self.shares, self.root = after.beta, after.shares, after.root
+        self.fixed, self.shares, self.root_output = after.beta, after.shares, after.root_output
         # The trigger tests x_s − x̂, and may compare it with x̂.
         self.estimation = 1 + sum(
             share * spectral_norm(outputs[C] @ plant.error.inverse_weight)
@@ -355,14 +361,14 @@ class ErrorGrowth:
 
     def after_test(self, states: Mapping[str, float]) -> float:
         """Return b, given bounds of sup‖C x‖; not linear in them."""
-        shares = sum(share * states[C] for C, share in self.shares.items() if self.root != C)
-        return math.hypot(self.fixed, states.get(self.root, 0.0)) + shares
+        shares = sum(share * states[C] for C, share in self.shares.items() if self.root_output != C)
+        return math.hypot(self.fixed, states.get(self.root_output, 0.0)) + shares
 
 
 def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[ErrorGrowth]:
     """Return how e_s grows after a test, and from 0 after an event, or one growth for both."""
-    tested_s, untested_s = sampling_s + bound.ago_s, sampling_s + bound.untested_s
-    if bound.is_one_growth:
+    tested_s, untested_s = sampling_s + bound.window_s, sampling_s + bound.untested_s
+    if bound.merges_growths:
         return [ErrorGrowth(plant, max(tested_s, untested_s), bound)]
     growths = []
     if bound.is_tested:
@@ -374,12 +380,12 @@ def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> l
 
 def _mean_ages_s(bound: TriggerBound, sampling_s: float) -> Vector | None:
     """Return the ages of the e_s of which the bound is that of a mean, at most, if it is one."""
-    if not (bound.is_mean and bound.ago_s):
+    if not (bound.is_mean and bound.window_s):
         return None
     if sampling_s == 0:
-        return bound.ago_s * np.arange(1, COARSE_CELLS + 1) / COARSE_CELLS
+        return bound.window_s * np.arange(1, COARSE_CELLS + 1) / COARSE_CELLS
     # The trapezoid of the two tests i and i + 1 before the last one.
-    tests = np.arange(1, round(bound.ago_s / sampling_s) + 1)
+    tests = np.arange(1, round(bound.window_s / sampling_s) + 1)
     return sampling_s * np.concatenate([tests, tests + 1])
 
 

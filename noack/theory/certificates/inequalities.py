@@ -181,7 +181,9 @@ class ErrorInequalities:
         self._states = {
             output: Coefficients(free + start[output], gain) for output, (free, gain) in plant.states.items()
         }
-        self._growths = [list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every]
+        self._growths = [
+            list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.all_bounds
+        ]
         self._begin_s = math.inf if earlier_error else conditions.start_s
 
     @property
@@ -437,9 +439,9 @@ class ErrorInequalities:
         return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
 
     def _missing_gain(self, output: Output, events: Counts, spacing_s: Vector) -> Vector:
-        if self._error.decays or math.isinf(self._bound.due_s):
+        if self._error.decays or math.isinf(self._bound.times.longest_s):
             return self._error.missing(output, events, spacing_s)
-        return self._error.missing_until(output, events, self._bound.due_s)
+        return self._error.missing_until(output, events, self._bound.times.longest_s)
 
     def inter_event_s(
         self,
@@ -464,12 +466,12 @@ class ErrorInequalities:
         input_error = np.maximum(earlier_input_error, self._first_input_error)
         estimation = np.where(searched, estimation_error, 0.0)
         # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
-        reached = [
-            (bound.reached, bound.ago_s or math.inf)
-            for bound in self._bound.every
-            if bound.reached is not None
+        levels_and_times = [
+            (bound.least_event_error, bound.window_s or math.inf)
+            for bound in self._bound.all_bounds
+            if bound.least_event_error is not None
         ]
-        levels, most_s = (np.array(values)[:, None] for values in zip(*reached, strict=True))
+        levels, most_s = (np.array(values)[:, None] for values in zip(*levels_and_times, strict=True))
         passed_s = first_passage_s(
             self._plant,
             np.where(searched, levels - estimation, 0.0),
@@ -479,7 +481,8 @@ class ErrorInequalities:
             estimation,
         )
         next_event_s = np.minimum(passed_s, most_s).max(axis=0)
-        next_event_s = np.maximum(np.minimum(next_event_s, self._bound.forced_s), self._bound.apart_s)
+        times = self._bound.times
+        next_event_s = np.maximum(np.minimum(next_event_s, times.earliest_due_s), times.shortest_s)
         if (grid_s := self._conditions.spacing_s) == 0:
             return np.asarray(next_event_s)
         return np.asarray(grid_s * np.maximum(np.ceil(next_event_s / grid_s - 1e-9), 1.0))

@@ -243,10 +243,10 @@ def solve_two_parts(
     beta, floor = decaying.bound.beta, persistent.bound.beta
 
     def solve_with(share: float | None) -> Search[tuple[Constants, Constants]]:
-        reached = (None, None) if share is None else (share * beta, (1 - share) * floor)
+        levels = (None, None) if share is None else (share * beta, (1 - share) * floor)
         parts = [
-            part._replace(bound=part.bound._replace(reached=level))
-            for part, level in zip((decaying, persistent), reached, strict=True)
+            part._replace(bound=part.bound._replace(least_event_error=level))
+            for part, level in zip((decaying, persistent), levels, strict=True)
         ]
         first_constants, second_constants = yield Problem(tuple(parts), conditions, earlier_error, structured)
         return first_constants, second_constants

@@ -103,8 +103,8 @@ class _Box(CertificateScope):
             return [(main, None, persistent) for main, persistent in starmap(self._checked, pairs)]
         trigger = self._trigger
         level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
-        tested, reached = trigger.tested(conditions), trigger.floor or None
-        constants = yield from self._solve(tested, 0.0, level, reached, longest=False)
+        tested, least_level = trigger.tested(conditions), trigger.floor or None
+        constants = yield from self._solve(tested, 0.0, level, least_level, longest=False)
         return [(*self._checked(constants, None), None)]
 
     def _coordinate_bounds(self, phases: list[Phases], conditions: NetworkConditions) -> Vector:

@@ -289,7 +289,8 @@ class CertificateScope:
             if plant.is_one_plant:
                 with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
                     bound = trigger.bound(tested, 0.0, None)
-                    bound = bound._replace(apart_s=max(bound.apart_s, apart_s))
+                    least_s = max(bound.times.shortest_s, apart_s)
+                    bound = bound._replace(times=bound.times._replace(shortest_s=least_s))
                     yield Deliveries(plant, tested, bound)
 
     def _phases(
@@ -389,7 +390,7 @@ class CertificateScope:
         conditions: NetworkConditions,
         alpha_per_s: float,
         level: float,
-        reached: float | None,
+        least_level: float | None,
         *,
         longest: bool = True,
     ) -> Search[Constants]:
@@ -401,7 +402,7 @@ class CertificateScope:
         plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
-        part = CertificatePart(plant.error, plant, self._trigger.bound(conditions, level, reached))
+        part = CertificatePart(plant.error, plant, self._trigger.bound(conditions, level, least_level))
         return (
             yield from sharpened(
                 Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)

@@ -42,7 +42,7 @@ class Problem(NamedTuple):
     All inequalities are linear in functions of time, for given events. So they may be divided into
     parts: what decays is one part, what persists another one. All parts bound e_c by the same
     method, since the sum of solutions of different inequalities bounds nothing. The threshold is at
-    least the sum of the parts' ``reached``, so the next event needs one part that reaches its own.
+    least the sum of the parts' ``least_event_error``, so the next event needs one part that reaches its own.
     """
 
     parts: tuple[CertificatePart, ...]
@@ -193,9 +193,11 @@ def _solve_together(problems: Sequence[Problem]) -> list[list[Constants] | Excep
         together = part._replace(plant=part.plant.together(plants))
         earlier = example.earlier_error if index == 0 else 0.0
         inequalities.append(ErrorInequalities(together, conditions, earlier))
-    apart_s = max(part.bound.apart_s for part in example.parts)
+    apart_s = max(part.bound.times.shortest_s for part in example.parts)
     least_s = max(conditions.spacing_s, apart_s)
-    is_separated = all(any(bound.reached is not None for bound in part.bound.every) for part in example.parts)
+    is_separated = all(
+        any(bound.least_event_error is not None for bound in part.bound.all_bounds) for part in example.parts
+    )
     searched = np.full(count, is_separated)
     if is_separated and not example.longest:
         searched = ~_smallest_constants(inequalities, np.full(count, least_s)).exists

@@ -411,7 +411,7 @@ class InsertedInequalities(ErrorInequalities):
 
     def next_event_s(self, bounds: KnownBounds) -> float:
         """Return the time between two events that follows from bounds; 0 if there is none."""
-        if all(bound.reached is None for bound in self._bound.every):
+        if all(bound.least_event_error is None for bound in self._bound.all_bounds):
             return 0.0
         times_s = self.inter_event_s(
             mismatch=np.array([bounds.signals[Signal.MISMATCH]]),

@@ -53,7 +53,7 @@ class SensorErrors(NamedTuple):
     """At an event it, or what is compared, is at least this large; 0 if nothing is known."""
     integrates: bool
     """Whether its integral since the event is compared."""
-    forced_s: float
+    earliest_due_s: float
     """So long after an event the next one may be due without any of this."""
 
 
@@ -105,7 +105,7 @@ def errors_after_losses(
         # The time until the next event. After a delivery e_s is at most ‖e^{(H+αI)r}‖ · first_error
         # larger than C_r z.
         late_error = 0.0 if lost else flow.model_growth * reach.effects.first_error
-        most_later_s = min(_LATEST * spacing_s, sensor.forced_s)
+        most_later_s = min(_LATEST * spacing_s, sensor.earliest_due_s)
         later_s = event.next_event_s(sensor, late_error, bend, most_later_s)
         since_delivery_s += max(spacing_s, later_s)
         if not lost:  # x(0) itself may be outside the ellipsoid

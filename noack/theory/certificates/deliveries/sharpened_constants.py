@@ -97,8 +97,8 @@ class _SharpenedBounds:
     def _ellipsoids(self) -> InvariantEllipsoids:
         error_bound, bound = self.bounds.errors[Output.WEIGHTED], self._part.bound
         # An event that is due to an integral, or to a deadline, does not need this ‖e_s‖_W.
-        needs_level = bound.ago_s == 0 and math.isinf(bound.forced_s)
-        level = bound.reached or 0.0 if self._is_ideal and needs_level else 0.0
+        needs_level = bound.window_s == 0 and math.isinf(bound.times.earliest_due_s)
+        level = bound.least_event_error or 0.0 if self._is_ideal and needs_level else 0.0
         return InvariantEllipsoids(self._part.plant, error_bound, self._inequalities.age_gains, level)
 
     @property
@@ -168,7 +168,7 @@ class _SharpenedBounds:
             at_event = max(float(errors_at_events(bounds.after_losses)[-1]), _LEAST_SHARE * reach.error_bound)
             at_events = replace(reach, error_bound=at_event)
             later_s = _next_event_s(at_events, level, self.spacing_s, bend)
-            later_s = min(later_s, self._part.bound.forced_s)
+            later_s = min(later_s, self._part.bound.times.earliest_due_s)
             self.spacing_s = max(self.spacing_s, self._next_test_s(later_s))
         kernel = error.kernels[Output.WEIGHTED]
         bounds.after_losses, apart_s = errors_after_losses(
@@ -195,10 +195,10 @@ class _SharpenedBounds:
     def _sensor_errors(self) -> SensorErrors:
         """Known bounds of e_s between two events."""
         bound, h_s = self._part.bound, self._conditions.sampling_s
-        level, grid_s = bound.reached or 0.0, self._conditions.spacing_s
+        level, grid_s = bound.least_event_error or 0.0, self._conditions.spacing_s
         if bound.is_mean:  # of an integral, over any time
-            level *= bound.ago_s
-        if bound.ago_s and not bound.is_mean:
+            level *= bound.window_s
+        if bound.window_s and not bound.is_mean:
             level = 0.0  # an event may need no e_s
         return SensorErrors(
             after_losses=self.bounds.sensor_after_losses,
@@ -207,7 +207,7 @@ class _SharpenedBounds:
             grid_s=grid_s,
             level=level,
             integrates=bound.is_mean,
-            forced_s=bound.forced_s,
+            earliest_due_s=bound.times.earliest_due_s,
         )
 
     def _next_test_s(self, time_s: float) -> float:
