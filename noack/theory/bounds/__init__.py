@@ -6,7 +6,7 @@ an interval, for G = H + αI (the models) and G = A + BK + αI (the plant's loop
 
 1. ``contraction.py``: coordinates L in which G contracts, ‖L e^{Gs} Y‖ ≤ ‖L Y‖ e^{−νs}. L comes
    from a Lyapunov equation or from eigenvectors; ν is computed from the final L, so nothing depends
-   on how L was found.
+   on how L was found. ``stacked_norms.py`` has products and norms of many matrices at once.
 2. ``enclosure.py``: the suprema and integrals. Between two nodes the distance of a response from
    its chord (``sag`` in names) is bounded by its second derivative (``bend``); beyond the last node
    ν bounds the response. Why samples are not sufficient: docs/theory.md, "Why the suprema are

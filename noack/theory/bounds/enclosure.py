@@ -31,20 +31,17 @@ from numpy.typing import NDArray
 
 from noack.core.cached_method import cached_function, cached_method
 from noack.core.linear_systems import Matrix, exponential
-from noack.theory.bounds.contraction import (
-    EPSILON,
-    Decay,
+from noack.theory.bounds.contraction import EPSILON, Decay, abscissas, find_decay, logarithmic_norm
+from noack.theory.bounds.stacked_norms import (
     Stack,
-    abscissas,
-    find_decay,
     frobenius_norms,
-    largest_gains,
-    logarithmic_norm,
-    product,
-    sizes,
+    frobenius_norms_along_last,
+    larger_ends,
+    product_along_last,
     spectral_norm,
     spectral_norms,
-    times,
+    spectral_norms_along_last,
+    stack_product,
 )
 
 _ROUNDING = 1.0 + 1e-9
@@ -243,12 +240,12 @@ class ResponseBounds:
         """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
         columns, nodes = self._columns, self._nodes
         steps_s = np.diff(self.edges_s)[..., None, None, :]
-        norms = outputs.each(largest_gains, times(outputs.stacked, nodes), columns)
-        magnitudes = times(np.abs(outputs.stacked), np.abs(nodes))
-        norms += EPSILON * nodes.shape[-3] * outputs.each(sizes, magnitudes, columns)
+        norms = outputs.each(spectral_norms_along_last, product_along_last(outputs.stacked, nodes), columns)
+        magnitudes = product_along_last(np.abs(outputs.stacked), np.abs(nodes))
+        norms += EPSILON * nodes.shape[-3] * outputs.each(frobenius_norms_along_last, magnitudes, columns)
         bends = self._bends.over(outputs)
         middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
-        highest = np.maximum(norms[..., :-1], norms[..., 1:]) + steps_s**2 / 8 * bends
+        highest = larger_ends(norms) + steps_s**2 / 8 * bends
         areas = (steps_s * middle + steps_s**3 / 12 * bends) * _ROUNDING
         highest *= _ROUNDING
         rate, tails = np.array(0.0), np.full(norms.shape[:-1], math.inf)
@@ -276,8 +273,8 @@ class ResponseBounds:
     def areas_of_columns(self, C: Matrix) -> Stack:
         """Return bounds of Σ_i ∫‖C e^{Gτ} D_i‖ over each cell, for the columns D_i of D."""
         steps_s, nodes, columns = np.diff(self.edges_s), self._nodes, self.states.shape[-1]
-        rounding = sizes(times(np.abs(C), np.abs(nodes)))
-        norms = np.linalg.norm(times(C, nodes), axis=-3).sum(axis=-2)
+        rounding = frobenius_norms_along_last(product_along_last(np.abs(C), np.abs(nodes)))
+        norms = np.linalg.norm(product_along_last(C, nodes), axis=-3).sum(axis=-2)
         # The sum over the columns is at most √columns times the Frobenius norm.
         norms = norms + np.sqrt(columns) * EPSILON * nodes.shape[-3] * rounding
         middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
@@ -287,8 +284,8 @@ class ResponseBounds:
 
 def norm_bounds(C: Matrix, states: Stack) -> Stack:
     """Return upper bounds of ‖C Y‖ for a stack of Y, (k, n, r) → (k,), including rounding."""
-    exact = product(C, states)
-    rounding = frobenius_norms(product(np.abs(C), np.abs(states)))
+    exact = stack_product(C, states)
+    rounding = frobenius_norms(stack_product(np.abs(C), np.abs(states)))
     return np.asarray(spectral_norms(exact) + EPSILON * len(C.T) * rounding)
 
 
@@ -317,9 +314,11 @@ class _Bends:
         """Return the bounds for output matrices C, (…, outputs, groups, k)."""
         turned = outputs.stacked[..., None, :, :] @ self.powers
         *lead, terms, rows, n = turned.shape
-        images = times(turned.reshape(*lead, terms * rows, n), self.nodes)
+        images = product_along_last(turned.reshape(*lead, terms * rows, n), self.nodes)
         images = images.reshape(*images.shape[:-3], terms, rows, *images.shape[-2:])
-        terms_of_bound = outputs.each(sizes, images, self.columns) * self.scales[..., None, None, :]
+        terms_of_bound = (
+            outputs.each(frobenius_norms_along_last, images, self.columns) * self.scales[..., None, None, :]
+        )
         bound = terms_of_bound.sum(axis=-4)
         remainder = outputs.norms[..., None, None] * self.rest[..., None, :, :]
         if self.decay is None:
@@ -339,8 +338,8 @@ def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None,
         scales.append(scales[-1] * (steps_s / order))
 
     def norms(matrix: Matrix) -> Stack:
-        values = times(matrix, nodes)
-        return np.stack([sizes(values[..., group, :]) for group in columns], axis=-2)
+        values = product_along_last(matrix, nodes)
+        return np.stack([frobenius_norms_along_last(values[..., group, :]) for group in columns], axis=-2)
 
     last = scales[-1][..., None, :]
     rest_decaying = least = np.zeros(0)

@@ -33,7 +33,6 @@ from noack.core.linear_systems import (
     spectral_abscissa,
 )
 from noack.scenario.resolution import LoopMatrices
-from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.enclosure import (
     KernelBounds,
     Outputs,
@@ -45,6 +44,7 @@ from noack.theory.bounds.enclosure import (
     response,
     response_until,
 )
+from noack.theory.bounds.stacked_norms import spectral_norm
 
 Counts = NDArray[np.int64]
 _ROUNDING = 1 + 1e-9

@@ -28,8 +28,8 @@ from noack.theory.bounds.certificate_terms import (
     NoCertificateError,
     TriggerBound,
 )
-from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.gains import Columns, Growth, Output, PlantGains
+from noack.theory.bounds.stacked_norms import spectral_norm
 from noack.trigger.trigger_rule import QuadraticForm, TriggerRule
 
 _ROUNDING = 1.0 + 1e-9

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.contraction import Stack
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.margins.switched_system import Graph, Numbers, SwitchedSystem
 

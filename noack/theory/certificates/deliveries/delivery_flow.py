@@ -23,8 +23,9 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
-from noack.theory.bounds.contraction import Stack, logarithmic_norm, product, spectral_norms
+from noack.theory.bounds.contraction import logarithmic_norm
 from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.stacked_norms import Stack, larger_ends, spectral_norms, stack_product
 
 _CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
 _MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000
@@ -119,14 +120,14 @@ class DeliveryFlow:
         shares = error_bound / np.maximum(errors, error_bound)
         at_nodes = np.linalg.norm(z @ C.T, axis=1)
         sags = np.diff(self.edges_s) ** 2 / 8 * bends * float(np.linalg.norm(C, 2))
-        cells = shares * (np.maximum(at_nodes[1:], at_nodes[:-1]) + sags)
+        cells = shares * (larger_ends(at_nodes) + sags)
         return float(cells[first_cell:].max()) * ROUNDING
 
     def first_event(self, level: float) -> int:
         """Return the first cell in which ‖e_s‖_W can reach a level after the start."""
         z, bends = self.start_response
         errors = np.linalg.norm(z[:, self.n :], axis=1)
-        highest = np.maximum(errors[1:], errors[:-1]) + np.diff(self.edges_s) ** 2 / 8 * bends
+        highest = larger_ends(errors) + np.diff(self.edges_s) ** 2 / 8 * bends
         return int(np.argmax(np.append(highest[:-1] * ROUNDING >= level, True)))
 
     def cell_at(self, time_s: float) -> int:
@@ -147,7 +148,7 @@ class DeliveryFlow:
         for responses in (by_error, by_input):
             at_nodes = spectral_norms(C @ responses)
             sags = sag_factors * norm * np.linalg.norm(responses[:-1], axis=(1, 2))
-            sups.append((np.maximum(at_nodes[1:], at_nodes[:-1]) + sags) * ROUNDING)
+            sups.append((larger_ends(at_nodes) + sags) * ROUNDING)
         return sups[0], np.cumsum(sups[1] * np.diff(self.edges_s))
 
     @cached_property
@@ -167,9 +168,9 @@ def bend_terms(
 
     ``states``: Y, e^{Fτ} at the left nodes of the cells.
     """
-    terms = [product(F @ F, states)]
+    terms = [stack_product(F @ F, states)]
     for order in range(1, count + 1):
-        terms.append(product(F, terms[-1]) * (steps_s / order)[:, None, None])
+        terms.append(stack_product(F, terms[-1]) * (steps_s / order)[:, None, None])
     with np.errstate(over="ignore"):
         growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s)
     return terms[:-1], growth[:, None, None] * terms[-1]

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import Outputs, response_until
 from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.stacked_norms import Stack
 
 ROUNDING = 1 + 1e-9
 _MOST_GAPS, _MOST_CELLS = 256, 640

@@ -28,15 +28,10 @@ from numpy.typing import NDArray
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, exponential
-from noack.theory.bounds.contraction import (
-    Stack,
-    largest_eigenvalues,
-    logarithmic_norm,
-    spectral_norm,
-    spectral_norms,
-)
+from noack.theory.bounds.contraction import logarithmic_norm
 from noack.theory.bounds.enclosure import response
 from noack.theory.bounds.gains import Output
+from noack.theory.bounds.stacked_norms import Stack, largest_eigenvalues, spectral_norm, spectral_norms
 from noack.theory.certificates.deliveries.delivery_flow import (
     NO_EFFECTS,
     ROUNDING,

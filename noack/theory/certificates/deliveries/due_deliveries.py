@@ -30,9 +30,9 @@ from noack.theory.bounds.certificate_terms import (
     NoCertificateError,
     TriggerBound,
 )
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, Outputs, response_until
 from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.bounds.trigger_bounds import ErrorGrowth
 from noack.theory.certificates.deliveries.delivery_gaps import (
     ERROR,

@@ -16,9 +16,9 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, solve_lyapunov, spectral_abscissa
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.certificates.deliveries.delivery_flow import (
     NO_EFFECTS,
     ROUNDING,

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import KernelBounds, response_until
+from noack.theory.bounds.stacked_norms import Stack, larger_ends
 from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, bend_rows, bend_terms
 from noack.theory.certificates.deliveries.delivery_reach import Reach, Wanted, largest_outputs
 
@@ -213,7 +213,7 @@ class _LostEvent:
         forms, e_s = self._forms[is_near], self._e_s[is_near]
         ends, _ = largest_outputs(forms, e_s, enough, wanted=Wanted.ALL, most=most)
         steps_s = np.diff(self._r_s[is_near])
-        cells = np.maximum(ends[1:], ends[:-1]) + steps_s**2 / 8 * bend + self._input_changes[1:][is_near[1:]]
+        cells = larger_ends(ends) + steps_s**2 / 8 * bend + self._input_changes[1:][is_near[1:]]
         if sensor.integrates:
             cells = np.cumsum(steps_s * (np.maximum.accumulate(cells) + late_error))
         reached_s = float(self._r_s[np.append(cells >= level, True).argmax()])

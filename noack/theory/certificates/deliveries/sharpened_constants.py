@@ -22,8 +22,8 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.bounds.certificate_terms import MEASURED, CertificatePart, Constants, NetworkConditions
-from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.gains import Output
+from noack.theory.bounds.stacked_norms import spectral_norm
 from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, InputEffects, error_since_event
 from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoid, Reach
 from noack.theory.certificates.deliveries.inserted_bounds import InsertedInequalities
