@@ -5,7 +5,7 @@
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -143,7 +143,8 @@ class CertificateScope:
         due = self._trigger.has_due_time
         self._held = not self._loop.H.any() and not due
         decays = math.inf if self._held or due else -spectral_abscissa(self._loop.H)
-        self._decay = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
+        self.decay_per_s = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
+        """Decay rates; that of the models is infinite if they hold."""
         assert start is None or self.is_simple  # other starts are those of the scenario
         self._plant_at = plant_at
         self._plants: dict[float, PlantGains] = {}
@@ -163,7 +164,7 @@ class CertificateScope:
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
-            phases = yield from self._constants(conditions)
+            phases = yield from self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
             void = error
         reason = None if void is None else str(void)
@@ -195,7 +196,7 @@ class CertificateScope:
         assumptions = certificate_assumptions(
             self._resolved,
             conditions,
-            self._decay,
+            self._decay_under(conditions),
             main,
             void,
             max((phase.loop_gain for phase in (main, persistent) if phase is not None), default=0.0),
@@ -219,7 +220,11 @@ class CertificateScope:
         # The slowest rate asks for least.
         return next((deliveries.gain for deliveries in self._deliveries(conditions, _TIMED_RATES[-1:])), gain)
 
-    def _constants(self, conditions: NetworkConditions) -> Search[list[Phases]]:
+    def _decay_under(self, conditions: NetworkConditions) -> Mapping[str, float]:
+        """Return the decay rates of the certificate under some conditions."""
+        return self.decay_per_s
+
+    def all_phases(self, conditions: NetworkConditions) -> Search[list[Phases]]:
         """Search for the constants of each bound of the run; all of them hold.
 
         Raises:
@@ -272,8 +277,8 @@ class CertificateScope:
         if self._start_error or self._start.shape[1] != 1 or self._resolved.observer is not None:
             return
         tested = trigger.tested(conditions)
-        for share in shares if self._decay["A + BK"] > 0 else ():
-            rate = share * self._decay["A + BK"]
+        for share in shares if self.decay_per_s["A + BK"] > 0 else ():
+            rate = share * self.decay_per_s["A + BK"]
             plant = self._plant_at(error_gains(loop, rate), self._start, rate)
             if plant.is_one_plant:
                 with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
@@ -298,7 +303,7 @@ class CertificateScope:
     ) -> Search[list[tuple[Constants, Constants | None]]]:
         """Search for the constants, and those to be added under persistent disturbances."""
         alpha = self._trigger.alpha_per_s
-        decays = not self._held and below(alpha, min(self._decay.values()))
+        decays = not self._held and below(alpha, min(self.decay_per_s.values()))
         search = self._disturbed.constants(conditions, decays=decays, longest=longest)
         pairs = yield from search
         return [self._checked(*pair) for pair in pairs]
@@ -306,7 +311,7 @@ class CertificateScope:
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
         return DisturbedCertificate(
-            self._resolved, self._plant_at, self._trigger, self._start_error, min(self._decay.values())
+            self._resolved, self._plant_at, self._trigger, self._start_error, min(self.decay_per_s.values())
         )
 
     def _checked(self, main: Constants, added: Constants | None) -> tuple[Constants, Constants | None]:
@@ -326,7 +331,7 @@ class CertificateScope:
         return main, added
 
     def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Search[Constants]:
-        trigger, decay = self._trigger, min(self._decay.values())
+        trigger, decay = self._trigger, min(self.decay_per_s.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         if trigger.is_homogeneous:
             if not longest:
