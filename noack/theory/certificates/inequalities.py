@@ -38,8 +38,8 @@ from numpy.typing import NDArray
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.certificate_terms import CertificatePart, Constants, NetworkConditions
+from noack.theory.bounds.error_growth import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
-from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 
 
 class Signal(IntEnum):

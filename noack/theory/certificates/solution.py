@@ -27,8 +27,8 @@ from noack.theory.bounds.certificate_terms import (
     TriggerBound,
 )
 from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.error_growth import LONGEST_S
 from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.bounds.trigger_bounds import LONGEST_S
 from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 

@@ -31,9 +31,9 @@ from noack.theory.bounds.certificate_terms import (
     TriggerBound,
 )
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, Outputs, response_until
+from noack.theory.bounds.error_growth import ErrorGrowth
 from noack.theory.bounds.gains import Output, PlantGains
 from noack.theory.bounds.stacked_norms import Stack
-from noack.theory.bounds.trigger_bounds import ErrorGrowth
 from noack.theory.certificates.deliveries.delivery_gaps import (
     ERROR,
     INPUT,

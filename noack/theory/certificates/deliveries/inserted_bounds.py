@@ -18,9 +18,9 @@ from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.enclosure import response_until
+from noack.theory.bounds.error_growth import COARSE_CELLS, ErrorGrowth
 from noack.theory.bounds.gains import Growth, Output, PlantGains
 from noack.theory.bounds.stacked_norms import Stack
-from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, Signal
 
 Growths = Sequence[Sequence[ErrorGrowth]]
