@@ -1,4 +1,4 @@
-"""The terms of a certificate: conditions, promises of trigger and observer, constants."""
+"""The terms of a certificate: conditions, bounds by trigger and observer, constants."""
 
 import math
 from collections.abc import Mapping
@@ -104,7 +104,7 @@ class EventTimes(NamedTuple):
 
 
 class TriggerBound(NamedTuple):
-    """What a trigger guarantees about e_s, scaled.
+    """Bounds of e_s that a trigger guarantees, scaled.
 
     After each of its tests ‖e_s‖_W ≤ β + Σ_C share_C sup‖C x‖.
     """

@@ -71,19 +71,19 @@ def find_decay(generator: Matrix) -> Decay | None:
 def _checked(generator: Matrix, factor: Matrix, may_decay: NDArray[np.bool_]) -> Decay:
     """Return L with ν, reduced by a bound of the rounding error; ν = 0 if L is not suitable."""
     inverse = _each(np.linalg.inv, factor)
-    turned = factor @ generator @ inverse
+    transformed = factor @ generator @ inverse
     # Rounding of the products, and the deviation of L times its computed inverse from identity.
     product = np.abs(factor) @ np.abs(generator) @ np.abs(inverse)
     identity = np.linalg.norm(np.abs(factor) @ np.abs(inverse), axis=(-2, -1))
-    identity = identity * np.linalg.norm(turned, axis=(-2, -1))
+    identity = identity * np.linalg.norm(transformed, axis=(-2, -1))
     size = np.linalg.norm(product, axis=(-2, -1)) + identity
     rounding = EPSILON * generator.shape[-1] * size
     usable = may_decay & np.isfinite(rounding)
     eye = np.eye(generator.shape[-1])
-    factor, inverse, turned = (
-        np.where(usable[..., None, None], matrix, eye) for matrix in (factor, inverse, turned)
+    factor, inverse, transformed = (
+        np.where(usable[..., None, None], matrix, eye) for matrix in (factor, inverse, transformed)
     )
-    rates = np.where(usable, -logarithmic_norm(turned) - rounding, 0.0)
+    rates = np.where(usable, -logarithmic_norm(transformed) - rounding, 0.0)
     return Decay(factor, inverse, rates)
 
 

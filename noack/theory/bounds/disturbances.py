@@ -79,12 +79,16 @@ def normal_bounds(resolved: Scenario) -> NormalBounds | None:
 
 def bound_forcing(resolved: Scenario, B: Matrix) -> Forcing | None:
     """Return the disturbances of a plant with the input matrix B, (n, m); None if it has none."""
-    plant, bounds, (n, m) = resolved.plant, normal_bounds(resolved), B.shape
-    if not plant.disturbances:
+    disturbances = resolved.plant.disturbances
+    if not disturbances:
         return None
-    columns, normal, durations_s = [np.zeros((n, 0))], [np.zeros((n, 0))], list[float]()
-    at_input, period_s = np.zeros(m), resolved.timing.plant_period_ns / NS_PER_S
-    for disturbance in plant.disturbances:
+    bounds = normal_bounds(resolved)
+    period_s = resolved.timing.plant_period_ns / NS_PER_S
+    n, m = B.shape
+    columns, durations_s = [np.zeros((n, 0))], list[float]()
+    normal = [np.zeros((n, 0))]
+    at_input = np.zeros(m)
+    for disturbance in disturbances:
         extent, deviations = disturbance.extent(), disturbance.deviations()
         if disturbance.at == "input":
             at_input = at_input + np.abs(extent).sum(axis=1)
@@ -281,13 +285,13 @@ class EstimationError:
         output_gain = spectral_norm(W @ np.linalg.inv(factor))
         last, total, largest = _last_axis(sources[-1]), 0.0, sums.max()
         powers = _powers(steps[-1], min(_ENTRIES // max(old.size, last.size) + 1, 256))
-        turned = factor @ powers[1:]
+        transformed = factor @ powers[1:]
 
         def rests(steps: slice) -> Stack:
-            sums = _sums(turned[steps], last) / (1 - rate) + _sums(turned[steps], old)
+            sums = _sums(transformed[steps], last) / (1 - rate) + _sums(transformed[steps], old)
             return np.asarray(output_gain * sums)
 
-        for _ in range(_MOST_STEPS // len(turned)):
+        for _ in range(_MOST_STEPS // len(transformed)):
             # The same for every number of further measurements, (powers,).
             totals = total + np.cumsum(_sums(W @ powers[:-1], last))
             sums = _sums(W @ powers[1:], old) + totals

@@ -33,6 +33,7 @@ from noack.core.cached_method import cached_function, cached_method
 from noack.core.linear_systems import Matrix, exponential
 from noack.theory.bounds.contraction import EPSILON, Decay, abscissas, find_decay, logarithmic_norm
 from noack.theory.bounds.stacked_norms import (
+    ROUNDING,
     Stack,
     frobenius_norms,
     frobenius_norms_along_last,
@@ -44,7 +45,6 @@ from noack.theory.bounds.stacked_norms import (
     stack_product,
 )
 
-_ROUNDING = 1.0 + 1e-9
 _TAYLOR_TERMS = 4
 _LARGEST_EXPONENT = 100.0
 _BLOCK = 64
@@ -246,13 +246,13 @@ class ResponseBounds:
         bends = self._bends.over(outputs)
         middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
         highest = larger_ends(norms) + steps_s**2 / 8 * bends
-        areas = (steps_s * middle + steps_s**3 / 12 * bends) * _ROUNDING
-        highest *= _ROUNDING
+        areas = (steps_s * middle + steps_s**3 / 12 * bends) * ROUNDING
+        highest *= ROUNDING
         rate, tails = np.array(0.0), np.full(norms.shape[:-1], math.inf)
         if self.endless and self.decay is not None:
             rate = self.decay.rate_per_s
             last = self.decay.sizes(self.states[..., -1:, :, :])[..., None, :]
-            tails = outputs.norms_with(self.decay.inverse)[..., :, None] * last * _ROUNDING
+            tails = outputs.norms_with(self.decay.inverse)[..., :, None] * last * ROUNDING
         decays = (rate > 0)[..., None, None]
         after = np.where(decays, tails / np.where(rate > 0, rate, 1.0)[..., None, None], math.inf)
         return {
@@ -279,7 +279,7 @@ class ResponseBounds:
         norms = norms + np.sqrt(columns) * EPSILON * nodes.shape[-3] * rounding
         middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
         bend = np.sqrt(columns) * self._bends.over(Outputs({"": C}))[..., 0, 0, :]
-        return np.asarray((steps_s * middle + steps_s**3 / 12 * bend) * _ROUNDING)
+        return np.asarray((steps_s * middle + steps_s**3 / 12 * bend) * ROUNDING)
 
 
 def norm_bounds(C: Matrix, states: Stack) -> Stack:
@@ -312,9 +312,9 @@ class _Bends:
 
     def over(self, outputs: Outputs[Name]) -> Stack:
         """Return the bounds for output matrices C, (…, outputs, groups, k)."""
-        turned = outputs.stacked[..., None, :, :] @ self.powers
-        *lead, terms, rows, n = turned.shape
-        images = product_along_last(turned.reshape(*lead, terms * rows, n), self.nodes)
+        transformed = outputs.stacked[..., None, :, :] @ self.powers
+        *lead, terms, rows, n = transformed.shape
+        images = product_along_last(transformed.reshape(*lead, terms * rows, n), self.nodes)
         images = images.reshape(*images.shape[:-3], terms, rows, *images.shape[-2:])
         terms_of_bound = (
             outputs.each(frobenius_norms_along_last, images, self.columns) * self.scales[..., None, None, :]

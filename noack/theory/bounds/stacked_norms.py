@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from noack.core.linear_systems import Matrix
 
 Stack = NDArray[np.float64]
+ROUNDING = 1 + 1e-9
+"""A computed norm, times this, is not below the exact one."""
 
 
 def stack_product(matrix: Matrix, stack: Stack) -> Stack:

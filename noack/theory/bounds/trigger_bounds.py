@@ -26,10 +26,9 @@ from noack.theory.bounds.certificate_terms import (
     NoCertificateError,
     TriggerBound,
 )
-from noack.theory.bounds.stacked_norms import spectral_norm
+from noack.theory.bounds.stacked_norms import ROUNDING, spectral_norm
 from noack.trigger.trigger_rule import QuadraticForm, TriggerRule
 
-_ROUNDING = 1.0 + 1e-9
 _RELATIVE, _RESIDUAL = 1e-7, 1e-13
 """Least eigenvalue of a positive definite Q₂₂, and the error of a computed Q, as shares of ‖Q‖."""
 _AVERAGED = 2.0 ** np.arange(-6, 5)
@@ -80,8 +79,8 @@ def comparison_bound(rule: TriggerRule, weight: Matrix) -> ComparisonBound | Non
         return ComparisonBound(1.0, (N,) if N.any() else (), 1.0, bool(N.any()))
     if not _is_definite(P.T @ P, 1.0):
         return None
-    size = float(np.linalg.norm(weight @ np.linalg.pinv(P), 2)) * _ROUNDING
-    least = 1 / (float(np.linalg.norm(P @ np.linalg.inv(weight), 2)) * _ROUNDING)
+    size = float(np.linalg.norm(weight @ np.linalg.pinv(P), 2)) * ROUNDING
+    least = 1 / (float(np.linalg.norm(P @ np.linalg.inv(weight), 2)) * ROUNDING)
     return ComparisonBound(size, (size * N,) if N.any() else (), least, bool(N.any()))
 
 
@@ -97,8 +96,8 @@ def _of_mixed_form(form: QuadraticForm, weight: Matrix) -> ComparisonBound | Non
     grown = values + _RESIDUAL / _RELATIVE * size_of_Q
     C = np.sqrt(grown[grown > 0])[:, None] * vectors.T[grown > 0]
     F = np.linalg.cholesky(Q[n:, n:]).T
-    size = float(np.linalg.norm(weight @ np.linalg.inv(F), 2)) * _ROUNDING
-    shares = (size * C, _ROUNDING * weight @ J)
+    size = float(np.linalg.norm(weight @ np.linalg.inv(F), 2)) * ROUNDING
+    shares = (size * C, ROUNDING * weight @ J)
     return ComparisonBound(size, tuple(S for S in shares if S.any()), 0.0, bool(C.any()))
 
 
@@ -121,7 +120,7 @@ class TriggerBounds:
 
     @cached_property
     def comparison(self) -> ComparisonBound | None:
-        """What follows from the comparison; None if nothing."""
+        """The bound that follows from the comparison; None if there is none."""
         return comparison_bound(self.rule, self.weight)
 
     @property
@@ -278,8 +277,8 @@ class TriggerBounds:
         if not self.has_chord or math.isinf(self.largest):
             return {}
         name, S = next(iter(self.outputs.items()))
-        largest_norm = self.largest * float(spectral_norm(S @ np.linalg.inv(self.weight))) * _ROUNDING
-        return {name: (math.hypot(level, largest_norm) - level) / largest_norm * _ROUNDING}
+        largest_norm = self.largest * float(spectral_norm(S @ np.linalg.inv(self.weight))) * ROUNDING
+        return {name: (math.hypot(level, largest_norm) - level) / largest_norm * ROUNDING}
 
     def _levels(
         self, conditions: NetworkConditions, level: float, least_error: float | None

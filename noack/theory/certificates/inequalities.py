@@ -133,7 +133,7 @@ def _eliminated(matrix: Matrix, *right_sides: Vector) -> tuple[Vector, ...]:
 
 
 class BoundMethod(Enum):
-    """How e_c is bounded. Bounds of parts may be added only if they use the same method."""
+    """The ways to bound e_c. Bounds of parts may be added only if they use the same method."""
 
     MISSING = "by e_s and by the errors of all missing events"
     DRIFTING = "by its value d ago, and by what has driven it since"
@@ -489,7 +489,7 @@ class ErrorInequalities:
 
 
 class _Stages(NamedTuple):
-    """What bounds ‖p‖ while few events are missing."""
+    """Bounds of ‖p‖ while few events are missing."""
 
     inputs: Matrix
     """Rows of the signals, while 0, 1, … events are missing, (count, loops, 6)."""

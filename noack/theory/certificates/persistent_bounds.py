@@ -173,7 +173,7 @@ class DisturbedCertificate:
         return self._at_rate(self.trigger.alpha_per_s, TriggerBound(self.trigger.beta, None))
 
     def _at_rate(self, rate_per_s: float, bound: TriggerBound) -> CertificatePart:
-        """What follows from the start, scaled by a rate."""
+        """Return the part that follows from the start, scaled by a rate."""
         plant = self._plant(rate_per_s)
         return CertificatePart(plant.error, plant, bound, self._estimation.decaying(rate_per_s))
 

@@ -151,7 +151,7 @@ class CertificateScope:
 
     @property
     def is_simple(self) -> bool:
-        """Whether no causes are bounded apart from the start, and added."""
+        """Whether nothing persists whose bounds are added to those from the start."""
         return self._resolved.coverage.is_undisturbed and not self._trigger.is_constant
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:

@@ -57,7 +57,7 @@ class Problem(NamedTuple):
 
     @property
     def likeness(self) -> Hashable:
-        """What problems must have in common to be solved together; None if this one is alone."""
+        """The common properties of problems that are solved together; None if this one is alone."""
         plants = [part.plant.likeness for part in self.parts]
         if None in plants:
             return None

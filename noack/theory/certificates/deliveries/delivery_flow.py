@@ -31,12 +31,12 @@ _CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
 _MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000
 _TAYLOR_TERMS = 4
 """Terms by which a second derivative over a cell is bounded."""
-ROUNDING = 1 + 1e-5
+FLOW_ROUNDING = 1 + 1e-5
 """Exceeds the error of e^{Fτ}: measured below 1e-12 of its norm, which is up to 1e6; no proof."""
 
 
 class InputEffects(NamedTuple):
-    """How much inputs that are held and late change the flow from the moment an update acts."""
+    """Bounds of what held and late inputs change in the flow, from the moment an update acts."""
 
     age_input: float = 0.0
     """Bound of ‖q‖, p = K e_c + q."""
@@ -121,14 +121,14 @@ class DeliveryFlow:
         at_nodes = np.linalg.norm(z @ C.T, axis=1)
         sags = np.diff(self.edges_s) ** 2 / 8 * bends * float(np.linalg.norm(C, 2))
         cells = shares * (larger_ends(at_nodes) + sags)
-        return float(cells[first_cell:].max()) * ROUNDING
+        return float(cells[first_cell:].max()) * FLOW_ROUNDING
 
     def first_event(self, level: float) -> int:
         """Return the first cell in which ‖e_s‖_W can reach a level after the start."""
         z, bends = self.start_response
         errors = np.linalg.norm(z[:, self.n :], axis=1)
         highest = larger_ends(errors) + np.diff(self.edges_s) ** 2 / 8 * bends
-        return int(np.argmax(np.append(highest[:-1] * ROUNDING >= level, True)))
+        return int(np.argmax(np.append(highest[:-1] * FLOW_ROUNDING >= level, True)))
 
     def cell_at(self, time_s: float) -> int:
         """Return the cell that contains a time."""
@@ -148,7 +148,7 @@ class DeliveryFlow:
         for responses in (by_error, by_input):
             at_nodes = spectral_norms(C @ responses)
             sags = sag_factors * norm * np.linalg.norm(responses[:-1], axis=(1, 2))
-            sups.append((larger_ends(at_nodes) + sags) * ROUNDING)
+            sups.append((larger_ends(at_nodes) + sags) * FLOW_ROUNDING)
         return sups[0], np.cumsum(sups[1] * np.diff(self.edges_s))
 
     @cached_property

@@ -401,8 +401,8 @@ class InsertedInequalities(ErrorInequalities):
     def _missing_events(self, spacing_s: float) -> int:
         """Return how many events may be missing: lost, or in flight."""
         conditions = self._conditions
-        flying = math.ceil(conditions.delay_s / spacing_s) if conditions.delay_s > 0 else 0
-        return conditions.dropouts + flying
+        in_flight = math.ceil(conditions.delay_s / spacing_s) if conditions.delay_s > 0 else 0
+        return conditions.dropouts + in_flight
 
     @property
     def start_error(self) -> float:

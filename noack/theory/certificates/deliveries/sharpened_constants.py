@@ -24,7 +24,7 @@ from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.bounds.certificate_terms import MEASURED, CertificatePart, Constants, NetworkConditions
 from noack.theory.bounds.gains import Output
 from noack.theory.bounds.stacked_norms import spectral_norm
-from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, InputEffects, error_since_event
+from noack.theory.certificates.deliveries.delivery_flow import FLOW_ROUNDING, InputEffects, error_since_event
 from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoid, Reach
 from noack.theory.certificates.deliveries.inserted_bounds import InsertedInequalities
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
@@ -150,7 +150,7 @@ class _SharpenedBounds:
         age_input = min(known_age_input, age_input)
         input_error = max(bounds.errors[Output.GAIN] + age_input, self._inequalities.start_error)
         R_E = plant.outputs[Output.MISMATCH] @ plant.error.inverse_weight
-        mismatch_in_ellipsoid = scale * float(spectral_norm(R_E @ ellipsoid.inverse)) * ROUNDING
+        mismatch_in_ellipsoid = scale * float(spectral_norm(R_E @ ellipsoid.inverse)) * FLOW_ROUNDING
         mismatch = min(known_mismatch, mismatch_in_ellipsoid)
         return InputEffects(
             age_input,
