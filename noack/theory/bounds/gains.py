@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.cached_method import cached_method
+from noack.core.cached_method import cached_function, cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import (
     Matrix,
@@ -535,22 +535,10 @@ class PlantGains:
         return self.error.growths(self.columns, until_s, cells, self.error.stacked)
 
 
+@cached_function(16, key=lambda plant: plant.identity)
 def first_equal(plant: PlantGains) -> PlantGains:
     """Return the first of several equal plants, which have no disturbances; the others use its gains."""
-    return _first_equal(_KnownPlant(plant.identity, plant))
-
-
-@dataclass(frozen=True)
-class _KnownPlant:
-    """A plant, which equals others of its identity."""
-
-    identity: Hashable
-    plant: PlantGains = field(compare=False)
-
-
-@lru_cache(maxsize=16)
-def _first_equal(known: _KnownPlant) -> PlantGains:
-    return known.plant
+    return plant
 
 
 def deviations(covariance: Matrix) -> Matrix:

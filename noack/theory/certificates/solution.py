@@ -11,13 +11,12 @@ import contextlib
 import math
 from collections import defaultdict
 from collections.abc import Generator, Hashable, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.cached_method import cached_function
 from noack.core.linear_systems import Vector
 from noack.theory.bounds.certificate_terms import (
     CertificatePart,
@@ -157,26 +156,18 @@ def sharpened(problem: Problem) -> Search[Constants]:
     (part,), conditions, *_ = problem
     is_plain = problem.structured and problem.earlier_error == 0.0
     if problem.longest and is_plain and can_be_sharpened(part):
-        key = id(part.plant), constants, repr((part.bound, conditions))
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
-            return sharpened_once(_SharpeningTask(key, constants, part, conditions))
+            return sharpened_once(constants, part, conditions)
     return constants
 
 
-@dataclass(frozen=True)
-class _SharpeningTask:
-    """What :func:`sharpened_constants` needs. The key has the plant's id: the part keeps the plant."""
-
-    key: Hashable
-    constants: Constants = field(compare=False)
-    part: CertificatePart = field(compare=False)
-    conditions: NetworkConditions = field(compare=False)
+def _sharpening_key(constants: Constants, part: CertificatePart, conditions: NetworkConditions) -> Hashable:
+    # The id is that of one plant only, because the part is kept, and keeps its plant.
+    return id(part.plant), constants, repr((part.bound, conditions))
 
 
-@lru_cache(maxsize=32)
-def sharpened_once(task: _SharpeningTask) -> Constants:
-    """Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
-    return sharpened_constants(task.constants, task.part, task.conditions)
+sharpened_once = cached_function(32, _sharpening_key)(sharpened_constants)
+"""Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
 
 
 def _solve_together(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
