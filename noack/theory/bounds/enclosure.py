@@ -385,12 +385,14 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
     decay = find_decay(generator)
     if decay is None or not (decay.rate_per_s > 0).all():
         raise NotDecayingError("no Lyapunov function of it was found to working precision")
+    # The grid so far: e^{Gτ} D at its nodes in blocks, and their edges.
     everything = Outputs({"": np.eye(generator.shape[-1])})
     lead = np.broadcast_shapes(generator.shape[:-2], D.shape[:-2])
     state = np.broadcast_to(D, (*lead, *D.shape[-2:]))
     parts: list[Stack] = []
     edges: list[Stack] = [np.zeros((*lead, 1))]
     area, cells, ends = np.zeros(lead), 0, np.zeros(lead, dtype=bool)
+    # The first steps are shorter than usual; longer ones are usable where the response is straight.
     most_cells = min(_MOST_CELLS, _MOST_ENTRIES // math.prod(D.shape[-2:]))
     usual_s = np.broadcast_to(_STEP / _fastest(generator), lead)
     step_s = usual_s * _FIRST_STEP / _STEP
@@ -400,6 +402,7 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
         return is_short if is_short.all() else is_short | _straight(generator, state, step_s, decay)
 
     while True:
+        # The next block of cells.
         states = _propagate(generator, state, step_s, _CELLS_PER_BLOCK)
         parts.append(states[..., :-1, :, :])
         passed_s = step_s[..., None] * np.arange(1.0, _CELLS_PER_BLOCK + 1)
@@ -407,10 +410,12 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
         state = states[..., -1, :, :]
         area = area + step_s * frobenius_norms(parts[-1]).sum(axis=-1)
         cells += _CELLS_PER_BLOCK
+        # The grid ends where the rest is a small share of the area so far.
         remainder = decay.bounds(everything.stacked, state[..., None, :, :])[..., 0] / decay.rate_per_s
         ends = ends | (remainder <= _TAIL_SHARE * area)
         if ends.all() or cells >= most_cells:
             break
+        # The next step is twice as long if that is usable, and shorter if need be.
         while not (usable := usable_step(step_s)).all():
             step_s = np.where(usable, step_s, step_s / 2)
         step_s = np.where(ends, 0.0, np.where(usable_step(2 * step_s), 2 * step_s, step_s))

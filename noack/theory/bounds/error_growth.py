@@ -100,6 +100,7 @@ def first_passage_s(
         error_gain: k = ‖K W^{−1}‖, (loops,).
         start: ‖e_s‖_W at first, (loops,).
     """
+    # How fast e_s can grow at first.
     start_of_growth = plant.growth(_SHORTEST_S, 1)
     speed = start_of_growth.mismatch.sup_on_grid() * mismatch
     speed = speed + start_of_growth.input_error.sup_on_grid() * (input_error + error_gain * level)
@@ -111,18 +112,26 @@ def first_passage_s(
     level, window_s = level.ravel(), window_s.ravel()
     known_s, cells = np.zeros(level.size), np.full(level.size, COARSE_CELLS)
     while is_open.any():
+        # All searches with the fewest cells together; e_s grows over the window of each.
         count = int(cells[is_open].min())
         places = np.flatnonzero(is_open & (cells == count))
         loop = places % loops
         columns = Columns(*(column[loop] if column.ndim == 3 else column for column in plant.columns))
         error = plant.error
         growth = error.growths(columns, window_s[places], count, error.stacked_norm)[Output.WEIGHTED]
+        started = [
+            size and size * error.stretch(until_s)
+            for size, until_s in zip(start[loop].tolist(), window_s[places].tolist(), strict=True)
+        ]
         first_cells = _first_crossed(
-            growth, level[places], mismatch[loop], input_error[loop], error_gain[loop],
-            np.array([column and column * error.stretch(until_s) for column, until_s in zip(
-                start[loop].tolist(), window_s[places].tolist(), strict=True
-            )]),
-        )  # fmt: skip
+            growth,
+            level[places],
+            mismatch[loop],
+            input_error[loop],
+            error_gain[loop],
+            np.array(started),
+        )
+        # The next window: the cell of the crossing with more cells, or twice the time.
         for place, edge_s, cell in zip(places.tolist(), growth.mismatch.edges_s, first_cells, strict=True):
             if cell < count:
                 known_s[place] = max(known_s[place], edge_s[cell])

@@ -256,6 +256,7 @@ def certificate_assumptions(
     how the trigger's rule bounds e_s; it is empty if nothing does. ``probability`` is that of a run
     that keeps a guarantee that nothing enforces, if it is known.
     """
+    # Of the trigger, and of the decay rates.
     alpha = policy_of(resolved).fading_per_s
     slower = 0.0 if constants is None else constants.rate_per_s
     why = trigger_bound or "not where it does not transmit"
@@ -270,8 +271,10 @@ def certificate_assumptions(
         if math.isinf(decay_per_s[matrix]):
             holds, why = False, "a hold does not decay: the certified bounds are constant"
         checked.append(_checked(f"α is below the decay rate of {matrix}", source, holds, why))
+    # Of the network, the schedule and the disturbances.
     checked += _conditions(conditions, resolved, probability)
     checked += _bounded_disturbances(resolved)
+    # Of the certificate itself.
     if constants is None:
         is_unchecked = isinstance(void, CertificateNotCheckedError)
         status = AssumptionStatus.NOT_CHECKED if is_unchecked else AssumptionStatus.VIOLATED

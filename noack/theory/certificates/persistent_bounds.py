@@ -77,6 +77,7 @@ class DisturbedCertificate:
             raise NoCertificateError("after a change or at a set-point the estimation error is not known")
         conditions = self.trigger.tested(conditions)
         structured = self.start_error == 0.0
+        # A part that decays as the threshold does, if there is one.
         if decays and self.resolved.coverage.is_decaying:
             try:
                 parts = yield from solve_two_parts(
@@ -91,6 +92,7 @@ class DisturbedCertificate:
             except NotDecayingError:
                 pass
         pairs = yield from self._without_decay(conditions, decays=decays, longest=longest)
+        # With a bound of x the chord of the threshold is shorter, which makes the bounds smaller.
         for _ in range(_CHORD_ROUNDS if longest and self.trigger.has_chord else 0):
             state_bounds = [
                 sum(

@@ -161,6 +161,7 @@ class CertificateScope:
     def search(self, conditions: NetworkConditions) -> Search[ScenarioCertificate]:
         """Search for the certificate under some conditions, perhaps together with others."""
         trigger = self._trigger
+        # The constants, or the reason for having none.
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
@@ -188,6 +189,7 @@ class CertificateScope:
                 other=certificate(*other_phases) if other_phases else None,
             )
 
+        # The assumptions under which they hold.
         unchecked = certificate(*phases)
         main, persistent = unchecked.constants, unchecked.persistent_constants
         probability = None
