@@ -18,7 +18,7 @@ from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from noack.theory.bounds import trigger_bounds as bounds_of_triggers
+from noack.theory.bounds import error_growth
 from noack.theory.bounds.certificate_terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
@@ -462,7 +462,7 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
         "send_on_area", with_trigger(NoTimeOfTheArea), {**FAR, "mansd": 0, "beta": 0.01},
     ),
     "send_on_area, a mean over the last moment": (
-        "send_on_area", patched(bounds_of_triggers, "_mean_ages_s", youngest),
+        "send_on_area", patched(error_growth, "_mean_ages_s", youngest),
         {**FAR, "mansd": 0, "beta": 0.01},
     ),
     "mixed, a chord that is too short": (
