@@ -474,11 +474,11 @@ class ErrorInequalities:
         levels, most_s = (np.array(values)[:, None] for values in zip(*levels_and_times, strict=True))
         passed_s = first_passage_s(
             self._plant,
-            np.where(searched, levels - estimation, 0.0),
-            np.where(searched, mismatch, 0.0),
-            np.where(searched, input_error, 0.0),
-            error_gain,
-            estimation,
+            level=np.where(searched, levels - estimation, 0.0),
+            mismatch=np.where(searched, mismatch, 0.0),
+            input_error=np.where(searched, input_error, 0.0),
+            error_gain=error_gain,
+            start=estimation,
         )
         next_event_s = np.minimum(passed_s, most_s).max(axis=0)
         times = self._bound.times

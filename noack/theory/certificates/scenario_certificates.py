@@ -195,15 +195,16 @@ class CertificateScope:
         probability = None
         if not self._resolved.network.enforce_mansd:
             probability = kept_probability(self._resolved, conditions.guarantee, unchecked.inter_event_s)
+        gains = [phase.loop_gain for phase in (main, persistent) if phase is not None]
         assumptions = certificate_assumptions(
             self._resolved,
             conditions,
-            self._decay_under(conditions),
-            main,
-            void,
-            max((phase.loop_gain for phase in (main, persistent) if phase is not None), default=0.0),
-            trigger.text(),
-            probability,
+            decay_per_s=self._decay_under(conditions),
+            constants=main,
+            void=void,
+            loop_gain=max(gains, default=0.0),
+            trigger_bound=trigger.text(),
+            probability=probability,
         )
         return replace(unchecked, assumptions=tuple(assumptions))
 
