@@ -93,7 +93,7 @@ MEASURED = EstimationBound()
 """The trigger tests the measurements: there is no estimation error."""
 
 
-class EventTimes(NamedTuple):
+class InterEventTimes(NamedTuple):
     """Times between two events that a trigger guarantees, whatever happens to e_s."""
 
     shortest_s: float = 0.0
@@ -128,7 +128,7 @@ class TriggerBound(NamedTuple):
     """Whether it also bounds the mean of ‖e_s‖_W over that time, or that since the event."""
     root_output: str = ""
     """A C of the shares for which (β² + sup‖C x‖²)^½ may take the place of β + share_C sup‖C x‖."""
-    times: EventTimes = EventTimes()
+    times: InterEventTimes = InterEventTimes()
     further: tuple["TriggerBound", ...] = ()
     """Further bounds that hold at the same time; only their e_s is used, not their times."""
     unit: float | None = None

@@ -100,14 +100,7 @@ def first_passage_s(
         error_gain: k = ‖K W^{−1}‖, (loops,).
         start: ‖e_s‖_W at first, (loops,).
     """
-    # How fast e_s can grow at first.
-    start_of_growth = plant.growth(_SHORTEST_S, 1)
-    speed = start_of_growth.mismatch.sup_on_grid() * mismatch
-    speed = speed + start_of_growth.input_error.sup_on_grid() * (input_error + error_gain * level)
-    speed = speed + start_of_growth.forced.sum(axis=-1) / _SHORTEST_S
-    # The first window is twice the time to the level at the initial speed, limited.
-    window_s = np.where(speed > 0, 2 * level / np.where(speed > 0, speed, 1.0), LONGEST_S)
-    window_s = window_s.clip(_SHORTEST_S, LONGEST_S)
+    window_s = _first_windows_s(plant, level, mismatch, input_error, error_gain)
     is_open, shape, loops = (level > start).ravel(), level.shape, level.shape[-1]
     level, window_s = level.ravel(), window_s.ravel()
     known_s, cells = np.zeros(level.size), np.full(level.size, COARSE_CELLS)
@@ -142,6 +135,18 @@ def first_passage_s(
             else:  # not reached, also after a coarse grid's overestimate: extend the window
                 known_s[place], window_s[place] = window_s[place], 2 * window_s[place]
     return known_s.reshape(shape)
+
+
+def _first_windows_s(
+    plant: PlantGains, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector
+) -> Vector:
+    """Return twice the times to the level at the speed at which e_s can grow at first, limited."""
+    growth = plant.growth(_SHORTEST_S, 1)
+    speed = growth.mismatch.sup_on_grid() * mismatch
+    speed = speed + growth.input_error.sup_on_grid() * (input_error + error_gain * level)
+    speed = speed + growth.forced.sum(axis=-1) / _SHORTEST_S
+    windows_s = np.where(speed > 0, 2 * level / np.where(speed > 0, speed, 1.0), LONGEST_S)
+    return windows_s.clip(_SHORTEST_S, LONGEST_S)
 
 
 def _first_crossed(

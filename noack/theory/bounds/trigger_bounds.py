@@ -21,7 +21,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import number
 from noack.theory.bounds.certificate_terms import (
-    EventTimes,
+    InterEventTimes,
     NetworkConditions,
     NoCertificateError,
     TriggerBound,
@@ -295,13 +295,13 @@ class TriggerBounds:
             return [(k * longest_s, self.area / (k * test_s), least / (k * longest_s)) for k in tests]
         return [(t_s, self.area / t_s, least / t_s) for t_s in times_s.tolist()]
 
-    def _between_events(self, conditions: NetworkConditions) -> EventTimes:
+    def _between_events(self, conditions: NetworkConditions) -> InterEventTimes:
         rule = self.rule
         earliest_ns = max(rule.idle_ns, 0.0)
         if not len(rule.form.up):  # nothing is compared
             earliest_ns = rule.longest_ns if rule.forecast is None else rule.shortest_ns
         step_s = conditions.spacing_s
-        return EventTimes(
+        return InterEventTimes(
             shortest_s=_rounded_up(min(earliest_ns, rule.longest_ns) / NS_PER_S, step_s),
             longest_s=self._longest_until_test(rule.longest_ns, conditions),
             earliest_due_s=_rounded_up(rule.longest_ns / NS_PER_S, step_s),

@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.certificate_terms import (
-    EventTimes,
+    InterEventTimes,
     NetworkConditions,
     NoCertificateError,
     TriggerBound,
@@ -25,7 +25,7 @@ ALPHA, STEP_S, HOLD_S = 0.1, 0.1, 0.03
 def loop_with(hold_s: float, dropouts: int = 1) -> GapLoop:
     """A loop with two states whose events are due at 0.1 s; its model is not its plant."""
     conditions = NetworkConditions(dropouts, STEP_S, STEP_S, hold_s=hold_s)
-    bound = TriggerBound(0.0, None, times=EventTimes(STEP_S, STEP_S))
+    bound = TriggerBound(0.0, None, times=InterEventTimes(STEP_S, STEP_S))
     models = ErrorGains(H, K, np.eye(2), ALPHA)
     plant = PlantGains(models, A, B, np.array([[1.0], [0.0]]), ALPHA)
     return GapLoop(plant, conditions, Gaps.of(conditions, bound))
@@ -43,7 +43,7 @@ def test_a_gap_is_a_sum_of_the_times_between_events(
     shortest_s: float, longest_s: float, steps: Sequence[int]
 ) -> None:
     conditions = NetworkConditions(2, 0.1, 0.1)
-    gaps = Gaps.of(conditions, TriggerBound(0.0, None, times=EventTimes(shortest_s, longest_s)))
+    gaps = Gaps.of(conditions, TriggerBound(0.0, None, times=InterEventTimes(shortest_s, longest_s)))
     assert gaps.counts.tolist() == steps
     assert gaps.step_s == pytest.approx(0.1)
     assert gaps.least_s == pytest.approx(shortest_s)
@@ -54,7 +54,7 @@ def test_events_that_are_not_due_at_few_times_have_no_gaps(spacing_s: float, lon
     with pytest.raises(NoCertificateError):
         Gaps.of(
             NetworkConditions(1, spacing_s, spacing_s),
-            TriggerBound(0.0, None, times=EventTimes(longest_s=longest_s)),
+            TriggerBound(0.0, None, times=InterEventTimes(longest_s=longest_s)),
         )
 
 
