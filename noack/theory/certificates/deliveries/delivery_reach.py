@@ -113,7 +113,7 @@ class DeliveryEllipsoid:
 
     @cached_property
     def cell_terms(self) -> tuple[Matrix, Matrix, Vector]:
-        """The terms of bounds of z over the cells, on the axes of their ellipsoids.
+        """What bounds of z over the cells need, on the axes of their ellipsoids.
 
         e^{Fτ} at both nodes of each cell, Taylor's terms of F² e^{Fτ}, both as columns; and bounds
         of the terms' remainder.
@@ -179,7 +179,7 @@ class DeliveryEllipsoid:
 
 @dataclass(frozen=True)
 class Reach:
-    """The possible z at all times after a delivery: ‖ΛWξ‖ ≤ c at the delivery, ‖e_c‖_W ≤ D since."""
+    """What z can be at some time after a delivery: ‖ΛWξ‖ ≤ c at the delivery, ‖e_c‖_W ≤ D since."""
 
     ellipsoid: DeliveryEllipsoid
     scale: float
@@ -279,7 +279,7 @@ class Reach:
 
     @cached_property
     def _last_windows(self) -> tuple[NDArray[np.int64], Stack, Stack, Stack]:
-        """Conditions on z a time T' ago, after the last node that is followed, for each T'.
+        """What holds of z a time T' ago, after the last node that is followed, for each T'.
 
         T' as a cell, the flow in it, forms that are at most 1, all for c = 1 and in (x_c, e_c):
         ‖x_c‖ ≤ h, and ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1 at several times; and the semi-axes of the ellipsoids
