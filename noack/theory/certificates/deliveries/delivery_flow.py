@@ -36,7 +36,7 @@ FLOW_ROUNDING = 1 + 1e-5
 
 
 class InputEffects(NamedTuple):
-    """Bounds of what held and late inputs change in the flow, from the moment an update acts."""
+    """Bounds of what held and late inputs change of the flow, from the moment an update acts."""
 
     age_input: float = 0.0
     """Bound of ‖q‖, p = K e_c + q."""

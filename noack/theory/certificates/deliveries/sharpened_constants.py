@@ -193,7 +193,7 @@ class _SharpenedBounds:
 
     @property
     def _sensor_errors(self) -> SensorErrors:
-        """Known bounds of e_s between two events."""
+        """Bounds of e_s between two events."""
         bound, h_s = self._part.bound, self._conditions.sampling_s
         level, grid_s = bound.least_event_error or 0.0, self._conditions.spacing_s
         if bound.is_mean:  # of an integral, over any time
