@@ -26,8 +26,9 @@ from noack.theory.certificates.conditions import (
     nominal_conditions,
     void_at_setpoint,
 )
+from noack.theory.certificates.network_limits import NetworkLimits, network_limits
 from noack.theory.certificates.region import RegionScope
-from noack.theory.certificates.scenario_certificates import NetworkLimits, box, network_limits, own_plant
+from noack.theory.certificates.scenario_certificates import box, own_plant
 from noack.theory.certificates.trigger_weight import choose_weight
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2

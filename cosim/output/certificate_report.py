@@ -22,7 +22,8 @@ from noack.scenario.resolution import loop_of, policy_of
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
 from noack.theory.certificates.conditions import BOX, REGION
-from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
+from noack.theory.certificates.network_limits import MOST_S
+from noack.theory.certificates.scenario_certificates import outside_box
 from noack.theory.margins.loss_margin import Stability
 from noack.theory.random_losses.unlimited_losses import UnlimitedLosses
 

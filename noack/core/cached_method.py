@@ -33,12 +33,21 @@ def cached_method(
     return found
 
 
-def cached_function(
-    most: int,
-) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Keep the latest ``most`` results of a function, whose arguments are hashable or arrays.
+def _bits(*args: object, **kwargs: object) -> Hashable:
+    return *map(_key, args), *((name, _key(value)) for name, value in kwargs.items())
 
-    Neither the arguments nor the results may be changed.
+
+def cached_function(
+    most: int, key: Callable[..., Hashable] = _bits
+) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Keep the latest ``most`` results of a function.
+
+    Neither the arguments nor the results may be changed. Both are kept.
+
+    Args:
+        most: number of results.
+        key: of arguments; those with equal keys have equal results. By default it consists of the
+            arguments, which are hashable or arrays.
     """
 
     def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -48,8 +57,7 @@ def cached_function(
 
         @wraps(function)
         def found(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            key = *map(_key, args), *((name, _key(value)) for name, value in kwargs.items())
-            return result_of(_Call(key, lambda: function(*args, **kwargs)))
+            return result_of(_Call(key(*args, **kwargs), lambda: function(*args, **kwargs)))
 
         return found
 

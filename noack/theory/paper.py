@@ -60,8 +60,8 @@ from noack.core.linear_systems import (
     transition,
 )
 from noack.scenario.resolution import LoopMatrices
-from noack.theory.bounds.contraction import spectral_norms
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
+from noack.theory.bounds.stacked_norms import spectral_norms
 from noack.trigger.trigger_rule import Policy, TriggerRule
 
 _PART_NUMBERS = 2**20

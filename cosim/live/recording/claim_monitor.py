@@ -21,8 +21,8 @@ from noack.protocol.roles import Notice
 from noack.scenario.resolution import resolved_loops, tables_of
 from noack.scenario.scenario import Scenario, phases_ns
 from noack.theory.certificates.conditions import allowed_conditions
+from noack.theory.certificates.network_limits import network_limit
 from noack.theory.certificates.region import scopes
-from noack.theory.certificates.scenario_certificates import network_limit
 
 MOST_CHECKED = 100
 _TURN_S = 0.01

@@ -16,7 +16,7 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.contraction import Stack
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.loss_margin import Burst
 from noack.theory.margins.switched_system import Graph, spectral_radii
 from noack.theory.margins.time_triggered_loop import LoopTimes, Timeline

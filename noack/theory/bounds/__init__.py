@@ -6,7 +6,7 @@ an interval, for G = H + αI (the models) and G = A + BK + αI (the plant's loop
 
 1. ``contraction.py``: coordinates L in which G contracts, ‖L e^{Gs} Y‖ ≤ ‖L Y‖ e^{−νs}. L comes
    from a Lyapunov equation or from eigenvectors; ν is computed from the final L, so nothing depends
-   on how L was found.
+   on how L was found. ``stacked_norms.py`` has products and norms of many matrices at once.
 2. ``enclosure.py``: the suprema and integrals. Between two nodes the distance of a response from
    its chord (``sag`` in names) is bounded by its second derivative (``bend``); beyond the last node
    ν bounds the response. Why samples are not sufficient: docs/theory.md, "Why the suprema are
@@ -23,10 +23,10 @@ an interval, for G = H + αI (the models) and G = A + BK + αI (the plant's loop
    input, bounded by a small-gain argument over its entries.
 5. ``certificate_terms.py``: the data of a certificate: its assumptions on the network, the bound of
    ‖e_s‖ that a trigger guarantees, and the certified bounds.
-6. ``trigger_bounds.py``: the bound of ‖e_s‖ after each test, for every trigger rule; and the growth
-   of e_s from this bound until the next test, or from 0 after an event until the rule can transmit
-   again (Volterra's inequality, iterated).
-7. ``disturbances.py``: bounded and normal disturbances and noise, and the error of an observer, as
+6. ``trigger_bounds.py``: the bound of ‖e_s‖ after each test, for every trigger rule.
+7. ``error_growth.py``: the growth of e_s from this bound until the next test, or from 0 after an
+   event until the rule can transmit again (Volterra's inequality, iterated).
+8. ``disturbances.py``: bounded and normal disturbances and noise, and the error of an observer, as
    sums over their sources (docs/derivations.md, "Disturbances and noise", "The observer's error").
 
 ``noack/theory/certificates`` combines these bounds.

@@ -21,9 +21,10 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, matrix_key
-from noack.theory.bounds.contraction import logarithmic_norm, spectral_norm
+from noack.theory.bounds.contraction import logarithmic_norm
 from noack.theory.bounds.enclosure import NotDecayingError, Outputs, ResponseBounds, response
 from noack.theory.bounds.gains import Coefficients, Columns, Output, PlantGains
+from noack.theory.bounds.stacked_norms import spectral_norm
 
 
 @dataclass(frozen=True)

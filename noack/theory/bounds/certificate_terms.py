@@ -1,4 +1,4 @@
-"""The terms of a certificate: conditions, promises of trigger and observer, constants."""
+"""The terms of a certificate: conditions, bounds by trigger and observer, constants."""
 
 import math
 from collections.abc import Mapping
@@ -93,47 +93,51 @@ MEASURED = EstimationBound()
 """The trigger tests the measurements: there is no estimation error."""
 
 
+class InterEventTimes(NamedTuple):
+    """Times between two events that a trigger guarantees, whatever happens to e_s."""
+
+    shortest_s: float = 0.0
+    longest_s: float = math.inf
+    earliest_due_s: float = math.inf
+    """The earliest time after an event at which the next one may be due without any e_s; before
+    :attr:`longest_s` where tests may be missing."""
+
+
 class TriggerBound(NamedTuple):
-    """What a trigger guarantees about e_s, scaled.
+    """Bounds of e_s that a trigger guarantees, scaled.
 
     After each of its tests ‖e_s‖_W ≤ β + Σ_C share_C sup‖C x‖.
     """
 
     beta: float
     """β, in the units of ‖W x‖."""
-    reached: float | None
+    least_event_error: float | None
     """The smallest ‖e_s‖_W at an event; None if it may be arbitrarily small."""
     shares: Mapping[str, float] = MappingProxyType({})
     """share_C by the name of C in :attr:`PlantGains.outputs`."""
     untested_s: float = 0.0
     """After an event the trigger is not tested for this time: e_s grows from 0 for up to h more."""
-    is_one_growth: bool = False
+    merges_growths: bool = False
     """Whether the growth without a test is bounded as after one, for the longest time of both."""
     is_tested: bool = True
     """Whether there is a test at all; without one, only the time since the event bounds e_s."""
-    ago_s: float = 0.0
+    window_s: float = 0.0
     """The bound is that of ‖e_s‖_W at some time up to this long before the test. An event comes no
-    earlier than this after the last one, unless ‖e_s‖_W has exceeded ``reached``."""
+    earlier than this after the last one, unless ‖e_s‖_W has exceeded ``least_event_error``."""
     is_mean: bool = False
     """Whether it also bounds the mean of ‖e_s‖_W over that time, or that since the event."""
-    root: str = ""
+    root_output: str = ""
     """A C of the shares for which (β² + sup‖C x‖²)^½ may take the place of β + share_C sup‖C x‖."""
-    apart_s: float = 0.0
-    """Events are at least this far apart, whatever happens to e_s."""
-    due_s: float = math.inf
-    """Events are at most this far apart."""
-    forced_s: float = math.inf
-    """The earliest time after an event at which the next one may be due; before :attr:`due_s` where
-    tests may be missing."""
-    also: tuple["TriggerBound", ...] = ()
+    times: InterEventTimes = InterEventTimes()
+    further: tuple["TriggerBound", ...] = ()
     """Further bounds that hold at the same time; only their e_s is used, not their times."""
     unit: float | None = None
     """Unit of the constants Δ and β̃/β; by default β."""
 
     @property
-    def every(self) -> tuple["TriggerBound", ...]:
+    def all_bounds(self) -> tuple["TriggerBound", ...]:
         """This bound and the further ones."""
-        return (self, *self.also)
+        return (self, *self.further)
 
 
 class CertificatePart(NamedTuple):

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from noack.core.cached_method import cached_function
 from noack.core.linear_systems import Matrix, solve_lyapunov
+from noack.theory.bounds.stacked_norms import Stack, frobenius_norms, spectral_norm, stack_product
 
-Stack = NDArray[np.float64]
 EPSILON = 8 * float(np.finfo(float).eps)
 """Times n and the product of the factors' magnitudes, this exceeds the rounding of a product."""
 
@@ -46,7 +46,7 @@ class Decay(NamedTuple):
 
     def sizes(self, states: Stack) -> Stack:
         """Return ‖L Y‖ for stacks of Y, (…, k, n, r) → (…, k), in the Frobenius norm."""
-        return frobenius_norms(product(self.factor, states))
+        return frobenius_norms(stack_product(self.factor, states))
 
 
 @cached_function(8)
@@ -71,19 +71,19 @@ def find_decay(generator: Matrix) -> Decay | None:
 def _checked(generator: Matrix, factor: Matrix, may_decay: NDArray[np.bool_]) -> Decay:
     """Return L with ν, reduced by a bound of the rounding error; ν = 0 if L is not suitable."""
     inverse = _each(np.linalg.inv, factor)
-    turned = factor @ generator @ inverse
+    transformed = factor @ generator @ inverse
     # Rounding of the products, and the deviation of L times its computed inverse from identity.
     product = np.abs(factor) @ np.abs(generator) @ np.abs(inverse)
     identity = np.linalg.norm(np.abs(factor) @ np.abs(inverse), axis=(-2, -1))
-    identity = identity * np.linalg.norm(turned, axis=(-2, -1))
+    identity = identity * np.linalg.norm(transformed, axis=(-2, -1))
     size = np.linalg.norm(product, axis=(-2, -1)) + identity
     rounding = EPSILON * generator.shape[-1] * size
     usable = may_decay & np.isfinite(rounding)
     eye = np.eye(generator.shape[-1])
-    factor, inverse, turned = (
-        np.where(usable[..., None, None], matrix, eye) for matrix in (factor, inverse, turned)
+    factor, inverse, transformed = (
+        np.where(usable[..., None, None], matrix, eye) for matrix in (factor, inverse, transformed)
     )
-    rates = np.where(usable, -logarithmic_norm(turned) - rounding, 0.0)
+    rates = np.where(usable, -logarithmic_norm(transformed) - rounding, 0.0)
     return Decay(factor, inverse, rates)
 
 
@@ -126,81 +126,3 @@ def logarithmic_norm(generator: Matrix) -> Stack:
     """Return μ of each matrix, (…, n, n) → (…): ‖e^{Gs}‖ ≤ e^{μs}, for the Euclidean norm."""
     symmetric = 0.5 * (generator + generator.swapaxes(-1, -2))
     return np.asarray(np.linalg.eigvalsh(symmetric).max(axis=-1))
-
-
-def product(matrix: Matrix, stack: Stack) -> Stack:
-    """Return M Y for stacks of Y, (…, k, n, r) → (…, k, q, r), by one product with all columns."""
-    *lead, k, n, r = stack.shape
-    columns = stack.swapaxes(-3, -2).reshape(*lead, n, k * r)
-    products = matrix @ columns
-    return np.asarray(products.reshape(*products.shape[:-1], k, r).swapaxes(-3, -2))
-
-
-def times(matrix: Matrix, values: Stack) -> Stack:
-    """Return M Y for matrices Y along the last axis, (…, n, r, k) → (…, q, r, k)."""
-    *lead, r, k = values.shape
-    products = matrix @ values.reshape(*lead, r * k)
-    return np.asarray(products.reshape(*products.shape[:-1], r, k))
-
-
-def frobenius_norms(stack: Stack) -> Stack:
-    """Return the Frobenius norms of stacks of matrices, (…, q, r) → (…)."""
-    return np.asarray(np.sqrt(np.einsum("...ij,...ij->...", stack, stack)))
-
-
-def spectral_norm(matrix: Matrix) -> Stack:
-    """Return the spectral norms of matrices, (…, q, r) → (…)."""
-    return np.asarray(np.linalg.svd(matrix, compute_uv=False)[..., 0])
-
-
-def spectral_norms(stack: Stack) -> Stack:
-    """Return the spectral norms of a long stack of matrices, (k, q, r) → (k,)."""
-    return largest_gains(np.ascontiguousarray(stack.transpose(1, 2, 0)))
-
-
-def sizes(values: Stack) -> Stack:
-    """Return the Frobenius norms of matrices along the last axis, (…, q, r, k) → (…, k)."""
-    return np.asarray(np.sqrt(np.einsum("...ijk,...ijk->...k", values, values)))
-
-
-def largest_gains(values: Stack) -> Stack:
-    """Return the spectral norms of matrices along the last axis, (…, q, r, k) → (…, k).
-
-    They are roots of eigenvalues of Y Yᵀ, whose largest one has a small relative rounding error.
-    """
-    q, r = values.shape[-3:-1]
-    if min(q, r) == 1:
-        products = np.einsum("...ijk,...ijk->...k", values, values)[None, None]
-    else:
-        pairs = "...ijk,...ljk->il...k" if q < r else "...jik,...jlk->il...k"
-        products = np.einsum(pairs, values, values)
-    if not np.isfinite(products).all():  # the norm may be finite
-        return np.asarray(np.linalg.norm(values, 2, axis=(-3, -2)))
-    return np.asarray(np.sqrt(np.maximum(_largest_eigenvalues(products), 0.0)))
-
-
-def largest_eigenvalues(stack: Stack) -> Stack:
-    """Return the largest eigenvalues of Gram matrices, (k, n, n) → (k,)."""
-    return _largest_eigenvalues(np.moveaxis(stack, 0, -1))
-
-
-def _largest_eigenvalues(products: Stack) -> Stack:
-    """Return the largest eigenvalues of Gram matrices, (n, n, …, k) → (…, k)."""
-    n = len(products)
-    if n == 1:
-        return np.asarray(products[0, 0])
-    if n == 2:
-        (a, b), (_, d) = products
-        return np.asarray(0.5 * (a + d) + np.hypot(0.5 * (a - d), b))
-    if n > 3:
-        return np.asarray(np.linalg.eigvalsh(np.moveaxis(products, (0, 1), (-2, -1)))[..., -1])
-    # The largest root of the characteristic polynomial, of the matrix with the trace 3.
-    (a, b, c), (_, d, e), (_, _, f) = products
-    scale = (a + d + f) / 3
-    a, b, c, d, e, f = np.array([a, b, c, d, e, f]) / np.where(scale > 0, scale, 1.0)
-    a, d, f = a - 1, d - 1, f - 1
-    spread = np.sqrt((a * a + d * d + f * f + 2 * (b * b + c * c + e * e)) / 6)
-    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    cosine = 0.5 * determinant / np.where(spread > 0, spread, 1.0) ** 3
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0)) / 3
-    return np.asarray(scale * (1 + 2 * spread * np.cos(angle)))

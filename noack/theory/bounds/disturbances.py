@@ -30,9 +30,9 @@ from noack.scenario.estimation import assumed_model
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import EstimationBound
-from noack.theory.bounds.contraction import largest_gains, spectral_norm, times
 from noack.theory.bounds.enclosure import NotDecayingError, factors
 from noack.theory.bounds.gains import Forcing, NormalForcing
+from noack.theory.bounds.stacked_norms import product_along_last, spectral_norm, spectral_norms_along_last
 
 MISMATCH = "Â − A"
 """Name of the output by which the plant's steps differ from the model's."""
@@ -79,12 +79,16 @@ def normal_bounds(resolved: Scenario) -> NormalBounds | None:
 
 def bound_forcing(resolved: Scenario, B: Matrix) -> Forcing | None:
     """Return the disturbances of a plant with the input matrix B, (n, m); None if it has none."""
-    plant, bounds, (n, m) = resolved.plant, normal_bounds(resolved), B.shape
-    if not plant.disturbances:
+    disturbances = resolved.plant.disturbances
+    if not disturbances:
         return None
-    columns, normal, durations_s = [np.zeros((n, 0))], [np.zeros((n, 0))], list[float]()
-    at_input, period_s = np.zeros(m), resolved.timing.plant_period_ns / NS_PER_S
-    for disturbance in plant.disturbances:
+    bounds = normal_bounds(resolved)
+    period_s = resolved.timing.plant_period_ns / NS_PER_S
+    n, m = B.shape
+    columns, durations_s = [np.zeros((n, 0))], list[float]()
+    normal = [np.zeros((n, 0))]
+    at_input = np.zeros(m)
+    for disturbance in disturbances:
         extent, deviations = disturbance.extent(), disturbance.deviations()
         if disturbance.at == "input":
             at_input = at_input + np.abs(extent).sum(axis=1)
@@ -281,13 +285,13 @@ class EstimationError:
         output_gain = spectral_norm(W @ np.linalg.inv(factor))
         last, total, largest = _last_axis(sources[-1]), 0.0, sums.max()
         powers = _powers(steps[-1], min(_ENTRIES // max(old.size, last.size) + 1, 256))
-        turned = factor @ powers[1:]
+        transformed = factor @ powers[1:]
 
         def rests(steps: slice) -> Stack:
-            sums = _sums(turned[steps], last) / (1 - rate) + _sums(turned[steps], old)
+            sums = _sums(transformed[steps], last) / (1 - rate) + _sums(transformed[steps], old)
             return np.asarray(output_gain * sums)
 
-        for _ in range(_MOST_STEPS // len(turned)):
+        for _ in range(_MOST_STEPS // len(transformed)):
             # The same for every number of further measurements, (powers,).
             totals = total + np.cumsum(_sums(W @ powers[:-1], last))
             sums = _sums(W @ powers[1:], old) + totals
@@ -298,7 +302,7 @@ class EstimationError:
                 number = np.argmax(every <= _TAIL_SHARE * largests)
                 return float((largests[number] + every[number]) * _ROUNDING)
             total, largest = totals[-1], largests[-1]
-            old, last = times(powers[-1], old), times(powers[-1], last)
+            old, last = product_along_last(powers[-1], old), product_along_last(powers[-1], last)
         return float((largest + last_rest) * _ROUNDING)
 
     def _excess(self, sources: Stack, total: float, alpha_per_s: float) -> float:
@@ -308,12 +312,13 @@ class EstimationError:
         growth, steps, W = self._growth(alpha_per_s), self._steps(0.0), self._weight
         sums, old = _accumulated(W, _last_axis(sources[0]), steps[1:-1], sources[1:-1])
         powers, new = _powers(steps[-1], len(sources) - 2), _last_axis(sources[-1])
-        settled = np.concatenate([times(power, new) for power in powers[::-1]], axis=2)
+        settled = np.concatenate([product_along_last(power, new) for power in powers[::-1]], axis=2)
         scales = growth ** np.arange(len(sums))
         # From then on the effects of these sources, and those with settled gains, follow F.
         factor, _ = _contraction(growth * steps[-1])
         output_gain = spectral_norm(W @ np.linalg.inv(factor))
-        remainder = scales[-1] * output_gain * largest_gains(times(factor, old - settled)).sum()
+        unsettled = spectral_norms_along_last(product_along_last(factor, old - settled))
+        remainder = scales[-1] * output_gain * unsettled.sum()
         return float(max((scales * (sums - total)).max(), remainder, 0.0) * _ROUNDING)
 
 
@@ -330,7 +335,7 @@ def _accumulated(C: Matrix, old: Stack, steps: Stack, sources: Stack) -> tuple[S
     """
     waiting, sums = [old], []
     for step, new in zip(steps, sources, strict=True):
-        old = np.concatenate([times(step, old), _last_axis(new)], axis=2)
+        old = np.concatenate([product_along_last(step, old), _last_axis(new)], axis=2)
         waiting.append(old)
         if len(waiting) * old.size > _ENTRIES:
             sums.append(_add_norms(C, waiting))
@@ -343,7 +348,7 @@ def _add_norms(C: Matrix, effects: list[Stack]) -> Stack:
     if not effects:
         return np.zeros(0)
     counts = np.cumsum([0, *(effect.shape[2] for effect in effects[:-1])])
-    norms = largest_gains(times(C, np.concatenate(effects, axis=2)))
+    norms = spectral_norms_along_last(product_along_last(C, np.concatenate(effects, axis=2)))
     return np.asarray(np.add.reduceat(norms, counts))
 
 
@@ -352,7 +357,7 @@ def _sums(matrices: Stack, effects: Stack) -> Stack:
     k, q, n = matrices.shape
     products = matrices.reshape(-1, n) @ effects.reshape(n, -1)
     values = products.reshape(k, q, *effects.shape[1:]).transpose(1, 2, 0, 3)
-    norms = largest_gains(values.reshape(*values.shape[:2], -1))
+    norms = spectral_norms_along_last(values.reshape(*values.shape[:2], -1))
     return np.asarray(norms.reshape(k, -1).sum(axis=1))
 
 

@@ -31,23 +31,20 @@ from numpy.typing import NDArray
 
 from noack.core.cached_method import cached_function, cached_method
 from noack.core.linear_systems import Matrix, exponential
-from noack.theory.bounds.contraction import (
-    EPSILON,
-    Decay,
+from noack.theory.bounds.contraction import EPSILON, Decay, abscissas, find_decay, logarithmic_norm
+from noack.theory.bounds.stacked_norms import (
+    ROUNDING,
     Stack,
-    abscissas,
-    find_decay,
     frobenius_norms,
-    largest_gains,
-    logarithmic_norm,
-    product,
-    sizes,
+    frobenius_norms_along_last,
+    larger_ends,
+    product_along_last,
     spectral_norm,
     spectral_norms,
-    times,
+    spectral_norms_along_last,
+    stack_product,
 )
 
-_ROUNDING = 1.0 + 1e-9
 _TAYLOR_TERMS = 4
 _LARGEST_EXPONENT = 100.0
 _BLOCK = 64
@@ -243,19 +240,19 @@ class ResponseBounds:
         """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
         columns, nodes = self._columns, self._nodes
         steps_s = np.diff(self.edges_s)[..., None, None, :]
-        norms = outputs.each(largest_gains, times(outputs.stacked, nodes), columns)
-        magnitudes = times(np.abs(outputs.stacked), np.abs(nodes))
-        norms += EPSILON * nodes.shape[-3] * outputs.each(sizes, magnitudes, columns)
+        norms = outputs.each(spectral_norms_along_last, product_along_last(outputs.stacked, nodes), columns)
+        magnitudes = product_along_last(np.abs(outputs.stacked), np.abs(nodes))
+        norms += EPSILON * nodes.shape[-3] * outputs.each(frobenius_norms_along_last, magnitudes, columns)
         bends = self._bends.over(outputs)
         middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
-        highest = np.maximum(norms[..., :-1], norms[..., 1:]) + steps_s**2 / 8 * bends
-        areas = (steps_s * middle + steps_s**3 / 12 * bends) * _ROUNDING
-        highest *= _ROUNDING
+        highest = larger_ends(norms) + steps_s**2 / 8 * bends
+        areas = (steps_s * middle + steps_s**3 / 12 * bends) * ROUNDING
+        highest *= ROUNDING
         rate, tails = np.array(0.0), np.full(norms.shape[:-1], math.inf)
         if self.endless and self.decay is not None:
             rate = self.decay.rate_per_s
             last = self.decay.sizes(self.states[..., -1:, :, :])[..., None, :]
-            tails = outputs.norms_with(self.decay.inverse)[..., :, None] * last * _ROUNDING
+            tails = outputs.norms_with(self.decay.inverse)[..., :, None] * last * ROUNDING
         decays = (rate > 0)[..., None, None]
         after = np.where(decays, tails / np.where(rate > 0, rate, 1.0)[..., None, None], math.inf)
         return {
@@ -276,19 +273,19 @@ class ResponseBounds:
     def areas_of_columns(self, C: Matrix) -> Stack:
         """Return bounds of Σ_i ∫‖C e^{Gτ} D_i‖ over each cell, for the columns D_i of D."""
         steps_s, nodes, columns = np.diff(self.edges_s), self._nodes, self.states.shape[-1]
-        rounding = sizes(times(np.abs(C), np.abs(nodes)))
-        norms = np.linalg.norm(times(C, nodes), axis=-3).sum(axis=-2)
+        rounding = frobenius_norms_along_last(product_along_last(np.abs(C), np.abs(nodes)))
+        norms = np.linalg.norm(product_along_last(C, nodes), axis=-3).sum(axis=-2)
         # The sum over the columns is at most √columns times the Frobenius norm.
         norms = norms + np.sqrt(columns) * EPSILON * nodes.shape[-3] * rounding
         middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
         bend = np.sqrt(columns) * self._bends.over(Outputs({"": C}))[..., 0, 0, :]
-        return np.asarray((steps_s * middle + steps_s**3 / 12 * bend) * _ROUNDING)
+        return np.asarray((steps_s * middle + steps_s**3 / 12 * bend) * ROUNDING)
 
 
 def norm_bounds(C: Matrix, states: Stack) -> Stack:
     """Return upper bounds of ‖C Y‖ for a stack of Y, (k, n, r) → (k,), including rounding."""
-    exact = product(C, states)
-    rounding = frobenius_norms(product(np.abs(C), np.abs(states)))
+    exact = stack_product(C, states)
+    rounding = frobenius_norms(stack_product(np.abs(C), np.abs(states)))
     return np.asarray(spectral_norms(exact) + EPSILON * len(C.T) * rounding)
 
 
@@ -315,11 +312,13 @@ class _Bends:
 
     def over(self, outputs: Outputs[Name]) -> Stack:
         """Return the bounds for output matrices C, (…, outputs, groups, k)."""
-        turned = outputs.stacked[..., None, :, :] @ self.powers
-        *lead, terms, rows, n = turned.shape
-        images = times(turned.reshape(*lead, terms * rows, n), self.nodes)
+        transformed = outputs.stacked[..., None, :, :] @ self.powers
+        *lead, terms, rows, n = transformed.shape
+        images = product_along_last(transformed.reshape(*lead, terms * rows, n), self.nodes)
         images = images.reshape(*images.shape[:-3], terms, rows, *images.shape[-2:])
-        terms_of_bound = outputs.each(sizes, images, self.columns) * self.scales[..., None, None, :]
+        terms_of_bound = (
+            outputs.each(frobenius_norms_along_last, images, self.columns) * self.scales[..., None, None, :]
+        )
         bound = terms_of_bound.sum(axis=-4)
         remainder = outputs.norms[..., None, None] * self.rest[..., None, :, :]
         if self.decay is None:
@@ -339,8 +338,8 @@ def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None,
         scales.append(scales[-1] * (steps_s / order))
 
     def norms(matrix: Matrix) -> Stack:
-        values = times(matrix, nodes)
-        return np.stack([sizes(values[..., group, :]) for group in columns], axis=-2)
+        values = product_along_last(matrix, nodes)
+        return np.stack([frobenius_norms_along_last(values[..., group, :]) for group in columns], axis=-2)
 
     last = scales[-1][..., None, :]
     rest_decaying = least = np.zeros(0)
@@ -386,12 +385,14 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
     decay = find_decay(generator)
     if decay is None or not (decay.rate_per_s > 0).all():
         raise NotDecayingError("no Lyapunov function of it was found to working precision")
+    # The grid so far: e^{Gτ} D at its nodes in blocks, and their edges.
     everything = Outputs({"": np.eye(generator.shape[-1])})
     lead = np.broadcast_shapes(generator.shape[:-2], D.shape[:-2])
     state = np.broadcast_to(D, (*lead, *D.shape[-2:]))
     parts: list[Stack] = []
     edges: list[Stack] = [np.zeros((*lead, 1))]
     area, cells, ends = np.zeros(lead), 0, np.zeros(lead, dtype=bool)
+    # The first steps are shorter than usual; longer ones are usable where the response is straight.
     most_cells = min(_MOST_CELLS, _MOST_ENTRIES // math.prod(D.shape[-2:]))
     usual_s = np.broadcast_to(_STEP / _fastest(generator), lead)
     step_s = usual_s * _FIRST_STEP / _STEP
@@ -401,6 +402,7 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
         return is_short if is_short.all() else is_short | _straight(generator, state, step_s, decay)
 
     while True:
+        # The next block of cells.
         states = _propagate(generator, state, step_s, _CELLS_PER_BLOCK)
         parts.append(states[..., :-1, :, :])
         passed_s = step_s[..., None] * np.arange(1.0, _CELLS_PER_BLOCK + 1)
@@ -408,10 +410,12 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
         state = states[..., -1, :, :]
         area = area + step_s * frobenius_norms(parts[-1]).sum(axis=-1)
         cells += _CELLS_PER_BLOCK
+        # The grid ends where the rest is a small share of the area so far.
         remainder = decay.bounds(everything.stacked, state[..., None, :, :])[..., 0] / decay.rate_per_s
         ends = ends | (remainder <= _TAIL_SHARE * area)
         if ends.all() or cells >= most_cells:
             break
+        # The next step is twice as long if that is usable, and shorter if need be.
         while not (usable := usable_step(step_s)).all():
             step_s = np.where(usable, step_s, step_s / 2)
         step_s = np.where(ends, 0.0, np.where(usable_step(2 * step_s), 2 * step_s, step_s))

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.cached_method import cached_method
+from noack.core.cached_method import cached_function, cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import (
     Matrix,
@@ -33,7 +33,6 @@ from noack.core.linear_systems import (
     spectral_abscissa,
 )
 from noack.scenario.resolution import LoopMatrices
-from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.enclosure import (
     KernelBounds,
     Outputs,
@@ -45,9 +44,9 @@ from noack.theory.bounds.enclosure import (
     response,
     response_until,
 )
+from noack.theory.bounds.stacked_norms import ROUNDING, spectral_norm
 
 Counts = NDArray[np.int64]
-_ROUNDING = 1 + 1e-9
 
 
 class NormalForcing(NamedTuple):
@@ -193,9 +192,9 @@ class ErrorGains:
     @cached_property
     def contracts(self) -> bool:
         """Whether ‖e^{(H+αI)τ}‖_W ≤ 1 for all τ: (H+αI)ᵀWᵀW + WᵀW(H+αI) ⪯ 0, to rounding."""
-        turned = self.weight @ self.scaled_H @ self.inverse_weight
-        size = float(np.linalg.norm(turned, 2))
-        return float(np.linalg.eigvalsh(turned + turned.T).max()) <= 1e-12 * size
+        transformed = self.weight @ self.scaled_H @ self.inverse_weight
+        size = float(np.linalg.norm(transformed, 2))
+        return float(np.linalg.eigvalsh(transformed + transformed.T).max()) <= 1e-12 * size
 
     @cached_method
     def now(self, output: Output) -> float:
@@ -338,7 +337,7 @@ class PlantGains:
 
     @property
     def likeness(self) -> Hashable:
-        """What plants must have in common for their gains to be computed together.
+        """The common properties of plants that allow for computing their gains together.
 
         None: those of this plant are computed alone.
         """
@@ -352,7 +351,7 @@ class PlantGains:
 
     @property
     def identity(self) -> Hashable:
-        """What equal plants without disturbances have in common."""
+        """The common properties of equal plants without disturbances."""
         values = [getattr(self, value.name) for value in fields(self)]
         return self.likeness, *(matrix_key(value) for value in values if isinstance(value, np.ndarray))
 
@@ -445,12 +444,14 @@ class PlantGains:
         normal = self._forcing.normal
         if normal is None:
             return 0.0
-        M, h, S = self.closed_loop, normal.period_s, self._deviations
+        M = self.closed_loop
+        h = normal.period_s
+        S = self._deviations
         growth = float(np.exp(np.linalg.norm(M, 2) * h))
         bend = 0.5 * h**2 * growth * np.linalg.norm(C, 2) * np.linalg.norm(M @ M @ S, 2)
         spread = np.linalg.norm(C @ S, 2) + h * np.linalg.norm(C @ M @ S, 2) + bend
-        pushed = np.linalg.norm(normal.columns, axis=0).sum() * np.linalg.norm(C, 2) * growth * h
-        return float(normal.radius * spread + normal.limit * pushed) * (1 + 1e-6)
+        entered = np.linalg.norm(normal.columns, axis=0).sum() * np.linalg.norm(C, 2) * growth * h
+        return float(normal.radius * spread + normal.limit * entered) * (1 + 1e-6)
 
     @cached_property
     def _deviations(self) -> Matrix:
@@ -460,8 +461,8 @@ class PlantGains:
         normal = self._forcing.normal
         assert normal is not None
         period_ns = round(normal.period_s * NS_PER_S)
-        step, pushed = discretise(self.closed_loop, normal.columns, period_ns)
-        return deviations(np.asarray(solve_discrete_lyapunov(step, pushed @ pushed.T)))
+        step, increments = discretise(self.closed_loop, normal.columns, period_ns)
+        return deviations(np.asarray(solve_discrete_lyapunov(step, increments @ increments.T)))
 
     @cached_property
     def _disturbed(self) -> list[ResponseBounds]:
@@ -495,8 +496,8 @@ class PlantGains:
         R = self.error.split_K[1]
         error = free.through(R).sup_on_grid()
         for column in self._forcing.limited.T:
-            pushed = response_until(drift, column[:, None], start_s)
-            error = error + pushed.through(R).integral_on_grid()
+            entered = response_until(drift, column[:, None], start_s)
+            error = error + entered.through(R).integral_on_grid()
         return error, {output: error * start_s * self.forced[output].sup() for output in self.outputs}
 
     @property
@@ -516,7 +517,7 @@ class PlantGains:
         def kernels(driven: Matrix) -> Mapping[Output, KernelBounds]:
             if error.scaled_H.any():
                 return response(error.scaled_H, driven).through_each(error.stacked)
-            norms = {C: spectral_norm(M @ driven) * _ROUNDING for C, M in error.outputs.items()}
+            norms = {C: spectral_norm(M @ driven) * ROUNDING for C, M in error.outputs.items()}
             return {output: constant_kernel(norm) for output, norm in norms.items()}
 
         by_input, mismatched = kernels(columns.input_error), kernels(columns.mismatch)
@@ -534,22 +535,10 @@ class PlantGains:
         return self.error.growths(self.columns, until_s, cells, self.error.stacked)
 
 
+@cached_function(16, key=lambda plant: plant.identity)
 def first_equal(plant: PlantGains) -> PlantGains:
     """Return the first of several equal plants, which have no disturbances; the others use its gains."""
-    return _first_equal(_KnownPlant(plant.identity, plant))
-
-
-@dataclass(frozen=True)
-class _KnownPlant:
-    """A plant, which equals others of its identity."""
-
-    identity: Hashable
-    plant: PlantGains = field(compare=False)
-
-
-@lru_cache(maxsize=16)
-def _first_equal(known: _KnownPlant) -> PlantGains:
-    return known.plant
+    return plant
 
 
 def deviations(covariance: Matrix) -> Matrix:

@@ -1,4 +1,4 @@
-"""What a certificate uses of a trigger rule: bounds of e_s after tests, its growth, event times.
+"""Bounds of a trigger rule for certificates: of e_s after its tests, and of times between events.
 
 Every rule is data (:mod:`noack.trigger.trigger_rule`), so the bounds follow from its fields:
 
@@ -6,9 +6,7 @@ Every rule is data (:mod:`noack.trigger.trigger_rule`), so the bounds follow fro
 * one of the integral, ∫‖e_s‖_W ≤ δ, bounds ‖e_s‖_W ≤ δ/T at some time of the last T, for each T;
 * until a dwell time has passed, and up to a deadline, e_s has grown from 0.
 
-:class:`TriggerBounds` states these bounds. :class:`ErrorGrowth` is how e_s grows from them until
-the next test, and :func:`first_passage_s` how long it takes from an event until it can reach a
-level.
+:class:`TriggerBounds` states these bounds.
 """
 
 import math
@@ -20,16 +18,26 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix
 from noack.core.number_format import number
-from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
-from noack.theory.bounds.contraction import spectral_norm
-from noack.theory.bounds.gains import Columns, Growth, Output, PlantGains
+from noack.theory.bounds.certificate_terms import (
+    InterEventTimes,
+    NetworkConditions,
+    NoCertificateError,
+    TriggerBound,
+)
+from noack.theory.bounds.stacked_norms import ROUNDING, spectral_norm
 from noack.trigger.trigger_rule import QuadraticForm, TriggerRule
 
-_ROUNDING = 1.0 + 1e-9
 _RELATIVE, _RESIDUAL = 1e-7, 1e-13
 """Least eigenvalue of a positive definite Q₂₂, and the error of a computed Q, as shares of ‖Q‖."""
+_AVERAGED = 2.0 ** np.arange(-6, 5)
+"""Times over which an integral is averaged, in time constants of the model."""
+_NONE = 'where the rule does not transmit, e_s may still have any size; combine it with policy = "deadline"'
+_ACCUMULATE = (
+    "events may accumulate, since no threshold keeps them apart; "
+    'test the rule at sampling times, or combine it with policy = "dwell"'
+)
 
 
 class ComparisonBound(NamedTuple):
@@ -71,8 +79,8 @@ def comparison_bound(rule: TriggerRule, weight: Matrix) -> ComparisonBound | Non
         return ComparisonBound(1.0, (N,) if N.any() else (), 1.0, bool(N.any()))
     if not _is_definite(P.T @ P, 1.0):
         return None
-    size = float(np.linalg.norm(weight @ np.linalg.pinv(P), 2)) * _ROUNDING
-    least = 1 / (float(np.linalg.norm(P @ np.linalg.inv(weight), 2)) * _ROUNDING)
+    size = float(np.linalg.norm(weight @ np.linalg.pinv(P), 2)) * ROUNDING
+    least = 1 / (float(np.linalg.norm(P @ np.linalg.inv(weight), 2)) * ROUNDING)
     return ComparisonBound(size, (size * N,) if N.any() else (), least, bool(N.any()))
 
 
@@ -88,8 +96,8 @@ def _of_mixed_form(form: QuadraticForm, weight: Matrix) -> ComparisonBound | Non
     grown = values + _RESIDUAL / _RELATIVE * size_of_Q
     C = np.sqrt(grown[grown > 0])[:, None] * vectors.T[grown > 0]
     F = np.linalg.cholesky(Q[n:, n:]).T
-    size = float(np.linalg.norm(weight @ np.linalg.inv(F), 2)) * _ROUNDING
-    shares = (size * C, _ROUNDING * weight @ J)
+    size = float(np.linalg.norm(weight @ np.linalg.inv(F), 2)) * ROUNDING
+    shares = (size * C, ROUNDING * weight @ J)
     return ComparisonBound(size, tuple(S for S in shares if S.any()), 0.0, bool(C.any()))
 
 
@@ -97,19 +105,6 @@ def _is_definite(Q: Matrix, size: float) -> bool:
     """Return whether a symmetric Q is positive definite beyond rounding, (n, n)."""
     values = np.linalg.eigvalsh(Q)
     return bool(values[0] > _RELATIVE * max(size, float(values[-1])))
-
-
-_AVERAGED = 2.0 ** np.arange(-6, 5)
-"""Times over which an integral is averaged, in time constants of the model."""
-_NONE = 'where the rule does not transmit, e_s may still have any size; combine it with policy = "deadline"'
-_ACCUMULATE = (
-    "events may accumulate, since no threshold keeps them apart; "
-    'test the rule at sampling times, or combine it with policy = "dwell"'
-)
-COARSE_CELLS = 64
-_FINE_CELLS = 256
-_SHORTEST_S, LONGEST_S = 1e-9, 1e6
-_PICARD_ROUNDS = 8
 
 
 @dataclass(frozen=True)
@@ -125,7 +120,7 @@ class TriggerBounds:
 
     @cached_property
     def comparison(self) -> ComparisonBound | None:
-        """What follows from the comparison; None if nothing."""
+        """The bound that follows from the comparison; None if there is none."""
         return comparison_bound(self.rule, self.weight)
 
     @property
@@ -190,46 +185,52 @@ class TriggerBounds:
             spacing_s = step_s or math.gcd(round(self.rule.grid_ns), round(due_ns)) / NS_PER_S
         return conditions._replace(sampling_s=grid_s, spacing_s=spacing_s)
 
-    def bound(self, conditions: NetworkConditions, level: float, reached: float | None) -> TriggerBound:
+    def bound(self, conditions: NetworkConditions, level: float, least_level: float | None) -> TriggerBound:
         """Return all bounds; their unit is the level, or 1 without one.
 
         Args:
             conditions: as :meth:`tested` returns them.
             level: the largest threshold, scaled.
-            reached: the smallest threshold; None if it may be arbitrarily small.
+            least_level: the smallest threshold; None if it may be arbitrarily small.
 
         Raises:
             NoCertificateError: nothing bounds e_s, or nothing separates events.
         """
-        due_s, forced_s, apart_s = self._between_events(conditions)
-        h_s = conditions.sampling_s
+        times, h_s = self._between_events(conditions), conditions.sampling_s
         idle_s = self._longest_until_test(self.rule.idle_ns, conditions)
         untested_s = max(idle_s - h_s, 0.0) if math.isfinite(idle_s) else 0.0
         bounds: list[TriggerBound] = []
         if self.comparison is not None:
-            if reached is not None:
-                reached = reached * self.comparison.least / self.comparison.size or None
+            least_error: float | None = None
+            if least_level is not None:
+                least_error = least_level * self.comparison.least / self.comparison.size or None
             shares = {**dict.fromkeys(self.outputs, 1.0), **self._slope(level)}
             # Of the trapezoids of tests that may be missing, the oldest may count most.
             is_mean = self.area > 0 and h_s == conditions.spacing_s
-            for ago_s, beta, least in self._levels(conditions, level, reached):
-                root = next(iter(shares)) if self.comparison.has_root else ""
-                bound = TriggerBound(beta, least, shares, untested_s, ago_s=ago_s, is_mean=is_mean, root=root)
+            for window_s, beta, least in self._levels(conditions, level, least_error):
+                bound = TriggerBound(
+                    beta=beta,
+                    least_event_error=least,
+                    shares=shares,
+                    untested_s=untested_s,
+                    window_s=window_s,
+                    is_mean=is_mean,
+                    root_output=next(iter(shares)) if self.comparison.has_root else "",
+                )
                 # What enters is followed if there is one growth; two growths are smaller.
-                bounds += [bound._replace(is_one_growth=True), bound] if untested_s else [bound]
-        if math.isfinite(due_s):
-            bounds.append(TriggerBound(0.0, None, {}, due_s - h_s, is_tested=False))
+                bounds += [bound._replace(merges_growths=True), bound] if untested_s else [bound]
+        if math.isfinite(times.longest_s):
+            bounds.append(TriggerBound(0.0, None, untested_s=times.longest_s - h_s, is_tested=False))
         if not bounds:
             raise NoCertificateError(_NONE)
-        is_separated = apart_s or conditions.spacing_s or any(bound.reached for bound in bounds)
+        # Events are apart by times, or because e_s has to grow.
+        is_separated = times.shortest_s or conditions.spacing_s or any(b.least_event_error for b in bounds)
         grows_first = level > 0 and self.comparison is not None and self.comparison.least > 0
         if not is_separated and not grows_first:
             raise NoCertificateError(_ACCUMULATE)
         if self.is_homogeneous:
-            apart_s = max(apart_s, conditions.spacing_s)
-        return bounds[0]._replace(
-            unit=level or 1.0, apart_s=apart_s, due_s=due_s, forced_s=forced_s, also=tuple(bounds[1:])
-        )
+            times = times._replace(shortest_s=max(times.shortest_s, conditions.spacing_s))
+        return bounds[0]._replace(unit=level or 1.0, times=times, further=tuple(bounds[1:]))
 
     def divided(
         self, conditions: NetworkConditions, apart_s: float
@@ -242,11 +243,10 @@ class TriggerBounds:
         Raises: as :meth:`bound`.
         """
         whole = self.bound(conditions, self.floor, self.floor or None)
+        times = whole.times._replace(shortest_s=apart_s)
         alone = [
-            bound._replace(
-                apart_s=apart_s, due_s=whole.due_s, forced_s=whole.forced_s, unit=1.0, reached=None, also=()
-            )
-            for bound in whole.every
+            bound._replace(times=times, unit=1.0, least_event_error=None, further=())
+            for bound in whole.all_bounds
         ]
         return [(bound._replace(beta=0.0), bound) for bound in alone]
 
@@ -277,15 +277,15 @@ class TriggerBounds:
         if not self.has_chord or math.isinf(self.largest):
             return {}
         name, S = next(iter(self.outputs.items()))
-        largest_norm = self.largest * float(spectral_norm(S @ np.linalg.inv(self.weight))) * _ROUNDING
-        return {name: (math.hypot(level, largest_norm) - level) / largest_norm * _ROUNDING}
+        largest_norm = self.largest * float(spectral_norm(S @ np.linalg.inv(self.weight))) * ROUNDING
+        return {name: (math.hypot(level, largest_norm) - level) / largest_norm * ROUNDING}
 
     def _levels(
-        self, conditions: NetworkConditions, level: float, reached: float | None
+        self, conditions: NetworkConditions, level: float, least_error: float | None
     ) -> list[tuple[float, float, float | None]]:
         """Return (T, β, least ‖e_s‖_W at an event): ‖e_s‖_W ≤ β at some time of the last T."""
         if not self.area:
-            return [(0.0, level, reached)]
+            return [(0.0, level, least_error)]
         assert self.comparison is not None
         least = self.comparison.least * self.rule.floor
         test_s, longest_s = conditions.spacing_s, conditions.sampling_s
@@ -295,21 +295,17 @@ class TriggerBounds:
             return [(k * longest_s, self.area / (k * test_s), least / (k * longest_s)) for k in tests]
         return [(t_s, self.area / t_s, least / t_s) for t_s in times_s.tolist()]
 
-    def _between_events(self, conditions: NetworkConditions) -> tuple[float, float, float]:
-        """Return times between two events, whatever e_s does.
-
-        Returns:
-            The longest; the shortest after which an event is due; the shortest.
-        """
+    def _between_events(self, conditions: NetworkConditions) -> InterEventTimes:
         rule = self.rule
-        due_s = self._longest_until_test(rule.longest_ns, conditions)
         earliest_ns = max(rule.idle_ns, 0.0)
         if not len(rule.form.up):  # nothing is compared
             earliest_ns = rule.longest_ns if rule.forecast is None else rule.shortest_ns
         step_s = conditions.spacing_s
-        apart_s = _rounded_up(min(earliest_ns, rule.longest_ns) / NS_PER_S, step_s)
-        forced_s = _rounded_up(rule.longest_ns / NS_PER_S, step_s)
-        return due_s, forced_s, apart_s
+        return InterEventTimes(
+            shortest_s=_rounded_up(min(earliest_ns, rule.longest_ns) / NS_PER_S, step_s),
+            longest_s=self._longest_until_test(rule.longest_ns, conditions),
+            earliest_due_s=_rounded_up(rule.longest_ns / NS_PER_S, step_s),
+        )
 
     def _longest_until_test(self, time_ns: float, conditions: NetworkConditions) -> float:
         """Return the longest time from an event to the first test a time after it."""
@@ -323,135 +319,3 @@ class TriggerBounds:
 def _rounded_up(time_s: float, step_s: float) -> float:
     is_exact = step_s == 0 or math.isinf(time_s)
     return time_s if is_exact else step_s * math.ceil(time_s / step_s - 1e-9)
-
-
-class ErrorGrowth:
-    """The growth of e_s without a test: from the bound after a test, or from 0 after an event.
-
-    Then ‖e_s‖_W ≤ ``fixed`` + ``estimation`` η + Σ_C ``shares``_C sup‖C x‖ =: b. Until the next
-    test, sup‖e_s‖_W ≤ ``stretch`` b + ``driven`` · (sup‖p‖, sup‖R_E x‖, 1).
-
-    ``ages_s``: b bounds the mean of ‖e_s‖_W over the times so long ago; by default ``longest_s``.
-    """
-
-    def __init__(
-        self, plant: PlantGains, longest_s: float, after: TriggerBound, ages_s: Vector | None = None
-    ) -> None:
-        outputs = plant.outputs
-        self.ages_s = np.array([longest_s]) if ages_s is None else ages_s
-        self.mean_s, self.highest = float(self.ages_s.mean()), np.zeros(())
-        self.longest_s, self.stretch = longest_s, plant.error.stretch(longest_s)
-        self.fixed, self.shares, self.root = after.beta, after.shares, after.root
-        # The trigger tests x_s − x̂, and may compare it with x̂.
-        self.estimation = 1 + sum(
-            share * spectral_norm(outputs[C] @ plant.error.inverse_weight)
-            for C, share in after.shares.items()
-        )
-        zero = np.zeros(())
-        self.driven: tuple[Vector, Vector, Vector] = (zero, zero, zero)
-        if longest_s > 0:
-            growth = plant.growth(longest_s, COARSE_CELLS)
-            self.driven, self.highest = growth.means(self.ages_s), growth.input_error.sup_on_grid()
-
-    def after_test(self, states: Mapping[str, float]) -> float:
-        """Return b, given bounds of sup‖C x‖; not linear in them."""
-        shares = sum(share * states[C] for C, share in self.shares.items() if self.root != C)
-        return math.hypot(self.fixed, states.get(self.root, 0.0)) + shares
-
-
-def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[ErrorGrowth]:
-    """Return how e_s grows after a test, and from 0 after an event, or one growth for both."""
-    tested_s, untested_s = sampling_s + bound.ago_s, sampling_s + bound.untested_s
-    if bound.is_one_growth:
-        return [ErrorGrowth(plant, max(tested_s, untested_s), bound)]
-    growths = []
-    if bound.is_tested:
-        growths.append(ErrorGrowth(plant, tested_s, bound, _mean_ages_s(bound, sampling_s)))
-    if bound.untested_s > 0 or not bound.is_tested:
-        growths.append(ErrorGrowth(plant, untested_s, TriggerBound(0.0, None)))
-    return growths
-
-
-def _mean_ages_s(bound: TriggerBound, sampling_s: float) -> Vector | None:
-    """Return the ages of the e_s of which the bound is that of a mean, at most, if it is one."""
-    if not (bound.is_mean and bound.ago_s):
-        return None
-    if sampling_s == 0:
-        return bound.ago_s * np.arange(1, COARSE_CELLS + 1) / COARSE_CELLS
-    # The trapezoid of the two tests i and i + 1 before the last one.
-    tests = np.arange(1, round(bound.ago_s / sampling_s) + 1)
-    return sampling_s * np.concatenate([tests, tests + 1])
-
-
-def first_passage_s(
-    plant: PlantGains, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector, start: Vector
-) -> Vector:
-    """Return times before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``, (…, loops).
-
-    Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
-
-        ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + k · ρ(r−s)) ds
-
-    and further terms from the disturbances and ``start``. This is iterated from ρ = ``level``;
-    every iterate is a bound until the level is reached.
-
-    Args:
-        plant: one plant, or as many as there are values, (loops,).
-        level: one ‖e_s‖_W or several of each loop, (…, loops).
-        mismatch: sup‖R_E x‖, (loops,).
-        input_error: π', the input error without the effect of the present e_s, (loops,).
-        error_gain: k = ‖K W^{−1}‖, (loops,).
-        start: ‖e_s‖_W at first, (loops,).
-    """
-    start_of_growth = plant.growth(_SHORTEST_S, 1)
-    speed = start_of_growth.mismatch.sup_on_grid() * mismatch
-    speed = speed + start_of_growth.input_error.sup_on_grid() * (input_error + error_gain * level)
-    speed = speed + start_of_growth.forced.sum(axis=-1) / _SHORTEST_S
-    # The first window is twice the time to the level at the initial speed, limited.
-    window_s = np.where(speed > 0, 2 * level / np.where(speed > 0, speed, 1.0), LONGEST_S)
-    window_s = window_s.clip(_SHORTEST_S, LONGEST_S)
-    is_open, shape, loops = (level > start).ravel(), level.shape, level.shape[-1]
-    level, window_s = level.ravel(), window_s.ravel()
-    known_s, cells = np.zeros(level.size), np.full(level.size, COARSE_CELLS)
-    while is_open.any():
-        count = int(cells[is_open].min())
-        places = np.flatnonzero(is_open & (cells == count))
-        loop = places % loops
-        columns = Columns(*(column[loop] if column.ndim == 3 else column for column in plant.columns))
-        error = plant.error
-        growth = error.growths(columns, window_s[places], count, error.stacked_norm)[Output.WEIGHTED]
-        first_cells = _first_crossed(
-            growth, level[places], mismatch[loop], input_error[loop], error_gain[loop],
-            np.array([column and column * error.stretch(until_s) for column, until_s in zip(
-                start[loop].tolist(), window_s[places].tolist(), strict=True
-            )]),
-        )  # fmt: skip
-        for place, edge_s, cell in zip(places.tolist(), growth.mismatch.edges_s, first_cells, strict=True):
-            if cell < count:
-                known_s[place] = max(known_s[place], edge_s[cell])
-                is_open[place] = count != _FINE_CELLS
-                window_s[place], cells[place] = edge_s[cell + 1], _FINE_CELLS
-            elif window_s[place] >= LONGEST_S:
-                known_s[place], is_open[place] = window_s[place], False
-            else:  # not reached, also after a coarse grid's overestimate: extend the window
-                known_s[place], window_s[place] = window_s[place], 2 * window_s[place]
-    return known_s.reshape(shape)
-
-
-def _first_crossed(
-    growth: Growth, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector, started: Vector
-) -> list[int]:
-    """Return the first cell of each loop in which the level may be reached, or their number."""
-    areas = growth.mismatch.area * mismatch[:, None]
-    areas = areas + growth.input_error.area * input_error[:, None]
-    fixed = np.cumsum(areas + growth.forced, axis=-1) + started[:, None]
-    rho = np.repeat(level[:, None], fixed.shape[-1], axis=1)
-    echoing = np.broadcast_to(growth.input_error.area, rho.shape)
-    for _ in range(_PICARD_ROUNDS):
-        echo = [np.convolve(area, r)[: len(r)] for area, r in zip(echoing, rho, strict=True)]
-        before, rho = rho, np.minimum(level[:, None], fixed + error_gain[:, None] * np.array(echo))
-        if np.array_equal(before, rho):
-            break
-    crossed = rho >= level[:, None]
-    cells: list[int] = np.where(crossed.any(axis=1), crossed.argmax(axis=1), rho.shape[1]).tolist()
-    return cells

@@ -16,8 +16,8 @@ loop"):
 3. ``persistent_bounds.py``. With persistent disturbances, noise, an observer or a constant threshold, each
    bound has a decaying part and a persistent part. All inequalities are linear in functions of
    time, so the bounds of the two parts are added.
-4. ``scenario_certificates.py``. Which of these a scenario gets, for its own plant and for the box;
-   and the largest sampling period, delay and age of inputs that are still certified.
+4. ``scenario_certificates.py``. Which of these a scenario gets, for its own plant and for the box.
+   ``network_limits.py``: the largest sampling period, delay and age of inputs that are certified.
 5. ``region.py``. A nonlinear plant is one of the plants of a box, as long as x and u stay in the
    region over which its equations are enclosed; they do if the box's bounds are inside it.
 6. ``certified_bounds.py``. The guarantee as bounds over time; and sharper ones from the newest

@@ -5,6 +5,7 @@ Assumptions about the run itself (delays, the longest loss burst) are checked ag
 """
 
 import math
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -241,36 +242,39 @@ def _actuation_gap(resolved: Scenario) -> str:
 def certificate_assumptions(
     resolved: Scenario,
     conditions: NetworkConditions,
-    decay: dict[str, float],
+    decay_per_s: Mapping[str, float],
     constants: Constants | None,
     void: ArithmeticError | None,
     loop_gain: float,
-    promise: str,
+    trigger_bound: str,
     probability: float | None,
 ) -> list[Assumption]:
     """Return the assumptions of a certificate, with verdicts.
 
-    ``decay`` has the decay rates per second of "the models" (infinite if they hold) and "A + BK".
-    Without a certificate, ``constants`` is None and ``void`` is the reason. ``promise`` is what the
-    trigger's rule says about e_s, or empty. ``probability`` is that of a run that keeps a
-    guarantee that nothing enforces, if it is known.
+    ``decay_per_s`` has the decay rates of "the models" (infinite if they hold) and "A + BK".
+    Without a certificate, ``constants`` is None and ``void`` is the reason. ``trigger_bound`` says
+    how the trigger's rule bounds e_s; it is empty if nothing does. ``probability`` is that of a run
+    that keeps a guarantee that nothing enforces, if it is known.
     """
+    # Of the trigger, and of the decay rates.
     alpha = policy_of(resolved).fading_per_s
     slower = 0.0 if constants is None else constants.rate_per_s
-    why = promise or "not where it does not transmit"
-    checked = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(promise), why)]
+    why = trigger_bound or "not where it does not transmit"
+    checked = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(trigger_bound), why)]
     for matrix, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
-        holds = below(alpha, decay[matrix])
-        why = f"α = {alpha:g} /s, {_decays(decay[matrix])}"
+        holds = below(alpha, decay_per_s[matrix])
+        why = f"α = {alpha:g} /s, {_decays(decay_per_s[matrix])}"
         if slower and not holds:
             why += f"; certified instead: bounds with decay rate {at_least(slower, 3)} /s"
         elif constants is not None and not holds:
             why += "; certified instead: constant bounds"
-        if math.isinf(decay[matrix]):
+        if math.isinf(decay_per_s[matrix]):
             holds, why = False, "a hold does not decay: the certified bounds are constant"
         checked.append(_checked(f"α is below the decay rate of {matrix}", source, holds, why))
+    # Of the network, the schedule and the disturbances.
     checked += _conditions(conditions, resolved, probability)
-    checked += _bounded_causes(resolved)
+    checked += _bounded_disturbances(resolved)
+    # Of the certificate itself.
     if constants is None:
         is_unchecked = isinstance(void, CertificateNotCheckedError)
         status = AssumptionStatus.NOT_CHECKED if is_unchecked else AssumptionStatus.VIOLATED
@@ -283,7 +287,7 @@ def certificate_assumptions(
     return [*checked, Assumption(assumed, source, AssumptionStatus.NOT_NEEDED, why)]
 
 
-def _bounded_causes(resolved: Scenario) -> list[Assumption]:
+def _bounded_disturbances(resolved: Scenario) -> list[Assumption]:
     """Return that disturbances and noise stay within their bounds."""
     if resolved.coverage.is_undisturbed:
         return []

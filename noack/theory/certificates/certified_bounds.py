@@ -1,4 +1,4 @@
-"""What a certificate guarantees: bounds over time, under its conditions and assumptions.
+"""Certified bounds over time, under their conditions and assumptions.
 
 :class:`ScenarioCertificate` has the bounds from the start of the run on. :class:`KnownStateBounds`
 are sharper ones from the newest event on, at which the sensor knows x. With M = A + BK and the
@@ -204,7 +204,7 @@ def envelope_formula(
 
 @dataclass(frozen=True)
 class KnownStatePart:
-    """What decays at a rate, or what persists: its constants, with the gains for their rate."""
+    """The part that decays, or the one that persists: its constants, with the gains for their rate."""
 
     plant: PlantGains
     constants: Constants
@@ -372,10 +372,10 @@ def known_state_bounds(resolved: Scenario, certificate: ScenarioCertificate) -> 
     parts = [part(decaying, level or 1.0, 0.0 if floor is None else certificate.floor / level)]
     parts += [] if persistent is None else [part(persistent, 1.0)]
     forcing = bound_forcing(resolved, loop.B)
-    pushes = np.zeros((loop.n, 0)) if forcing is None else forcing.limited
+    increments = np.zeros((loop.n, 0)) if forcing is None else forcing.limited
     return KnownStateBounds(
         tuple(parts),
         certificate.conditions.delay_s,
-        pushes,
+        increments,
         None if certificate.other is None else known_state_bounds(resolved, certificate.other),
     )

@@ -29,7 +29,7 @@ misses g by r, adding w max r/(w − F w) is enough.
 
 import math
 from collections.abc import Mapping, Sequence
-from enum import Enum
+from enum import Enum, IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -38,11 +38,29 @@ from numpy.typing import NDArray
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.certificate_terms import CertificatePart, Constants, NetworkConditions
+from noack.theory.bounds.error_growth import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
-from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth, first_passage_s, list_growths
 
-_SIGNALS = 6
-_AGE_INPUT, _INPUT_ERROR, _ONE = (np.eye(_SIGNALS)[index] for index in (0, 3, 5))
+
+class Signal(IntEnum):
+    """The entries of v, in their order in all rows and columns."""
+
+    AGE_INPUT = 0
+    """q, the part of the input that its age adds."""
+    AFTER_TEST = 1
+    """b, the bound of ‖e_s‖_W after each test, or β̃."""
+    ESTIMATION_ERROR = 2
+    """η = sup‖x̂ − x‖_W."""
+    INPUT_ERROR = 3
+    """π."""
+    MISMATCH = 4
+    """sup‖R_E x‖."""
+    ONE = 5
+    """The constant 1."""
+
+
+_UNIT = np.eye(len(Signal))
+"""For each signal the row that selects it."""
 MOST_STAGES = 16
 """With more missing events π is used for all of them."""
 _EPSILON = float(np.finfo(float).eps)
@@ -115,7 +133,7 @@ def _eliminated(matrix: Matrix, *right_sides: Vector) -> tuple[Vector, ...]:
 
 
 class BoundMethod(Enum):
-    """How e_c is bounded. Bounds of parts may be added only if they use the same method."""
+    """The ways to bound e_c. Bounds of parts may be added only if they use the same method."""
 
     MISSING = "by e_s and by the errors of all missing events"
     DRIFTING = "by its value d ago, and by what has driven it since"
@@ -163,7 +181,9 @@ class ErrorInequalities:
         self._states = {
             output: Coefficients(free + start[output], gain) for output, (free, gain) in plant.states.items()
         }
-        self._growths = [list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every]
+        self._growths = [
+            list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.all_bounds
+        ]
         self._begin_s = math.inf if earlier_error else conditions.start_s
 
     @property
@@ -190,7 +210,7 @@ class ErrorInequalities:
         gain = np.where(is_counted, np.min([gain for _, gain, _ in solved], axis=0), np.inf)
         by_bound = []
         for signals, _, bound in solved:  # each b is another one
-            bound = np.where(np.arange(_SIGNALS) == 1, bound, smallest)
+            bound = np.where(_UNIT[Signal.AFTER_TEST] == 1, bound, smallest)
             by_bound.append(self._implied_bounds(signals, events, gain, bound, is_counted))
         exists = np.any([constants.exists for constants in by_bound], axis=0)
         return LoopConstants(*map(np.fmin.reduce, zip(*by_bound, strict=True)))._replace(exists=exists)
@@ -216,25 +236,26 @@ class ErrorInequalities:
         solved: Matrix,
         is_counted: NDArray[np.bool_],
     ) -> LoopConstants:
-        """Return what follows from bounds of the signals, (loops, 6)."""
-        age_input, estimation = solved[..., 0], solved[..., 2]
+        """Return what follows from bounds of v, (loops, 6)."""
+        age_input, estimation = solved[..., Signal.AGE_INPUT], solved[..., Signal.ESTIMATION_ERROR]
         input_error = _product(signals.input_error, solved)
         state = {C: free + gain * input_error for C, (free, gain) in self._states.items()}
-        fields = (
-            (_product(signals.errors[Output.WEIGHTED], solved) + estimation) / self.unit,
-            (_product(signals.sensor, solved) + estimation) / self.unit,
-            input_error,
-            self._start_error,
-            state[Output.STATE],
-            state[Output.WEIGHTED],
-            state[Output.MISMATCH],
-            loop_gain,
-            estimation,
-            _product(signals.received, solved) + age_input,
-            _product(signals.earlier, solved) + age_input,
-            np.isfinite(solved).all(axis=-1) & is_counted,
+        constants = LoopConstants(
+            missing_events=events,
+            delta=(_product(signals.errors[Output.WEIGHTED], solved) + estimation) / self.unit,
+            overshoot=(_product(signals.sensor, solved) + estimation) / self.unit,
+            input_error=input_error,
+            start_error=self._start_error,
+            state=state[Output.STATE],
+            state_weighted=state[Output.WEIGHTED],
+            mismatch=state[Output.MISMATCH],
+            loop_gain=loop_gain,
+            estimation_error=estimation,
+            received_input_error=_product(signals.received, solved) + age_input,
+            earlier_input_error=_product(signals.earlier, solved) + age_input,
+            exists=np.isfinite(solved).all(axis=-1) & is_counted,
         )
-        return LoopConstants._make([events, *(np.broadcast_to(values, events.shape) for values in fields)])
+        return LoopConstants._make(np.broadcast_to(values, events.shape) for values in constants)
 
     @property
     def unit(self) -> float:
@@ -244,15 +265,15 @@ class ErrorInequalities:
     def _signals(
         self, method: BoundMethod, events: Counts, spacing_s: Vector, own_growth: ErrorGrowth | None
     ) -> "_Signals":
-        """Return how all outputs depend on (q, b, η, π, sup‖R_E x‖, 1).
+        """Return how all outputs depend on v.
 
         Every ‖e_s‖_W has grown by ``own_growth`` from at most b at the last test; without it b is β̃. An
         event's x_s − x̂ is at most this plus η, the present x_s − x is at most this.
         """
-        sensor = np.eye(_SIGNALS)[1]
+        sensor = _UNIT[Signal.AFTER_TEST]
         if own_growth is not None:
             sensor = self._with_start(
-                _columns(0.0, own_growth.stretch, 0.0, *own_growth.driven), own_growth.highest
+                _signal_row(own_growth.stretch, 0.0, own_growth.driven), own_growth.highest
             )
         counted = events
         at_present = present = {output: self._present(output, own_growth) for output in self._error.outputs}
@@ -271,7 +292,7 @@ class ErrorInequalities:
         stages = self._stages(present[Output.GAIN], counted, spacing_s, own_growth)
         errors = {output: with_missing(output, row, counted, stages) for output, row in present.items()}
         input_error = errors[Output.GAIN]
-        earlier = input_error if drifts else with_missing(Output.GAIN, 0 * _ONE, counted, stages)
+        earlier = input_error if drifts else with_missing(Output.GAIN, np.zeros(len(Signal)), counted, stages)
         received = with_missing(Output.GAIN, at_present[Output.GAIN], 0 * events)
         return _Signals(errors, sensor, received, earlier)
 
@@ -293,7 +314,7 @@ class ErrorInequalities:
         if until_s > 0:
             growth = self._plant.growths(until_s, COARSE_CELLS)[output]
             driven = growth.totals if own_growth is None else growth.means(own_growth.ages_s + later_s)
-        return _columns(0.0, self._error.now_until(until_s)[output], 0.0, *driven)
+        return _signal_row(self._error.now_until(until_s)[output], 0.0, driven)
 
     def _with_missing(
         self,
@@ -317,9 +338,9 @@ class ErrorInequalities:
                 followed = own_growth.mean_s * sum_of_sups(kernel, events, spacing_s)
                 driven[index] = np.minimum(driven[index], followed)
         highest = self._plant.driven[output][0].sup() if self._error.decays else 0.0
-        row = self._with_start(present + _columns(0.0, gain, gain, *driven), highest)
+        row = self._with_start(present + _signal_row(gain, gain, driven), highest)
         if stages is not None and own_growth is not None:
-            row[..., 3] = present[..., 3]
+            row[..., Signal.INPUT_ERROR] = present[..., Signal.INPUT_ERROR]
             row += stages.entered(
                 *self._input_effects(output, len(stages.inputs), spacing_s, own_growth), events
             )
@@ -330,8 +351,8 @@ class ErrorInequalities:
 
         ``highest`` bounds what a p of 1 adds in a unit of time.
         """
-        by_first_input = np.fmin(row[..., 3], self._begin_s * highest)
-        return np.asarray(row + (self._first_input_error * by_first_input)[..., None] * _ONE)
+        by_first_input = np.fmin(row[..., Signal.INPUT_ERROR], self._begin_s * highest)
+        return np.asarray(row + (self._first_input_error * by_first_input)[..., None] * _UNIT[Signal.ONE])
 
     def _input_effects(
         self, output: Output, count: int, spacing_s: Vector, own_growth: ErrorGrowth
@@ -365,18 +386,21 @@ class ErrorInequalities:
         ):
             return None
         sizes, sups = self._input_effects(Output.GAIN, count, spacing_s, own_growth)
-        shape = len(spacing_s), _SIGNALS
+        shape = len(spacing_s), len(Signal)
         late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own_growth.longest_s)
         highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
         counts = np.arange(count)[:, None] + np.zeros_like(events)
-        rows = _AGE_INPUT + self._with_missing(Output.GAIN, present, counts, spacing_s, own_growth)
-        late = np.minimum(present[..., 3], highest * (delay_s - counts * spacing_s).clip(min=0.0))
-        rows[..., 3] = late
-        shares_left = 1 - (present[..., 3] - late)[..., None]
+        rows = self._with_missing(Output.GAIN, present, counts, spacing_s, own_growth)
+        rows += _UNIT[Signal.AGE_INPUT]
+        by_input = present[..., Signal.INPUT_ERROR]
+        late = np.minimum(by_input, highest * (delay_s - counts * spacing_s).clip(min=0.0))
+        rows[..., Signal.INPUT_ERROR] = late
+        shares_left = 1 - (by_input - late)[..., None]
         stages = _Stages(np.zeros((0, *shape)), late_s)
         for row, share_left, number in zip(rows, shares_left, counts, strict=True):
             row = row + stages.entered(sizes, sups, number)
-            row = np.where(share_left > 0, row / np.where(share_left > 0, share_left, 1.0), _INPUT_ERROR)
+            solved = row / np.where(share_left > 0, share_left, 1.0)
+            row = np.where(share_left > 0, solved, _UNIT[Signal.INPUT_ERROR])
             stages = stages._replace(inputs=np.concatenate([stages.inputs, row[None]]))
         return stages
 
@@ -385,7 +409,7 @@ class ErrorInequalities:
     ) -> Solution:
         """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6).
 
-        Each inequality of (q, b, η, π, sup‖R_E x‖, 1) is a row of the signals and a constant.
+        The inequality of each signal is a row of the signals and a constant.
         """
         input_error, estimation = signals.input_error, self._estimation
         row, constant = self._by_state(signals, {str(C): gain for C, gain in self.age_gains.items()})
@@ -398,62 +422,77 @@ class ErrorInequalities:
         )
         mismatch = self._by_state(signals, {Output.MISMATCH: 1.0})
         row, constant = self._by_state(signals, growth.shares)
-        after_test = (row + growth.estimation * np.eye(_SIGNALS)[2], growth.fixed + constant)
+        after_test = (row + growth.estimation * _UNIT[Signal.ESTIMATION_ERROR], growth.fixed + constant)
         if own_growth is None:
-            driven = self._with_start(_columns(0.0, 0.0, 0.0, *growth.driven), growth.highest)
+            driven = self._with_start(_signal_row(0.0, 0.0, growth.driven), growth.highest)
             after_test = growth.stretch * after_test[0] + driven, growth.stretch * after_test[1]
-        one = (0.0 * input_error, 1.0)
-        all_rows = (age_input, after_test, estimation_error, (input_error, 0.0), mismatch, one)
-        rows = _rows(*(row for row, _ in all_rows))
-        right = _columns(*(right for _, right in all_rows))
+        inequalities = {
+            Signal.AGE_INPUT: age_input,
+            Signal.AFTER_TEST: after_test,
+            Signal.ESTIMATION_ERROR: estimation_error,
+            Signal.INPUT_ERROR: (input_error, 0.0),
+            Signal.MISMATCH: mismatch,
+            Signal.ONE: (0.0 * input_error, 1.0),
+        }
+        rows = _rows(*(inequalities[signal][0] for signal in Signal))
+        right = _columns(*(inequalities[signal][1] for signal in Signal))
         return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
 
     def _missing_gain(self, output: Output, events: Counts, spacing_s: Vector) -> Vector:
-        if self._error.decays or math.isinf(self._bound.due_s):
+        if self._error.decays or math.isinf(self._bound.times.longest_s):
             return self._error.missing(output, events, spacing_s)
-        return self._error.missing_until(output, events, self._bound.due_s)
+        return self._error.missing_until(output, events, self._bound.times.longest_s)
 
     def inter_event_s(
-        self, constants: LoopConstants, drifts: NDArray[np.bool_], searched: NDArray[np.bool_]
+        self,
+        *,
+        mismatch: Vector,
+        earlier_input_error: Vector,
+        estimation_error: Vector,
+        drifts: NDArray[np.bool_],
+        searched: NDArray[np.bool_],
     ) -> Vector:
-        """Return the times that ‖e_s‖_W needs to the next event, given the constants until then.
+        """Return the times that ‖e_s‖_W needs to the next event, (loops,).
 
         Args:
-            constants: of all loops.
+            mismatch: bounds of ‖E x‖_W until then, (loops,).
+            earlier_input_error: those of the input error without the part of the present e_s.
+            estimation_error: those of ‖x̂ − x‖_W at the measurements.
             drifts: where the method is ``DRIFTING``, (loops,).
             searched: the loops whose times are needed, (loops,); the others are of no use.
         """
         # The part of D_K that is the e_s of now.
         error_gain = np.where(drifts, 0.0, self._error.now(Output.GAIN))
-        other_input_error = constants.earlier_input_error
-        estimation = np.where(searched, constants.estimation_error, 0.0)
+        input_error = np.maximum(earlier_input_error, self._first_input_error)
+        estimation = np.where(searched, estimation_error, 0.0)
         # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
-        reached = [
-            (bound.reached, bound.ago_s or math.inf)
-            for bound in self._bound.every
-            if bound.reached is not None
+        levels_and_times = [
+            (bound.least_event_error, bound.window_s or math.inf)
+            for bound in self._bound.all_bounds
+            if bound.least_event_error is not None
         ]
-        levels, most_s = (np.array(values)[:, None] for values in zip(*reached, strict=True))
+        levels, most_s = (np.array(values)[:, None] for values in zip(*levels_and_times, strict=True))
         passed_s = first_passage_s(
             self._plant,
-            np.where(searched, levels - estimation, 0.0),
-            np.where(searched, constants.mismatch, 0.0),
-            np.where(searched, np.maximum(other_input_error, self._first_input_error), 0.0),
-            error_gain,
-            estimation,
+            level=np.where(searched, levels - estimation, 0.0),
+            mismatch=np.where(searched, mismatch, 0.0),
+            input_error=np.where(searched, input_error, 0.0),
+            error_gain=error_gain,
+            start=estimation,
         )
         next_event_s = np.minimum(passed_s, most_s).max(axis=0)
-        next_event_s = np.maximum(np.minimum(next_event_s, self._bound.forced_s), self._bound.apart_s)
+        times = self._bound.times
+        next_event_s = np.maximum(np.minimum(next_event_s, times.earliest_due_s), times.shortest_s)
         if (grid_s := self._conditions.spacing_s) == 0:
             return np.asarray(next_event_s)
         return np.asarray(grid_s * np.maximum(np.ceil(next_event_s / grid_s - 1e-9), 1.0))
 
 
 class _Stages(NamedTuple):
-    """What bounds ‖p‖ while few events are missing."""
+    """Bounds of ‖p‖ while few events are missing."""
 
     inputs: Matrix
-    """Of (q, b, η, π, sup‖R_E x‖, 1), while 0, 1, … events are missing, (count, loops, 6)."""
+    """Rows of the signals, while 0, 1, … events are missing, (count, loops, 6)."""
     late_s: Matrix
     """For how long after the test before the first, second, … missing event an earlier update may
     not have taken effect yet, (count, loops)."""
@@ -467,35 +506,39 @@ class _Stages(NamedTuple):
         for count in range(1, len(self.inputs) + 1):
             late = np.minimum(sizes[:count], self.late_s[count - 1 :: -1] * sups[:count])
             row = np.einsum("kl,klj->lj", sizes[:count] - late, self.inputs[count - 1 :: -1])
-            row[:, 3] += late.sum(axis=0)
+            row[:, Signal.INPUT_ERROR] += late.sum(axis=0)
             largest = np.where((count <= events)[:, None], np.maximum(largest, row), largest)
         return largest
 
 
 class _Signals(NamedTuple):
-    """The errors as linear functions of (q, b, η, π, sup‖R_E x‖, 1).
-
-    η = sup‖x̂ − x‖_W, and b bounds ‖e_s‖_W after each test, or is β̃.
-    """
+    """The errors as linear functions of the signals: rows, (…, 6)."""
 
     errors: Mapping[Output, Vector]
-    """(…, 6) of sup‖C e_c‖."""
+    """Of sup‖C e_c‖."""
     sensor: Vector
-    """(…, 6) of β̃ = sup‖e_s‖_W."""
+    """Of β̃ = sup‖e_s‖_W."""
     received: Vector
-    """(…, 6) of sup‖K e_c‖ while no event is missing."""
+    """Of sup‖K e_c‖ while no event is missing."""
     earlier: Vector
-    """(…, 6) of the part of sup‖K e_c‖ that does not come from the present e_s."""
+    """Of the part of sup‖K e_c‖ that does not come from the present e_s."""
 
     @property
     def input_error(self) -> Vector:
-        """(…, 6) of π."""
-        return np.asarray(self.errors[Output.GAIN] + _AGE_INPUT)
+        """Of π."""
+        return np.asarray(self.errors[Output.GAIN] + _UNIT[Signal.AGE_INPUT])
 
 
 def _product(row: Vector, column: Vector) -> Vector:
     """Return the scalar products of vectors, (…, k)."""
     return np.asarray((row[..., None, :] @ column[..., None])[..., 0, 0])
+
+
+def _signal_row(
+    after_test: Vector | float, estimation_error: Vector | float, driven: Sequence[Vector | float]
+) -> Matrix:
+    """Return a row of the signals; ``driven`` has the entries of π, sup‖R_E x‖ and 1."""
+    return _columns(0.0, after_test, estimation_error, *driven)
 
 
 def _columns(*values: Vector | float) -> Matrix:

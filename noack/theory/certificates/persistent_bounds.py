@@ -77,6 +77,7 @@ class DisturbedCertificate:
             raise NoCertificateError("after a change or at a set-point the estimation error is not known")
         conditions = self.trigger.tested(conditions)
         structured = self.start_error == 0.0
+        # A part that decays as the threshold does, if there is one.
         if decays and self.resolved.coverage.is_decaying:
             try:
                 parts = yield from solve_two_parts(
@@ -91,6 +92,7 @@ class DisturbedCertificate:
             except NotDecayingError:
                 pass
         pairs = yield from self._without_decay(conditions, decays=decays, longest=longest)
+        # With a bound of x the chord of the threshold is shorter, which makes the bounds smaller.
         for _ in range(_CHORD_ROUNDS if longest and self.trigger.has_chord else 0):
             state_bounds = [
                 sum(
@@ -173,7 +175,7 @@ class DisturbedCertificate:
         return self._at_rate(self.trigger.alpha_per_s, TriggerBound(self.trigger.beta, None))
 
     def _at_rate(self, rate_per_s: float, bound: TriggerBound) -> CertificatePart:
-        """What follows from the start, scaled by a rate."""
+        """Return the part that follows from the start, scaled by a rate."""
         plant = self._plant(rate_per_s)
         return CertificatePart(plant.error, plant, bound, self._estimation.decaying(rate_per_s))
 
@@ -243,10 +245,10 @@ def solve_two_parts(
     beta, floor = decaying.bound.beta, persistent.bound.beta
 
     def solve_with(share: float | None) -> Search[tuple[Constants, Constants]]:
-        reached = (None, None) if share is None else (share * beta, (1 - share) * floor)
+        levels = (None, None) if share is None else (share * beta, (1 - share) * floor)
         parts = [
-            part._replace(bound=part.bound._replace(reached=level))
-            for part, level in zip((decaying, persistent), reached, strict=True)
+            part._replace(bound=part.bound._replace(least_event_error=level))
+            for part, level in zip((decaying, persistent), levels, strict=True)
         ]
         first_constants, second_constants = yield Problem(tuple(parts), conditions, earlier_error, structured)
         return first_constants, second_constants

@@ -14,9 +14,11 @@ first, or the equations their enclosure, there is no certificate, and the report
 
 import contextlib
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from itertools import starmap
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,7 +92,7 @@ class _Box(CertificateScope):
         try:
             phases = yield from self.without_decay(conditions)
         except (NoCertificateError, NotDecayingError, OverflowError, np.linalg.LinAlgError):
-            phases = yield from self._constants(conditions)
+            phases = yield from self.all_phases(conditions)
         return phases, self._coordinate_bounds(phases, conditions)
 
     def without_decay(self, conditions: NetworkConditions) -> Search[list[Phases]]:
@@ -103,8 +105,8 @@ class _Box(CertificateScope):
             return [(main, None, persistent) for main, persistent in starmap(self._checked, pairs)]
         trigger = self._trigger
         level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
-        tested, reached = trigger.tested(conditions), trigger.floor or None
-        constants = yield from self._solve(tested, 0.0, level, reached, longest=False)
+        tested, least_level = trigger.tested(conditions), trigger.floor or None
+        constants = yield from self._solve(tested, 0.0, level, least_level, longest=False)
         return [(*self._checked(constants, None), None)]
 
     def _coordinate_bounds(self, phases: list[Phases], conditions: NetworkConditions) -> Vector:
@@ -123,11 +125,18 @@ class _Box(CertificateScope):
         return np.asarray(np.min(bounds, axis=0))
 
 
+class _ProvenRegion(NamedTuple):
+    """A region that x and u do not leave, and the decay rates of the box over it."""
+
+    region: Region
+    decay_per_s: Mapping[str, float]
+
+
 class RegionScope(_Box):
     """A nonlinear plant within a region; see :class:`CertificateScope`."""
 
     def __init__(self, resolved: Scenario, start_error: float = 0.0, start: Matrix | None = None) -> None:
-        loop, self._regions = loop_of(resolved), dict[NetworkConditions, Region]()
+        loop, self._proven = loop_of(resolved), dict[NetworkConditions, _ProvenRegion]()
         self._other_start = start
         # The plants of the model; those of each region take their place.
         model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
@@ -138,12 +147,16 @@ class RegionScope(_Box):
         certificate = yield from super().search(conditions)
         if certificate.constants is None:
             return certificate
-        region = self._regions[conditions]
+        region = self._proven[conditions].region
         why = "the bounds on the region are inside it, so that there is no first exit"
         stays = "x and u stay in the region over which the equations are enclosed"
         proven = Assumption(stays, "certificate", AssumptionStatus.HOLDS, why)
         assumptions = (*certificate.assumptions, proven, self._rest())
         return replace(certificate, region=region, assumptions=assumptions)
+
+    def _decay_under(self, conditions: NetworkConditions) -> Mapping[str, float]:
+        proven = self._proven.get(conditions)
+        return self.decay_per_s if proven is None else proven.decay_per_s
 
     def _rest(self) -> Assumption:
         """Return that f(0, 0) = 0, on which the inclusion rests."""
@@ -156,16 +169,23 @@ class RegionScope(_Box):
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain on the region; at least 1, perhaps infinite, if there is none."""
         try:
-            phases = completed_alone(self._constants(conditions, longest=False, near=True))
+            phases = completed_alone(self.all_phases(conditions, longest=False, near=True))
         except NoCertificateError as error:
             return max(error.loop_gain, 1.0)
         except NotDecayingError:
             return math.inf
         return max(phase.loop_gain for phase in phases[0] if phase is not None)
 
-    def _constants(
+    def all_phases(
         self, conditions: NetworkConditions, *, longest: bool = True, near: bool = False
     ) -> Search[list[Phases]]:
+        """Search for the constants on a region that x and u do not leave.
+
+        ``longest``: search for the tightest bounds on this region; otherwise any suffice. ``near``:
+        begin with the region of shorter times; the search may end before it has found a region.
+
+        Raises: as :meth:`CertificateScope.all_phases`.
+        """
         widths = self._widths_within(conditions) if near else np.zeros(self._loop.n + self._loop.m)
         where, step = "near 0", 0.0
         for _ in range(_ATTEMPTS):
@@ -183,11 +203,11 @@ class RegionScope(_Box):
             except NotDecayingError as error:
                 raise NotDecayingError(f"{where}: {error}") from None
             if (reached < widths).all():
-                self._regions[conditions] = Region.of(widths, inclusion)
-                self._decay = box._decay
+                region = Region.of(widths, inclusion)
+                self._proven[conditions] = _ProvenRegion(region, box.decay_per_s)
                 if longest:
                     with contextlib.suppress(NoCertificateError, NotDecayingError):
-                        return (yield from box._constants(conditions))
+                        return (yield from box.all_phases(conditions))
                 return phases
             wider = np.maximum(widths, _WIDER * reached + _LEAST * reached.max())
             # The bounds grow faster than the region: towards a region that holds them, steps shrink.
@@ -202,7 +222,7 @@ class RegionScope(_Box):
 
         The bounds increase with the times, so that this region is not larger than the smallest one.
         """
-        for known, region in reversed(self._regions.items()):
+        for known, (region, _) in reversed(self._proven.items()):
             shorter = all(getattr(known, name) <= getattr(conditions, name) for name in _TIMES)
             if shorter and known.guarantee == conditions.guarantee:
                 return np.array(region.x + region.u)

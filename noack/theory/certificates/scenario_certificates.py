@@ -1,15 +1,13 @@
-"""Certificates of a scenario: their constants, assumptions and conditions, and the largest times.
+"""Certificates of a scenario: their constants, assumptions and conditions.
 
-:class:`CertificateScope` is a scenario's own plant, or its uncertainty box. :func:`network_limits`
-searches for the largest sampling period, delay and age of inputs for which a certificate exists.
+:class:`CertificateScope` is a scenario's own plant, or its uncertainty box.
 """
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,15 +32,6 @@ from noack.theory.certificates.deliveries.due_deliveries import Deliveries
 from noack.theory.certificates.persistent_bounds import DisturbedCertificate, PlantAt, choose_rate
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
-MOST_S = 10.0
-"""No larger times are tried."""
-_LEAST_S, _USUAL_S = 1e-6, 1e-3
-_RESOLUTION = 1e-3
-_WIDER, _NEXT = 4.0, 1.2
-_STEPS = 6
-"""After so many steps the middle is tried, if interpolation has not found the limit."""
-Points = Sequence[tuple[float, float]]
-"""Logarithms of loop gains, and of their times."""
 _SLOWER = 0.9
 _TIMED_RATES = (0.7, 0.4, 0.1)
 """Rates that are tried where events are due, as shares of the decay rate of A + BK: the first that
@@ -154,14 +143,15 @@ class CertificateScope:
         due = self._trigger.has_due_time
         self._held = not self._loop.H.any() and not due
         decays = math.inf if self._held or due else -spectral_abscissa(self._loop.H)
-        self._decay = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
+        self.decay_per_s = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
+        """Decay rates; that of the models is infinite if they hold."""
         assert start is None or self.is_simple  # other starts are those of the scenario
         self._plant_at = plant_at
         self._plants: dict[float, PlantGains] = {}
 
     @property
     def is_simple(self) -> bool:
-        """Whether no causes are bounded apart from the start, and added."""
+        """Whether nothing persists whose bounds are added to those from the start."""
         return self._resolved.coverage.is_undisturbed and not self._trigger.is_constant
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
@@ -171,10 +161,11 @@ class CertificateScope:
     def search(self, conditions: NetworkConditions) -> Search[ScenarioCertificate]:
         """Search for the certificate under some conditions, perhaps together with others."""
         trigger = self._trigger
+        # The constants, or the reason for having none.
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
-            phases = yield from self._constants(conditions)
+            phases = yield from self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
             void = error
         reason = None if void is None else str(void)
@@ -184,25 +175,36 @@ class CertificateScope:
         ) -> ScenarioCertificate:
             main, floor, persistent = phase
             return ScenarioCertificate(
-                self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-                self._loop.weight is not None, conditions, (), main, floor, reason, persistent,
-                certificate(*other_phases) if other_phases else None,
-            )  # fmt: skip
+                scope=self.name,
+                beta=trigger.beta,
+                alpha_per_s=trigger.alpha_per_s,
+                floor=trigger.floor,
+                weighted=self._loop.weight is not None,
+                conditions=conditions,
+                assumptions=(),
+                constants=main,
+                floor_constants=floor,
+                void=reason,
+                persistent_constants=persistent,
+                other=certificate(*other_phases) if other_phases else None,
+            )
 
+        # The assumptions under which they hold.
         unchecked = certificate(*phases)
         main, persistent = unchecked.constants, unchecked.persistent_constants
         probability = None
         if not self._resolved.network.enforce_mansd:
             probability = kept_probability(self._resolved, conditions.guarantee, unchecked.inter_event_s)
+        gains = [phase.loop_gain for phase in (main, persistent) if phase is not None]
         assumptions = certificate_assumptions(
             self._resolved,
             conditions,
-            self._decay,
-            main,
-            void,
-            max((phase.loop_gain for phase in (main, persistent) if phase is not None), default=0.0),
-            trigger.text(),
-            probability,
+            decay_per_s=self._decay_under(conditions),
+            constants=main,
+            void=void,
+            loop_gain=max(gains, default=0.0),
+            trigger_bound=trigger.text(),
+            probability=probability,
         )
         return replace(unchecked, assumptions=tuple(assumptions))
 
@@ -221,7 +223,11 @@ class CertificateScope:
         # The slowest rate asks for least.
         return next((deliveries.gain for deliveries in self._deliveries(conditions, _TIMED_RATES[-1:])), gain)
 
-    def _constants(self, conditions: NetworkConditions) -> Search[list[Phases]]:
+    def _decay_under(self, conditions: NetworkConditions) -> Mapping[str, float]:
+        """Return the decay rates of the certificate under some conditions."""
+        return self.decay_per_s
+
+    def all_phases(self, conditions: NetworkConditions) -> Search[list[Phases]]:
         """Search for the constants of each bound of the run; all of them hold.
 
         Raises:
@@ -274,13 +280,14 @@ class CertificateScope:
         if self._start_error or self._start.shape[1] != 1 or self._resolved.observer is not None:
             return
         tested = trigger.tested(conditions)
-        for share in shares if self._decay["A + BK"] > 0 else ():
-            rate = share * self._decay["A + BK"]
+        for share in shares if self.decay_per_s["A + BK"] > 0 else ():
+            rate = share * self.decay_per_s["A + BK"]
             plant = self._plant_at(error_gains(loop, rate), self._start, rate)
             if plant.is_one_plant:
                 with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
                     bound = trigger.bound(tested, 0.0, None)
-                    bound = bound._replace(apart_s=max(bound.apart_s, apart_s))
+                    least_s = max(bound.times.shortest_s, apart_s)
+                    bound = bound._replace(times=bound.times._replace(shortest_s=least_s))
                     yield Deliveries(plant, tested, bound)
 
     def _phases(
@@ -299,7 +306,7 @@ class CertificateScope:
     ) -> Search[list[tuple[Constants, Constants | None]]]:
         """Search for the constants, and those to be added under persistent disturbances."""
         alpha = self._trigger.alpha_per_s
-        decays = not self._held and below(alpha, min(self._decay.values()))
+        decays = not self._held and below(alpha, min(self.decay_per_s.values()))
         search = self._disturbed.constants(conditions, decays=decays, longest=longest)
         pairs = yield from search
         return [self._checked(*pair) for pair in pairs]
@@ -307,7 +314,7 @@ class CertificateScope:
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
         return DisturbedCertificate(
-            self._resolved, self._plant_at, self._trigger, self._start_error, min(self._decay.values())
+            self._resolved, self._plant_at, self._trigger, self._start_error, min(self.decay_per_s.values())
         )
 
     def _checked(self, main: Constants, added: Constants | None) -> tuple[Constants, Constants | None]:
@@ -327,7 +334,7 @@ class CertificateScope:
         return main, added
 
     def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Search[Constants]:
-        trigger, decay = self._trigger, min(self._decay.values())
+        trigger, decay = self._trigger, min(self.decay_per_s.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         if trigger.is_homogeneous:
             if not longest:
@@ -380,7 +387,7 @@ class CertificateScope:
         conditions: NetworkConditions,
         alpha_per_s: float,
         level: float,
-        reached: float | None,
+        least_level: float | None,
         *,
         longest: bool = True,
     ) -> Search[Constants]:
@@ -392,7 +399,7 @@ class CertificateScope:
         plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
-        part = CertificatePart(plant.error, plant, self._trigger.bound(conditions, level, reached))
+        part = CertificatePart(plant.error, plant, self._trigger.bound(conditions, level, least_level))
         return (
             yield from sharpened(
                 Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
@@ -425,85 +432,3 @@ def _is_finite(constants: Constants) -> bool:
     """Return whether every constant is finite; only the inter-event time may be infinite."""
     numbers = [v for v in constants._replace(inter_event_s=None) if v is not None]
     return all(map(math.isfinite, numbers)) and not math.isnan(constants.inter_event_s or 0.0)
-
-
-class NetworkLimits(NamedTuple):
-    """Largest certified value of each quantity; the others are those of the schedule."""
-
-    sampling_s: float
-    delay_s: float
-    hold_s: float
-
-
-def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
-    """Return the limits for some plants; 0 means that there is no certificate at any time."""
-    return NetworkLimits(
-        *(network_limit(scope, scheduled, quantity) for quantity in ("sampling", "delay", "hold"))
-    )
-
-
-_CHANGES: dict[str, Callable[[NetworkConditions, float], NetworkConditions]] = {
-    "sampling": lambda conditions, s: conditions._replace(sampling_s=s, spacing_s=s),
-    "delay": lambda conditions, s: conditions._replace(delay_s=s, start_s=s),
-    "hold": lambda conditions, s: conditions._replace(hold_s=s),
-    "start": lambda conditions, s: conditions._replace(start_s=s),
-}
-
-
-def network_limit(scope: CertificateScope, scheduled: NetworkConditions, quantity: str) -> float:
-    """Return the limit of one of the times ``sampling``, ``delay``, ``hold`` and ``start``, in s.
-
-    0 means that there is no certificate at any time.
-    """
-    change = _CHANGES[quantity]
-    usual_s: float = getattr(scheduled, f"{quantity}_s")
-    return largest(lambda value_s: scope.loop_gain(change(scheduled, value_s)), usual_s)
-
-
-def largest(loop_gain: Callable[[float], float], usual_s: float) -> float:
-    """Return the largest time with a loop gain below 1, to 0.1 %, or 0 below 1 µs.
-
-    The gain grows with the time; it is infinite where it is not known.
-
-    Args:
-        loop_gain: of a time in s.
-        usual_s: a time in s for which the gain is probably below 1.
-    """
-    low_s, high_s, known = 0.0, math.inf, list[tuple[float, float]]()
-    tried_s, step = min(usual_s or _USUAL_S, MOST_S), 0
-    while high_s > _LEAST_S and (math.isinf(high_s) or high_s - low_s > _RESOLUTION * high_s):
-        gain = loop_gain(tried_s)
-        if 0 < gain < math.inf:
-            known.append((math.log(gain), math.log(tried_s)))
-        low_s, high_s = (tried_s, high_s) if gain < 1 else (low_s, tried_s)
-        if low_s == MOST_S:
-            break
-        step += low_s > 0 and math.isfinite(high_s)
-        tried_s = _next_s(low_s, high_s, known, middle=step % _STEPS == 0)
-    return low_s
-
-
-def _next_s(low_s: float, high_s: float, known: Points, *, middle: bool) -> float:
-    """Return the time to try next, between those with gains below and above 1."""
-    guess_s = _interpolated_s(known)
-    if low_s == 0:
-        return high_s / _WIDER
-    if math.isinf(high_s):
-        is_found = len(known) > 1 and guess_s > low_s
-        guess_s = max(guess_s, _NEXT * low_s) if is_found else _WIDER * low_s
-        return min(guess_s, _WIDER**2 * low_s, MOST_S)
-    if middle or not low_s < guess_s < high_s:
-        return math.sqrt(low_s * high_s)
-    # Next to a time that is close to the guess, the next one is on the other side of it.
-    margin = 0.9 * _RESOLUTION
-    return min(max(guess_s, low_s * (1 + margin)), high_s * (1 - margin))
-
-
-def _interpolated_s(known: Points) -> float:
-    """Return the time at which the gain is 1, from the gains nearest to it, in logarithms."""
-    nearest = sorted(known, key=lambda point: abs(point[0]))[:3]
-    interpolated = 0.0
-    for gain, time in nearest:
-        other_gains = [other_gain for other_gain, _ in nearest if other_gain != gain]
-        interpolated += time * math.prod(other_gain / (other_gain - gain) for other_gain in other_gains)
-    return math.exp(min(interpolated, math.log(MOST_S)))

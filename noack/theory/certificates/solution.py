@@ -11,13 +11,12 @@ import contextlib
 import math
 from collections import defaultdict
 from collections.abc import Generator, Hashable, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.cached_method import cached_function
 from noack.core.linear_systems import Vector
 from noack.theory.bounds.certificate_terms import (
     CertificatePart,
@@ -27,8 +26,8 @@ from noack.theory.bounds.certificate_terms import (
     TriggerBound,
 )
 from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.error_growth import LONGEST_S
 from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.bounds.trigger_bounds import LONGEST_S
 from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 
@@ -42,7 +41,7 @@ class Problem(NamedTuple):
     All inequalities are linear in functions of time, for given events. So they may be divided into
     parts: what decays is one part, what persists another one. All parts bound e_c by the same
     method, since the sum of solutions of different inequalities bounds nothing. The threshold is at
-    least the sum of the parts' ``reached``, so the next event needs one part that reaches its own.
+    least the sum of the parts' ``least_event_error``, so the next event needs one part that reaches its own.
     """
 
     parts: tuple[CertificatePart, ...]
@@ -57,7 +56,7 @@ class Problem(NamedTuple):
 
     @property
     def likeness(self) -> Hashable:
-        """What problems must have in common to be solved together; None if this one is alone."""
+        """The common properties of problems that are solved together; None if this one is alone."""
         plants = [part.plant.likeness for part in self.parts]
         if None in plants:
             return None
@@ -157,26 +156,18 @@ def sharpened(problem: Problem) -> Search[Constants]:
     (part,), conditions, *_ = problem
     is_plain = problem.structured and problem.earlier_error == 0.0
     if problem.longest and is_plain and can_be_sharpened(part):
-        key = id(part.plant), constants, repr((part.bound, conditions))
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
-            return sharpened_once(_SharpeningTask(key, constants, part, conditions))
+            return sharpened_once(constants, part, conditions)
     return constants
 
 
-@dataclass(frozen=True)
-class _SharpeningTask:
-    """What :func:`sharpened_constants` needs. The key has the plant's id: the part keeps the plant."""
-
-    key: Hashable
-    constants: Constants = field(compare=False)
-    part: CertificatePart = field(compare=False)
-    conditions: NetworkConditions = field(compare=False)
+def _sharpening_key(constants: Constants, part: CertificatePart, conditions: NetworkConditions) -> Hashable:
+    # The id is that of one plant only, because the part is kept, and keeps its plant.
+    return id(part.plant), constants, repr((part.bound, conditions))
 
 
-@lru_cache(maxsize=32)
-def sharpened_once(task: _SharpeningTask) -> Constants:
-    """Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
-    return sharpened_constants(task.constants, task.part, task.conditions)
+sharpened_once = cached_function(32, _sharpening_key)(sharpened_constants)
+"""Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
 
 
 def _solve_together(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
@@ -193,9 +184,11 @@ def _solve_together(problems: Sequence[Problem]) -> list[list[Constants] | Excep
         together = part._replace(plant=part.plant.together(plants))
         earlier = example.earlier_error if index == 0 else 0.0
         inequalities.append(ErrorInequalities(together, conditions, earlier))
-    apart_s = max(part.bound.apart_s for part in example.parts)
+    apart_s = max(part.bound.times.shortest_s for part in example.parts)
     least_s = max(conditions.spacing_s, apart_s)
-    is_separated = all(any(bound.reached is not None for bound in part.bound.every) for part in example.parts)
+    is_separated = all(
+        any(bound.least_event_error is not None for bound in part.bound.all_bounds) for part in example.parts
+    )
     searched = np.full(count, is_separated)
     if is_separated and not example.longest:
         searched = ~_smallest_constants(inequalities, np.full(count, least_s)).exists
@@ -225,7 +218,13 @@ def _longest_spacing_s(
         for part, constants in zip(reversed(inequalities), reversed(smallest.parts), strict=True):
             # Often what persists, which is the last part, gives a time of at most the least one.
             loops = is_open & (implied_s > least_s)
-            passed_s = part.inter_event_s(constants, smallest.drifts, loops)
+            passed_s = part.inter_event_s(
+                mismatch=constants.mismatch,
+                earlier_input_error=constants.earlier_input_error,
+                estimation_error=constants.estimation_error,
+                drifts=smallest.drifts,
+                searched=loops,
+            )
             implied_s = np.where(loops, np.minimum(implied_s, passed_s), implied_s)
         is_open &= implied_s < spacing_s
         # Iterate from above.

@@ -18,9 +18,9 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
-from noack.theory.bounds.contraction import Stack, product, spectral_norms
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, response
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
+from noack.theory.bounds.stacked_norms import Stack, larger_ends, spectral_norms, stack_product
 from noack.theory.certificates.solution import solve
 
 _ROUNDS_PER_SCALE, _ROUNDS, _ROUNDS_PER_ENTRY = 15, 40, 12
@@ -142,7 +142,7 @@ class _SampledPlant(PlantGains):
         coefficients = {}
         for output, C in self.outputs.items():
             nodes_s, states = self.samples.plant
-            followed = product(C, states)
+            followed = stack_product(C, states)
             coefficients[output] = Coefficients(
                 _sampled(nodes_s, followed[:, :, :1]).sup(), _sampled(nodes_s, followed[:, :, 1:]).integral()
             )
@@ -160,7 +160,10 @@ class _SampledPlant(PlantGains):
     @cached_property
     def forced(self) -> Mapping[str, KernelBounds]:
         nodes_s, states = self.samples.plant
-        return {output: _sampled(nodes_s, product(C, states[:, :, 1:])) for output, C in self.outputs.items()}
+        return {
+            output: _sampled(nodes_s, stack_product(C, states[:, :, 1:]))
+            for output, C in self.outputs.items()
+        }
 
 
 def _thinned(generator: Matrix, D: Matrix) -> tuple[Vector, Stack]:
@@ -173,9 +176,8 @@ def _thinned(generator: Matrix, D: Matrix) -> tuple[Vector, Stack]:
 def _sampled(nodes_s: Vector, values: Stack) -> KernelBounds:
     """Return the norms of a kernel from its values at nodes; beyond the last node it is 0."""
     norms = spectral_norms(values)
-    ends = np.maximum(norms[:-1], norms[1:])
     areas, zero = np.diff(nodes_s) * (norms[:-1] + norms[1:]) / 2, np.zeros(())
-    return KernelBounds(nodes_s, ends, areas, zero, zero, zero)
+    return KernelBounds(nodes_s, larger_ends(norms), areas, zero, zero, zero)
 
 
 def _weight(H: Matrix, alpha_per_s: float, L: Matrix) -> Matrix | None:

@@ -21,7 +21,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 
 _UNIT = 2.0**-53
-_ENLARGED = 1 + 2.0**-40
+ENLARGED = 1 + 2.0**-40
 _UNDERFLOW = 1e-290
 _DIGITS = 384
 _ONE = 1 << _DIGITS
@@ -42,13 +42,13 @@ class IntervalMatrix(NamedTuple):
         left, right = np.abs(self.middle), np.abs(other.middle)
         terms = left.shape[-1] + 4
         radius = left @ (other.radius + terms * _UNIT * right) + self.radius @ (right + other.radius)
-        return IntervalMatrix(self.middle @ other.middle, radius * _ENLARGED + terms * _UNDERFLOW)
+        return IntervalMatrix(self.middle @ other.middle, radius * ENLARGED + terms * _UNDERFLOW)
 
     def __sub__(self, other: "IntervalMatrix") -> "IntervalMatrix":
         """Enclose the differences."""
         middle = self.middle - other.middle
         radius = self.radius + other.radius + 2 * _UNIT * np.abs(middle)
-        return IntervalMatrix(middle, radius * _ENLARGED + _UNDERFLOW)
+        return IntervalMatrix(middle, radius * ENLARGED + _UNDERFLOW)
 
     def scaled(self, exponent: int | NDArray[np.int64]) -> "IntervalMatrix":
         """Return the matrices times 2^exponent, which may differ from entry to entry."""
@@ -57,7 +57,7 @@ class IntervalMatrix(NamedTuple):
     @property
     def magnitude(self) -> Matrix:
         """Upper bounds of the absolute values."""
-        bound: NDArray[np.float64] = (np.abs(self.middle) + self.radius) * _ENLARGED
+        bound: NDArray[np.float64] = (np.abs(self.middle) + self.radius) * ENLARGED
         return bound
 
     @property
@@ -87,10 +87,10 @@ def inverse(matrices: Matrix) -> IntervalMatrix | None:
         return None
     errors = exactly(np.eye(matrices.shape[-1])) - exactly(approximate) @ exactly(matrices)
     defects = errors.magnitude.sum(axis=-1).max(axis=-1)
-    if not (defects * _ENLARGED < 0.5).all():
+    if not (defects * ENLARGED < 0.5).all():
         return None
     shares = (defects / (1 - defects))[..., None, None]
-    columns = np.abs(approximate).max(axis=-2, keepdims=True) * shares * _ENLARGED**4
+    columns = np.abs(approximate).max(axis=-2, keepdims=True) * shares * ENLARGED**4
     return IntervalMatrix(approximate, np.broadcast_to(columns, matrices.shape).copy())
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
+from noack.theory.margins.exact_matrices import ENLARGED, IntervalMatrix, exactly
 from noack.theory.margins.switched_system import Cycle, SwitchedSystem
 
 _EXCHANGES = 400
@@ -26,7 +26,6 @@ _IMPROVEMENT = 1e-11
 _PIVOT = 1e-9
 _PRODUCTS = 250_000
 """Of a product of matrices: the BLAS uses several threads for larger ones, which is slower here."""
-_ENLARGED = 1 + 2.0**-40
 UNIT = 0.1
 _INSIDE = 1 - 1e-9
 _ROUNDS = 60
@@ -116,7 +115,7 @@ class PolytopeNorm:
         basis = exactly(self.vertices[combinations.vertices])
         sums = exactly(combinations.coefficients[:, None, :]) @ basis
         missed = (points - IntervalMatrix(*(part[:, 0] for part in sums))).magnitude
-        bounds = (combinations.norms + (missed / self._units).sum(axis=1)) * _ENLARGED
+        bounds = (combinations.norms + (missed / self._units).sum(axis=1)) * ENLARGED
         return np.where(np.isnan(bounds), np.inf, bounds)
 
 

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.contraction import Stack
-from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
+from noack.theory.bounds.stacked_norms import Stack
+from noack.theory.margins.exact_matrices import ENLARGED, IntervalMatrix, exactly
 from noack.theory.margins.switched_system import Graph, Numbers, SwitchedSystem
 
 _FASTEST, _STEADY = 8, 17
@@ -37,7 +37,6 @@ _ATTEMPTS = 8
 _SETTLED = 1e-4
 _LARGEST_LOGARITHM = 300.0
 _SMALLEST = 1e-300
-_ENLARGED = 1 + 2.0**-40
 
 
 class QuadraticNorms(NamedTuple):
@@ -283,5 +282,5 @@ def norms_above(matrices: IntervalMatrix) -> Vector:
     defect = exactly(np.eye(M.middle.shape[2])) - V.transposed @ V
     size, missed = (matrix.magnitude.sum(axis=2).max(axis=1) for matrix in (square, defect))
     with np.errstate(divide="ignore", invalid="ignore"):
-        bounds = np.sqrt(size / (1 - missed)) * _ENLARGED
+        bounds = np.sqrt(size / (1 - missed)) * ENLARGED
     return np.where((missed < 0.5) & ~np.isnan(bounds), bounds, np.inf)

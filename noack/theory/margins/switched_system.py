@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Vector, balancing_exponents
-from noack.theory.bounds.contraction import Stack
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 
 Numbers = NDArray[np.int64]

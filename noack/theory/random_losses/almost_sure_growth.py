@@ -24,7 +24,8 @@ from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.contraction import EPSILON, Stack
+from noack.theory.bounds.contraction import EPSILON
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, inverse
 from noack.theory.margins.loss_margin import intervals_ns, loop_times
 from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop

@@ -38,7 +38,7 @@ from noack.impairments.loss_prediction import OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.contraction import Stack
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.loss_margin import intervals_ns, loop_times, require_idle_watchdog
 from noack.theory.margins.time_triggered_loop import LoopTimes, Timeline, repeated

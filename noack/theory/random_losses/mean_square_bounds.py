@@ -33,9 +33,9 @@ import numpy as np
 
 from noack.core.linear_systems import Vector, exponential
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.certificates.inequalities import solve_inequalities
 from noack.theory.random_losses.stochastic_lyapunov import (
     KnownRms,

@@ -25,7 +25,8 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector, balancing_exponents
 from noack.impairments.loss_prediction import OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
-from noack.theory.bounds.contraction import EPSILON, Stack
+from noack.theory.bounds.contraction import EPSILON
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 from noack.theory.margins.switched_system import Graph
 from noack.theory.margins.time_triggered_loop import LoopTimes

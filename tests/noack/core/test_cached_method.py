@@ -20,3 +20,11 @@ def test_latest_results_are_kept_by_the_bits_of_the_arguments() -> None:
     assert len(computed) == 3
     total(ones, factor=3)  # it was the oldest of three
     assert len(computed) == 4
+
+
+def test_results_are_kept_by_a_key_of_the_arguments() -> None:
+    @cached_function(2, key=len)
+    def first(values: list[int]) -> int:
+        return values[0]
+
+    assert [first([1, 2]), first([3, 4]), first([5])] == [1, 1, 5]

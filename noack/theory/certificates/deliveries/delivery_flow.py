@@ -23,19 +23,20 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
-from noack.theory.bounds.contraction import Stack, logarithmic_norm, product, spectral_norms
+from noack.theory.bounds.contraction import logarithmic_norm
 from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.stacked_norms import Stack, larger_ends, spectral_norms, stack_product
 
 _CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
 _MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000
 _TAYLOR_TERMS = 4
 """Terms by which a second derivative over a cell is bounded."""
-ROUNDING = 1 + 1e-5
+FLOW_ROUNDING = 1 + 1e-5
 """Exceeds the error of e^{Fτ}: measured below 1e-12 of its norm, which is up to 1e6; no proof."""
 
 
 class InputEffects(NamedTuple):
-    """How much inputs that are held and late change the flow from the moment an update acts."""
+    """Bounds of what held and late inputs change of the flow, from the moment an update acts."""
 
     age_input: float = 0.0
     """Bound of ‖q‖, p = K e_c + q."""
@@ -119,15 +120,15 @@ class DeliveryFlow:
         shares = error_bound / np.maximum(errors, error_bound)
         at_nodes = np.linalg.norm(z @ C.T, axis=1)
         sags = np.diff(self.edges_s) ** 2 / 8 * bends * float(np.linalg.norm(C, 2))
-        cells = shares * (np.maximum(at_nodes[1:], at_nodes[:-1]) + sags)
-        return float(cells[first_cell:].max()) * ROUNDING
+        cells = shares * (larger_ends(at_nodes) + sags)
+        return float(cells[first_cell:].max()) * FLOW_ROUNDING
 
     def first_event(self, level: float) -> int:
         """Return the first cell in which ‖e_s‖_W can reach a level after the start."""
         z, bends = self.start_response
         errors = np.linalg.norm(z[:, self.n :], axis=1)
-        highest = np.maximum(errors[1:], errors[:-1]) + np.diff(self.edges_s) ** 2 / 8 * bends
-        return int(np.argmax(np.append(highest[:-1] * ROUNDING >= level, True)))
+        highest = larger_ends(errors) + np.diff(self.edges_s) ** 2 / 8 * bends
+        return int(np.argmax(np.append(highest[:-1] * FLOW_ROUNDING >= level, True)))
 
     def cell_at(self, time_s: float) -> int:
         """Return the cell that contains a time."""
@@ -147,7 +148,7 @@ class DeliveryFlow:
         for responses in (by_error, by_input):
             at_nodes = spectral_norms(C @ responses)
             sags = sag_factors * norm * np.linalg.norm(responses[:-1], axis=(1, 2))
-            sups.append((np.maximum(at_nodes[1:], at_nodes[:-1]) + sags) * ROUNDING)
+            sups.append((larger_ends(at_nodes) + sags) * FLOW_ROUNDING)
         return sups[0], np.cumsum(sups[1] * np.diff(self.edges_s))
 
     @cached_property
@@ -167,9 +168,9 @@ def bend_terms(
 
     ``states``: Y, e^{Fτ} at the left nodes of the cells.
     """
-    terms = [product(F @ F, states)]
+    terms = [stack_product(F @ F, states)]
     for order in range(1, count + 1):
-        terms.append(product(F, terms[-1]) * (steps_s / order)[:, None, None])
+        terms.append(stack_product(F, terms[-1]) * (steps_s / order)[:, None, None])
     with np.errstate(over="ignore"):
         growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s)
     return terms[:-1], growth[:, None, None] * terms[-1]

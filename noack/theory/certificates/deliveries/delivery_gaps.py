@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import Outputs, response_until
 from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.stacked_norms import Stack
 
 ROUNDING = 1 + 1e-9
 _MOST_GAPS, _MOST_CELLS = 256, 640
@@ -60,10 +60,12 @@ class Gaps(NamedTuple):
             NoCertificateError: they are not covered.
         """
         most_events, step_s = conditions.dropouts + 1, conditions.spacing_s
-        least_s = max(bound.apart_s, step_s)
-        if step_s == 0 or not math.isfinite(bound.due_s):
+        least_s = max(bound.times.shortest_s, step_s)
+        if step_s == 0 or not math.isfinite(bound.times.longest_s):
             raise NoCertificateError("events are not due at sampling times")
-        fewest_steps, most_steps = (math.floor(time_s / step_s + 1e-9) for time_s in (least_s, bound.due_s))
+        fewest_steps, most_steps = (
+            math.floor(time_s / step_s + 1e-9) for time_s in (least_s, bound.times.longest_s)
+        )
         if fewest_steps == most_steps:
             return cls(fewest_steps * step_s, np.arange(1, most_events + 1), fewest_steps * step_s)
         if most_events * most_steps > _MOST_GAPS:

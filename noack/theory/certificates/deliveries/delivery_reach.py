@@ -1,4 +1,4 @@
-"""What x and e_c can be after a delivery, for all states ξ of an ellipsoid.
+"""Bounds of x and e_c after a delivery, for all states ξ of an ellipsoid.
 
 All that is uncertain of the flow (``delivery_flow.py``) is ξ, and the time of the next delivery.
 Let ‖Λξ‖ ≤ 1 and ‖e_c‖_W ≤ D at all times. At the time τ, ξ has ‖Λξ‖ ≤ 1 and ‖Nξ‖_W ≤ D, N the rows
@@ -28,18 +28,13 @@ from numpy.typing import NDArray
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, exponential
-from noack.theory.bounds.contraction import (
-    Stack,
-    largest_eigenvalues,
-    logarithmic_norm,
-    spectral_norm,
-    spectral_norms,
-)
+from noack.theory.bounds.contraction import logarithmic_norm
 from noack.theory.bounds.enclosure import response
 from noack.theory.bounds.gains import Output
+from noack.theory.bounds.stacked_norms import Stack, largest_eigenvalues, spectral_norm, spectral_norms
 from noack.theory.certificates.deliveries.delivery_flow import (
+    FLOW_ROUNDING,
     NO_EFFECTS,
-    ROUNDING,
     DeliveryFlow,
     InputEffects,
     bend_terms,
@@ -210,7 +205,7 @@ class Reach:
 
     def sup_state(self, C: Matrix) -> float:
         """Bound ‖C W x‖ at all times, for C of shape (q, n)."""
-        in_ellipsoid = self.scale * float(spectral_norm(C @ self.ellipsoid.inverse)) * ROUNDING
+        in_ellipsoid = self.scale * float(spectral_norm(C @ self.ellipsoid.inverse)) * FLOW_ROUNDING
         return max(in_ellipsoid, self._from_start(np.hstack([C, np.zeros_like(C)])))
 
     def _from_start(self, C: Matrix) -> float:
@@ -230,7 +225,7 @@ class Reach:
         """
         largest, input_errors, bounds = self.ellipsoid.drive_limit
         input_errors = input_errors + (self._changes(bounds) + self.effects.age_input) / self.scale
-        first_cell = int(np.argmax(np.append(input_errors, np.inf) * ROUNDING >= largest))
+        first_cell = int(np.argmax(np.append(input_errors, np.inf) * FLOW_ROUNDING >= largest))
         states = self.ellipsoid.state_bounds
         is_inside = self._sup_after_last_node(states, 1.0, most=1.0) <= 1
         return is_inside and self._sup_followed(states, 1.0, first_cell) <= 1
@@ -272,7 +267,7 @@ class Reach:
         images = Y[:, None] @ semi_axes
         norms = spectral_norms(images.reshape(-1, *images.shape[2:])).reshape(images.shape[:2])
         added = changes[cells] / self.scale
-        smallest = float((norms.min(axis=1) * ROUNDING + added).min())
+        smallest = float((norms.min(axis=1) * FLOW_ROUNDING + added).min())
         if smallest <= enough:
             return smallest
         first_weights = np.full(forms.shape[:2], _WEIGHT_OF_OTHERS / forms.shape[1])
@@ -367,8 +362,8 @@ class _CellBounds:
         while True:  # the highest bounds become better, until that of the highest is settled
             cells = np.argsort(highest)[-_AT_ONCE:]
             is_last = rounds[cells[-1]] > len(_WIDTHS) or joint == _MOST_JOINT
-            if is_last or highest[cells[-1]] * ROUNDING <= enough:
-                return float(highest[cells[-1]]) * ROUNDING
+            if is_last or highest[cells[-1]] * FLOW_ROUNDING <= enough:
+                return float(highest[cells[-1]]) * FLOW_ROUNDING
             settled = cells[rounds[cells] == len(_WIDTHS)]
             if len(settled):
                 wanted = (enough - added[settled]).clip(min=0.0)
@@ -459,7 +454,7 @@ def _balancing_coordinates(rows: Stack) -> Stack:
 
 
 class Wanted(Enum):
-    """Which of several bounds are improved."""
+    """The bounds that are improved, of several."""
 
     ALL = "all of them"
     LARGEST = "those that are nearly as large as the largest one"
@@ -490,7 +485,7 @@ def largest_outputs(
         chosen = forms[active]
         Z = np.linalg.solve(np.einsum("ji,jiab->jab", weights[active], chosen), Y[active].swapaxes(1, 2))
         values, vectors = np.linalg.eigh(Y[active] @ Z)
-        norms = np.sqrt(values[:, -1].clip(min=0.0)) * ROUNDING
+        norms = np.sqrt(values[:, -1].clip(min=0.0)) * FLOW_ROUNDING
         better = norms < bounds[active]
         best[active[better]] = weights[active[better]]
         bounds[active] = np.minimum(bounds[active], norms)

@@ -30,10 +30,10 @@ from noack.theory.bounds.certificate_terms import (
     NoCertificateError,
     TriggerBound,
 )
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, Outputs, response_until
+from noack.theory.bounds.error_growth import ErrorGrowth
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.trigger_bounds import ErrorGrowth
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.certificates.deliveries.delivery_gaps import (
     ERROR,
     INPUT,
@@ -102,9 +102,9 @@ class Deliveries:
         plant, conditions, bound = self._loop.plant, self._loop.conditions, self._bound
         sup = dict(zip(self._loop.outputs, self._output_bounds().tolist(), strict=True))
         start_error = float(plant.start_up(conditions.start_s)[0])
-        by_input, by_mismatch, _ = ErrorGrowth(plant, bound.due_s, TriggerBound(0.0, None)).driven
+        by_input, by_mismatch, _ = ErrorGrowth(plant, bound.times.longest_s, TriggerBound(0.0, None)).driven
         sensor = by_input * max(sup[INPUT], start_error) + by_mismatch * sup[Output.MISMATCH]
-        apart_s = max(bound.apart_s, conditions.spacing_s)
+        apart_s = max(bound.times.shortest_s, conditions.spacing_s)
         return Constants(
             rate_per_s=plant.alpha_per_s,
             missing_events=conditions.dropouts + math.ceil(conditions.delay_s / apart_s - 1e-9),

@@ -17,11 +17,11 @@ import numpy as np
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import response_until
+from noack.theory.bounds.error_growth import COARSE_CELLS, ErrorGrowth
 from noack.theory.bounds.gains import Growth, Output, PlantGains
-from noack.theory.bounds.trigger_bounds import COARSE_CELLS, ErrorGrowth
-from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
+from noack.theory.bounds.stacked_norms import Stack
+from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, Signal
 
 Growths = Sequence[Sequence[ErrorGrowth]]
 """How e_s may grow under each bound of it. All bounds hold, and of each one growth applies."""
@@ -200,7 +200,7 @@ class KnownBounds:
     """Bounds of one loop that hold, each of which may be replaced by a smaller one."""
 
     signals: Vector
-    """Of (q, b, η, π, sup‖R_E x‖, 1), or β̃ for b."""
+    """Of each :class:`Signal`."""
     states: dict[str, float]
     """Of sup‖C x‖."""
     errors: dict[Output, float]
@@ -228,7 +228,15 @@ class KnownBounds:
     @property
     def input_error(self) -> float:
         """π."""
-        return self.errors[Output.GAIN] + float(self.signals[0])
+        return self.errors[Output.GAIN] + float(self.signals[Signal.AGE_INPUT])
+
+    @property
+    def driving(self) -> tuple[float, float, float]:
+        """q, π and sup‖R_E x‖, which drive the errors."""
+        age_input, input_error, mismatch = self.signals[
+            [Signal.AGE_INPUT, Signal.INPUT_ERROR, Signal.MISMATCH]
+        ].tolist()
+        return age_input, input_error, mismatch
 
 
 class InsertedInequalities(ErrorInequalities):
@@ -245,10 +253,10 @@ class InsertedInequalities(ErrorInequalities):
 
     def insert(self, bounds: KnownBounds, spacing_s: float) -> None:
         """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
-        signals, states, errors = bounds.signals, bounds.states, bounds.errors
+        states, errors, (_, input_error, _) = bounds.states, bounds.errors, bounds.driving
         # x from the start on.
         for name, (free, forced) in self._timed_states.items():
-            states[name] = min(states[name], float((free + forced * bounds.signals[3]).max()))
+            states[name] = min(states[name], float((free + forced * input_error).max()))
         # e_s after a test, for each way in which it may grow from there.
         growths = [growth for row in self._growths for growth in row]
         b = np.array([growth.after_test(states) for growth in growths])
@@ -258,13 +266,18 @@ class InsertedInequalities(ErrorInequalities):
         if spacing_s >= self.acts_within_s:
             self._insert_lost(bounds, b, spacing_s)
         self._insert_sensor(bounds, b)
-        age = sum(gain * (states[C] + errors[C]) for C, gain in self.age_gains.items())
-        new_signals = [age, signals[1], 0.0, bounds.input_error, states[Output.MISMATCH], 1.0]
-        bounds.signals = np.minimum(signals, np.array(new_signals, dtype=np.float64))
+        new_signals = bounds.signals.copy()
+        new_signals[Signal.AGE_INPUT] = sum(
+            gain * (states[C] + errors[C]) for C, gain in self.age_gains.items()
+        )
+        new_signals[Signal.ESTIMATION_ERROR] = 0.0
+        new_signals[Signal.INPUT_ERROR] = bounds.input_error
+        new_signals[Signal.MISMATCH] = states[Output.MISMATCH]
+        bounds.signals = np.minimum(bounds.signals, new_signals)
 
     def _insert_errors(self, bounds: KnownBounds, b: Vector, spacing_s: float) -> None:
         """Insert bounds of e_c, given those of e_s after a test: as a sum, and in open loop."""
-        age_input, input_error, mismatch = bounds.signals[[0, 3, 4]].tolist()
+        age_input, input_error, mismatch = bounds.driving
         weighted, gain = self._rows
         for method, sums in self._error_sums(spacing_s).items():
             parts, at_start = sums.bound(b, input_error, mismatch, self.start_error)
@@ -288,7 +301,7 @@ class InsertedInequalities(ErrorInequalities):
 
     def _insert_lost(self, bounds: KnownBounds, b: Vector, spacing_s: float) -> None:
         """Insert bounds of e_c after 0, 1, … lost events, if an update acts before the next event."""
-        age_input, input_error, mismatch = bounds.signals[[0, 3, 4]].tolist()
+        age_input, input_error, mismatch = bounds.driving
         weighted, gain = self._rows
         inputs = np.minimum(
             bounds.inputs_after_losses, self._error.now(Output.GAIN) * bounds.after_losses + age_input
@@ -311,7 +324,7 @@ class InsertedInequalities(ErrorInequalities):
 
     def _insert_sensor(self, bounds: KnownBounds, b: Vector) -> None:
         """Insert bounds of e_s, given those after a test."""
-        input_error, mismatch = bounds.signals[3:5].tolist()
+        _, input_error, mismatch = bounds.driving
         inputs = np.minimum(bounds.inputs_after_losses + np.zeros_like(bounds.after_losses), input_error)
         received = inputs[0] = min(float(inputs[0]), bounds.received_input_error)
         inputs = np.append(input_error, inputs)
@@ -388,8 +401,8 @@ class InsertedInequalities(ErrorInequalities):
     def _missing_events(self, spacing_s: float) -> int:
         """Return how many events may be missing: lost, or in flight."""
         conditions = self._conditions
-        flying = math.ceil(conditions.delay_s / spacing_s) if conditions.delay_s > 0 else 0
-        return conditions.dropouts + flying
+        in_flight = math.ceil(conditions.delay_s / spacing_s) if conditions.delay_s > 0 else 0
+        return conditions.dropouts + in_flight
 
     @property
     def start_error(self) -> float:
@@ -398,11 +411,13 @@ class InsertedInequalities(ErrorInequalities):
 
     def next_event_s(self, bounds: KnownBounds) -> float:
         """Return the time between two events that follows from bounds; 0 if there is none."""
-        if all(bound.reached is None for bound in self._bound.every):
+        if all(bound.least_event_error is None for bound in self._bound.all_bounds):
             return 0.0
-        zero, never = np.zeros(1), np.zeros(1, dtype=bool)
-        events = np.zeros(1, dtype=np.int64)
-        mismatch, earlier = bounds.signals[4:5], zero + bounds.earlier_input_error
-        before, after = (zero,) * 6, (zero,) * 3
-        constants = LoopConstants(events, *before, mismatch, *after, earlier, ~never)
-        return float(self.inter_event_s(constants, never, ~never)[0])
+        times_s = self.inter_event_s(
+            mismatch=np.array([bounds.signals[Signal.MISMATCH]]),
+            earlier_input_error=np.array([bounds.earlier_input_error]),
+            estimation_error=np.zeros(1),
+            drifts=np.array([False]),
+            searched=np.array([True]),
+        )
+        return float(times_s[0])

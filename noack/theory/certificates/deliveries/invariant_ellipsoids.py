@@ -16,12 +16,12 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, solve_lyapunov, spectral_abscissa
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.certificates.deliveries.delivery_flow import (
+    FLOW_ROUNDING,
     NO_EFFECTS,
-    ROUNDING,
     DeliveryFlow,
     InputEffects,
 )
@@ -201,7 +201,7 @@ class InvariantEllipsoids:
             if not self._first_event_cell
             else self.flow.start_response[0][self._first_event_cell, :n]
         )
-        largest = np.linalg.norm(shapes @ first_state, axis=1) ** 2 * ROUNDING
+        largest = np.linalg.norm(shapes @ first_state, axis=1) ** 2 * FLOW_ROUNDING
         candidates, nodes = np.nonzero(np.linalg.eigvalsh(state)[..., -1] >= 1)
         if len(candidates):
             state, error = state[candidates, nodes], error[candidates, nodes]

@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential
-from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import KernelBounds, response_until
-from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, bend_rows, bend_terms
+from noack.theory.bounds.stacked_norms import Stack, larger_ends
+from noack.theory.certificates.deliveries.delivery_flow import FLOW_ROUNDING, bend_rows, bend_terms
 from noack.theory.certificates.deliveries.delivery_reach import Reach, Wanted, largest_outputs
 
 _NEAR, _RATIO, _MOST_NODES = np.linspace(0.0, 1.0, 20).tolist(), 1.03, 300
@@ -39,7 +39,7 @@ _LATE_TERMS = 8
 
 
 class SensorErrors(NamedTuple):
-    """What is known of ‖e_s‖_W between two events."""
+    """Bounds of ‖e_s‖_W between two events."""
 
     after_losses: Vector
     """Its bounds, while 0, 1, … events have been lost since the delivery."""
@@ -53,7 +53,7 @@ class SensorErrors(NamedTuple):
     """At an event it, or what is compared, is at least this large; 0 if nothing is known."""
     integrates: bool
     """Whether its integral since the event is compared."""
-    forced_s: float
+    earliest_due_s: float
     """So long after an event the next one may be due without any of this."""
 
 
@@ -87,7 +87,7 @@ def errors_after_losses(
     # The nodes r after an event, e^{Fr}, and ‖e_s‖_W at them after a test.
     r_s = _nodes_s(spacing_s, kernel, 2 * most_s, sensor.grid_s)
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
-    tested = np.where(r_s * ROUNDING >= sensor.first_test_s, sensor.after_test, math.inf)
+    tested = np.where(r_s * FLOW_ROUNDING >= sensor.first_test_s, sensor.after_test, math.inf)
     first_event_s = float(flow.edges_s[reach.first_cell]) if reach.first_cell else math.inf
     since_delivery_s, apart_s, state_bound = -reach.effects.acts_within_s, math.inf, reach.scale
     for lost, sensor_error in enumerate(sensor.after_losses.tolist()):
@@ -105,7 +105,7 @@ def errors_after_losses(
         # The time until the next event. After a delivery e_s is at most ‖e^{(H+αI)r}‖ · first_error
         # larger than C_r z.
         late_error = 0.0 if lost else flow.model_growth * reach.effects.first_error
-        most_later_s = min(_LATEST * spacing_s, sensor.forced_s)
+        most_later_s = min(_LATEST * spacing_s, sensor.earliest_due_s)
         later_s = event.next_event_s(sensor, late_error, bend, most_later_s)
         since_delivery_s += max(spacing_s, later_s)
         if not lost:  # x(0) itself may be outside the ellipsoid
@@ -131,7 +131,7 @@ def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float, grid_s: floa
 
 
 class _LostEvent:
-    """What follows an event, a time w or more after the delivery, for times r since it.
+    """Bounds at times r since an event that is a time w or more after the delivery.
 
     z is e^{Fw} ζ at the event. What q has changed since some time before is bounded with e^{−Fs} (BU, −BU).
     Up to the event ‖e_c‖_W ≤ ``error_before`` and ‖Λx‖ ≤ ``state_bound``. ``flows`` are e^{Fr}.
@@ -197,7 +197,7 @@ class _LostEvent:
         # e_c of Taylor's terms, and the whole remainder.
         for rows in (*(term[:, self._flow.n :] for term in terms), remainder):
             bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", rows, inverse, rows)))
-        return np.asarray(steps_s**2 / 8 * bends * ROUNDING)
+        return np.asarray(steps_s**2 / 8 * bends * FLOW_ROUNDING)
 
     def next_event_s(self, sensor: SensorErrors, late_error: float, bend: float, most_s: float) -> float:
         """Return a time before which there is no event; e_s may be larger than C_r z by ``late_error``."""
@@ -213,7 +213,7 @@ class _LostEvent:
         forms, e_s = self._forms[is_near], self._e_s[is_near]
         ends, _ = largest_outputs(forms, e_s, enough, wanted=Wanted.ALL, most=most)
         steps_s = np.diff(self._r_s[is_near])
-        cells = np.maximum(ends[1:], ends[:-1]) + steps_s**2 / 8 * bend + self._input_changes[1:][is_near[1:]]
+        cells = larger_ends(ends) + steps_s**2 / 8 * bend + self._input_changes[1:][is_near[1:]]
         if sensor.integrates:
             cells = np.cumsum(steps_s * (np.maximum.accumulate(cells) + late_error))
         reached_s = float(self._r_s[np.append(cells >= level, True).argmax()])

@@ -22,13 +22,14 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.bounds.certificate_terms import MEASURED, CertificatePart, Constants, NetworkConditions
-from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.gains import Output
-from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, InputEffects, error_since_event
+from noack.theory.bounds.stacked_norms import spectral_norm
+from noack.theory.certificates.deliveries.delivery_flow import FLOW_ROUNDING, InputEffects, error_since_event
 from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoid, Reach
 from noack.theory.certificates.deliveries.inserted_bounds import InsertedInequalities
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
 from noack.theory.certificates.deliveries.lost_events import SensorErrors, bend_of_error, errors_after_losses
+from noack.theory.certificates.inequalities import Signal
 
 _ROUNDS, _SETTLED = 20, 0.99
 _MOST_INSERTIONS, _INSERTIONS_SETTLED = 60, 0.9999
@@ -96,8 +97,8 @@ class _SharpenedBounds:
     def _ellipsoids(self) -> InvariantEllipsoids:
         error_bound, bound = self.bounds.errors[Output.WEIGHTED], self._part.bound
         # An event that is due to an integral, or to a deadline, does not need this ‖e_s‖_W.
-        needs_level = bound.ago_s == 0 and math.isinf(bound.forced_s)
-        level = bound.reached or 0.0 if self._is_ideal and needs_level else 0.0
+        needs_level = bound.window_s == 0 and math.isinf(bound.times.earliest_due_s)
+        level = bound.least_event_error or 0.0 if self._is_ideal and needs_level else 0.0
         return InvariantEllipsoids(self._part.plant, error_bound, self._inequalities.age_gains, level)
 
     @property
@@ -120,7 +121,7 @@ class _SharpenedBounds:
         reach = self._ellipsoids.reach_within(error_bound, effects_of, conditions.start_s)
         if reach is None:
             return False
-        bounds.signals[0] = min(bounds.signals[0], reach.effects.age_input)
+        bounds.signals[Signal.AGE_INPUT] = min(bounds.signals[Signal.AGE_INPUT], reach.effects.age_input)
         inverse = self._part.plant.error.inverse_weight
         for name, C in self._part.plant.outputs.items():
             bounds.states[name] = min(bounds.states[name], reach.sup_state(C @ inverse))
@@ -143,13 +144,14 @@ class _SharpenedBounds:
         x_c, from which the input is computed, is e^{(H+αI)τ} x of the event of the last update.
         """
         bounds, plant = self.bounds, self._part.plant
+        known_age_input, _, known_mismatch = bounds.driving
         gains = self._inequalities.age_gains.items()
         age_input = sum(gain * ellipsoid.model_sups[C] for C, gain in gains) * scale
-        age_input = min(float(bounds.signals[0]), age_input)
+        age_input = min(known_age_input, age_input)
         input_error = max(bounds.errors[Output.GAIN] + age_input, self._inequalities.start_error)
         R_E = plant.outputs[Output.MISMATCH] @ plant.error.inverse_weight
-        mismatch_in_ellipsoid = scale * float(spectral_norm(R_E @ ellipsoid.inverse)) * ROUNDING
-        mismatch = min(float(bounds.signals[4]), mismatch_in_ellipsoid)
+        mismatch_in_ellipsoid = scale * float(spectral_norm(R_E @ ellipsoid.inverse)) * FLOW_ROUNDING
+        mismatch = min(known_mismatch, mismatch_in_ellipsoid)
         return InputEffects(
             age_input,
             self._inequalities.entered(self._acts_within_s, input_error, mismatch),
@@ -166,7 +168,7 @@ class _SharpenedBounds:
             at_event = max(float(errors_at_events(bounds.after_losses)[-1]), _LEAST_SHARE * reach.error_bound)
             at_events = replace(reach, error_bound=at_event)
             later_s = _next_event_s(at_events, level, self.spacing_s, bend)
-            later_s = min(later_s, self._part.bound.forced_s)
+            later_s = min(later_s, self._part.bound.times.earliest_due_s)
             self.spacing_s = max(self.spacing_s, self._next_test_s(later_s))
         kernel = error.kernels[Output.WEIGHTED]
         bounds.after_losses, apart_s = errors_after_losses(
@@ -174,7 +176,8 @@ class _SharpenedBounds:
         )
         self.spacing_s = self._next_test_s(apart_s)
         # An event comes after the first input has been applied.
-        entered = self._inequalities.entered(conditions.delay_s, *bounds.signals[3:5].tolist())
+        _, input_error, mismatch = bounds.driving
+        entered = self._inequalities.entered(conditions.delay_s, input_error, mismatch)
         return error.stretch(conditions.delay_s) * float(bounds.after_losses[-1]) + entered
 
     @property
@@ -190,18 +193,21 @@ class _SharpenedBounds:
 
     @property
     def _sensor_errors(self) -> SensorErrors:
-        """What is known of e_s between two events."""
-        bounds, bound, conditions = self.bounds, self._part.bound, self._conditions
-        level, h_s = bound.reached or 0.0, conditions.sampling_s
+        """Bounds of e_s between two events."""
+        bound, h_s = self._part.bound, self._conditions.sampling_s
+        level, grid_s = bound.least_event_error or 0.0, self._conditions.spacing_s
         if bound.is_mean:  # of an integral, over any time
-            level *= bound.ago_s
-        if bound.ago_s and not bound.is_mean:
+            level *= bound.window_s
+        if bound.window_s and not bound.is_mean:
             level = 0.0  # an event may need no e_s
-        tested = bounds.tested_sensor_error if h_s == conditions.spacing_s else math.inf
-        first_test_s = bound.untested_s + h_s if bound.untested_s else 0.0
-        test_s, forced_s = conditions.spacing_s, bound.forced_s
         return SensorErrors(
-            bounds.sensor_after_losses, tested, first_test_s, test_s, level, bound.is_mean, forced_s
+            after_losses=self.bounds.sensor_after_losses,
+            after_test=self.bounds.tested_sensor_error if h_s == grid_s else math.inf,
+            first_test_s=bound.untested_s + h_s if bound.untested_s else 0.0,
+            grid_s=grid_s,
+            level=level,
+            integrates=bound.is_mean,
+            earliest_due_s=bound.times.earliest_due_s,
         )
 
     def _next_test_s(self, time_s: float) -> float:

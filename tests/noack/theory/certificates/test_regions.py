@@ -19,8 +19,8 @@ from noack.scenario.scenario_file import load
 from noack.theory.certificates.assumptions import AssumptionStatus
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import nominal_conditions
+from noack.theory.certificates.network_limits import network_limit
 from noack.theory.certificates.region import RegionScope
-from noack.theory.certificates.scenario_certificates import network_limit
 from tests.oracles.attacked_regions import CASES, SCENARIOS, attacked, certificate_of, inclusion_share
 
 pytest.importorskip("flint")

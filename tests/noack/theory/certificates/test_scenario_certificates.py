@@ -4,7 +4,6 @@ tests/cosim/analysis/claims compares ``nominal_conditions`` with the machines.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,14 +21,7 @@ from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
-from noack.theory.certificates.scenario_certificates import (
-    MOST_S,
-    box,
-    certify,
-    certify_box,
-    largest,
-    own_plant,
-)
+from noack.theory.certificates.scenario_certificates import box, certify, certify_box, own_plant
 from noack.theory.certificates.solution import completed
 from tests.noack.theory.certificates.certificate_kinds.policies import exceeded_by, scenario_with
 from tests.oracles.lossy_loops import SEARCH, STEPS, System, Trace, networks, seeds, simulate, systems
@@ -177,35 +169,6 @@ def test_the_networks_delay_adds_to_the_delay_of_updates(content: dict[str, Any]
     # The input does not pass through this network.
     assert delayed.hold_s == at_once.hold_s
     assert any("up to 30 ms" in assumption.why for assumption in assumptions(resolved))
-
-
-GAINS: dict[str, Callable[[float], float]] = {
-    "proportional": lambda share: share,
-    "steep": lambda share: share**9,
-    "exponential": lambda share: math.exp(min(share, 500.0) - 1),
-    "unknown above": lambda share: share if share < 1 else math.inf,
-    "in steps": lambda share: 0.3 + 0.8 * math.floor(share),
-    "without a gain": lambda share: 0.0 if share < 1 else 5.0,
-}
-
-
-@pytest.mark.parametrize("name", GAINS)
-@pytest.mark.parametrize("limit_s", [3e-6, 0.04, 3.0])
-@pytest.mark.parametrize("usual_s", [0.0, 1.0])
-def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s: float) -> None:
-    tried: list[float] = []
-
-    def gain(value_s: float) -> float:
-        tried.append(value_s)
-        return GAINS[name](value_s / limit_s)
-
-    assert (1 - 1.1e-3) * limit_s <= largest(gain, usual_s) < limit_s
-    assert len(tried) < 40
-
-
-def test_all_times_or_none_may_have_a_certificate() -> None:
-    assert largest(lambda value_s: 0.5, 0.01) == MOST_S
-    assert largest(lambda value_s: math.inf, 0.01) == 0.0
 
 
 def test_events_that_are_due_may_come_as_soon_as_they_are_due() -> None:

@@ -18,7 +18,7 @@ from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from noack.theory.bounds import trigger_bounds as bounds_of_triggers
+from noack.theory.bounds import error_growth
 from noack.theory.bounds.certificate_terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
@@ -331,17 +331,19 @@ class NoCrossTerm(TriggerBounds):
 
 @dataclass(frozen=True)
 class NoDwell(TriggerBounds):
-    def bound(self, conditions: Conditions, level: float, reached: float | None) -> TriggerBound:
-        return super().bound(conditions, level, reached)._replace(untested_s=0.0, also=())
+    def bound(self, conditions: Conditions, level: float, least_level: float | None) -> TriggerBound:
+        return super().bound(conditions, level, least_level)._replace(untested_s=0.0, further=())
 
 
 @dataclass(frozen=True)
 class NoTimeOfTheArea(TriggerBounds):
     """Takes the average of ‖e_s‖ for its value now."""
 
-    def bound(self, conditions: Conditions, level: float, reached: float | None) -> TriggerBound:
-        found = super().bound(conditions, level, reached)
-        return found._replace(ago_s=0.0, also=tuple(one._replace(ago_s=0.0) for one in found.also))
+    def bound(self, conditions: Conditions, level: float, least_level: float | None) -> TriggerBound:
+        found = super().bound(conditions, level, least_level)
+        return found._replace(
+            window_s=0.0, further=tuple(one._replace(window_s=0.0) for one in found.further)
+        )
 
 
 @dataclass(frozen=True)
@@ -356,15 +358,15 @@ class ShortChord(TriggerBounds):
 class AThirdOfTheTime(TriggerBounds):
     """Takes a third of the time up to the next event."""
 
-    def bound(self, conditions: Conditions, level: float, reached: float | None) -> TriggerBound:
-        found, h_s = super().bound(conditions, level, reached), conditions.sampling_s
-        assert not all(one.is_tested for one in found.every)
+    def bound(self, conditions: Conditions, level: float, least_level: float | None) -> TriggerBound:
+        found, h_s = super().bound(conditions, level, least_level), conditions.sampling_s
+        assert not all(one.is_tested for one in found.all_bounds)
 
         def wrong(one: TriggerBound) -> TriggerBound:
             third_s = (one.untested_s + h_s) / 3
             return one if one.is_tested else one._replace(untested_s=third_s - h_s)
 
-        return wrong(found)._replace(also=tuple(map(wrong, found.also)))
+        return wrong(found)._replace(further=tuple(map(wrong, found.further)))
 
 
 def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], Any]:
@@ -391,7 +393,7 @@ def patched(target: Any, name: str, wrong: Any) -> Callable[[Scenario, Condition
 
 def youngest(bound: TriggerBound, sampling_s: float) -> Any:
     """Ages of a mean, most of which are that of the last test."""
-    return np.append(np.full(9, 1e-9), 1.0) * (bound.ago_s + sampling_s) if bound.ago_s else None
+    return np.append(np.full(9, 1e-9), 1.0) * (bound.window_s + sampling_s) if bound.window_s else None
 
 
 def without_one_loss(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
@@ -460,7 +462,7 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
         "send_on_area", with_trigger(NoTimeOfTheArea), {**FAR, "mansd": 0, "beta": 0.01},
     ),
     "send_on_area, a mean over the last moment": (
-        "send_on_area", patched(bounds_of_triggers, "_mean_ages_s", youngest),
+        "send_on_area", patched(error_growth, "_mean_ages_s", youngest),
         {**FAR, "mansd": 0, "beta": 0.01},
     ),
     "mixed, a chord that is too short": (

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
-from noack.theory.certificates.deliveries.delivery_flow import ROUNDING, DeliveryFlow
+from noack.theory.certificates.deliveries.delivery_flow import FLOW_ROUNDING, DeliveryFlow
 from noack.theory.margins.exact_matrices import exponential
 from tests.oracles.lossy_loops import SEARCH, System, systems
 
@@ -32,4 +32,4 @@ def test_the_error_of_the_flow_is_far_below_what_its_bounds_are_enlarged_by(
         largest = max(largest, float(np.linalg.norm(exact, 2)), 1.0)
         error = np.linalg.norm(flow.states[node] - exact[:, : flow.n], 2)
         assert error <= 1e-12 * largest
-    assert ROUNDING - 1 > 1e6 * 1e-12
+    assert FLOW_ROUNDING - 1 > 1e6 * 1e-12

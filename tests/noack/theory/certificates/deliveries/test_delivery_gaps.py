@@ -8,7 +8,12 @@ import pytest
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
+from noack.theory.bounds.certificate_terms import (
+    InterEventTimes,
+    NetworkConditions,
+    NoCertificateError,
+    TriggerBound,
+)
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.deliveries.delivery_gaps import GapLoop, Gaps
 
@@ -20,14 +25,14 @@ ALPHA, STEP_S, HOLD_S = 0.1, 0.1, 0.03
 def loop_with(hold_s: float, dropouts: int = 1) -> GapLoop:
     """A loop with two states whose events are due at 0.1 s; its model is not its plant."""
     conditions = NetworkConditions(dropouts, STEP_S, STEP_S, hold_s=hold_s)
-    bound = TriggerBound(0.0, None, apart_s=STEP_S, due_s=STEP_S)
+    bound = TriggerBound(0.0, None, times=InterEventTimes(STEP_S, STEP_S))
     models = ErrorGains(H, K, np.eye(2), ALPHA)
     plant = PlantGains(models, A, B, np.array([[1.0], [0.0]]), ALPHA)
     return GapLoop(plant, conditions, Gaps.of(conditions, bound))
 
 
 @pytest.mark.parametrize(
-    ("apart_s", "due_s", "steps"),
+    ("shortest_s", "longest_s", "steps"),
     [
         (0.1, 0.1, [1, 2, 3]),  # one event after the other, of which up to two are lost
         (0.2, 0.3, [2, 3, 4, 5, 6, 7, 8, 9]),
@@ -35,19 +40,22 @@ def loop_with(hold_s: float, dropouts: int = 1) -> GapLoop:
     ],
 )
 def test_a_gap_is_a_sum_of_the_times_between_events(
-    apart_s: float, due_s: float, steps: Sequence[int]
+    shortest_s: float, longest_s: float, steps: Sequence[int]
 ) -> None:
     conditions = NetworkConditions(2, 0.1, 0.1)
-    gaps = Gaps.of(conditions, TriggerBound(0.0, None, apart_s=apart_s, due_s=due_s))
+    gaps = Gaps.of(conditions, TriggerBound(0.0, None, times=InterEventTimes(shortest_s, longest_s)))
     assert gaps.counts.tolist() == steps
     assert gaps.step_s == pytest.approx(0.1)
-    assert gaps.least_s == pytest.approx(apart_s)
+    assert gaps.least_s == pytest.approx(shortest_s)
 
 
-@pytest.mark.parametrize(("spacing_s", "due_s"), [(0.0, 1.0), (0.1, math.inf), (0.001, 1.0)])
-def test_events_that_are_not_due_at_few_times_have_no_gaps(spacing_s: float, due_s: float) -> None:
+@pytest.mark.parametrize(("spacing_s", "longest_s"), [(0.0, 1.0), (0.1, math.inf), (0.001, 1.0)])
+def test_events_that_are_not_due_at_few_times_have_no_gaps(spacing_s: float, longest_s: float) -> None:
     with pytest.raises(NoCertificateError):
-        Gaps.of(NetworkConditions(1, spacing_s, spacing_s), TriggerBound(0.0, None, due_s=due_s))
+        Gaps.of(
+            NetworkConditions(1, spacing_s, spacing_s),
+            TriggerBound(0.0, None, times=InterEventTimes(longest_s=longest_s)),
+        )
 
 
 def scaled_after(gap_s: float, xi: Vector, ages_s: Sequence[float]) -> tuple[Vector, Vector]:

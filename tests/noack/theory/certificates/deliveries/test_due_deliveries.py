@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from noack.theory.bounds.certificate_terms import Constants, NetworkConditions, TriggerBound
+from noack.theory.bounds.certificate_terms import Constants, InterEventTimes, NetworkConditions, TriggerBound
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
 from noack.theory.certificates.deliveries import due_deliveries
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries, _Ball, _BallHistory
@@ -20,7 +20,7 @@ def scalar_loop(delay_s: float) -> Deliveries:
     models = ErrorGains(np.zeros((1, 1)), np.array([[k]]), np.eye(1), ALPHA)
     plant = PlantGains(models, np.array([[a]]), np.array([[b]]), np.array([[X0]]), ALPHA)
     conditions = NetworkConditions(0, STEP_S, STEP_S, delay_s)
-    return Deliveries(plant, conditions, TriggerBound(0.0, None, apart_s=STEP_S, due_s=STEP_S))
+    return Deliveries(plant, conditions, TriggerBound(0.0, None, times=InterEventTimes(STEP_S, STEP_S)))
 
 
 def state_after(r_s: np.ndarray) -> np.ndarray:
@@ -136,7 +136,9 @@ def slow_loop(dropouts: int) -> Deliveries:
     models = ErrorGains(np.zeros((4, 4)), GAIN, np.eye(4), alpha)
     plant = PlantGains(models, MODES, INPUT, START[:, None], alpha)
     conditions = NetworkConditions(dropouts, SLOW_STEP_S, SLOW_STEP_S)
-    return Deliveries(plant, conditions, TriggerBound(0.0, None, apart_s=SLOW_STEP_S, due_s=SLOW_STEP_S))
+    return Deliveries(
+        plant, conditions, TriggerBound(0.0, None, times=InterEventTimes(SLOW_STEP_S, SLOW_STEP_S))
+    )
 
 
 def without_return(loop: Deliveries) -> Constants:

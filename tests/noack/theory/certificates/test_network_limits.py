@@ -1,0 +1,36 @@
+"""The search for the largest time, with loop gains that grow in many ways."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from noack.theory.certificates.network_limits import MOST_S, largest_stable_time_s
+
+GAINS: dict[str, Callable[[float], float]] = {
+    "proportional": lambda share: share,
+    "steep": lambda share: share**9,
+    "exponential": lambda share: math.exp(min(share, 500.0) - 1),
+    "unknown above": lambda share: share if share < 1 else math.inf,
+    "in steps": lambda share: 0.3 + 0.8 * math.floor(share),
+    "without a gain": lambda share: 0.0 if share < 1 else 5.0,
+}
+
+
+@pytest.mark.parametrize("name", GAINS)
+@pytest.mark.parametrize("limit_s", [3e-6, 0.04, 3.0])
+@pytest.mark.parametrize("usual_s", [0.0, 1.0])
+def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s: float) -> None:
+    tried: list[float] = []
+
+    def gain(value_s: float) -> float:
+        tried.append(value_s)
+        return GAINS[name](value_s / limit_s)
+
+    assert (1 - 1.1e-3) * limit_s <= largest_stable_time_s(gain, usual_s) < limit_s
+    assert len(tried) < 40
+
+
+def test_all_times_or_none_may_have_a_certificate() -> None:
+    assert largest_stable_time_s(lambda value_s: 0.5, 0.01) == MOST_S
+    assert largest_stable_time_s(lambda value_s: math.inf, 0.01) == 0.0
