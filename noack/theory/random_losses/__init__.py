@@ -16,7 +16,7 @@ losses"). The losses are a Markov chain over the packets
    been added to e_s. They are linear, or concave, and solved in the same way. A moment that decays
    as e^{−αt} gives almost sure decay at every smaller rate (Borel and Cantelli).
 3. ``stochastic_lyapunov.py`` makes these bounds smaller: a quadratic function of the loop's state,
-   whose mean no event increases.
+   whose mean no event increases. ``matrix_inequalities.py`` looks for the function.
 
 Time-triggered loops have exact answers:
 

@@ -20,12 +20,10 @@ is sent. (V has no product of x and y: an event changes y and leaves x, so the f
 not hold with one.)
 
 These are linear matrix inequalities. :func:`quadratic_functions` looks for those with the smallest
-bounds by a barrier method, which stays inside of them; that the result is inside is checked with a
-margin for rounding. Without delay and age they can be met for all p̄ < 1 (derivations.md, "Without a
+bounds (``matrix_inequalities.py``). Without delay and age they can be met for all p̄ < 1
 limit on the losses").
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -33,22 +31,18 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
+from noack.theory.random_losses.matrix_inequalities import Blocks, MatrixInequalities, is_positive
 from noack.theory.random_losses.mean_square_growth import from_triangles, triangles
 
 _OF_STATE, _OF_ERROR = (0.1, 0.35), (0.35, 0.75)
 """λ for small bounds of ‖x‖ and of ‖ê_c‖, as shares of the decay rate that is left at α."""
-_GAP, _HEAVIER, _NEWTON_STEPS = 0.02, 8.0, 60
-_CENTERED, _DECREASE, _SHORTEST = 0.05, 0.1, 1e-10
 _LARGEST = 1e4
 """Bound of the traces of X and P where ‖e_s‖_W ≤ 1 and V ≤ 1; without one they could be infinite."""
-_ROUNDING = 1e-13
 _INFLATED = 1 + 1e-9
 _MOST_STATES = 8
 """With 7 the four searches took up to 12 s of CPU on a busy machine, with 12 about a minute."""
 _LEFT = 0.01
 """Share of the decay of x that the input's age leaves where the search begins."""
-Blocks = tuple[Vector, *tuple[Matrix, ...]]
-"""Numbers that are to be positive, and symmetric matrices that are to be positive definite."""
 
 
 class KnownRms(NamedTuple):
@@ -216,7 +210,7 @@ class _Search:
         try:
             first = self._first()
             found = (
-                None if first is None else _MatrixInequalities(self._blocks, len(first)).maximise_last(first)
+                None if first is None else MatrixInequalities(self._blocks, len(first)).maximise_last(first)
             )
         except np.linalg.LinAlgError:  # a matrix is singular to rounding
             return None
@@ -298,7 +292,7 @@ class _Search:
         while True:
             zetas = np.where(loop.inputs, [large, of_flight, 1.0], 0.0)
             begin = _Unknowns(X, P, large, large, zetas, 0.0)
-            if _is_positive(self._between_events(begin)):
+            if is_positive(self._between_events(begin)):
                 break
             large *= 4
             if not np.isfinite(large):
@@ -308,7 +302,7 @@ class _Search:
         level = large * (1 + self._begun + (1 + self._other) / (2 * self._rate))
         level += float(self._start @ X @ self._start + np.trace(X) + np.trace(P))
         first = self._values(begin._replace(gain=gain)) / (4 * level)
-        return first if all(map(_is_positive, self._blocks(first))) else None
+        return first if all(map(is_positive, self._blocks(first))) else None
 
     def _state_form(self) -> tuple[Matrix, Matrix | None]:
         """X that decays, and a root of what is left of its decay; ζ_h = 1 covers the input's age.
@@ -329,102 +323,12 @@ class _Search:
             except (np.linalg.LinAlgError, ValueError):
                 return X, None
             left = self._decay(loop.closed_loop, X) - aged - X @ loop.input @ loop.input.T @ X
-        has_root = _is_positive(left) and _is_positive(X)
+        has_root = is_positive(left) and is_positive(X)
         return X, np.asarray(np.linalg.cholesky(left)) if has_root else None
 
     def _decay(self, M: Matrix, form: Matrix) -> Matrix:
         """What is left of a form's decay along z' = M z beside the rate λ."""
         return np.asarray(-(M.T @ form + form @ M) - 2 * self._rate * form)
-
-
-class _MatrixInequalities:
-    """Numbers and matrices that are affine in a vector, and are to be positive."""
-
-    def __init__(self, blocks: Callable[[Vector], Blocks], size: int) -> None:
-        self._constants = blocks(np.zeros(size))
-        units = zip(*(blocks(unit) for unit in np.eye(size)), strict=True)
-        self._slopes = [
-            np.stack(parts, axis=-1) - c[..., None] for parts, c in zip(units, self._constants, strict=True)
-        ]
-        """What each value adds, (k, size) and (n, n, size)."""
-
-    def _at(self, values: Vector) -> list[Matrix]:
-        return [c + slopes @ values for c, slopes in zip(self._constants, self._slopes, strict=True)]
-
-    def _hold(self, values: Vector) -> bool:
-        """Whether all are positive by more than rounding."""
-        sizes = (
-            np.abs(c) + np.abs(slopes) @ np.abs(values)
-            for c, slopes in zip(self._constants, self._slopes, strict=True)
-        )
-        return all(
-            _is_positive(block - _rounding(size)) for block, size in zip(self._at(values), sizes, strict=True)
-        )
-
-    def maximise_last(self, values: Vector) -> Vector | None:
-        """Return values inside for which the last one is the largest, to a share of _GAP.
-
-        t times the last value plus Σ log det is made large by Newton's method, for larger and larger t.
-        The last values that are inside by more than rounding are returned, None if there are none.
-        """
-        dimension = sum(map(len, self._constants))
-        weight, confirmed = 1.0, None
-        while True:
-            for _ in range(_NEWTON_STEPS):
-                step, decrement = self._newton_step(values, weight)
-                moved = self._step_along(values, step, weight, decrement) if decrement > _CENTERED else None
-                if moved is None:
-                    break
-                values = moved
-            if self._hold(values):
-                confirmed = values
-            if dimension < _GAP * weight * values[-1]:
-                return confirmed
-            weight *= _HEAVIER
-
-    def _newton_step(self, values: Vector, weight: float) -> tuple[Vector, float]:
-        """Return Newton's step and its decrement.
-
-        The Hessian is AᵀA, with a column of A for each value: R of A's QR decomposition loses half of
-        the digits that AᵀA would lose.
-        """
-        (numbers, *matrices), (of_numbers, *of_matrices) = self._at(values), self._slopes
-        parts = [of_numbers / numbers[:, None]]
-        gradient = parts[0].sum(axis=0)
-        gradient[-1] += weight
-        for matrix, slopes in zip(matrices, of_matrices, strict=True):
-            undone = np.linalg.inv(np.linalg.cholesky(matrix))
-            turned = undone @ np.moveaxis(slopes, -1, 0) @ undone.T
-            gradient += np.trace(turned, axis1=1, axis2=2)
-            rows, columns = np.tril_indices(len(matrix))
-            parts.append(turned[:, rows, columns].T * np.where(rows > columns, np.sqrt(2), 1.0)[:, None])
-        A = np.vstack(parts)
-        scales = 1 / np.linalg.norm(A, axis=0)
-        R = np.asarray(np.linalg.qr(A * scales, mode="r"))
-        step = scales * np.linalg.solve(R, np.linalg.solve(R.T, scales * gradient))
-        return step, float(gradient @ step)
-
-    def _step_along(self, values: Vector, step: Vector, weight: float, decrement: float) -> Vector | None:
-        """Return the values after a step along which the objective grows, shortened if need be."""
-        length, now = 1.0, self._objective(values, weight)
-        while length > _SHORTEST:
-            moved = values + length * step
-            if self._objective(moved, weight) >= now + _DECREASE * length * decrement:
-                return np.asarray(moved)
-            length /= 2
-        return None
-
-    def _objective(self, values: Vector, weight: float) -> float:
-        """Return t times the last value plus Σ log det; −∞ outside."""
-        numbers, *matrices = self._at(values)
-        if not (numbers > 0).all():
-            return -np.inf
-        try:
-            roots = [np.linalg.cholesky(matrix) for matrix in matrices]
-        except np.linalg.LinAlgError:
-            return -np.inf
-        logarithms = np.log(numbers).sum() + 2 * sum(np.log(np.diagonal(root)).sum() for root in roots)
-        return float(weight * values[-1] + logarithms)
 
 
 def _decaying_form(M: Matrix, rate_per_s: float) -> Matrix:
@@ -433,26 +337,3 @@ def _decaying_form(M: Matrix, rate_per_s: float) -> Matrix:
     both_sides = np.kron(flow, identity) + np.kron(identity, flow)
     form = np.linalg.solve(both_sides, -identity.ravel()).reshape(M.shape)
     return np.asarray((form + form.T) / 2)
-
-
-def _rounding(sizes: Matrix) -> Matrix:
-    """Bound rounding by a share of these sizes: what is above it is positive whatever the rounding.
-
-    A matrix whose entries are at most as large as those of ε S is at most the diagonal one with
-    ε Σ_j S_ij √(S_jj/S_ii).
-    """
-    if sizes.ndim == 1:
-        return _ROUNDING * sizes
-    scales = np.sqrt(np.diagonal(sizes))
-    return np.diag(_ROUNDING * sizes @ scales / scales)
-
-
-def _is_positive(block: Matrix) -> bool:
-    """Whether numbers are positive, or a symmetric matrix is positive definite."""
-    if block.ndim == 1:
-        return bool((block > 0).all())
-    try:
-        np.linalg.cholesky(block)
-    except np.linalg.LinAlgError:
-        return False
-    return True
