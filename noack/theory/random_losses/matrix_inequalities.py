@@ -54,7 +54,7 @@ class MatrixInequalities:
         """Return values inside for which the last one is the largest, to a share of _GAP.
 
         t times the last value plus Σ log det is made large by Newton's method, for larger and larger t.
-        The last values that are inside by more than rounding are returned, None if there are none.
+        The last values that are inside by more than rounding are retransformed, None if there are none.
         """
         dimension = sum(map(len, self._constants))
         weight, confirmed = 1.0, None
@@ -82,11 +82,11 @@ class MatrixInequalities:
         gradient = parts[0].sum(axis=0)
         gradient[-1] += weight
         for matrix, slopes in zip(matrices, of_matrices, strict=True):
-            undone = np.linalg.inv(np.linalg.cholesky(matrix))
-            turned = undone @ np.moveaxis(slopes, -1, 0) @ undone.T
-            gradient += np.trace(turned, axis1=1, axis2=2)
+            inverse_root = np.linalg.inv(np.linalg.cholesky(matrix))
+            transformed = inverse_root @ np.moveaxis(slopes, -1, 0) @ inverse_root.T
+            gradient += np.trace(transformed, axis1=1, axis2=2)
             rows, columns = np.tril_indices(len(matrix))
-            parts.append(turned[:, rows, columns].T * np.where(rows > columns, np.sqrt(2), 1.0)[:, None])
+            parts.append(transformed[:, rows, columns].T * np.where(rows > columns, np.sqrt(2), 1.0)[:, None])
         A = np.vstack(parts)
         scales = 1 / np.linalg.norm(A, axis=0)
         R = np.asarray(np.linalg.qr(A * scales, mode="r"))

@@ -90,8 +90,8 @@ class QuadraticFunction(NamedTuple):
 
     def bound_error(self, C: Matrix, known: KnownRms) -> float:
         """Bound of the root mean square of ‖C ê_c‖."""
-        turned = C @ self.loop.inverse_weight
-        return _root(self.errors, np.hstack([turned, turned]), self.level(known))
+        transformed = C @ self.loop.inverse_weight
+        return _root(self.errors, np.hstack([transformed, transformed]), self.level(known))
 
 
 def _root(form: Matrix, C: Matrix, level: float) -> float:

@@ -16,7 +16,7 @@ from noack.impairments.loss_prediction import loss_process
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.exact_matrices import exactly
-from noack.theory.margins.loss_margin import loop_times
+from noack.theory.margins.scenario_times import loop_times
 from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop, repeated
 from noack.theory.random_losses.exact_moments import (
     LoopMoments,
