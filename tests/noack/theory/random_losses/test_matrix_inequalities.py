@@ -77,6 +77,22 @@ def test_numbers_divide_a_sum_in_the_best_way() -> None:
     assert (alone[:3] > costs * alone[3]).all()
 
 
+def test_a_matrix_of_unknowns_divides_a_trace_in_the_best_way() -> None:
+    """The largest t with X ≻ tC and tr X < 1 is 1/tr C."""
+    C = positive_matrix(np.random.default_rng(2), 3)
+    rows, columns = np.tril_indices(3)
+
+    def blocks(values: Vector) -> Blocks:
+        X = np.zeros((3, 3))
+        X[rows, columns] = X[columns, rows] = values[:6]
+        return np.array([1 - np.trace(X)]), X - values[6] * C
+
+    first = np.append(0.2 * np.eye(3)[rows, columns], 1e-3 / np.trace(C))
+    found = MatrixInequalities(blocks, 7).maximise_last(first)
+    assert found is not None
+    assert NEARLY_LARGEST / np.trace(C) <= found[6] < 1 / np.trace(C)
+
+
 @pytest.mark.parametrize(("distance", "is_confirmed"), [(1e-15, False), (1e-11, True)])
 def test_a_matrix_that_is_positive_by_rounding_alone_is_not_confirmed(
     distance: float, is_confirmed: bool
