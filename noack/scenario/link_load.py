@@ -39,7 +39,6 @@ from noack.scenario.run_sections import ProvenDelay
 from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections
 from noack.scenario.scenario_checks import with_settings
 from noack.scenario.sections import DirectionSection
-from noack.trigger.periodic_trigger import PeriodicSettings
 from noack.trigger.trigger_rule import CodedPolicy
 
 
@@ -462,16 +461,8 @@ def _inter_event_times_ns(loop: Scenario) -> tuple[float, float]:
     measured_ns = loop.timing.measurement_period_ns
     if isinstance(rule, CodedPolicy):  # it may transmit at every measurement, or never
         return measured_ns, math.inf
-    least_ns = max(measured_ns, rule.idle_ns)
-    if rule.forecast is not None:
-        least_ns = max(least_ns, rule.shortest_ns)
-    if isinstance(loop.trigger, PeriodicSettings):
-        least_ns = max(least_ns, rule.longest_ns)
-    # An event that is due between two measurements happens at the later one.
-    largest_ns = math.inf
-    if rule.longest_ns < loop.timing.horizon_ns:
-        largest_ns = math.ceil(rule.longest_ns / measured_ns) * measured_ns
-    return least_ns, largest_ns
+    is_due = rule.longest_ns < loop.timing.horizon_ns
+    return max(measured_ns, rule.earliest_ns), rule.latest_ns(measured_ns) if is_due else math.inf
 
 
 def _actuations(loop: Scenario, count: int) -> Demand:

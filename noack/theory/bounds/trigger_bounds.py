@@ -303,11 +303,8 @@ class TriggerBounds:
         """
         rule = self.rule
         due_s = self._longest_until_test(rule.longest_ns, conditions)
-        earliest_ns = max(rule.idle_ns, 0.0)
-        if not len(rule.form.up):  # nothing is compared
-            earliest_ns = rule.longest_ns if rule.forecast is None else rule.shortest_ns
         step_s = conditions.spacing_s
-        apart_s = _rounded_up(min(earliest_ns, rule.longest_ns) / NS_PER_S, step_s)
+        apart_s = _rounded_up(rule.earliest_ns / NS_PER_S, step_s)
         forced_s = _rounded_up(rule.longest_ns / NS_PER_S, step_s)
         return due_s, forced_s, apart_s
 

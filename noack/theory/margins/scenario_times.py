@@ -63,11 +63,8 @@ def intervals_ns(resolved: Scenario) -> tuple[int, int]:
             "between two events, as periodic and deadline have; use e.g. "
             "--set 'trigger={policy=\"periodic\", period_s=0.5}'"
         )
-    longest_ns = max(-int(-rule.longest_ns // step_ns), 1) * step_ns
-    if rule.forecast is None and not len(rule.form.up):  # nothing is compared
-        return longest_ns, longest_ns
-    least_ns = max(rule.idle_ns, 0.0 if rule.forecast is None else rule.shortest_ns, step_ns)
-    return min(-int(-least_ns // step_ns) * step_ns, longest_ns), longest_ns
+    shortest_ns = max(math.ceil(rule.earliest_ns / step_ns), 1) * step_ns
+    return shortest_ns, int(rule.latest_ns(step_ns))
 
 
 def loop_times(resolved: Scenario, unit_ns: int) -> LoopTimes:
