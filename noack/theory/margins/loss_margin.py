@@ -132,7 +132,7 @@ def _merged(bursts: list[Burst]) -> list[Burst]:
 
 
 class Stability(NamedTuple):
-    """What is known about all loss patterns of a guarantee."""
+    """Bounds of the growth of all loss patterns of a guarantee."""
 
     lower: float
     """The pattern grows at least by this factor per longest interval, in the long run."""

@@ -54,7 +54,7 @@ class RandomGrowth(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What follows, as a sentence."""
+        """The conclusion as a sentence."""
         factor = f"{self.mean_square:.6g}"
         square = f"√E‖z‖² of the loop's state z changes by the factor {factor} per period"
         if self.mean_square < 1:

@@ -35,7 +35,7 @@ class MatrixInequalities:
         self._slopes = [
             np.stack(parts, axis=-1) - c[..., None] for parts, c in zip(units, self._constants, strict=True)
         ]
-        """What each value adds, (k, size) and (n, n, size)."""
+        """The slope for each value, (k, size) and (n, n, size)."""
 
     def _at(self, values: Vector) -> list[Matrix]:
         return [c + slopes @ values for c, slopes in zip(self._constants, self._slopes, strict=True)]

@@ -35,7 +35,7 @@ ROUNDING = 1 + 1e-5
 
 
 class InputEffects(NamedTuple):
-    """How much inputs that are held and late change the flow from the moment an update acts."""
+    """Bounds of what held and late inputs change of the flow, from the moment an update acts."""
 
     age_input: float = 0.0
     """Bound of ‖q‖, p = K e_c + q."""

@@ -39,7 +39,7 @@ _LATE_TERMS = 8
 
 
 class SensorErrors(NamedTuple):
-    """What is known of ‖e_s‖_W between two events."""
+    """Bounds of ‖e_s‖_W between two events."""
 
     after_losses: Vector
     """Its bounds, while 0, 1, … events have been lost since the delivery."""
@@ -131,7 +131,7 @@ def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float, grid_s: floa
 
 
 class _LostEvent:
-    """What follows an event, a time w or more after the delivery, for times r since it.
+    """Bounds at times r since an event that is a time w or more after the delivery.
 
     z is e^{Fw} ζ at the event. What q has changed since some time before is bounded with e^{−Fs} (BU, −BU).
     Up to the event ‖e_c‖_W ≤ ``error_before`` and ‖Λx‖ ≤ ``state_bound``. ``flows`` are e^{Fr}.

@@ -190,7 +190,7 @@ class _SharpenedBounds:
 
     @property
     def _sensor_errors(self) -> SensorErrors:
-        """What is known of e_s between two events."""
+        """Bounds of e_s between two events."""
         bounds, bound, conditions = self.bounds, self._part.bound, self._conditions
         level, h_s = bound.reached or 0.0, conditions.sampling_s
         if bound.is_mean:  # of an integral, over any time
