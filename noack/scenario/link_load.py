@@ -69,11 +69,11 @@ class LinkLoad(NamedTuple):
     key: str
     flow: Flow
     window: LossWindow
-    """How many of successive datagrams of a loop may be lost; the others must pass."""
+    """The successive datagrams of a loop, and those of them that may be lost; the others must pass."""
     rate_bps: float
-    """What it carries; a link with recorded opportunities: on average."""
+    """The rate that it carries; a link with recorded opportunities: on average."""
     mandatory_at_most_bps: float
-    """Those datagrams that must pass, if each loop transmits as often as it can."""
+    """The rate of the datagrams that must pass, if each loop transmits as often as it can."""
     mandatory_at_least_bps: float
     """The same, if each loop transmits as rarely as it can."""
     delay_bound_s: float | None
@@ -116,7 +116,7 @@ class DelayBound(NamedTuple):
 
 
 def link_loads(scenario: Scenario) -> list[LinkLoad]:
-    """Return what the loops need of each bottleneck of the network, in either direction.
+    """Return the load of each bottleneck of the network, in either direction.
 
     A change of settings that alters it adds an element. Acknowledgements are left out: how many
     there are depends on the losses of updates.
@@ -131,7 +131,7 @@ def link_loads(scenario: Scenario) -> list[LinkLoad]:
 
 
 def update_delay(scenario: Scenario) -> DelayBound:
-    """Return what bounds the delay of updates, and what the certificates cover.
+    """Return bounds of the delay of updates, and the delays that the certificates cover.
 
     Raises:
         CallerError: as :func:`link_loads`.
@@ -238,7 +238,7 @@ def _slot_loads(
     path: tuple[str, Flow],
     delays_of: Sequence[tuple[str, float]],
 ) -> Iterator[LinkLoad]:
-    """Yield for each entry of [[loops]] what its loop with the fewest slots needs of them.
+    """Yield for each entry of [[loops]] the load of the slots of its loop with the fewest of them.
 
     ``delays_of`` has the name of each loop of the run and the bound of its delay.
     """
@@ -429,7 +429,7 @@ def require_capacity(scenario: Scenario) -> None:
 
 
 def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str]:
-    """Yield what may go wrong at the bottlenecks, one line each."""
+    """Yield warnings about the bottlenecks, one line each."""
     overloaded = [load for load in loads if load.mandatory_at_most_bps > load.rate_bps]
     for load in overloaded:
         yield (
