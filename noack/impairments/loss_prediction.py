@@ -65,9 +65,29 @@ _PARTS = 16
 _TINY = 1e-12
 _DIGITS = 12
 """The probability is rounded, so that every machine draws the same losses."""
-_MOST_FOUND = 1000
-_found: dict[str, float] = {}
-"""Probabilities by :func:`_key`."""
+
+
+class ProbabilityCache:
+    """The newest probabilities that have been found, by :func:`_key`."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._probabilities = dict[str, float]()
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._probabilities
+
+    def __getitem__(self, key: str) -> float:
+        return self._probabilities[key]
+
+    def add(self, probabilities: Mapping[str, float]) -> None:
+        """Add some; the oldest ones are removed."""
+        while len(self._probabilities) > self._most:
+            del self._probabilities[next(iter(self._probabilities))]
+        self._probabilities.update(probabilities)
+
+
+_probabilities = ProbabilityCache(1000)
 
 
 class LossPrediction(NamedTuple):
@@ -421,22 +441,20 @@ def with_target_loss(settings: LinkSettings) -> LinkSettings:
     if len(target_losses) > 1:
         raise ValueError(f"{target_loss.impairment.text()}: only one loss of a direction can be kept")
     key = _key(settings)
-    if key not in _found:
+    if key not in _probabilities:
         remember({key: _probability(settings, target_loss)})
-    return _with_probability(settings, target_loss, _found[key])
+    return _with_probability(settings, target_loss, _probabilities[key])
 
 
 def found_probabilities(*links: LinkSettings) -> dict[str, float]:
     """Return the probabilities of valid settings, for :func:`remember`; none where none is kept."""
     keys = [_key(link) for link in links if with_target_loss(link) is not link]
-    return {key: _found[key] for key in keys}
+    return {key: _probabilities[key] for key in keys}
 
 
 def remember(probabilities: Mapping[str, float]) -> Mapping[str, float]:
     """Use these probabilities, which another process found, instead of computing them."""
-    while len(_found) > _MOST_FOUND:
-        del _found[next(iter(_found))]
-    _found.update(probabilities)
+    _probabilities.add(probabilities)
     return probabilities
 
 

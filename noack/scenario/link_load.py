@@ -1,4 +1,4 @@
-"""What the loops of a run need of a bottleneck that they share, before the run.
+"""The load of a bottleneck that the loops of a run share, and their delays on it, before the run.
 
 Of any M successive datagrams of a loop, one must pass (M − 1 = the longest burst of losses); a
 constraint can require more, at least K − m of any K. The share s that must pass is the largest of
@@ -39,7 +39,6 @@ from noack.scenario.run_sections import ProvenDelay
 from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections
 from noack.scenario.scenario_checks import with_settings
 from noack.scenario.sections import DirectionSection
-from noack.trigger.periodic_trigger import PeriodicSettings
 from noack.trigger.trigger_rule import CodedPolicy
 
 
@@ -55,24 +54,26 @@ class Demand(NamedTuple):
 class _RunPart(NamedTuple):
     """A part of the run, between two changes of settings."""
 
-    begin: str  # Where it begins, in words; empty: at the start of the run
+    change: int | None  # The change of settings with which it begins; None: the start of the run
     direction: DirectionSection
     loops: Sequence[Demand]
 
 
 class LinkLoad(NamedTuple):
-    """What the loops need of a bottleneck; rates in bits per second."""
+    """The load of a bottleneck; rates in bits per second."""
 
-    begin: str
-    """From when on, and for which loop's slots, in words; empty: from the start, for all."""
+    change: int | None
+    """The change of settings from which on this holds; None: from the start of the run on."""
+    loop: tuple[int, str] | None
+    """Number and name of the loop whose slots these are; None: what all loops share."""
     key: str
     flow: Flow
     window: LossWindow
-    """How many of successive datagrams of a loop may be lost; the others must pass."""
+    """The successive datagrams of a loop, and those of them that may be lost; the others must pass."""
     rate_bps: float
-    """What it carries; a link with recorded opportunities: on average."""
+    """The rate that it carries; a link with recorded opportunities: on average."""
     mandatory_at_most_bps: float
-    """Those datagrams that must pass, if each loop transmits as often as it can."""
+    """The rate of the datagrams that must pass, if each loop transmits as often as it can."""
     mandatory_at_least_bps: float
     """The same, if each loop transmits as rarely as it can."""
     delay_bound_s: float | None
@@ -80,9 +81,15 @@ class LinkLoad(NamedTuple):
     loop_bounds_s: tuple[tuple[str, float], ...] = ()
     """The bounds of the loops that have one each, infinite if there is none: which loops, bound."""
 
+    @property
+    def scope(self) -> str:
+        """From when on this holds, and for which loop, as the beginning of a sentence."""
+        change = "" if self.change is None else f"from changes.{self.change} on, "
+        return change if self.loop is None else f"{change}loop {self.loop[0]} ({self.loop[1]}), "
+
 
 class DelayBound(NamedTuple):
-    """What bounds the delay of updates in the network, in the whole run and in virtual time."""
+    """Bounds of the delay of updates in the network, in the whole run and in virtual time."""
 
     impairments_s: dict[str, float]
     """The largest delay in each impairment that delays, by its key; infinite: no bound is known."""
@@ -109,7 +116,7 @@ class DelayBound(NamedTuple):
 
 
 def link_loads(scenario: Scenario) -> list[LinkLoad]:
-    """Return what the loops need of each bottleneck of the network, in either direction.
+    """Return the load of each bottleneck of the network, in either direction.
 
     A change of settings that alters it adds an element. Acknowledgements are left out: how many
     there are depends on the losses of updates.
@@ -124,7 +131,7 @@ def link_loads(scenario: Scenario) -> list[LinkLoad]:
 
 
 def update_delay(scenario: Scenario) -> DelayBound:
-    """Return what bounds the delay of updates, and what the certificates cover.
+    """Return bounds of the delay of updates, and the delays that the certificates cover.
 
     Raises:
         CallerError: as :func:`link_loads`.
@@ -160,15 +167,14 @@ def _run_parts(scenario: Scenario) -> tuple[list[_RunPart], list[_RunPart]]:
     loops = [loop_scenario(scenario, section) for section in sections]
     counts = [section.count for section in sections]
     updates, actuations = list[_RunPart](), list[_RunPart]()
-    for number in range(len(scenario.changes) + 1):
-        begin = f"from changes.{number - 1} on, " if number else ""
-        if number:
-            loops = [with_settings(loop, scenario.changes[number - 1].set) for loop in loops]
+    for change in (None, *range(len(scenario.changes))):
+        if change is not None:
+            loops = [with_settings(loop, scenario.changes[change].set) for loop in loops]
         network = loops[0].network
-        updates.append(_RunPart(begin, network, [*map(_demand, loops, counts)]))
+        updates.append(_RunPart(change, network, [*map(_demand, loops, counts)]))
         if network.actuation is not None:
             demands = [*map(_actuations, loops, counts)]
-            actuations.append(_RunPart(begin, network.actuation, demands))
+            actuations.append(_RunPart(change, network.actuation, demands))
     return updates, actuations
 
 
@@ -187,18 +193,24 @@ def _link_loads(run_parts: Sequence[_RunPart], flow: Flow, path: str, names: Seq
         previous: LinkLoad | None = None
         delay_s = _largest_bound(delays[index])
         by_loops = tuple(_by_loops(names, delays[index])) if len(delays[index]) > 1 else ()
-        for begin, direction, loops in run_parts:
+        for change, direction, loops in run_parts:
             window = _window(direction)
             bits = [int(impairment.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
-            needed_bps = (
-                sum(b / loop.least_s for b, loop in zip(bits, loops, strict=True)),
-                sum(b / loop.largest_s for b, loop in zip(bits, loops, strict=True)),
-            )
-            at_most_bps, at_least_bps = (_share(window) * bps for bps in needed_bps)
+            at_most_bps = sum(b / loop.least_s for b, loop in zip(bits, loops, strict=True))
+            at_least_bps = sum(b / loop.largest_s for b, loop in zip(bits, loops, strict=True))
             load = LinkLoad(
-                begin, key, flow, window, impairment.rate_bps, at_most_bps, at_least_bps, delay_s, by_loops
+                change=change,
+                loop=None,
+                key=key,
+                flow=flow,
+                window=window,
+                rate_bps=impairment.rate_bps,
+                mandatory_at_most_bps=_share(window) * at_most_bps,
+                mandatory_at_least_bps=_share(window) * at_least_bps,
+                delay_bound_s=delay_s,
+                loop_bounds_s=by_loops,
             )
-            if previous is None or load._replace(begin=previous.begin) != previous:
+            if previous is None or load._replace(change=previous.change) != previous:
                 loads.append(load)
             previous = load
     return loads
@@ -226,7 +238,7 @@ def _slot_loads(
     path: tuple[str, Flow],
     delays_of: Sequence[tuple[str, float]],
 ) -> Iterator[LinkLoad]:
-    """Yield for each entry of [[loops]] what its loop with the fewest slots needs of them.
+    """Yield for each entry of [[loops]] the load of the slots of its loop with the fewest of them.
 
     ``delays_of`` has the name of each loop of the run and the bound of its delay.
     """
@@ -237,12 +249,13 @@ def _slot_loads(
         number = min(range(first, first + loops.loops), key=lambda loop: len(slots[loop]))
         first += loops.loops
         name, delay_s = delays_of[number]
-        for begin, direction, demands in run_parts:
+        for change, direction, demands in run_parts:
             loop, window = demands[entry], _window(direction)
             bits = 8 * loop.payload_bytes
             must_pass = bits * _share(window)
             yield LinkLoad(
-                begin=f"{begin}loop {number} ({name}), ",
+                change=change,
+                loop=(number, name),
                 key=key,
                 flow=flow,
                 window=window,
@@ -303,12 +316,12 @@ def _slot_delays_s(
 ) -> list[float]:
     """Return the bounds for the slots of each loop; see :func:`_queue_delay_s`."""
     least_s = [
-        min(stage.loops[entry].least_s for stage in run_parts)
+        min(part.loops[entry].least_s for part in run_parts)
         for entry, demand in enumerate(run_parts[0].loops)
         for _ in range(demand.loops)
     ]
-    share = max(_share(_window(stage.direction)) for stage in run_parts)
-    if any(stage.direction.constraints for stage in run_parts):
+    share = max(_share(_window(part.direction)) for part in run_parts)
+    if any(part.direction.constraints for part in run_parts):
         share = math.inf
     delays_s = []
     for slots, loop_least_s in zip(_slots(schedule, run_parts), least_s, strict=True):
@@ -333,10 +346,10 @@ def _chosen_delays_s(rate: Rate, scheduler: Scheduler, run_parts: Sequence[_RunP
     A change of the direction's settings makes the order of what waits final, so that any may go first.
     """
     demands = run_parts[0].loops
-    changes = any(stage.direction.link != run_parts[0].direction.link for stage in run_parts)
+    changes = any(part.direction.link != run_parts[0].direction.link for part in run_parts)
     senders_ns = [
         (
-            round(min(stage.loops[entry].least_s for stage in run_parts) * NS_PER_S),
+            round(min(part.loops[entry].least_s for part in run_parts) * NS_PER_S),
             max(-(-int(rate.line_bits(demand.payload_bytes)) * NS_PER_S // rate.rate_bps), 1),
         )
         for entry, demand in enumerate(demands)
@@ -359,7 +372,7 @@ def _chosen_delays_s(rate: Rate, scheduler: Scheduler, run_parts: Sequence[_RunP
 def _queue_delay_s(rate: Rate, run_parts: Sequence[_RunPart], spread_s: float, *, copied: bool) -> float:
     """Return the bound for the least M and the shortest times between transmissions of the run.
 
-    What waits in the queue at a change was sent before it, so no stage has a bound of its own.
+    What waits in the queue at a change was sent before it, so no part has a bound of its own.
 
     Args:
         rate: the bottleneck.
@@ -371,15 +384,15 @@ def _queue_delay_s(rate: Rate, run_parts: Sequence[_RunPart], spread_s: float, *
         return math.inf
     bits = [int(rate.line_bits(loop.payload_bytes)) for loop in run_parts[0].loops]
     counts = [loop.loops for loop in run_parts[0].loops]
-    by_loops = zip(*(stage.loops for stage in run_parts), strict=True)
+    by_loops = zip(*(part.loops for part in run_parts), strict=True)
     least_s: list[float] = [min(demand.least_s for demand in demands) for demands in by_loops]
     every_bps: float = sum(b * k / d for b, k, d in zip(bits, counts, least_s, strict=True))
     together = sum(b * k for b, k in zip(bits, counts, strict=True))
     copies = 2 if copied else 1
     if copies * every_bps <= rate.rate_bps:
         return copies * (together + every_bps * spread_s) / rate.rate_bps
-    needed_bps = every_bps * max(_share(_window(stage.direction)) for stage in run_parts)
-    if needed_bps < rate.rate_bps and not any(stage.direction.constraints for stage in run_parts):
+    needed_bps = every_bps * max(_share(_window(part.direction)) for part in run_parts)
+    if needed_bps < rate.rate_bps and not any(part.direction.constraints for part in run_parts):
         waiting = rate.queue * max(bits) + together + needed_bps * spread_s
         return waiting / (rate.rate_bps - needed_bps)
     return math.inf
@@ -409,18 +422,18 @@ def require_capacity(scenario: Scenario) -> None:
         if load.mandatory_at_least_bps > load.rate_bps:
             losses, packets = load.window
             raise CallerError(
-                f"{load.key}: {load.begin}the datagrams that must pass, {packets - losses} of any "
+                f"{load.key}: {load.scope}the datagrams that must pass, {packets - losses} of any "
                 f"{packets} of each loop, need {math.ceil(load.mandatory_at_least_bps)} bit/s, "
                 f"and it carries {load.rate_bps:.0f}; the queue would grow without bound"
             )
 
 
 def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str]:
-    """Yield what may go wrong at the bottlenecks, one line each."""
+    """Yield warnings about the bottlenecks, one line each."""
     overloaded = [load for load in loads if load.mandatory_at_most_bps > load.rate_bps]
     for load in overloaded:
         yield (
-            f"{load.key}, {load.rate_bps:.0f} bit/s: {load.begin}if all loops transmit as "
+            f"{load.key}, {load.rate_bps:.0f} bit/s: {load.scope}if all loops transmit as "
             "often as they can, the datagrams that must pass need "
             f"{math.ceil(load.mandatory_at_most_bps)} bit/s; then the queue grows without bound"
         )
@@ -448,16 +461,8 @@ def _inter_event_times_ns(loop: Scenario) -> tuple[float, float]:
     measured_ns = loop.timing.measurement_period_ns
     if isinstance(rule, CodedPolicy):  # it may transmit at every measurement, or never
         return measured_ns, math.inf
-    least_ns = max(measured_ns, rule.idle_ns)
-    if rule.forecast is not None:
-        least_ns = max(least_ns, rule.shortest_ns)
-    if isinstance(loop.trigger, PeriodicSettings):
-        least_ns = max(least_ns, rule.longest_ns)
-    # An event that is due between two measurements happens at the later one.
-    largest_ns = math.inf
-    if rule.longest_ns < loop.timing.horizon_ns:
-        largest_ns = math.ceil(rule.longest_ns / measured_ns) * measured_ns
-    return least_ns, largest_ns
+    is_due = rule.longest_ns < loop.timing.horizon_ns
+    return max(measured_ns, rule.earliest_ns), rule.latest_ns(measured_ns) if is_due else math.inf
 
 
 def _actuations(loop: Scenario, count: int) -> Demand:

@@ -80,7 +80,7 @@ class ScenarioTables(ScenarioSection):
 
     @property
     def between_updates(self) -> str:
-        """What the controller does between updates, in words."""
+        """The controller's behaviour between updates, in words."""
         words = "model-based" if self.mode == "model" else "zero-order hold"
         if self.controller.update_timeout_s is None:
             return words
@@ -236,7 +236,7 @@ class Timing:
 
     @property
     def acknowledgement_timeout_ns(self) -> int:
-        """How long the sensor waits for an acknowledgement before it transmits again."""
+        """The time that the sensor waits for an acknowledgement before it transmits again."""
         network = self.scenario.network
         if network.reverse.timeout_s is not None:
             return round(network.reverse.timeout_s * NS_PER_S)
@@ -300,7 +300,7 @@ UNCERTIFIED_ACKNOWLEDGEMENTS = (
 
 @dataclass(frozen=True)
 class TheoryCoverage:
-    """Which of the paper's theorems, the certificates and the exact simulation cover a scenario."""
+    """The theorems of the paper, certificates and exact simulation that cover a scenario."""
 
     scenario: ScenarioTables
 

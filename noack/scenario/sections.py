@@ -415,7 +415,7 @@ class NetworkSection(DirectionSection):
 
     @property
     def flows(self) -> tuple[Flow, ...]:
-        """What crosses the network; the place of a flow here is the number of its direction."""
+        """The flows that cross the network; the index of a flow is the number of its direction."""
         if self.protocol == "ack":
             return Flow.UPDATE, Flow.ACKNOWLEDGEMENT
         return (Flow.UPDATE,) if self.actuation is None else (Flow.UPDATE, Flow.ACTUATION)
@@ -456,5 +456,5 @@ class NetworkSection(DirectionSection):
     @property
     @cached_method
     def guarantee(self) -> LossGuarantee:
-        """What mansd and the constraints say, also if the network does not enforce it."""
+        """The guarantee of mansd and the constraints, also if the network does not enforce it."""
         return join_guarantee(self.mansd, self.constraints)

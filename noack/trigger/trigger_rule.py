@@ -111,6 +111,22 @@ class TriggerRule(NamedTuple):
         compares = np.array_equal(up, error_map(n, self.weight)) and not self.grid_ns
         return self.floor if compares and not self.integrates else None
 
+    @property
+    def earliest_ns(self) -> float:
+        """The first time after an event at which the next one can happen, whatever is measured."""
+        if len(self.form.up):
+            earliest_ns = max(self.idle_ns, 0.0)
+        else:  # nothing is compared
+            earliest_ns = self.longest_ns if self.forecast is None else self.shortest_ns
+        return min(earliest_ns, self.longest_ns)
+
+    def latest_ns(self, period_ns: int) -> float:
+        """Return the last such time if measurements are a period apart; infinite if none is due."""
+        if math.isinf(self.longest_ns):
+            return math.inf
+        # An event that is due between two measurements happens at the later one.
+        return max(math.ceil(self.longest_ns / period_ns), 1) * period_ns
+
     def threshold(self, t_ns: float) -> float:
         """Return max(c e^{−ρt}, f)."""
         return max(self.level * math.exp(-self.rate_per_s * t_ns * 1e-9), self.floor)

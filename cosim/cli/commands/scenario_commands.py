@@ -200,7 +200,7 @@ def _check_loops(loaded: "scenario.Scenario", *, json: bool) -> None:
         delay = load.delay_bound_s
         by_loops = "; ".join(f"{loops}: {_bound(own_s)}" for loops, own_s in load.loop_bounds_s)
         print(
-            f"{_COMMENT}{load.key}: {load.begin}{load.rate_bps:.0f} bit/s; "
+            f"{_COMMENT}{load.key}: {load.scope}{load.rate_bps:.0f} bit/s; "
             f"datagrams that must pass: {load.mandatory_at_least_bps:.0f} to "
             f"{load.mandatory_at_most_bps:.0f} bit/s; delay: "
             + ("no bound" if delay is None else f"{_bound(delay)} in virtual time")

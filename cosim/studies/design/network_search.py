@@ -34,14 +34,8 @@ from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows, rows_of
-from noack.theory.margins.loss_margin import (
-    LossMargin,
-    Stability,
-    capped,
-    list_bursts,
-    uncapped,
-    without_timeout,
-)
+from noack.theory.margins.loss_margin import LossMargin, Stability, capped, list_bursts, uncapped
+from noack.theory.margins.scenario_times import without_timeout
 from noack.theory.margins.time_triggered_loop import LoopTimes
 from noack.trigger.periodic_trigger import PeriodicSettings
 

@@ -297,12 +297,9 @@ class TriggerBounds:
 
     def _between_events(self, conditions: NetworkConditions) -> InterEventTimes:
         rule = self.rule
-        earliest_ns = max(rule.idle_ns, 0.0)
-        if not len(rule.form.up):  # nothing is compared
-            earliest_ns = rule.longest_ns if rule.forecast is None else rule.shortest_ns
         step_s = conditions.spacing_s
         return InterEventTimes(
-            shortest_s=_rounded_up(min(earliest_ns, rule.longest_ns) / NS_PER_S, step_s),
+            shortest_s=_rounded_up(rule.earliest_ns / NS_PER_S, step_s),
             longest_s=self._longest_until_test(rule.longest_ns, conditions),
             earliest_due_s=_rounded_up(rule.longest_ns / NS_PER_S, step_s),
         )

@@ -7,7 +7,8 @@ certificates are sufficient only (docs/theory.md, "The margin of a time-triggere
 1. ``time_triggered_loop.py``. A delivered update removes all knowledge of older ones. So from one
    delivery to the next the loop is one linear map, z → Φ z, that depends on the number of lost
    updates between, on the times, and on the controller's ticks. The maps are computed without
-   rounding (``exact_matrices.py``) and enclosed.
+   rounding (``exact_matrices.py``) and enclosed. ``scenario_times.py`` has the times of a
+   scenario's loop, and refuses loops without them.
 2. ``loss_margin.py``. The guarantee is an automaton; its states at deliveries are the nodes of a
    graph, the bursts it allows are the edges. Every pattern is a path. With the maps as matrices of
    the edges this is a switched system (``switched_system.py``).

@@ -82,16 +82,16 @@ class PolytopeNorm:
             if not len(active):
                 break
             try:
-                undone = np.linalg.inv(V[chosen[active]] * signs[active][:, :, None])
+                inverse_basis = np.linalg.inv(V[chosen[active]] * signs[active][:, :, None])
             except np.linalg.LinAlgError:  # by rounding
                 break
             # The vertex that violates the dual's inequalities most enters the basis.
-            scores = undone.sum(axis=2) @ V.T
+            scores = inverse_basis.sum(axis=2) @ V.T
             self.work += scores.size * n
             entering = np.abs(scores).argmax(axis=1)
             value = scores[np.arange(len(active)), entering]
             sign = np.sign(value)
-            rates = np.einsum("ki,kij->kj", V[entering] * sign[:, None], undone)
+            rates = np.einsum("ki,kij->kj", V[entering] * sign[:, None], inverse_basis)
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratios = np.where(rates > _PIVOT, coefficients[active] / rates, np.inf)
             # The vertex whose coefficient reaches 0 first leaves it.

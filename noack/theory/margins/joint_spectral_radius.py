@@ -248,7 +248,7 @@ _LARGEST_EXPONENT, _NEAR_1 = 600.0, 1e-6
 
 
 class ProductBound(NamedTuple):
-    """What a limited number of products proves."""
+    """The bound that a limited number of products proves."""
 
     upper: float
     """Upper bound of the joint spectral radius."""

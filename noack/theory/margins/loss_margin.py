@@ -9,7 +9,6 @@ pattern of losses, and of such times, is a path. The edges, with the loop's maps
 (:mod:`noack.theory.margins.switched_system`).
 """
 
-import math
 import time
 from functools import cache
 from typing import NamedTuple
@@ -18,16 +17,15 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.impairments.kinds.delay import Delay
 from noack.impairments.loss_guarantee import LongestBurst, LossAutomaton, LossGuarantee, outcome_letters
-from noack.scenario.resolution import loop_of, rule_of, setpoint_of
+from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import ACCURACY, MOST_VERTICES, joint_spectral_radius
+from noack.theory.margins.scenario_times import intervals_ns, loop_times, require_covered
 from noack.theory.margins.switched_system import Edge
 from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 
 MOST_EDGES = 5000
-_WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
 _FIRST_ACCURACY = 1e-2
 _QUICK_ACCURACY = 3e-2
 
@@ -134,7 +132,7 @@ def _merged(bursts: list[Burst]) -> list[Burst]:
 
 
 class Stability(NamedTuple):
-    """What is known about all loss patterns of a guarantee."""
+    """Bounds of the growth of all loss patterns of a guarantee."""
 
     lower: float
     """The pattern grows at least by this factor per longest interval, in the long run."""
@@ -315,97 +313,3 @@ class LossMargin:
     def first_bounds(self) -> Stability:
         """Return bounds that take less than a second; they may leave stability undecided."""
         return self.stability(accuracy=_QUICK_ACCURACY, decide=False)
-
-
-def require_covered(resolved: Scenario) -> None:
-    """Raise CallerError unless the loop is linear, transmits in time, and the watchdog is idle."""
-    resolved.coverage.require_direct_inputs()
-    without_timeout(resolved).coverage.require_exact()
-    resolved.coverage.require_constant()
-    require_idle_watchdog(resolved)
-    if resolved.controller.update_timeout_s is None or resolved.controller.timeout_input == "hold":
-        return
-    setpoint, m = setpoint_of(resolved), resolved.model.dimensions[1]
-    at_rest = np.zeros(m) if setpoint is None else setpoint[1]
-    if not np.allclose(resolved.controller.safe_input or np.zeros(m), at_rest, rtol=1e-9, atol=0):
-        raise CallerError(
-            "controller.safe_input: with update_timeout_s the margin needs the input at rest, "
-            f"{[float(f'{u:.10g}') for u in at_rest]}"
-        )
-
-
-def without_timeout(scenario: Scenario) -> Scenario:
-    """Return a scenario whose controller uses every update, however old."""
-    controller = scenario.controller.model_copy(update={"update_timeout_s": None})
-    return scenario.model_copy(update={"controller": controller})
-
-
-def require_idle_watchdog(resolved: Scenario) -> None:
-    """Raise CallerError if the watchdog may replace the controller's inputs."""
-    timing = resolved.timing
-    if timing.plant_period_ns + timing.controller_period_ns > timing.actuation_timeout_ns:
-        raise CallerError(
-            "plant.watchdog.timeout_s: shorter than the age of the actuations without any delay"
-        )
-
-
-def intervals_ns(resolved: Scenario) -> tuple[int, int]:
-    """Return the shortest and the longest time between two transmissions, as measurements allow.
-
-    Raises:
-        CallerError: there is no longest time.
-    """
-    rule, step_ns = rule_of(resolved), resolved.timing.measurement_period_ns
-    if rule.longest_ns == math.inf:
-        raise CallerError(
-            f'trigger.policy = "{resolved.trigger.policy}": this needs a longest time '
-            "between two events, as periodic and deadline have; use e.g. "
-            "--set 'trigger={policy=\"periodic\", period_s=0.5}'"
-        )
-    longest_ns = max(-int(-rule.longest_ns // step_ns), 1) * step_ns
-    if rule.forecast is None and not len(rule.form.up):  # nothing is compared
-        return longest_ns, longest_ns
-    least_ns = max(rule.idle_ns, 0.0 if rule.forecast is None else rule.shortest_ns, step_ns)
-    return min(-int(-least_ns // step_ns) * step_ns, longest_ns), longest_ns
-
-
-def loop_times(resolved: Scenario, unit_ns: int) -> LoopTimes:
-    """Return the times of a loop with an update every ``unit_ns``, or at multiples of it.
-
-    Raises:
-        CallerError: the delay of the updates is longer.
-    """
-    timing, delay_ns = resolved.timing, update_delay_ns(resolved)
-    if delay_ns >= unit_ns:
-        is_every = unit_ns != timing.measurement_period_ns
-        pair = "two updates" if is_every else "two measurements"
-        raise CallerError(
-            f"network.impairments: a delay of {delay_ns / NS_PER_S:g} s; expected less "
-            f"than the period between {pair}, {unit_ns / NS_PER_S:g} s"
-        )
-    return LoopTimes(
-        timing.plant_period_ns,
-        timing.controller_period_ns,
-        timing.controller_phase_ns,
-        unit_ns,
-        delay_ns,
-        timing.update_timeout_ns,
-        resolved.controller.timeout_input == "hold",
-    )
-
-
-def update_delay_ns(resolved: Scenario) -> int:
-    """Return the constant delay of the updates; raise CallerError if it may vary."""
-    delay_ns = 0
-    for number, impairment in enumerate(resolved.network.impairments):
-        constant = isinstance(impairment, Delay) and not (
-            impairment.jitter_s or impairment.samples_s or impairment.file
-        )
-        if isinstance(impairment, Delay) and constant:
-            delay_ns += round(impairment.delay_s * NS_PER_S)
-        elif impairment.kind not in _WITHOUT_DELAY:
-            raise CallerError(
-                f"network.impairments.{number}: {impairment.kind}: this needs a constant "
-                "delay; use delay_s alone"
-            )
-    return delay_ns

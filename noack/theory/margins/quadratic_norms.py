@@ -95,9 +95,9 @@ class NormSearch:
 
     def _proven(self, forms: Stack) -> QuadraticNorms:
         durations = self._system.graph.durations
-        if (turned := self._system.in_coordinates(forms)) is None:
+        if (transformed := self._system.in_coordinates(forms)) is None:
             return QuadraticNorms(None, np.full(len(durations), np.inf))
-        return QuadraticNorms(turned, norms_above(turned.matrices) ** (1 / durations) * (1 + 1e-15))
+        return QuadraticNorms(transformed, norms_above(transformed.matrices) ** (1 / durations) * (1 + 1e-15))
 
 
 def number_of_entries(system: SwitchedSystem) -> int:
@@ -119,8 +119,8 @@ class _Centers(NamedTuple):
     def log_growths(self, P: Stack) -> Vector:
         """Return log γ of every edge, (k,)."""
         forms = np.linalg.cholesky(P).swapaxes(1, 2)
-        turned = forms[self.graph.targets] @ self.matrices @ np.linalg.inv(forms)[self.graph.sources]
-        norms = np.linalg.norm(turned, 2, axis=(1, 2))
+        transformed = forms[self.graph.targets] @ self.matrices @ np.linalg.inv(forms)[self.graph.sources]
+        norms = np.linalg.norm(transformed, 2, axis=(1, 2))
         return np.asarray(np.log(np.maximum(norms, _SMALLEST)) / self.graph.durations)
 
     def approach(self, P: Stack, goal: float) -> Stack:
@@ -197,7 +197,7 @@ class _Centers(NamedTuple):
         size, carried = basis.shape[1], self._carried(P, steps)
         G = np.asarray(np.linalg.inv(P[sources] - carried), dtype=np.float64)
         S = 2 * durations[:, None, None] * carried
-        mixed, turned = G @ steps.swapaxes(1, 2), G @ S
+        mixed, transformed = G @ steps.swapaxes(1, 2), G @ S
 
         def of_nodes(edges: Stack, first: Matrix) -> Vector:
             """Return Σ tr(X dF) as a function of all P, for X of each edge, and tr(Y dP_v)."""
@@ -220,11 +220,11 @@ class _Centers(NamedTuple):
         shape = (count * size, count * size)
         curvature = coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=shape).tocsc()
         solver = splu(curvature, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        slope, border = of_nodes(-G, np.eye(n)), of_nodes(turned @ G, np.zeros((n, n)))
+        slope, border = of_nodes(-G, np.eye(n)), of_nodes(transformed @ G, np.zeros((n, n)))
         along, across = solver.solve(slope), solver.solve(border)
-        sums = np.trace(turned, axis1=1, axis2=2)
+        sums = np.trace(transformed, axis1=1, axis2=2)
         own_slope = weight - float(sums.sum())
-        corner = float(np.einsum("eij,eji->", turned, turned) + 2 * durations @ sums)
+        corner = float(np.einsum("eij,eji->", transformed, transformed) + 2 * durations @ sums)
         corner -= float(border @ across)
         if not corner > 0:
             raise np.linalg.LinAlgError

@@ -201,10 +201,10 @@ class SwitchedSystem:
 
         None: an inverse could not be enclosed.
         """
-        if (undone := inverse(forms)) is None:
+        if (inverse_forms := inverse(forms)) is None:
             return None
         sources, targets = self.graph.sources, self.graph.targets
-        return replace(self, matrices=exactly(forms[targets]) @ self.matrices @ undone.at(sources))
+        return replace(self, matrices=exactly(forms[targets]) @ self.matrices @ inverse_forms.at(sources))
 
     def in_similar_units(self) -> "SwitchedSystem":
         """Return the system with its states times powers of two, the same at every node.
@@ -244,11 +244,11 @@ def spectral_radius_bounds(product: IntervalMatrix) -> tuple[float, float]:
     values, vectors = np.linalg.eig(product.middle)
     # A real basis in which a matrix is nearly block-diagonal.
     basis = np.ascontiguousarray(np.where(values.imag >= 0, vectors.real, vectors.imag))
-    undone = inverse(basis)
-    if undone is not None:
+    inverse_basis = inverse(basis)
+    if inverse_basis is not None:
         with np.errstate(over="ignore", invalid="ignore"):  # the basis may be nearly singular
-            turned = undone @ product @ exactly(basis)
-            bounds += [_power_bounds(turned), _normal_bounds(turned, values)]
+            transformed = inverse_basis @ product @ exactly(basis)
+            bounds += [_power_bounds(transformed), _normal_bounds(transformed, values)]
     lower, upper = zip(*bounds, strict=True)
     return max(lower), min(upper)
 

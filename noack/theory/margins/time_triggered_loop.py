@@ -72,7 +72,7 @@ class LoopTimes(NamedTuple):
 
 
 class Step(Protocol):
-    """What becomes of a state over some time."""
+    """A map of the state over some time."""
 
     def then(self, later: Self) -> Self:
         """Return this step and the one after it."""
@@ -92,11 +92,11 @@ def repeated(step: _Step, times: int) -> _Step:
 
 
 class Timeline(Generic[_Step]):
-    """What happens to (x, x_c, u, w) while no update arrives, in any arithmetic.
+    """The maps of (x, x_c, u, w) while no update arrives, in any arithmetic.
 
     Args:
         times: of the loop.
-        flow: what happens in some nanoseconds between steps and ticks.
+        flow: the map over some nanoseconds between steps and ticks.
         latch: a step of the plant.
         tick: of the controller.
         late_tick: a tick when no update is new enough.

@@ -27,7 +27,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.contraction import EPSILON
 from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, inverse
-from noack.theory.margins.loss_margin import intervals_ns, loop_times
+from noack.theory.margins.scenario_times import intervals_ns, loop_times
 from noack.theory.margins.time_triggered_loop import TimeTriggeredLoop
 from noack.theory.random_losses.mean_square_growth import (
     PeriodMaps,
@@ -55,7 +55,7 @@ class RandomGrowth(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What follows, as a sentence."""
+        """The conclusion as a sentence."""
         factor = f"{self.mean_square:.6g}"
         square = f"√E‖z‖² of the loop's state z changes by the factor {factor} per period"
         if self.mean_square < 1:
@@ -168,9 +168,12 @@ class _Tilts:
         sizes = np.bincount(self._steps[1], chances * np.abs(s), len(self._chain.lost))
         moves = self._chain.lost + self._chain.delivered - np.eye(len(by_state))
         moves[:, -1] = 1.0
-        if (undone := inverse(moves)) is None:
+        if (inverse_moves := inverse(moves)) is None:
             raise NotPredictableError("the frequencies of the losses could not be enclosed")
-        shares, radii = undone.middle[-1], undone.radius[-1] + EPSILON * undone.magnitude.sum(axis=0)
+        shares, radii = (
+            inverse_moves.middle[-1],
+            inverse_moves.radius[-1] + EPSILON * inverse_moves.magnitude.sum(axis=0),
+        )
         error = (radii + (len(s) + 4) * EPSILON * np.abs(shares)) @ sizes
         return float(shares @ by_state + error * (1 + 1e-9))
 

@@ -40,7 +40,7 @@ from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import exactly
-from noack.theory.margins.loss_margin import intervals_ns, loop_times, require_idle_watchdog
+from noack.theory.margins.scenario_times import intervals_ns, loop_times, require_idle_watchdog
 from noack.theory.margins.time_triggered_loop import LoopTimes, Timeline, repeated
 from noack.theory.random_losses.mean_square_growth import (
     from_triangles,

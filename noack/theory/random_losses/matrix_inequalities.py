@@ -36,7 +36,7 @@ class MatrixInequalities:
         self._slopes = [
             np.stack(parts, axis=-1) - c[..., None] for parts, c in zip(units, self._constants, strict=True)
         ]
-        """What each value adds, (k, size) and (n, n, size)."""
+        """The slope for each value, (k, size) and (n, n, size)."""
         self._triangles = [_triangle(len(matrix)) for matrix in self._constants[1:]]
 
     def _at(self, values: Vector) -> list[Matrix]:
@@ -56,7 +56,7 @@ class MatrixInequalities:
         """Return values inside for which the last one is the largest, to a share of _GAP.
 
         t times the last value plus Σ log det is made large by Newton's method, for larger and larger t.
-        The last values that are inside by more than rounding are returned, None if there are none.
+        The last values that are inside by more than rounding are retransformed, None if there are none.
         """
         dimension = sum(map(len, self._constants))
         weight, confirmed = 1.0, None

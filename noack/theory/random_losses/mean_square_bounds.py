@@ -190,7 +190,7 @@ class _MomentInequalities:
         return bounds
 
     def _known_parts(self, bounds: _Bounds) -> KnownRms:
-        """What is known of the parts of v; errors[C] bounds both ‖C e_c‖ and ‖C(e_c − ê_c)‖ with a delay."""
+        """Bound the parts of v; errors[C] bounds both ‖C e_c‖ and ‖C(e_c − ê_c)‖ with a delay."""
         states, errors, conditions = bounds.states, bounds.errors, self._conditions
         gains = dict(self._ages)
         in_flight, by_rate = 0.0, gains.pop(Output.GAIN_RATE)
@@ -285,23 +285,23 @@ class _MomentInequalities:
 
 
 def _input_row(gains: Iterable[Stack], signals: _Signals) -> Vector:
-    """Return the row of what E x and B p do with these gains."""
+    """Return the row of E x and B p with these gains."""
     return sum((gain * row for gain, row in zip(gains, signals, strict=False)), np.zeros(3))
 
 
 class _Missing(NamedTuple):
-    """What bounds the part of C e_c that missing events have; rows but for the last."""
+    """Bounds of the part of C e_c that missing events have; all but the last are rows."""
 
     present: Vector
     """Of e_s, now and when the oldest update in flight was sent."""
     recent: Vector
-    """What has been added to e_s while updates in flight were sent."""
+    """The part added to e_s while updates in flight were sent."""
     whole: Vector
-    """What has ever been added to e_s."""
+    """The part ever added to e_s."""
     overshoot: Vector
-    """What is added to e_s between two tests, at most."""
+    """The part added to e_s between two tests, at most."""
     ceilings: Vector
-    """What the i-th last event since the last delivery has at most, without the overshoot."""
+    """The largest part of the i-th last event since the last delivery, without the overshoot."""
 
     def burst(self, probability: float, whole: float) -> Vector:
         """Bound √(Σ_i (S_i² − S_{i−1}²) min(1, p^i D/c_i)) by its tangent at a value of D."""

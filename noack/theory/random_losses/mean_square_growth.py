@@ -98,14 +98,14 @@ class PeriodMaps(NamedTuple):
         nodes = np.zeros(len(every), np.int64)
         (T,) = Graph(nodes, nodes, nodes + 1).balancing(every)
         range_maps = T @ range_maps @ np.linalg.inv(T)
-        turned = U.T.copy()
-        turned[:rank] = T @ turned[:rank]
-        if (undone := inverse(turned)) is None:
+        coordinates = U.T.copy()
+        coordinates[:rank] = T @ coordinates[:rank]
+        if (inverse_coordinates := inverse(coordinates)) is None:
             raise NotPredictableError("the loop's states have too different sizes")
         enclosed = [
             (
-                exactly(turned) @ delivered.scaled(shifts) @ undone,
-                exactly(turned) @ lost.scaled(shifts) @ undone,
+                exactly(coordinates) @ delivered.scaled(shifts) @ inverse_coordinates,
+                exactly(coordinates) @ lost.scaled(shifts) @ inverse_coordinates,
             )
             for delivered, lost in maps
         ]
@@ -178,8 +178,8 @@ def _is_positive(forms: IntervalMatrix) -> bool:
         R = np.linalg.inv(np.linalg.cholesky((forms.middle + forms.middle.swapaxes(1, 2)) / 2))
     except np.linalg.LinAlgError:
         return False
-    turned = exactly(R) @ forms @ exactly(R.swapaxes(1, 2).copy())
-    defect = (exactly(np.eye(R.shape[-1])) - turned).magnitude.sum(axis=-1)
+    transformed = exactly(R) @ forms @ exactly(R.swapaxes(1, 2).copy())
+    defect = (exactly(np.eye(R.shape[-1])) - transformed).magnitude.sum(axis=-1)
     return bool(defect.max() * (1 + 1e-12) < 1)
 
 

@@ -21,7 +21,7 @@ not hold with one.)
 
 These are linear matrix inequalities. :func:`quadratic_functions` looks for those with the smallest
 bounds (``matrix_inequalities.py``). Without delay and age they can be met for all p̄ < 1
-limit on the losses").
+(docs/derivations.md, "Without a limit on the losses").
 """
 
 from typing import NamedTuple
@@ -90,8 +90,8 @@ class QuadraticFunction(NamedTuple):
 
     def bound_error(self, C: Matrix, known: KnownRms) -> float:
         """Bound of the root mean square of ‖C ê_c‖."""
-        turned = C @ self.loop.inverse_weight
-        return _root(self.errors, np.hstack([turned, turned]), self.level(known))
+        transformed = C @ self.loop.inverse_weight
+        return _root(self.errors, np.hstack([transformed, transformed]), self.level(known))
 
 
 def _root(form: Matrix, C: Matrix, level: float) -> float:
@@ -123,15 +123,19 @@ class LossyFlow:
         self.decay_per_s = -max(spectral_abscissa(M) for M in generators)
         W, self.inverse_weight = error.weight, error.inverse_weight
         self.closed_loop, self.model = (W @ M @ self.inverse_weight for M in generators)
-        self.probability, self.delay_s = probability, conditions.delay_s
-        self.start_s, self.start = conditions.start_s, W @ plant.start[:, 0]
+        self.probability = probability
+        self.delay_s = conditions.delay_s
+        self.start_s = conditions.start_s
+        self.start = W @ plant.start[:, 0]
         delayed, aged = conditions.delay_s > 0, conditions.hold_s > 0
         self.counts_age = aged and counts_age
         self.inputs = np.array([delayed or aged or conditions.start_s > 0, delayed, self.counts_age])
         """Whether there is w, v_f and v_h."""
         self.age = conditions.hold_s * error.outputs[Output.GAIN_RATE] @ self.inverse_weight
-        self.input, self.gain = W @ plant.input_matrix, error.split_K[1] @ self.inverse_weight
-        BK, E = self.input @ self.gain, self.closed_loop - self.model
+        self.input = W @ plant.input_matrix
+        self.gain = error.split_K[1] @ self.inverse_weight
+        BK = self.input @ self.gain
+        E = self.closed_loop - self.model
         zero = np.zeros_like(E)
         self.flow = np.block([
             [self.closed_loop, BK, BK],
@@ -195,13 +199,19 @@ class _Search:
     def __init__(
         self, loop: LossyFlow, known: KnownRms, share: float, of_state: Matrix, of_error: Matrix
     ) -> None:
-        self._loop, self._rate = loop, share * loop.decay_per_s
-        n = len(loop.model)
-        self._n = n
-        self._sum, self._sensor = np.hstack([np.eye(n)] * 2), np.diag(np.repeat([0.0, 1.0], n))
-        self._of_state, self._of_error = of_state, of_error @ self._sum
+        self._loop = loop
+        self._rate = share * loop.decay_per_s
+        self._n = n = len(loop.model)
+        self._sum = np.hstack([np.eye(n)] * 2)
+        """(I I): q + e_s from (q, e_s)."""
+        self._sensor = np.diag(np.repeat([0.0, 1.0], n))
+        """The form ‖e_s‖² of (q, e_s)."""
+        self._of_state = of_state
+        self._of_error = of_error @ self._sum
+        # The mean squares of w, then and at first, and x(0), for a = 1.
         unit = known.sensor_error
-        self._other, self._begun = (loop.other(known) / unit) ** 2, (known.start / unit) ** 2 * loop.start_s
+        self._other = (loop.other(known) / unit) ** 2
+        self._begun = (known.start / unit) ** 2 * loop.start_s
         self._start = loop.start / unit
         self._flight = loop.flight(self._rate) if loop.delay_s > 0 else None
 
@@ -233,7 +243,7 @@ class _Search:
         return np.array([*triangles(X), *triangles(P), mu, nu, *zetas[self._loop.inputs], gain])
 
     def _blocks(self, values: Vector) -> Blocks:
-        """What is to be positive definite; affine in the values."""
+        """Return the numbers and matrices that are to be positive; affine in the values."""
         X, P, mu, nu, zetas, gain = unknowns = self._unknowns(values)
         n, rest = self._n, 1 - nu - zetas[0] * self._begun
         at_event = P - self._loop.probability * self._sum.T @ P[:n, :n] @ self._sum
@@ -251,7 +261,7 @@ class _Search:
         )
 
     def _between_events(self, unknowns: _Unknowns) -> Matrix:
-        """What V' + 2λV is below it, as a form of (x, q, e_s) and of w, v_f and v_h."""
+        """Return the bound of V' + 2λV minus V' + 2λV, as a form of (x, q, e_s) and of w, v_f and v_h."""
         X, P, mu, _, zetas, _ = unknowns
         loop, n = self._loop, self._n
         V, entering = np.zeros((3 * n, 3 * n)), np.zeros((3 * n, 3 * n))
@@ -278,6 +288,7 @@ class _Search:
         Q = _decaying_form(loop.model, (self._rate + loop.decay_per_s) / 2)
         if root is None:
             return None
+        # How large P_qq must be for what q does to x, and P_ss for the events.
         pushed = np.linalg.solve(root, X @ loop.input)
         of_flight = 8 * float(np.linalg.norm(pushed, 2)) ** 2
         left = np.linalg.cholesky(self._decay(loop.model, Q))
@@ -289,6 +300,7 @@ class _Search:
             lost, taken = (self._sum.T @ form @ self._sum for form in (p * Q, self._flight))
             size += 2 * of_flight * float(np.linalg.norm(np.linalg.solve(P - lost, taken), 2))
         P, large = P * size, size
+        # μ and ζ that are large enough for what e_s and w do.
         while True:
             zetas = np.where(loop.inputs, [large, of_flight, 1.0], 0.0)
             begin = _Unknowns(X, P, large, large, zetas, 0.0)
@@ -297,6 +309,7 @@ class _Search:
             large *= 4
             if not np.isfinite(large):
                 return None
+        # A small gain, and all divided by so much that V and the traces are small enough.
         least = min(float(np.linalg.eigvalsh(form)[0]) for form in (X, P))
         gain = least / (1 + float(np.linalg.norm(self._of_state) ** 2 + np.linalg.norm(self._of_error) ** 2))
         level = large * (1 + self._begun + (1 + self._other) / (2 * self._rate))
@@ -327,7 +340,7 @@ class _Search:
         return X, np.asarray(np.linalg.cholesky(left)) if has_root else None
 
     def _decay(self, M: Matrix, form: Matrix) -> Matrix:
-        """What is left of a form's decay along z' = M z beside the rate λ."""
+        """Return the decay of a form along z' = M z that is left beside the rate λ."""
         return np.asarray(-(M.T @ form + form @ M) - 2 * self._rate * form)
 
 

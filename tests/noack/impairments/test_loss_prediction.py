@@ -20,6 +20,7 @@ from noack.impairments.loss_guarantee import (
 )
 from noack.impairments.loss_prediction import (
     LossProcess,
+    ProbabilityCache,
     expected_loss,
     found_probabilities,
     loss_process,
@@ -175,7 +176,7 @@ def test_a_probability_that_another_process_found_is_not_computed_again(monkeypa
     settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
     found = found_probabilities(settings, settings_of("delay 1ms"))
     assert list(found.values()) == [with_target_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
-    monkeypatch.setattr(loss_prediction, "_found", {})
+    monkeypatch.setattr(loss_prediction, "_probabilities", ProbabilityCache(10))
     monkeypatch.setattr(loss_prediction, "predict", None)
     remember(json.loads(json.dumps(found)))
     assert found_probabilities(settings_of("loss 10% keep loss 5% delay 9ms mansd 1")) == found

@@ -62,6 +62,25 @@ def test_the_rate_for_what_must_pass_is_the_limit(
     require_capacity(scenario_of(content, 1000, 5, loops, enforce_mansd=False))
 
 
+@pytest.mark.parametrize(
+    ("trigger", "least_s", "largest_s"),
+    [
+        (PERIODIC, 0.05, 0.05),
+        ({"policy": "dwell", "interval_s": 0.02, "rule": PERIODIC}, 0.05, 0.05),
+        ({"policy": "dwell", "interval_s": 0.3, "rule": DEADLINE["rule"]}, 0.3, math.inf),
+        # What is due happens in spite of a dwell time.
+        ({**DEADLINE, "rule": {"policy": "dwell", "interval_s": 0.3, "rule": DEADLINE["rule"]}}, 0.049, 0.05),
+    ],
+)
+def test_the_load_is_that_of_the_shortest_and_the_longest_time_between_events(
+    content: dict[str, Any], trigger: dict[str, Any], least_s: float, largest_s: float
+) -> None:
+    content["plant"]["rate_hz"] = 100.0
+    (load,) = link_loads(scenario_of(content, 10**6, 5, {"name": "a", "trigger": trigger}))
+    assert load.mandatory_at_most_bps == pytest.approx(BITS / 3 / least_s)
+    assert load.mandatory_at_least_bps == pytest.approx(BITS / 3 / largest_s)
+
+
 def test_an_event_trigger_is_only_warned_about(content: dict[str, Any]) -> None:
     loops = {"name": "a", "count": 30}
     slow = scenario_of(content, 1000, 5, loops)

@@ -18,8 +18,9 @@ An ellipsoid that x never leaves sharpens the constants of the inequalities:
 
 If events are due at finitely many times, x is followed from one delivery to the next by balls:
 
-7. ``delivery_gaps.py``. What one gap between two deliveries makes of a ball.
-8. ``due_deliveries.py``. The balls from x(0) on, until all later bounds are smaller.
+7. ``delivery_gaps.py``. The gains of one gap between two deliveries.
+8. ``delivery_balls.py``. The balls of all times, and a return of their centres.
+9. ``due_deliveries.py``. The balls from x(0) on, until all later bounds are smaller.
 
 Words of names and fields, and their symbols in the docstrings:
 
@@ -34,9 +35,9 @@ Words of names and fields, and their symbols in the docstrings:
   the least ‖e_s‖_W at an event.
 * ``KnownBounds``: the bounds that hold already. ``after_losses`` has one for each number of events
   that have been lost since a delivery.
-* ``gap``: the time g between two delivered events. ``removal``: J, what the next update removes from
-  the input's error; ``removals``: S, the J of all updates in flight. ``gains``: what follows from
-  what after a gap; ``state_from_state`` is γ_g, by which a gap multiplies ‖Λξ‖.
-* A ball: ‖ξ − ``centre``‖ ≤ ``rho`` in coordinates Λξ. ``weighted_sum``: ρ + θJ. ``extent``: ρ, J, and
-  this sum. A ``return``: ξ(t) = κ c(t − m) + r.
+* ``gap``: the time g between two delivered events. ``late_effect``: J, by how much the error that an
+  update removes changes the input while the update is in flight; ``late_effects``: S, the sum of
+  these of all updates in flight. ``gains``: the table of ``GapGains``.
+* A ball: ‖ξ − ``centre``‖ ≤ ``radius`` ρ in coordinates Λξ. ``weighted_sum``: ρ + θS. ``extent``: ρ,
+  S, and this sum. A ``return``: ξ(t) = κ c(t − m) + r.
 """

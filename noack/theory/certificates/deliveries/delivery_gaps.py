@@ -1,4 +1,4 @@
-"""What one gap between two delivered events makes of a ball, where events are due.
+"""Gains of one gap between two delivered events, where events are due.
 
 Let ξ = x at a delivered event, and z = (x, e_c) with e_c = 0 there. Until the next delivered event,
 a time g later, and scaled by e^{αt},
@@ -6,10 +6,11 @@ a time g later, and scaled by e^{αt},
     z' = F z + (B; −B) w,   F = [[A + BK, BK], [−E, H − BK]] + αI,   w = u − K(x + e_c)
 
 If events are due, g is one of finitely many times. w is only what lateness adds: the age of the
-applied input, ‖w‖ ≤ sup_{|τ|≤σ} ‖K(e^{−Hτ} − I)e^{Hr}ξ‖, and for a time d after the event the error
-e⁻ that the update removes, ‖w‖ ≤ J = sup ‖K e^{H(r−τ)} e⁻‖ more. S is the sum of the J of all
-updates in flight, each counted by the share μ of its time that is left. All norms over cells of
-time are enclosed (:mod:`noack.theory.bounds.enclosure`).
+applied input, ‖w‖ ≤ sup_{|τ|≤σ} ‖K(e^{−Hτ} − I)e^{Hr}ξ‖, and for a time d after the event, while the
+update is in flight, the error e⁻ that it removes: ‖w‖ ≤ J = sup ‖K e^{H(r−τ)} e⁻‖ more. J is the
+late effect of this update. S is the sum of the late effects of all updates in flight, each counted
+by the share μ of its time that is left. All norms over cells of time are enclosed
+(:mod:`noack.theory.bounds.enclosure`).
 """
 
 import itertools
@@ -24,9 +25,8 @@ from noack.core.linear_systems import Matrix, Vector, exponential
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.bounds.enclosure import Outputs, response_until
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.stacked_norms import Stack
+from noack.theory.bounds.stacked_norms import ROUNDING, Stack, larger_ends, spectral_norm
 
-ROUNDING = 1 + 1e-9
 _MOST_GAPS, _MOST_CELLS = 256, 640
 _CELL = 0.04
 """Length of a cell, in time constants of the flow."""
@@ -127,36 +127,42 @@ class GapGrid(NamedTuple):
 
 
 class GapGains(NamedTuple):
-    """What one gap makes of ‖Λξ‖ ≤ 1 and of S = 1: arrays of (gaps,), (cells,) or (gaps, cells).
+    """Gains of each gap: bounds after it, per unit of what they come from before it.
 
-    ``removal`` is J of the next event, ``removals`` is S, ``input`` a ‖w‖ of 1 in each cell.
+    ======  =============  ======================  ================================================
+    Symbol  Bounds         Per unit of             Field
+    ======  =============  ======================  ================================================
+    γ_g     ‖Λξ‖           ‖Λξ‖                    ``state_from_state``
+    k_g     ‖Λξ‖           S                       ``state_from_late_effects``
+    j_g     J              ‖Λξ‖                    ``late_effect_from_state``
+    l_g     S              S                       ``late_effect_from_late_effects``, of the next
+                                                   update, + ``late_effects_left``, of earlier ones
+    θ       weight of S in ‖Λξ‖ + θS               ``theta``
+    ======  =============  ======================  ================================================
+
+    The gains from ‖Λξ‖ include the age of the input. Arrays are (gaps,), unless a shape is given.
     """
 
     shape: Matrix
-    """Λ"""
+    """Λ, (n, n)."""
     age_sags: Vector
-    """How far ‖w‖ may lie above its values at nodes, from the age of the input."""
+    """How far ‖w‖ may lie above its values at nodes, from the age of the input, (cells,)."""
     age_input: Vector
-    """‖w‖ in each cell from the age of the input."""
+    """‖w‖ in each cell from the age of the input, (cells,)."""
     state_from_state: Vector
-    """γ_g: ‖Λξ‖ after the gap, with the age of the input."""
     state_from_input: Matrix
-    """∫‖ΛΨ‖ over each cell."""
-    state_from_removals: Vector
-    """k_g"""
-    removal_from_state: Vector
-    """j_g, with the age of the input."""
-    removal_from_input: Matrix
-    removal_from_removals: Vector
-    """l_g without what is left of S."""
-    removals_left: Vector
-    """What is left of S."""
-    sum_from_removals: Vector
-    """‖Λξ‖/θ + S"""
+    """∫‖ΛΨ‖ over each cell: ‖Λξ‖ for a ‖w‖ of 1 in this cell, (gaps, cells)."""
+    state_from_late_effects: Vector
+    late_effect_from_state: Vector
+    late_effect_from_input: Matrix
+    """J for a ‖w‖ of 1 in each cell, (gaps, cells)."""
+    late_effect_from_late_effects: Vector
+    late_effects_left: Vector
+    weighted_sum_from_late_effects: Vector
+    """‖Λξ‖/θ + S for S = 1."""
     theta: float
-    """θ"""
     largest: float
-    """‖Λξ‖ + θS after a gap, at most, if it was 1."""
+    """‖Λξ‖ + θS after any gap, at most, if it was 1."""
 
 
 class GapLoop:
@@ -203,8 +209,8 @@ class GapLoop:
         return np.array(powers)
 
     @cached_property
-    def removal_rows(self) -> tuple[Stack, float]:
-        """C and b with J ≤ max_i ‖C_i e⁻‖ + b ‖e⁻‖_W, C of shape (nodes, q, n).
+    def late_effect_rows(self) -> tuple[Stack, float]:
+        """C and b with J ≤ max_i ‖C_i e⁻‖ + b ‖e⁻‖_W, (nodes, q, n) and a number.
 
         C_i = e^{αd} R e^{Hu} at nodes of u from −σ to d + σ; b is for u between two nodes.
         """
@@ -219,24 +225,24 @@ class GapLoop:
         nodes = [grown * self.R @ exponential(H * u_s) for u_s in nodes_s.tolist()]
         return np.array(nodes), sag * ROUNDING
 
-    def removals(self, errors: Matrix) -> Vector:
+    def late_effects(self, errors: Matrix) -> Vector:
         """Bound J for errors e⁻, (k, n)."""
-        nodes, sag = self.removal_rows
+        nodes, sag = self.late_effect_rows
         at_nodes = np.linalg.norm(np.einsum("iqn,kn->kiq", nodes, errors), axis=-1).max(axis=-1)
         weighted = np.linalg.norm(errors @ self.plant.error.weight.T, axis=-1)
         return np.asarray((at_nodes + sag * weighted) * ROUNDING)
 
     @cached_property
-    def removal_outputs(self) -> dict[str, Matrix]:
+    def late_effect_outputs(self) -> dict[str, Matrix]:
         """C of outputs of z; J is at most the largest of all but the last one, plus the last one."""
-        nodes, sag = self.removal_rows
+        nodes, sag = self.late_effect_rows
         rows = [*nodes, sag * self.plant.error.weight]
         return {f"{number}": np.hstack([0 * C, C]) for number, C in enumerate(rows)}
 
     @cached_property
-    def removal_areas(self) -> Vector:
+    def late_effect_areas(self) -> Vector:
         """Bound ∫J over each cell, for J as what z = e^{Fr} (B; −B) U causes."""
-        kernels = self._response.through_each(Outputs(self.removal_outputs))
+        kernels = self._response.through_each(Outputs(self.late_effect_outputs))
         *nodes, weighted = (kernel.area for kernel in kernels.values())
         return np.asarray(np.max(nodes, axis=0) + weighted)
 
@@ -252,34 +258,44 @@ class GapLoop:
         return np.array(areas)
 
     def gains(self, shape: Matrix) -> GapGains:
-        """Return what one gap makes of ‖Λξ‖ ≤ 1 and of S = 1."""
+        """Return the gains of each gap for a Λ."""
         grid, inverse = self.grid, np.asarray(np.linalg.inv(shape))
+        # ‖w‖ from the age of the input.
         age_sags, second_order = self._age_sags(shape, inverse)
-        age_input = (of_cells(_norms(self.input_by_age @ inverse).max(axis=1)) + age_sags) * ROUNDING
-        # From w.
+        age_input = (
+            larger_ends(spectral_norm(self.input_by_age @ inverse).max(axis=1)) + age_sags
+        ) * ROUNDING
+        # From any w.
         state_from_input = grid.until_ends(self._response.through(np.hstack([shape, 0 * shape])).area)
-        removal_from_input = grid.until_ends(self.removal_areas)
+        late_effect_from_input = grid.until_ends(self.late_effect_areas)
         # From ξ: J is that of the error at the end of the gap, which the next update removes.
         state_from_state = self._state_gains(shape, inverse) + state_from_input @ second_order
         errors = self.flows[grid.ends, self.n :] @ inverse
-        nodes, sag = self.removal_rows
-        removal = _norms(nodes @ errors[:, None]).max(axis=1)
-        removal = removal + sag * _norms(self.plant.error.weight @ errors)
-        removal_from_state = removal * ROUNDING + removal_from_input @ age_input
-        # From the updates in flight, (gaps, windows), of which the largest counts.
-        from_removals = (
-            grid.within_windows(state_from_input),
-            grid.within_windows(removal_from_input),
-            grid.shares_left,
+        nodes, sag = self.late_effect_rows
+        without_ages = spectral_norm(nodes @ errors[:, None]).max(axis=1)
+        without_ages = without_ages + sag * spectral_norm(self.plant.error.weight @ errors)
+        late_effect_from_state = without_ages * ROUNDING + late_effect_from_input @ age_input
+        # From the update of each window, (gaps, windows), of which the largest counts.
+        state_by_window = grid.within_windows(state_from_input)
+        late_effect_by_window = grid.within_windows(late_effect_from_input)
+        theta, largest, weighted_sums = _best_theta(
+            state_from_state, late_effect_from_state, state_by_window, late_effect_by_window, grid.shares_left
         )
-        state_from_removals, removal_from_removals, left = (part.max(axis=1) for part in from_removals)
-        theta, largest, sums = _best_theta(state_from_state, removal_from_state, *from_removals)
         return GapGains(
-            shape, age_sags, age_input,
-            state_from_state, state_from_input, state_from_removals,
-            removal_from_state, removal_from_input, removal_from_removals,
-            left, sums, theta, largest,
-        )  # fmt: skip
+            shape=shape,
+            age_sags=age_sags,
+            age_input=age_input,
+            state_from_state=state_from_state,
+            state_from_input=state_from_input,
+            state_from_late_effects=state_by_window.max(axis=1),
+            late_effect_from_state=late_effect_from_state,
+            late_effect_from_input=late_effect_from_input,
+            late_effect_from_late_effects=late_effect_by_window.max(axis=1),
+            late_effects_left=grid.shares_left.max(axis=1),
+            weighted_sum_from_late_effects=weighted_sums,
+            theta=theta,
+            largest=largest,
+        )
 
     def _state_gains(self, shape: Matrix, inverse: Matrix) -> Vector:
         """Bound ‖Λξ‖ after each gap with ages to first order, (gaps,).
@@ -287,21 +303,22 @@ class GapLoop:
         w = −τ KHe^{Hr}ξ. In a few pieces of a gap, Ψ(g − r) KHe^{Hr} is replaced by its mean; then
         only the mean of τ counts, and a norm is largest for means of ±σ.
         """
-        s, G, F, n = self.conditions.hold_s, self.scaled_H, self.F, self.n
-        cells, cell_s, until_s = self.grid.cells, self.grid.cell_s, self.grid.until_s
-        without_ages = shape @ self.flows[self.grid.ends, :n] @ inverse
-        if s == 0 or not self.H.any():
-            return _norms(without_ages) * ROUNDING
+        grid, F, G = self.grid, self.F, self.scaled_H
+        without_ages = shape @ self.flows[grid.ends, : self.n] @ inverse
+        if self.conditions.hold_s == 0 or not self.H.any():
+            return spectral_norm(without_ages) * ROUNDING
         # By how much the products at the nodes may differ from those between them.
         input_rate = self.BK @ self.H
         row = np.hstack([shape, 0 * shape])
         Y = F @ F @ input_rate - 2 * F @ input_rate @ G + input_rate @ G @ G
-        bend = response_until(F, Y @ inverse, until_s, cells).through(row).sup_on_grid()
-        models = response_until(G, inverse, until_s, cells).through(shape).sup_on_grid()
-        sag = cell_s**2 / 8 * float(bend) * float(models)
-        left, right = row @ self._powers(F) @ input_rate, self._powers(G) @ inverse
+        bend = response_until(F, Y @ inverse, grid.until_s, grid.cells).through(row).sup_on_grid()
+        models = response_until(G, inverse, grid.until_s, grid.cells).through(shape).sup_on_grid()
+        sag = grid.cell_s**2 / 8 * float(bend) * float(models)
+        # The products Ψ(g − r) KHe^{Hr} at the nodes of each gap.
+        left = row @ self._powers(F) @ input_rate
+        right = self._powers(G) @ inverse
         gains = list[float]()
-        for end, map_without_ages in zip(self.grid.ends.tolist(), without_ages, strict=True):
+        for end, map_without_ages in zip(grid.ends.tolist(), without_ages, strict=True):
             products = left[end::-1] @ right[: end + 1]
             gains.append(self._gain_with_mean_ages(map_without_ages, products, sag))
             if gains[-1] >= 1:  # of no use: the other gaps do not matter
@@ -309,22 +326,24 @@ class GapLoop:
         return np.array(gains + gains[-1:] * (len(without_ages) - len(gains)))
 
     def _gain_with_mean_ages(self, without_ages: Matrix, products: Stack, sag: float) -> float:
-        """Bound ‖Λξ‖ after one gap by the products at its nodes: by their means, and what differs."""
-        s, cell_s, n = self.conditions.hold_s, self.grid.cell_s, self.n
-        deviation, means = 0.0, np.zeros((_PIECES, n, n))
+        """Bound ‖Λξ‖ after one gap by the products at its nodes: by their means, and the deviations."""
+        s, cell_s = self.conditions.hold_s, self.grid.cell_s
+        deviation = 0.0
+        means = np.zeros((_PIECES, self.n, self.n))
         for number, piece in enumerate(np.array_split(np.arange(len(products) - 1), _PIECES)):
             if len(piece):
                 nodes = products[piece[0] : piece[-1] + 2]
                 mean = nodes.mean(axis=0)
-                deviations = of_cells(np.linalg.norm(nodes - mean, axis=(1, 2))) + sag
+                deviations = larger_ends(np.linalg.norm(nodes - mean, axis=(1, 2))) + sag
                 deviation += s * cell_s * float(deviations.sum())
                 means[number] = mean * cell_s * len(piece)
         ends = without_ages + np.einsum("sp,pij->sij", s * _SIGNS, means)
-        return (float(_norms(ends).max()) + deviation) * ROUNDING
+        return (float(spectral_norm(ends).max()) + deviation) * ROUNDING
 
     def _age_sags(self, shape: Matrix, inverse: Matrix) -> tuple[Vector, Vector]:
         """Bound, over each cell, how far ‖w‖ may lie above its nodes, and from the first order."""
-        s, H, G, grid = self.conditions.hold_s, self.H, self.scaled_H, self.grid
+        s, grid = self.conditions.hold_s, self.grid
+        H, G = self.H, self.scaled_H
         if s == 0:
             return np.zeros(grid.cells), np.zeros(grid.cells)
         outputs = Outputs({"τ": self.R @ H @ H, "r": self.R @ H @ G @ G})
@@ -339,29 +358,20 @@ class GapLoop:
 
 def _best_theta(
     state_from_state: Vector,
-    removal_from_state: Vector,
-    state_from_removals: Matrix,
-    removal_from_removals: Matrix,
-    removals_left: Matrix,
+    late_effect_from_state: Vector,
+    state_by_window: Matrix,
+    late_effect_by_window: Matrix,
+    shares_left: Matrix,
 ) -> tuple[float, float, Vector]:
     """Return the θ that lets ‖Λξ‖ + θS grow least, by how much, and ‖Λξ‖/θ + S for S = 1, (gaps,).
 
     The gains from ξ are (gaps,), those from S (gaps, windows).
     """
-    least = state_from_removals / (1 - removal_from_removals - removals_left).clip(min=1e-9)
+    # ‖Λξ‖/θ + S for each θ: S = 1 is the effect of the worst window.
+    least = state_by_window / (1 - late_effect_by_window - shares_left).clip(min=1e-9)
     thetas = (float(least.max()) * ROUNDING or _LEAST_THETA) * _THETAS[:, None]
-    from_removals = state_from_removals / thetas[..., None] + removal_from_removals + removals_left
-    sums = from_removals.max(axis=-1)
-    gains = np.maximum(state_from_state + thetas * removal_from_state, sums).max(axis=1)
+    by_window = state_by_window / thetas[..., None] + late_effect_by_window + shares_left
+    weighted_sums = by_window.max(axis=-1)
+    gains = np.maximum(state_from_state + thetas * late_effect_from_state, weighted_sums).max(axis=1)
     best = int(gains.argmin())
-    return float(thetas[best, 0]), float(gains[best]), sums[best]
-
-
-def _norms(matrices: Stack) -> Stack:
-    """Return ‖·‖ of matrices, (…, q, n)."""
-    return np.asarray(np.linalg.norm(matrices, 2, axis=(-2, -1)))
-
-
-def of_cells(values: Stack) -> Stack:
-    """Return the larger of the values at both ends of each cell."""
-    return np.asarray(np.maximum(values[..., :-1], values[..., 1:]))
+    return float(thetas[best, 0]), float(gains[best]), weighted_sums[best]

@@ -40,11 +40,16 @@ from noack.theory.certificates.deliveries.delivery_flow import (
     bend_terms,
 )
 
-_LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), 40.0)
 _ONLY_LAST_DELIVERY = 40.0
-"""λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
-_NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
-_AT_ONCE, _MOST_JOINT = 16, 3
+"""The logit of a λ of 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
+_LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), _ONLY_LAST_DELIVERY)
+"""Logits of λ, ln λ/(1 − λ), that are tried first."""
+_NEIGHBOURS = np.array([-1.0, 0.0, 1.0])
+_WIDTHS = np.array([1.5, 0.75, 0.37, 0.18, 0.09])
+"""Changes of the logit in each round of the search."""
+_CELLS_AT_ONCE = 16
+_MOST_JOINT = 3
+"""The conditions of earlier times are used in so many rounds at most."""
 _FIRST_WEIGHTS = np.array(
     [
         (first, (1 - first) * (1 - last), (1 - first) * last, 0.0)
@@ -67,7 +72,11 @@ _WEIGHTED_FORMS = [0, 1, 2 * _EARLIER_TIMES + 1, 2]
 _WEIGHT_OF_OTHERS = 0.1
 """Sum of the first weights of all other forms."""
 _HALVINGS = 12
-_ROUNDS, _POWER, _LEAST_WEIGHT, _NEARLY_LARGEST = 40, 0.3, 1e-9, 0.97
+_ROUNDS = 40
+_POWER = 0.3
+"""Weights are multiplied by this power of their form at the worst z."""
+_LEAST_WEIGHT = 1e-9
+_NEARLY_LARGEST = 0.97
 _CLEARLY_ENOUGH = 0.98
 """Share of a sufficient bound from which on a bound at one end of a cell is not improved."""
 _NEARLY_OPTIMAL = 1 + 1e-5
@@ -113,10 +122,10 @@ class DeliveryEllipsoid:
 
     @cached_property
     def cell_terms(self) -> tuple[Matrix, Matrix, Vector]:
-        """What bounds of z over the cells need, on the axes of their ellipsoids.
+        """The flow over the cells, on the axes of their ellipsoids.
 
-        e^{Fτ} at both nodes of each cell, Taylor's terms of F² e^{Fτ}, both as columns; and bounds
-        of the terms' remainder.
+        e^{Fτ} at both nodes of each cell, and Taylor's terms of F² e^{Fτ}, both as columns; and
+        bounds of the terms' remainder.
         """
         flow, axes = self.flow, self.axes[1]
         ends = [flow.states[:-1] @ axes, flow.states[1:] @ axes]
@@ -131,19 +140,28 @@ class DeliveryEllipsoid:
     @cached_method
     def windows(self, last_node: int) -> list[_Window]:
         """Return the windows before a node, for each T'."""
-        flow, identity, windows = self.flow, np.eye(self.flow.n), []
+        flow, identity = self.flow, np.eye(self.flow.n)
         last_s = float(flow.edges_s[last_node])
+        windows = []
         for share in _WINDOWS:
             node = max(int(flow.edges_s.searchsorted(last_s - share * last_s)) - 1, 0)
             since_s = last_s - float(flow.edges_s[node])
+            # z from (x_c, e_c) = (x + e_c, e_c).
             flows = [np.block([[identity, -identity], [np.zeros_like(identity), identity]])]
             step = exponential(flow.generator * (since_s / _EARLIER_TIMES))
             for _ in range(_EARLIER_TIMES):
                 flows.append(step @ flows[-1])
             cells = [flow.cell_at(number * since_s / _EARLIER_TIMES) for number in range(_EARLIER_TIMES + 1)]
             model = flow.states[node, : flow.n] + flow.states[node, flow.n :]
-            norm, largest = (float(np.linalg.norm(M, 2)) for M in (model, model @ self.inverse))
-            windows.append(_Window(node, np.array(cells), np.array(flows), model, norm, largest))
+            window = _Window(
+                node=node,
+                cells=np.array(cells),
+                flows=np.array(flows),
+                model=model,
+                model_norm=float(np.linalg.norm(model, 2)),
+                largest_model=float(np.linalg.norm(model @ self.inverse, 2)),
+            )
+            windows.append(window)
         return windows
 
     @cached_property
@@ -155,31 +173,36 @@ class DeliveryEllipsoid:
 
     @cached_property
     def drive_limit(self) -> tuple[float, Vector, "_CellBounds"]:
-        """The largest ‖p‖ that does not drive ‖Λx‖ beyond 1, ‖K e_c‖ over the cells, its bounds.
+        """The largest ‖p‖ that does not drive ‖Λx‖ beyond 1; bounds of ‖K e_c‖; their cells.
 
         On ‖y‖ = 1, y = Λx, d‖y‖/dt ≤ yᵀSy + yᵀΛBU p, and yᵀΛBU p ≤ ‖p‖ (γ/2 + ‖(ΛBU)ᵀy‖²/2γ).
         """
         flow = self.flow
+        # The largest ‖p‖ for each γ, by bisection.
         S = self.shape @ flow.closed_loop @ self.inverse
         by_input = self.shape @ flow.input_error
-        squares, largest = by_input @ by_input.T / 2, 0.0
+        squares = by_input @ by_input.T / 2
         gain = float(np.linalg.norm(by_input, 2))
+        largest = 0.0
         if gain:
             gamma = gain * np.exp(np.linspace(-4.0, 0.0, 17))
-            low, high = np.zeros(len(gamma)), -2 * logarithmic_norm(S).clip(max=0.0) / gamma
+            low = np.zeros(len(gamma))
+            high = -2 * logarithmic_norm(S).clip(max=0.0) / gamma
             for _ in range(_HALVINGS):
                 middle = (low + high) / 2
                 driven = S + (middle / gamma)[:, None, None] * squares
                 grows = logarithmic_norm(driven) + middle * gamma / 2 >= 0
-                low, high = np.where(grows, low, middle), np.where(grows, middle, high)
+                low = np.where(grows, low, middle)
+                high = np.where(grows, middle, high)
             largest = float(low.max())
-        bounds = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
-        return largest, bounds.frobenius_bounds(np.ones(1), np.array([_ONLY_LAST_DELIVERY]))[:, 0], bounds
+        cells = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
+        input_errors = cells.frobenius_bounds(np.ones(1), np.array([_ONLY_LAST_DELIVERY]))[:, 0]
+        return largest, input_errors, cells
 
 
 @dataclass(frozen=True)
 class Reach:
-    """What z can be at some time after a delivery: ‖ΛWξ‖ ≤ c at the delivery, ‖e_c‖_W ≤ D since."""
+    """All z after a delivery with ‖ΛWξ‖ ≤ c at the delivery and ‖e_c‖_W ≤ D since then."""
 
     ellipsoid: DeliveryEllipsoid
     scale: float
@@ -262,6 +285,7 @@ class Reach:
         A bound of at most ``enough`` is not improved, nor one that cannot become at most ``most``.
         """
         changes = self.effects.age_input * bounds.unit_effects[1]
+        # By the ellipsoids of the first weights.
         cells, flows, forms, semi_axes = self._last_windows
         Y = bounds.C @ flows
         images = Y[:, None] @ semi_axes
@@ -270,8 +294,8 @@ class Reach:
         smallest = float((norms.min(axis=1) * FLOW_ROUNDING + added).min())
         if smallest <= enough:
             return smallest
-        first_weights = np.full(forms.shape[:2], _WEIGHT_OF_OTHERS / forms.shape[1])
-        first_weights[:, _WEIGHTED_FORMS] += (1 - _WEIGHT_OF_OTHERS) * _FIRST_WEIGHTS[norms.argmin(axis=1)]
+        # By those of better weights.
+        first_weights = _weights_of(forms, _WEIGHTED_FORMS, _FIRST_WEIGHTS[norms.argmin(axis=1)])
         largest, _ = largest_outputs(
             forms, Y, enough, first_weights, wanted=Wanted.SMALLEST, added=added, most=min(smallest, most)
         )
@@ -279,32 +303,13 @@ class Reach:
 
     @cached_property
     def _last_windows(self) -> tuple[NDArray[np.int64], Stack, Stack, Stack]:
-        """What holds of z a time T' ago, after the last node that is followed, for each T'.
+        """The cell, the flow and the forms of the time T' ago, after the last node that is followed.
 
-        T' as a cell, the flow in it, forms that are at most 1, all for c = 1 and in (x_c, e_c):
-        ‖x_c‖ ≤ h, and ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1 at several times; and the semi-axes of the ellipsoids
-        of ``_FIRST_WEIGHTS``.
+        For each T': T' as a cell; the flow in it; forms of (x_c, e_c) T' ago that are at most 1, for
+        c = 1; and the semi-axes of the ellipsoids of ``_FIRST_WEIGHTS``.
         """
-        ellipsoid, flow, n = self.ellipsoid, self.ellipsoid.flow, self.ellipsoid.flow.n
-        error_bound, windows = self.error_bound / self.scale, ellipsoid.windows(self._followed_cells)
-        # By how much held inputs change ‖e_c‖, and the bound of ‖Λx‖, over each cell.
-        age_input = self.effects.age_input / self.scale
-        error_changes = age_input * flow.error_effects[1]
-        state_changes = age_input * ellipsoid.state_bounds.unit_effects[1]
-        rows = np.zeros((len(windows), 2 * _EARLIER_TIMES + 2, n, 2 * n))
-        for row, window in zip(rows, windows, strict=True):
-            # h bounds x_c = x + e_c, which follows the model, at the node T' ago.
-            h = window.largest_model + window.model_norm * self.effects.first_error / self.scale
-            if self.first_cell:
-                h = max(h, float(np.linalg.norm(window.model @ flow.start)) / self.scale)
-            # The conditions at times from T' ago until now, as rows for (x_c, e_c) T' ago.
-            state_bound = 1.0 if window.node >= self.first_cell else self.largest_state() / self.scale
-            added = np.array([error_changes[window.cells], state_changes[window.cells]])
-            added[:, 0] = 0.0
-            errors, states = error_bound + added[0], state_bound + added[1, :-1]
-            row[0, :, :n] = np.eye(n) / (flow.model_growth * h)
-            row[1::2] = window.flows[:, n:] / errors[:, None, None]
-            row[2::2] = (ellipsoid.shape @ window.flows[:-1, :n]) / states[:, None, None]
+        n, windows = self.ellipsoid.flow.n, self.ellipsoid.windows(self._followed_cells)
+        rows = np.array([self._rows_in(window) for window in windows])
         # Semi-axes of the ellipsoids of the first weights, in balanced coordinates.
         coordinates = _balancing_coordinates(rows)
         balanced = rows @ coordinates[:, None]
@@ -317,6 +322,30 @@ class Reach:
         cells = np.array([window.cells[-1] for window in windows])
         flows = np.array([window.flows[-1] for window in windows]) @ coordinates
         return cells, flows, forms, semi_axes
+
+    def _rows_in(self, window: _Window) -> Stack:
+        """Return rows C with ‖C (x_c, e_c)‖ ≤ 1 T' ago, for c = 1, (i, n, 2n).
+
+        They are ‖x_c‖ ≤ h then, and in turns ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1 at times from then until now.
+        """
+        ellipsoid, flow, n = self.ellipsoid, self.ellipsoid.flow, self.ellipsoid.flow.n
+        # h bounds x_c = x + e_c, which follows the model, at the node T' ago.
+        h = window.largest_model + window.model_norm * self.effects.first_error / self.scale
+        if self.first_cell:
+            h = max(h, float(np.linalg.norm(window.model @ flow.start)) / self.scale)
+        # Held inputs change e_c and x after that node.
+        age_input = self.effects.age_input / self.scale
+        error_changes = (age_input * flow.error_effects[1])[window.cells]
+        state_changes = (age_input * ellipsoid.state_bounds.unit_effects[1])[window.cells]
+        error_changes[0] = state_changes[0] = 0.0
+        state_bound = 1.0 if window.node >= self.first_cell else self.largest_state() / self.scale
+        errors = self.error_bound / self.scale + error_changes
+        states = state_bound + state_changes[:-1]
+        rows = np.zeros((2 * _EARLIER_TIMES + 2, n, 2 * n))
+        rows[0, :, :n] = np.eye(n) / (flow.model_growth * h)
+        rows[1::2] = window.flows[:, n:] / errors[:, None, None]
+        rows[2::2] = (ellipsoid.shape @ window.flows[:-1, :n]) / states[:, None, None]
+        return rows
 
 
 class _CellBounds:
@@ -355,22 +384,27 @@ class _CellBounds:
         bounds = self.frobenius_bounds(errors, _LOGITS)
         if not np.isfinite(bounds).all():
             return math.inf
-        highest, logits = bounds.min(axis=1) + added, _LOGITS[bounds.argmin(axis=1)]
+        highest = bounds.min(axis=1) + added
+        logits = _LOGITS[bounds.argmin(axis=1)]
         highest[: followed_cells.start] = 0.0
         highest[followed_cells.stop :] = 0.0
-        rounds, joint = np.zeros(len(highest), dtype=np.int64), 0
+        rounds = np.zeros(len(highest), dtype=np.int64)
+        joint_rounds = 0
         while True:  # the highest bounds become better, until that of the highest is settled
-            cells = np.argsort(highest)[-_AT_ONCE:]
-            is_last = rounds[cells[-1]] > len(_WIDTHS) or joint == _MOST_JOINT
+            cells = np.argsort(highest)[-_CELLS_AT_ONCE:]
+            is_last = rounds[cells[-1]] > len(_WIDTHS) or joint_rounds == _MOST_JOINT
             if is_last or highest[cells[-1]] * FLOW_ROUNDING <= enough:
                 return float(highest[cells[-1]]) * FLOW_ROUNDING
+            # Where the best λ is found, by the conditions of earlier times.
             settled = cells[rounds[cells] == len(_WIDTHS)]
             if len(settled):
                 wanted = (enough - added[settled]).clip(min=0.0)
                 values = self._joint_bounds(errors, states, settled, logits[settled, None], wanted)
                 highest[settled] = np.minimum(highest[settled], values + added[settled])
-                rounds[settled], joint = rounds[settled] + 1, joint + 1
+                rounds[settled] += 1
+                joint_rounds += 1
                 continue
+            # Elsewhere, by a better λ.
             cells = cells[rounds[cells] < len(_WIDTHS)]
             candidates = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
             values = self._spectral_bounds(errors, cells, candidates)
@@ -383,7 +417,8 @@ class _CellBounds:
         """Return bounds in the Frobenius norm, for every λ, (k, j), given D for each cell."""
         singular = self._singular / errors[:, None]
         norms = np.sqrt(_semi_axes(singular, logits) ** 2 @ self._squares)
-        ends, bends = norms[..., :2].max(axis=2), norms[..., 2:].sum(axis=2)
+        ends = norms[..., :2].max(axis=2)
+        bends = norms[..., 2:].sum(axis=2)
         return np.asarray(ends + self._sag_factors_s2[:, None] * bends)
 
     def _spectral_bounds(self, errors: Vector, cells: NDArray[np.int64], logits: Stack) -> Stack:
@@ -393,18 +428,23 @@ class _CellBounds:
         grams = np.einsum("qoki,qokj->koij", ends, ends)[:, None]
         scaled = grams * semi_axes[:, :, None, :, None] * semi_axes[:, :, None, None, :]
         squares = largest_eigenvalues(scaled.reshape(-1, *scaled.shape[-2:])).clip(min=0.0)
-        bends = np.sqrt(semi_axes**2 @ self._squares[cells, :, 2:]).sum(axis=2)
         at_ends = np.sqrt(squares.reshape(scaled.shape[:-2])).max(axis=2)
-        return np.asarray(at_ends + self._sag_factors_s2[cells, None] * bends)
+        return np.asarray(at_ends + self._sags(cells, semi_axes))
+
+    def _sags(self, cells: NDArray[np.int64], semi_axes: Stack) -> Matrix:
+        """Bound how far ‖C z‖ may lie above both ends of some cells, for each λ, (k, j)."""
+        bends = np.sqrt(semi_axes**2 @ self._squares[cells, :, 2:]).sum(axis=2)
+        return np.asarray(self._sag_factors_s2[cells, None] * bends)
 
     def _joint_bounds(
         self, errors: Vector, states: Vector, cells: NDArray[np.int64], logits: Stack, enough: Vector
     ) -> Vector:
-        """Return bounds by all conditions at several earlier nodes, (k,); the bends are as above.
+        """Return bounds by all conditions at several earlier nodes, (k,).
 
         One that is clearly below ``enough`` is not improved.
         """
         flow, n = self._flow, self._flow.n
+        # The conditions, as rows for ξ: ‖Λξ‖ ≤ 1, ‖e_c‖ ≤ D, ‖Λx‖ ≤ 1; the last ‖e_c‖ has most weight.
         times_s = flow.edges_s[cells, None] * (np.arange(1, _EARLIER_TIMES + 1) / _EARLIER_TIMES)
         nodes = np.minimum(flow.edges_s.searchsorted(times_s, side="right") - 1, cells[:, None])
         flows, shape = flow.states[nodes], self._shape
@@ -417,9 +457,8 @@ class _CellBounds:
             axis=1,
         )
         share = 1 / (1 + np.exp(-logits[:, 0]))
-        first_weights = np.full(rows.shape[:2], _WEIGHT_OF_OTHERS / rows.shape[1])
-        first_weights[:, 0] += (1 - _WEIGHT_OF_OTHERS) * share
-        first_weights[:, _EARLIER_TIMES] += (1 - _WEIGHT_OF_OTHERS) * (1 - share)
+        first_weights = _weights_of(rows, [0, _EARLIER_TIMES], np.stack([share, 1 - share], axis=1))
+        # The best weights at the right end, which are used at both ends.
         coordinates = _balancing_coordinates(rows * np.sqrt(first_weights)[..., None, None])
         rows = rows @ coordinates[:, None]
         forms = rows.swapaxes(-1, -2) @ rows
@@ -429,8 +468,7 @@ class _CellBounds:
         squares = np.linalg.eigvalsh(ends @ inverse @ ends.swapaxes(-1, -2))[..., -1].max(axis=0)
         squares = np.where(np.isfinite(bounds), squares.clip(min=0.0), np.inf)
         semi_axes = _semi_axes(self._singular[cells] / errors[cells, None], logits)
-        bends = np.sqrt(semi_axes**2 @ self._squares[cells, :, 2:]).sum(axis=2)[:, 0]
-        return np.asarray(np.sqrt(squares) + self._sag_factors_s2[cells] * bends)
+        return np.asarray(np.sqrt(squares) + self._sags(cells, semi_axes)[:, 0])
 
 
 def _semi_axes(singular: Vector, logits: Vector) -> Stack:
@@ -442,6 +480,13 @@ def _semi_axes(singular: Vector, logits: Vector) -> Stack:
 def _columns(stacks: list[Stack]) -> Matrix:
     """Return stacks of the same shape (k, 2n, n) side by side."""
     return np.asarray(np.concatenate(stacks).transpose(1, 0, 2).reshape(stacks[0].shape[1], -1))
+
+
+def _weights_of(forms: Stack, chosen: list[int], shares: Matrix) -> Matrix:
+    """Return weights of forms, (j, i): shares (j, chosen) of chosen ones, and a little for all of them."""
+    weights = np.full(forms.shape[:2], _WEIGHT_OF_OTHERS / forms.shape[1])
+    weights[:, chosen] += (1 - _WEIGHT_OF_OTHERS) * shares
+    return weights
 
 
 def _balancing_coordinates(rows: Stack) -> Stack:
@@ -478,16 +523,19 @@ def largest_outputs(
     that cannot become at most ``most``. Bounds above ``cap`` count as that, and all of them with
     what is ``added``.
     """
-    bounds, possible = np.full(len(forms), np.inf), np.zeros(len(forms))
     weights = np.full(forms.shape[:2], 1 / forms.shape[1]) if first_weights is None else first_weights
-    active, best = np.arange(len(forms)), weights.copy()
+    best_weights = weights.copy()
+    bounds = np.full(len(forms), np.inf)
+    possible = np.zeros(len(forms))
+    active = np.arange(len(forms))
     for _ in range(_ROUNDS):
+        # The bounds by these weights.
         chosen = forms[active]
         Z = np.linalg.solve(np.einsum("ji,jiab->jab", weights[active], chosen), Y[active].swapaxes(1, 2))
         values, vectors = np.linalg.eigh(Y[active] @ Z)
         norms = np.sqrt(values[:, -1].clip(min=0.0)) * FLOW_ROUNDING
         better = norms < bounds[active]
-        best[active[better]] = weights[active[better]]
+        best_weights[active[better]] = weights[active[better]]
         bounds[active] = np.minimum(bounds[active], norms)
         # The forms of the z with the largest ‖Y z‖: those above the mean need more weight.
         z = (Z @ vectors[:, :, -1:])[..., 0]
@@ -498,17 +546,27 @@ def largest_outputs(
         weights[active] *= (of_z / largest[:, None]) ** _POWER
         weights = weights.clip(min=_LEAST_WEIGHT)
         weights /= weights.sum(axis=1, keepdims=True)
-        totals, least = np.minimum(bounds, cap) + added, enough
-        if wanted is Wanted.LARGEST:
-            least = np.maximum(enough, _NEARLY_LARGEST * float(totals.max()))
-        elif wanted is Wanted.SMALLEST:
-            if (totals <= enough).any():
-                break
-            most = min(most, float(totals.min()))
-        may_become_smaller = (bounds > _NEARLY_OPTIMAL * possible) & (possible + added <= most)
-        active = np.flatnonzero((totals > least) & may_become_smaller)
+        totals = np.minimum(bounds, cap) + added
+        may_become_smaller = bounds > _NEARLY_OPTIMAL * possible
+        active = np.flatnonzero(
+            may_become_smaller & _is_wanted(wanted, totals, possible + added, enough, most)
+        )
         if not len(active):
             break
-    sums = np.linalg.eigvalsh(np.einsum("ji,jiab->jab", best, forms))
+    # Sums of forms that are too flat bound nothing.
+    sums = np.linalg.eigvalsh(np.einsum("ji,jiab->jab", best_weights, forms))
     bounds[~(sums[:, 0] > _LEAST_CONDITION * sums[:, -1])] = np.inf
-    return bounds, best
+    return bounds, best_weights
+
+
+def _is_wanted(
+    wanted: Wanted, totals: Vector, possible: Vector, enough: Vector | float, most: float
+) -> NDArray[np.bool_]:
+    """Return which bounds are improved, given values that are possible, (j,)."""
+    if wanted is Wanted.LARGEST:
+        enough = np.maximum(enough, _NEARLY_LARGEST * float(totals.max()))
+    elif wanted is Wanted.SMALLEST:
+        if (totals <= enough).any():
+            return np.zeros(len(totals), dtype=bool)
+        most = min(most, float(totals.min()))
+    return np.asarray((totals > enough) & (possible <= most))

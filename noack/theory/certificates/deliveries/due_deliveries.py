@@ -2,13 +2,13 @@
 
 Let ξ = Λx at a delivered event. If events are due, the next delivered event is one of finitely many
 times g later, and ``delivery_gaps.py`` bounds what g makes of ξ. So of every time t at which there
-may be a delivered event, a ball ‖ξ − c‖ ≤ ρ and a bound J of what the update removes follow from
-those a time g before:
+may be a delivered event, a ball ‖ξ − c‖ ≤ ρ and a bound S of the late effects of the updates in
+flight (``delivery_balls.py``) follow from those a time g before:
 
     ρ(t) = max_g ‖Φ_g c − c(t)‖ + γ_g ρ + ∫‖ΛΨ‖ ‖w‖,      Φ_g = Λ (I 0) e^{Fg} (I; 0) Λ⁻¹
 
 The c are any points; they follow the loop. This goes on until the bounds of the times before are
-larger than all later ones. These have two bounds. No step increases ‖ξ‖ + θJ. And as the loop is
+larger than all later ones. These have two bounds. No step increases ‖ξ‖ + θS. And as the loop is
 linear, what follows from ξ(t) = κ c(t − m) + r is κ times what followed from c(t − m), and what
 follows from r. If h bounds the outputs before t, and τ what follows from r, the outputs from t on
 are at most y = |κ| max(y, h) + τ.
@@ -18,10 +18,10 @@ import contextlib
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
 from noack.theory.bounds.certificate_terms import (
@@ -33,29 +33,28 @@ from noack.theory.bounds.certificate_terms import (
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, Outputs, response_until
 from noack.theory.bounds.error_growth import ErrorGrowth
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.stacked_norms import Stack
-from noack.theory.certificates.deliveries.delivery_gaps import (
-    ERROR,
-    INPUT,
-    ROUNDING,
-    GapGains,
-    GapLoop,
-    Gaps,
-    of_cells,
+from noack.theory.bounds.stacked_norms import ROUNDING, Stack, larger_ends
+from noack.theory.certificates.deliveries.delivery_balls import (
+    Ball,
+    BallHistory,
+    BallsAfterGaps,
+    RecentBalls,
+    lengths,
 )
+from noack.theory.certificates.deliveries.delivery_gaps import ERROR, INPUT, GapGains, GapLoop, Gaps
 
-_MOST_TIMES = 6000
-_DECAY_SHARES, _LEAST_SHARE = (0.9, 0.7, 0.4), 1e-6
-"""Decay rates of Λ that are tried, as shares of that of the scaled A + BK."""
-_AT_ONCE = 64
+MOST_TIMES = 6000
+"""Balls are followed for so many steps of the gaps at most."""
+BALLS_AT_ONCE = 64
 """Outputs are bounded for so many balls at once."""
+_DECAY_SHARES = (0.9, 0.7, 0.4)
+"""Decay rates of Λ that are tried, as shares of that of the scaled A + BK."""
+_LEAST_SHARE = 1e-6
 _CENTRING_ROUNDS = 3
-_DELAYS = 64
-"""So many m are tried."""
 
 
 class Deliveries:
-    """What x can be at the deliveries of an undisturbed plant's loop, from its x(0) on.
+    """The deliveries of an undisturbed plant's loop, from its x(0) on.
 
     Raises:
         NoCertificateError: the times between deliveries are not covered, or the loop grows from one
@@ -64,8 +63,8 @@ class Deliveries:
 
     def __init__(self, plant: PlantGains, conditions: NetworkConditions, bound: TriggerBound) -> None:
         self._bound = bound
-        self._loop = loop = GapLoop(plant, conditions, Gaps.of(conditions, bound))
-        self._gains = gains = _contracting_gains(loop)
+        self.loop = loop = GapLoop(plant, conditions, Gaps.of(conditions, bound))
+        self.gains = gains = _contracting_gains(loop)
         self._x0 = loop.plant.start[:, 0]
         self._start_input = 0.0
         """Bound of ‖w‖ from the start, if it goes on after the next events; otherwise 0."""
@@ -78,29 +77,24 @@ class Deliveries:
         self._feedthrough = np.array([[float(name == INPUT)] for name in loop.outputs])
         """1 for the output that contains w itself."""
         without_ages, self._output_sags = _outputs_without_ages(loop, inverse)
-        by_age = self._feedthrough * gains.age_input, loop.input_responses @ gains.age_input
-        self._outputs_from_state = without_ages + by_age[0] + by_age[1]
-        self._outputs_from_removals = loop.grid.within_windows(loop.input_responses).max(axis=-1)
-        # What follows after each gap: linear functions of a ball's centre, of ‖w‖, and of ρ and J.
+        from_ages = loop.input_responses @ gains.age_input
+        self._outputs_from_state = without_ages + self._feedthrough * gains.age_input + from_ages
+        self._outputs_from_late_effects = loop.grid.within_windows(loop.input_responses).max(axis=-1)
+        # What follows after each gap: linear functions of a ball's centre, of ‖w‖, and of ρ and S.
         self._age_maps = _StackedMaps(loop.input_by_age @ inverse)
         self._centre_maps = _centre_maps(loop, gains.shape, inverse)
-        self._from_input = np.vstack([gains.state_from_input, gains.removal_from_input]).T
-        gamma, j, theta = gains.state_from_state, gains.removal_from_state, gains.theta
-        removals = gains.removal_from_removals + gains.removals_left
-        from_rho = [gamma, j, gamma + theta * j]
-        from_J = [gains.state_from_removals, removals, theta * gains.sum_from_removals]
-        self._from_extent = np.stack([from_rho, from_J], axis=-1)
-        """Of ρ, J, and ρ + θJ, (3, gaps, 2)."""
+        self._from_input = np.vstack([gains.state_from_input, gains.late_effect_from_input]).T
+        self._from_extent = _maps_of_extents(gains)
 
     @property
     def gain(self) -> float:
         """By what the norm of x grows from one delivery to the next, at most; below 1."""
-        return self._gains.largest
+        return self.gains.largest
 
     def constants(self, unit: float) -> Constants:
         """Return the constants; ``unit`` is that of Δ and β̃."""
-        plant, conditions, bound = self._loop.plant, self._loop.conditions, self._bound
-        sup = dict(zip(self._loop.outputs, self._output_bounds().tolist(), strict=True))
+        plant, conditions, bound = self.loop.plant, self.loop.conditions, self._bound
+        sup = dict(zip(self.loop.outputs, self._output_bounds().tolist(), strict=True))
         start_error = float(plant.start_up(conditions.start_s)[0])
         by_input, by_mismatch, _ = ErrorGrowth(plant, bound.times.longest_s, TriggerBound(0.0, None)).driven
         sensor = by_input * max(sup[INPUT], start_error) + by_mismatch * sup[Output.MISMATCH]
@@ -122,187 +116,227 @@ class Deliveries:
 
     def _output_bounds(self) -> Vector:
         """Follow balls until all later bounds are smaller; return those of all outputs, (outputs,)."""
-        loop, counts = self._loop, self._loop.gaps.counts
-        highest, start_balls = self._start_bounds_and_balls()
-        recent = _RecentBalls(counts, start_balls)
-        batch = int(counts[0])  # so many successive times do not depend on each other
-        history = _BallHistory.without_balls(_MOST_TIMES + batch, loop.n)
+        loop = self.loop
+        longest, batch = int(loop.gaps.counts[-1]), int(loop.gaps.counts[0])
         # Before, what the start causes is not among the balls yet.
-        settled = max(int(counts[-1]) + 1, math.ceil(loop.conditions.start_s / loop.gaps.step_s))
-        pending, tail = list[_Ball](), np.full_like(highest, np.inf)
-        for first_time in range(1, _MOST_TIMES, batch):
-            times = range(first_time, first_time + batch)
-            new_balls = [
-                self._enclosing(*balls, time) for time in times if (balls := recent.leading_to(time))
-            ]
-            recent.forget(times)
-            if new_balls:
-                recent.store([ball.time for ball in new_balls], self._after_gaps(new_balls))
-                history.add(new_balls)
-                pending += new_balls
-            is_last = times.stop >= _MOST_TIMES
-            if len(pending) >= _AT_ONCE or is_last:
-                highest = np.maximum(highest, self._until_next_delivery(pending))
+        settled = max(longest + 1, math.ceil(loop.conditions.start_s / loop.gaps.step_s))
+        history = BallHistory.without_balls(MOST_TIMES + batch, loop.n)
+        pending = list[Ball]()
+        highest = self._outputs_from_start()
+        later = np.full_like(highest, np.inf)
+        for times, balls in self.balls():
+            history.add(balls)
+            pending += balls
+            is_last = times.stop >= MOST_TIMES
+            if len(pending) >= BALLS_AT_ONCE or is_last:
+                highest = np.maximum(highest, self.outputs_until_next_delivery(pending))
                 pending.clear()
-                if times[-1] < settled:
-                    continue
-                tail = self._tail(history, times[-1], highest)
-                if (tail <= highest).all():
-                    break
-        return np.asarray(np.maximum(tail, highest) * ROUNDING)
+                if times[-1] >= settled:
+                    last = slice(times[-1] - longest, times[-1] + 1)
+                    later = self._outputs_of_rest(history, last, highest)
+            if is_last or (later <= highest).all():
+                break
+        return np.asarray(np.maximum(later, highest) * ROUNDING)
 
-    def _enclosing(self, centres: Matrix, extents: Matrix, time: int) -> "_Ball":
+    def balls(self) -> Iterator[tuple[range, list[Ball]]]:
+        """Yield times, and a ball of each of them at which there may be a delivered event, without end.
+
+        These are so many successive times that they do not depend on each other.
+        """
+        batch = int(self.loop.gaps.counts[0])
+        recent = RecentBalls(self.loop.gaps.counts, self._balls_from_start())
+        for first_time in itertools.count(1, batch):
+            times = range(first_time, first_time + batch)
+            balls = [self._enclosing(*parts, time) for time in times if (parts := recent.leading_to(time))]
+            recent.forget(times)
+            if balls:
+                recent.store([ball.time for ball in balls], self._after_gaps(balls))
+            yield times, balls
+
+    def _enclosing(self, centres: Matrix, extents: Matrix, time: int) -> Ball:
         """Return a small ball around balls with these centres, (k, n), and extents, (k, 3)."""
-        middle, rounding = np.add.reduce(centres) / len(centres), 1e-12 * float(_lengths(centres).max())
+        # The middle of the centres moves towards the ball that is furthest from it.
+        middle = np.add.reduce(centres) / len(centres)
+        rounding = 1e-12 * float(lengths(centres).max())
         for number in range(1, _CENTRING_ROUNDS + 1):
-            furthest = int((_lengths(centres - middle) + extents[:, 2]).argmax())
+            furthest = int((lengths(centres - middle) + extents[:, 2]).argmax())
             middle = middle + (centres[furthest] - middle) / (number + 2)
-        extents[:, ::2] += (_lengths(centres - middle) + rounding)[:, None]  # ρ, and ρ + θJ
-        rho, J, weighted_sum = extents.max(axis=0).tolist()
-        return _Ball(middle, rho * ROUNDING, J, weighted_sum * ROUNDING, self._gains.theta, time)
+        extents[:, ::2] += (lengths(centres - middle) + rounding)[:, None]  # ρ, and ρ + θS
+        radius, late_effects, weighted_sum = extents.max(axis=0).tolist()
+        return Ball(middle, radius * ROUNDING, late_effects, weighted_sum * ROUNDING, self.gains.theta, time)
 
-    def _after_gaps(self, balls: Sequence["_Ball"]) -> "_Balls":
+    def _after_gaps(self, balls: Sequence[Ball]) -> BallsAfterGaps:
         """Return what follows from balls after each gap, (k, gaps)."""
-        centres, removals, weighted = self._centre_maps.apply(np.array([ball.centre for ball in balls]))
-        rho, J = np.split(self._inputs(balls) @ self._from_input, 2, axis=1)  # from ‖w‖
-        J = J + (_lengths(removals).max(axis=1) + _lengths(weighted)) * ROUNDING
+        centres = np.array([ball.centre for ball in balls])
+        by_age = self._age_inputs(centres)
+        later_centres, late_at_nodes, late_sags = self._centre_maps.apply(centres)
+        # From ‖w‖, from c, and from ρ and S.
+        radius, late_effects = np.split(self._inputs(balls, by_age) @ self._from_input, 2, axis=1)
+        late_effects = late_effects + (lengths(late_at_nodes).max(axis=1) + lengths(late_sags)) * ROUNDING
         corners = np.array([ball.corners for ball in balls])[:, None]  # (k, 1, 2, corners)
         extents = (self._from_extent @ corners).max(axis=-1)  # (k, 3, gaps)
-        extents += np.stack([rho, J, rho + self._gains.theta * J], axis=1)
-        return _Balls(centres, extents.swapaxes(1, 2))
+        extents += np.stack([radius, late_effects, radius + self.gains.theta * late_effects], axis=1)
+        return BallsAfterGaps(later_centres, extents.swapaxes(1, 2))
 
-    def _tail(self, history: "_BallHistory", now: int, highest: Vector) -> Vector:
-        """Bound all outputs from the last gap on; ``highest`` bounds those before."""
-        last = slice(now - int(self._loop.gaps.counts[-1]), now + 1)
-        J = float(np.nanmax(history.J[last]))
-        weighted_sum = float(np.nanmax(_lengths(history.centres[last]) + history.weighted_sums[last]))
-        tail = self._later_outputs(weighted_sum, J)
-        if (tail > highest).any() and (last_return := history.last_return(last)) is not None:
-            kappa, rest = last_return
-            of_rest = self._later_outputs(rest, J)
-            tail = np.minimum(tail, np.maximum(kappa * highest + of_rest, of_rest / (1 - kappa)))
-        return tail
-
-    def _later_outputs(self, weighted_sum: float, J: float) -> Vector:
-        """Bound all outputs from events on at which ‖ξ‖ + θJ is at most ``weighted_sum``."""
-        gains = self._gains
-        decrease = 1 - float((gains.removal_from_removals + gains.removals_left).max())
-        from_state = float(gains.removal_from_state.max()) * weighted_sum
-        later_J = from_state / decrease if decrease > 0 else math.inf
-        J = min(max(J, later_J), weighted_sum / gains.theta)
-        return np.asarray(
-            (self._outputs_from_state * weighted_sum + self._outputs_from_removals * J).max(axis=1)
-        )
-
-    def _age_inputs(self, centres: Matrix) -> Matrix:
-        """Bound ‖w‖ over each cell, as far as it comes from the input's age, for centres (k, n)."""
-        if self._loop.conditions.hold_s == 0:
-            return np.zeros((len(centres), self._loop.grid.cells))
-        (nodes,) = self._age_maps.apply(centres)
-        at_nodes = of_cells(_lengths(nodes).max(axis=-1))
-        return np.asarray((at_nodes + self._gains.age_sags * _lengths(centres)[:, None]) * ROUNDING)
-
-    def _inputs(self, balls: Sequence["_Ball"]) -> Matrix:
-        """Bound ‖w‖ over each cell for ξ = c of each ball, without J, (k, cells)."""
-        loop, by_age = self._loop, self._age_inputs(np.array([ball.centre for ball in balls]))
-        if not self._start_input:
-            return by_age
-        times = np.array([ball.time for ball in balls])[:, None]
-        cells_s = times * loop.gaps.step_s + loop.grid.cell_s * np.arange(loop.grid.cells)
-        return np.asarray(by_age + self._start_input * (cells_s < loop.conditions.start_s))
-
-    def _until_next_delivery(self, balls: Sequence["_Ball"]) -> Vector:
-        """Bound all outputs from events with these balls until the next delivery."""
-        loop, highest = self._loop, []
+    def outputs_until_next_delivery(self, balls: Sequence[Ball]) -> Vector:
+        """Bound all outputs from events with these balls until the next delivery, (outputs,)."""
+        loop = self.loop
         centres = np.array([ball.centre for ball in balls])
         corners = np.array([ball.corners for ball in balls])[..., None]
-        nodes = np.einsum("ran,kn->kra", self._flows, centres)
-        by_age, inputs = self._age_inputs(centres), self._inputs(balls)
-        lengths = _lengths(centres)
+        at_nodes = np.einsum("ran,kn->kra", self._flows, centres)
+        by_age = self._age_inputs(centres)
+        inputs = self._inputs(balls, by_age)
+        highest = []
         for number, C in enumerate(loop.outputs.values()):
-            from_rho, from_J = self._outputs_from_state[number], self._outputs_from_removals[number]
-            from_extent = (from_rho * corners[:, 0] + from_J * corners[:, 1]).max(axis=1)
-            cells = of_cells(np.linalg.norm(nodes @ C.T, axis=-1))
-            cells = cells + self._output_sags[number] * lengths[:, None] + from_extent
+            # From c, from ρ and S, and from ‖w‖.
+            cells = larger_ends(np.linalg.norm(at_nodes @ C.T, axis=-1))
+            from_radius = self._outputs_from_state[number] * corners[:, 0]
+            from_late_effects = self._outputs_from_late_effects[number] * corners[:, 1]
+            from_extent = (from_radius + from_late_effects).max(axis=1)
+            cells = cells + self._output_sags[number] * lengths(centres)[:, None] + from_extent
             cells = cells + inputs @ loop.input_responses[number].T
             highest.append((cells + self._feedthrough[number] * by_age).max())
         return np.array(highest)
 
-    def _start_bounds_and_balls(self) -> tuple[Vector, "_Balls"]:
-        """Bound all outputs until the next delivery after t = 0, and return what follows."""
-        loop, x0, T = self._loop, self._x0, self._loop.conditions.start_s
-        if loop.starts_late:
-            start_ball = _Ball(self._gains.shape @ x0, 0.0, 0.0, 0.0, self._gains.theta)
-            return self._until_next_delivery([start_ball]), self._after_gaps([start_ball])
-        # What a w that ends at T has added to z, at the nodes from T on.
-        F, cell_s, n, alpha = loop.F, loop.grid.cell_s, loop.n, loop.plant.alpha_per_s
-        x, x_c = (
-            exponential(generator * T) @ x0 for generator in (loop.plant.A + alpha * np.eye(n), loop.scaled_H)
+    def _outputs_of_rest(self, history: BallHistory, last: slice, highest: Vector) -> Vector:
+        """Bound all outputs from the last longest gap on; ``highest`` bounds those before."""
+        late_effects = float(np.nanmax(history.late_effects[last]))
+        weighted_sum = float(np.nanmax(lengths(history.centres[last]) + history.weighted_sums[last]))
+        later = self._later_outputs(weighted_sum, late_effects)
+        if (later > highest).any() and (last_return := history.last_return(last)) is not None:
+            kappa, rest = last_return
+            of_rest = self._later_outputs(rest, late_effects)
+            later = np.minimum(later, outputs_after_return(kappa, highest, of_rest))
+        return later
+
+    def _later_outputs(self, weighted_sum: float, late_effects: float) -> Vector:
+        """Bound all outputs from events on at which ‖ξ‖ + θS is at most ``weighted_sum``."""
+        gains = self.gains
+        decrease = 1 - float((gains.late_effect_from_late_effects + gains.late_effects_left).max())
+        from_state = float(gains.late_effect_from_state.max()) * weighted_sum
+        later_late_effects = from_state / decrease if decrease > 0 else math.inf
+        late_effects = min(max(late_effects, later_late_effects), weighted_sum / gains.theta)
+        from_state_and_late_effects = (
+            self._outputs_from_state * weighted_sum + self._outputs_from_late_effects * late_effects
         )
+        return np.asarray(from_state_and_late_effects.max(axis=1))
+
+    def _age_inputs(self, centres: Matrix) -> Matrix:
+        """Bound ‖w‖ over each cell, as far as it comes from the input's age, for centres (k, n)."""
+        if self.loop.conditions.hold_s == 0:
+            return np.zeros((len(centres), self.loop.grid.cells))
+        (nodes,) = self._age_maps.apply(centres)
+        at_nodes = larger_ends(lengths(nodes).max(axis=-1))
+        return np.asarray((at_nodes + self.gains.age_sags * lengths(centres)[:, None]) * ROUNDING)
+
+    def _inputs(self, balls: Sequence[Ball], by_age: Matrix) -> Matrix:
+        """Bound ‖w‖ over each cell for ξ = c of each ball, without S, (k, cells)."""
+        if not self._start_input:
+            return by_age
+        gaps, grid = self.loop.gaps, self.loop.grid
+        times = np.array([ball.time for ball in balls])[:, None]
+        cells_s = times * gaps.step_s + grid.cell_s * np.arange(grid.cells)
+        return np.asarray(by_age + self._start_input * (cells_s < self.loop.conditions.start_s))
+
+    @property
+    def _start_ball(self) -> Ball:
+        return Ball(self.gains.shape @ self._x0, 0.0, 0.0, 0.0, self.gains.theta)
+
+    @cached_property
+    def _start_flow(self) -> "_StartFlow":
+        """The flow z after t = 0, if updates act before the next event."""
+        loop, x0, T = self.loop, self._x0, self.loop.conditions.start_s
+        # What a w that ends at T has added to z there: z with an input of 0, minus z with w = 0.
+        drift = loop.plant.A + loop.plant.alpha_per_s * np.eye(loop.n)
+        x = exponential(drift * T) @ x0
+        x_c = exponential(loop.scaled_H * T) @ x0
+        added_at_T = np.append(x, x_c - x) - exponential(loop.F * T)[:, : loop.n] @ x0
+        # The same at the nodes from T on.
+        cell_s = loop.grid.cell_s
         first_node = math.ceil(T / cell_s - 1e-9)
-        added_at_T = np.append(x, x_c - x) - exponential(F * T)[:, :n] @ x0
-        step = exponential(F * cell_s)
-        added = [exponential(F * max(first_node * cell_s - T, 0.0)) @ added_at_T]
+        step = exponential(loop.F * cell_s)
+        added = [exponential(loop.F * max(first_node * cell_s - T, 0.0)) @ added_at_T]
         for _ in range(loop.grid.cells - first_node):
             added.append(step @ added[-1])
-        age_input = self._age_inputs(x0[None] @ self._gains.shape.T)[0]
-        start = _StartFlow(loop.flows @ x0, np.array(added), first_node, age_input)
-        return self._outputs_from_start(start), self._balls_from_start(start)
+        age_input = self._age_inputs(x0[None] @ self.gains.shape.T)[0]
+        return _StartFlow(loop.flows @ x0, np.array(added), first_node, age_input)
 
-    def _outputs_from_start(self, start: "_StartFlow") -> Vector:
+    def _outputs_from_start(self) -> Vector:
         """Bound all outputs until the next delivery after t = 0, (outputs,)."""
-        loop, T, F, first = self._loop, self._loop.conditions.start_s, self._loop.F, start.first_node
-        BK, cells, cell_s = loop.BK, loop.grid.cells, loop.grid.cell_s
+        if self.loop.starts_late:
+            return self.outputs_until_next_delivery([self._start_ball])
+        loop, start = self.loop, self._start_flow
+        T, first, cells = loop.conditions.start_s, start.first_node, loop.grid.cells
         with_input = start.free[first:] + start.added
         highest = []
         for number, C in enumerate(loop.outputs.values()):
-            bounds = of_cells(np.linalg.norm(start.free @ C.T, axis=-1))
+            # At the nodes: without w, and with a w until T.
+            bounds = larger_ends(np.linalg.norm(start.free @ C.T, axis=-1))
             later = np.linalg.norm(with_input @ C.T, axis=-1)
-            bounds[first:] = np.maximum(bounds[first:], of_cells(later))
+            bounds[first:] = np.maximum(bounds[first:], larger_ends(later))
+            # A w until an earlier time, and times between two nodes.
             bounds[first:] += T**2 / 8 * self._start_response(C, self._start_bend, cells)
-            bounds[first:] += cell_s**2 / 8 * T * self._start_response(C @ F @ F, BK, cells)
-            bounds[:first] += T * self._start_response(C, BK, max(first, 1))
-            bounds += self._output_sags[number] * np.linalg.norm(self._gains.shape @ self._x0)
+            second_derivative = self._start_response(C @ loop.F @ loop.F, loop.BK, cells)
+            bounds[first:] += loop.grid.cell_s**2 / 8 * T * second_derivative
+            bounds[:first] += T * self._start_response(C, loop.BK, max(first, 1))
+            bounds += self._output_sags[number] * np.linalg.norm(self.gains.shape @ self._x0)
+            # The age of the input.
             bounds += loop.input_responses[number] @ start.age_input
             highest.append((bounds + self._feedthrough[number] * start.age_input).max())
         return np.array(highest)
 
-    def _balls_from_start(self, start: "_StartFlow") -> "_Balls":
+    def _balls_from_start(self) -> BallsAfterGaps:
         """Return the balls after each gap from t = 0; the middle of the line is their centre."""
-        loop, gains, T, n = self._loop, self._gains, self._loop.conditions.start_s, self._loop.n
-        cells, bend = loop.grid.cells, self._start_bend
-        added = start.added[loop.grid.ends - start.first_node]
+        if self.loop.starts_late:
+            return self._after_gaps([self._start_ball])
+        loop, gains, start = self.loop, self.gains, self._start_flow
+        T, n, cells = loop.conditions.start_s, loop.n, loop.grid.cells
         at_ends = start.free[loop.grid.ends]
-        sag = T**2 / 8 * self._start_response(np.hstack([gains.shape, 0 * gains.shape]), bend, cells)
-        half = np.linalg.norm(added[:, :n] @ gains.shape.T, axis=-1) / 2
-        rho = half * ROUNDING + sag + gains.state_from_input @ start.age_input
-        *J_sags, weighted = (
-            T**2 / 8 * self._start_response(C, bend, cells) for C in loop.removal_outputs.values()
-        )
-        J = np.maximum(loop.removals(at_ends[:, n:]), loop.removals((at_ends + added)[:, n:]))
-        J = J + max(J_sags) + weighted + gains.removal_from_input @ start.age_input
+        added = start.added[loop.grid.ends - start.first_node]
         centres = (at_ends[:, :n] + added[:, :n] / 2) @ gains.shape.T
-        extents = np.stack([rho, J, rho + gains.theta * J], axis=-1)
-        return _Balls(centres[None], extents[None])
+        # ρ: half of the line, its bend, and the age of the input.
+        half = np.linalg.norm(added[:, :n] @ gains.shape.T, axis=-1) / 2
+        shape_rows = np.hstack([gains.shape, 0 * gains.shape])
+        sag = T**2 / 8 * self._start_response(shape_rows, self._start_bend, cells)
+        radius = half * ROUNDING + sag + gains.state_from_input @ start.age_input
+        # S: the larger one of both ends of the line, and the same.
+        *late_sags, weighted_sag = (
+            T**2 / 8 * self._start_response(C, self._start_bend, cells)
+            for C in loop.late_effect_outputs.values()
+        )
+        without_w, with_w = (loop.late_effects(errors[:, n:]) for errors in (at_ends, at_ends + added))
+        late_effects = np.maximum(without_w, with_w)
+        late_effects = late_effects + max(late_sags) + weighted_sag
+        late_effects = late_effects + gains.late_effect_from_input @ start.age_input
+        extents = np.stack([radius, late_effects, radius + gains.theta * late_effects], axis=-1)
+        return BallsAfterGaps(centres[None], extents[None])
 
     @property
     def _start_bend(self) -> Matrix:
         """Y: what w has added bends by e^{Fr} Y e^{Hs} x(0) where it ends at s, r ago."""
-        loop = self._loop
+        loop = self.loop
         return loop.F @ loop.BK - loop.BK @ loop.scaled_H
 
     def _start_response(self, C: Matrix, Y: Matrix, cells: int) -> float:
         """Bound ‖C e^{Fr} Y e^{Hs} x(0)‖ over cells of r, and s up to T."""
-        loop, T = self._loop, self._loop.conditions.start_s
+        loop, T, G = self.loop, self.loop.conditions.start_s, self.loop.scaled_H
         if T == 0:
             return 0.0
-        until_s, G, largest = cells * loop.grid.cell_s, loop.scaled_H, 0.0
+        until_s = cells * loop.grid.cell_s
+        # At s = 0 and s = T.
+        largest = 0.0
         for x in (self._x0, exponential(G * T) @ self._x0):
             kernel = response_until(loop.F, (Y @ x)[:, None], until_s, cells).through(C)
             largest = max(largest, float(kernel.sup_on_grid()))
+        # Between them.
         model_bend = response_until(G, self._x0[:, None], T).through(G @ G).sup_on_grid()
         gain = response_until(loop.F, Y, until_s, cells).through(C).sup_on_grid()
         return (largest + T**2 / 8 * float(model_bend) * float(gain)) * ROUNDING
+
+
+def outputs_after_return(kappa: float, highest: Vector, of_rest: Vector) -> Vector:
+    """Bound y ≤ |κ| max(y, h) + τ: all later outputs, for h before and what follows from the rest, τ."""
+    return np.asarray(np.maximum(kappa * highest + of_rest, of_rest / (1 - kappa)))
 
 
 class _StartFlow(NamedTuple):
@@ -319,98 +353,6 @@ class _StartFlow(NamedTuple):
     """The first node from T on."""
     age_input: Vector
     """‖w‖ over each cell from the age of the input."""
-
-
-class _Ball(NamedTuple):
-    """‖ξ − c‖ ≤ ρ, J, and ρ + θJ at a delivered event, at most."""
-
-    centre: Vector
-    """c"""
-    rho: float
-    J: float
-    weighted_sum: float
-    theta: float
-    time: int = 0
-    """In steps of the gaps."""
-
-    @property
-    def corners(self) -> Matrix:
-        """ρ and J where linear functions of both, that do not fall, are largest, (2, corners)."""
-        rho, J = min(self.rho, self.weighted_sum), min(self.J, self.weighted_sum / self.theta)
-        J_at_rho = max(min(J, (self.weighted_sum - rho) / self.theta), 0.0)
-        rho_at_J = max(min(rho, self.weighted_sum - self.theta * J), 0.0)
-        return np.array([[rho, rho_at_J], [J_at_rho, J]]) * ROUNDING
-
-
-class _BallHistory(NamedTuple):
-    """The balls of all times; NaN where there is none."""
-
-    centres: Matrix
-    J: Vector
-    weighted_sums: Vector
-    """ρ + θJ"""
-
-    @classmethod
-    def without_balls(cls, times: int, n: int) -> "_BallHistory":
-        return cls(*(np.full(shape, np.nan) for shape in ((times, n), times, times)))
-
-    def add(self, balls: Sequence[_Ball]) -> None:
-        for ball in balls:
-            self.centres[ball.time], self.J[ball.time] = ball.centre, ball.J
-            self.weighted_sums[ball.time] = ball.weighted_sum
-
-    def last_return(self, last: slice) -> tuple[float, float] | None:
-        """Return |κ|, and ‖r‖ + ρ + θJ at most, of ξ(t) = κ c(t − m) + r at the last times t.
-
-        Of the m that are tried, it is that with the smallest (‖r‖ + ρ + θJ)/(1 − |κ|); None if there is none.
-        """
-        times = np.arange(last.start, last.stop)[~np.isnan(self.J[last])]
-        delays = np.unique(np.linspace(len(self.J[last]), last.start - 1, _DELAYS).astype(int))
-        earlier, now = self.centres[times - delays[delays > 0, None]], self.centres[times]  # (m, times, n)
-        kappas = (earlier * now).sum(axis=(1, 2)) / np.square(earlier).sum(axis=(1, 2))
-        residuals = _lengths(now - kappas[:, None, None] * earlier) + 1e-12 * _lengths(now)
-        rests, kappas = (residuals + self.weighted_sums[times]).max(axis=1), np.abs(kappas)
-        bounds = np.where(kappas < 1, rests / (1 - kappas), np.nan)
-        if np.isnan(bounds).all():
-            return None
-        best = int(np.nanargmin(bounds))
-        return float(kappas[best]), float(rests[best])
-
-
-class _Balls(NamedTuple):
-    """The balls after each gap, for delivered events at some times."""
-
-    centres: Stack
-    """c, (times, gaps, n)"""
-    extents: Stack
-    """ρ, J, and ρ + θJ, (times, gaps, 3)"""
-
-
-class _RecentBalls:
-    """What follows from the balls of the last times, as far back as the longest gap."""
-
-    def __init__(self, counts: NDArray[np.int64], start_balls: _Balls) -> None:
-        self._counts, slots = counts, int(counts[-1]) + 1
-        self._balls = _Balls(*(np.zeros((slots, *array.shape[1:])) for array in start_balls))
-        """By their time modulo the number of slots."""
-        self._has_balls = np.zeros(slots, dtype=bool)
-        self.store([0], start_balls)
-
-    def leading_to(self, time: int) -> tuple[Matrix, Matrix] | None:
-        """Return centres and extents of the balls at a time, one for each gap; None if there is none."""
-        slots = (time - self._counts) % len(self._has_balls)
-        gaps = np.flatnonzero(self._has_balls[slots])
-        if not len(gaps):
-            return None
-        return self._balls.centres[slots[gaps], gaps], self._balls.extents[slots[gaps], gaps]
-
-    def forget(self, times: range) -> None:
-        self._has_balls[np.array(times) % len(self._has_balls)] = False
-
-    def store(self, times: list[int], balls: _Balls) -> None:
-        slots = np.array(times) % len(self._has_balls)
-        self._balls.centres[slots], self._balls.extents[slots] = balls
-        self._has_balls[slots] = True
 
 
 class _StackedMaps:
@@ -430,14 +372,30 @@ class _StackedMaps:
 
 
 def _centre_maps(loop: GapLoop, shape: Matrix, inverse: Matrix) -> _StackedMaps:
-    """Return what maps Λξ to itself after each gap, and to what bounds J: at nodes, and between them."""
-    at_ends, (nodes, sag) = loop.flows[loop.grid.ends], loop.removal_rows
+    """Return the maps of Λξ to Λξ after each gap, and to what bounds J: at nodes, and between them."""
+    at_ends = loop.flows[loop.grid.ends]
+    nodes, sag = loop.late_effect_rows
     errors = at_ends[:, loop.n :] @ inverse
     return _StackedMaps(
         shape @ at_ends[:, : loop.n] @ inverse,
         nodes[:, None] @ errors,
         sag * loop.plant.error.weight @ errors,
     )
+
+
+def _maps_of_extents(gains: GapGains) -> Stack:
+    """Return the maps of ρ and S to ρ, S, and ρ + θS after each gap, (3, gaps, 2)."""
+    from_radius = [
+        gains.state_from_state,
+        gains.late_effect_from_state,
+        gains.state_from_state + gains.theta * gains.late_effect_from_state,
+    ]
+    from_late_effects = [
+        gains.state_from_late_effects,
+        gains.late_effect_from_late_effects + gains.late_effects_left,
+        gains.theta * gains.weighted_sum_from_late_effects,
+    ]
+    return np.stack([from_radius, from_late_effects], axis=-1)
 
 
 def _outputs_without_ages(loop: GapLoop, inverse: Matrix) -> tuple[Matrix, Matrix]:
@@ -471,7 +429,8 @@ def _shapes(plant: PlantGains) -> Iterator[Matrix]:
     """Yield matrices Λ that may suit: ‖Λx‖ decays while e_c is 0."""
     from scipy.linalg import solve_continuous_lyapunov  # slow to import
 
-    decay_per_s, identity = -spectral_abscissa(plant.closed_loop), np.eye(len(plant.A))
+    decay_per_s = -spectral_abscissa(plant.closed_loop)
+    identity = np.eye(len(plant.A))
     if decay_per_s <= 0:
         raise NotDecayingError(f"a mode of the loop grows at {-decay_per_s:.3g} /s")
     rate = plant.error.split_K[1] @ plant.error.H
@@ -481,11 +440,6 @@ def _shapes(plant: PlantGains) -> Iterator[Matrix]:
         form = solve_continuous_lyapunov(shifted.T, -right)
         with contextlib.suppress(np.linalg.LinAlgError):
             yield np.linalg.cholesky(0.5 * (form + form.T)).T
-
-
-def _lengths(vectors: Stack) -> Stack:
-    """Return ‖·‖ of vectors, (…, n)."""
-    return np.asarray(np.sqrt(np.einsum("...n,...n->...", vectors, vectors)))
 
 
 def _highest(kernels: dict[str, KernelBounds]) -> Matrix:

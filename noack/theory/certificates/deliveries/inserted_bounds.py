@@ -24,7 +24,7 @@ from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, Signal
 
 Growths = Sequence[Sequence[ErrorGrowth]]
-"""How e_s may grow under each bound of it. All bounds hold, and of each one growth applies."""
+"""Growths of e_s that are possible under each bound of it. All bounds hold; of each, one growth applies."""
 
 
 def _smallest(values: Matrix, growths: Growths) -> Matrix:

@@ -80,7 +80,8 @@ def errors_after_losses(
     Returns:
         The bounds, and a time between events that is at least ``spacing_s``.
     """
-    flow, errors = reach.ellipsoid.flow, without_flow.copy()
+    flow = reach.ellipsoid.flow
+    errors = without_flow.copy()
     most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
     if spacing_s >= most_s or len(without_flow) == 1:
         return errors, spacing_s
@@ -89,7 +90,10 @@ def errors_after_losses(
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
     tested = np.where(r_s * FLOW_ROUNDING >= sensor.first_test_s, sensor.after_test, math.inf)
     first_event_s = float(flow.edges_s[reach.first_cell]) if reach.first_cell else math.inf
-    since_delivery_s, apart_s, state_bound = -reach.effects.acts_within_s, math.inf, reach.scale
+    # The delivery, then one lost event after the other.
+    since_delivery_s = -reach.effects.acts_within_s
+    apart_s = math.inf
+    state_bound = reach.scale
     for lost, sensor_error in enumerate(sensor.after_losses.tolist()):
         at_delivery = max(_ERROR_AT_DELIVERY * sensor_error, reach.effects.first_error)
         error_before = float(errors[lost - 1]) if lost else at_delivery
@@ -99,9 +103,9 @@ def errors_after_losses(
         if lost:
             summed = sensor_error + kernel.sups(r_s) * error_before
             largest = event.largest_error(np.minimum(tested, sensor_error), summed)
-            errors[lost] = min(without_flow[lost], max(largest, float(summed[-1]), error_before))
+            errors[lost] = min(without_flow[lost], largest)
             if lost > 1 and errors[lost] > _NEARLY_SUMMED * float(summed[0]):
-                return errors, spacing_s  # later stages gain nothing, either
+                return errors, spacing_s  # after more losses nothing is gained, either
         # The time until the next event. After a delivery e_s is at most ‖e^{(H+αI)r}‖ · first_error
         # larger than C_r z.
         late_error = 0.0 if lost else flow.model_growth * reach.effects.first_error
@@ -109,7 +113,8 @@ def errors_after_losses(
         later_s = event.next_event_s(sensor, late_error, bend, most_later_s)
         since_delivery_s += max(spacing_s, later_s)
         if not lost:  # x(0) itself may be outside the ellipsoid
-            since_delivery_s, later_s = min(since_delivery_s, first_event_s), min(later_s, first_event_s)
+            since_delivery_s = min(since_delivery_s, first_event_s)
+            later_s = min(later_s, first_event_s)
             state_bound = reach.largest_state(first_event_s - since_delivery_s)
         apart_s = min(apart_s, max(spacing_s, later_s))
     return errors, apart_s
@@ -147,15 +152,19 @@ class _LostEvent:
         r_s: Vector,
         flows: Stack,
     ) -> None:
-        self._flow, self._r_s, self._error_before = reach.ellipsoid.flow, r_s, error_before
-        self._age_input, self._acts_within_s = reach.effects.age_input, reach.effects.acts_within_s
-        n, shape, identity = self._flow.n, reach.ellipsoid.shape, np.eye(2 * self._flow.n)
-        event = exponential(self._flow.generator * window_s)
-        by_input = self._flow.error_effects[1][[self._flow.cell_at(time_s) for time_s in r_s.tolist()]]
+        self._flow = flow = reach.ellipsoid.flow
+        self._r_s = r_s
+        self._error_before = error_before
+        self._age_input = reach.effects.age_input
+        self._acts_within_s = reach.effects.acts_within_s
+        n, shape, identity = flow.n, reach.ellipsoid.shape, np.eye(2 * flow.n)
+        event = exponential(flow.generator * window_s)
+        # What q changes after the event, and has changed before it.
+        by_input = flow.error_effects[1][[flow.cell_at(time_s) for time_s in r_s.tolist()]]
         self._input_changes = self._age_input * by_input if self._age_input else np.zeros(len(r_s))
-        error_change, state_change = (
-            self._age_input * self._input_response_before(C, window_s) for C in (identity[n:, n:], shape)
-        )
+        error_change = self._age_input * self._input_response_before(identity[n:, n:], window_s)
+        state_change = self._age_input * self._input_response_before(shape, window_s)
+        # Forms of z a time w before the event: of bounds there, at the event, and of its outputs.
         rows = [
             identity[n:] / (error_before + error_change),
             shape @ identity[:n] / (state_bound + state_change),
@@ -179,14 +188,17 @@ class _LostEvent:
         return float(responses.through(C).integral_on_grid())
 
     def largest_error(self, sensor_errors: Vector, summed: Vector) -> float:
-        """Bound ‖e_c‖_W up to the last r, given bounds of e_s, and of e_c without the flow, at each r."""
-        n, squares = self._flow.n, (sensor_errors + self._input_changes)[:-1, None, None] ** 2
+        """Bound ‖e_c‖_W from the event on, given bounds of e_s, and of e_c without the flow, at each r."""
+        # No event has happened before the next node.
+        squares = (sensor_errors + self._input_changes)[:-1, None, None] ** 2
         no_events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1] / squares
         forms = np.concatenate([self._forms[:-1], no_events[:, None]], axis=1)
+        # Up to the last node by the flow, then without it.
         cap = summed[:-1] - self._input_changes[1:]
-        ends, weights = largest_outputs(forms, self._z[1:, n:], float(summed[-1]), cap=cap)
+        ends, weights = largest_outputs(forms, self._z[1:, self._flow.n :], float(summed[-1]), cap=cap)
         cells = np.maximum(ends, np.append(self._error_before, ends[:-1])) + self._sags(forms, weights)
-        return float(np.minimum(cells + self._input_changes[1:], summed[:-1]).max())
+        until_last = float(np.minimum(cells + self._input_changes[1:], summed[:-1]).max())
+        return max(until_last, float(summed[-1]), self._error_before)
 
     def _sags(self, forms: Stack, weights: Stack) -> Vector:
         """Bound how much e_c differs from its chord in each cell of r."""
@@ -201,14 +213,16 @@ class _LostEvent:
 
     def next_event_s(self, sensor: SensorErrors, late_error: float, bend: float, most_s: float) -> float:
         """Return a time before which there is no event; e_s may be larger than C_r z by ``late_error``."""
-        is_near, flow, level = self._r_s <= most_s, self._flow, sensor.level
-        level -= late_error * self._acts_within_s if sensor.integrates else late_error
+        flow = self._flow
+        level = sensor.level - (late_error * self._acts_within_s if sensor.integrates else late_error)
         if level <= 0:
             return 0.0
         if self._age_input:  # what is followed differs from e_s
             by_input = flow.unit_effects(bend_rows(flow))[1][flow.cell_at(most_s)]
             difference = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._input_changes.max())
             bend = bend + self._age_input * float(by_input) + difference
+        # e_s over each cell.
+        is_near = self._r_s <= most_s
         enough, most = (0.0, math.inf) if sensor.integrates else (0.9 * level, level)
         forms, e_s = self._forms[is_near], self._e_s[is_near]
         ends, _ = largest_outputs(forms, e_s, enough, wanted=Wanted.ALL, most=most)

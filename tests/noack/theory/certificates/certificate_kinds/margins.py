@@ -17,7 +17,8 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.margins import loss_margin
 from noack.theory.margins.joint_spectral_radius import JointSpectralRadius
-from noack.theory.margins.loss_margin import LossMargin, Stability, capped, intervals_ns, without_timeout
+from noack.theory.margins.loss_margin import LossMargin, Stability, capped
+from noack.theory.margins.scenario_times import intervals_ns, without_timeout
 from noack.theory.margins.switched_system import Edge, SwitchedSystem, find_cycle
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.policies import scenario_of

@@ -24,6 +24,7 @@ from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.deliveries import due_deliveries
+from noack.theory.certificates.deliveries.delivery_balls import BallHistory
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.decaying import search
@@ -412,8 +413,8 @@ def without(name: str) -> Callable[[Scenario, Conditions], Any]:
 def without_later_times(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
     """The certificate if nothing followed from what is left of the first return."""
     with (
-        patch.object(due_deliveries._BallHistory, "last_return", lambda history, last: (0.0, 0.0)),
-        patch.object(due_deliveries, "_AT_ONCE", 1),
+        patch.object(BallHistory, "last_return", lambda history, last: (0.0, 0.0)),
+        patch.object(due_deliveries, "BALLS_AT_ONCE", 1),
     ):
         return certify(resolved, conditions)
 

@@ -75,7 +75,7 @@ def test_without_ages_the_gains_are_the_norms_of_the_matrices_by_which_a_gap_mul
         columns = [scaled_after(gap_s, xi, [0.0]) for xi in np.linalg.inv(shape).T]
         states, errors = (np.array(part).T for part in zip(*columns, strict=True))
         assert gains.state_from_state[number] == pytest.approx(np.linalg.norm(shape @ states, 2))
-        assert gains.removal_from_state[number] == pytest.approx(np.linalg.norm(K @ errors, 2))
+        assert gains.late_effect_from_state[number] == pytest.approx(np.linalg.norm(K @ errors, 2))
 
 
 def test_no_age_of_the_input_exceeds_the_gains_and_the_worst_one_comes_close() -> None:

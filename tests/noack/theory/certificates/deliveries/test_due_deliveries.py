@@ -1,6 +1,7 @@
 """Balls from delivery to delivery: by hand, a return of their centres, and what it may change."""
 
 import math
+from itertools import islice
 from unittest.mock import patch
 
 import numpy as np
@@ -10,7 +11,8 @@ from scipy.linalg import expm
 from noack.theory.bounds.certificate_terms import Constants, InterEventTimes, NetworkConditions, TriggerBound
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
 from noack.theory.certificates.deliveries import due_deliveries
-from noack.theory.certificates.deliveries.due_deliveries import Deliveries, _Ball, _BallHistory
+from noack.theory.certificates.deliveries.delivery_balls import Ball, BallHistory
+from noack.theory.certificates.deliveries.due_deliveries import Deliveries, outputs_after_return
 
 a, b, k, ALPHA, STEP_S, DELAY_S, X0 = 0.5, 2.0, -0.7, 0.05, 0.4, 0.2, 3.0
 """A scalar loop with a zero-order hold that transmits every 0.4 s."""
@@ -43,56 +45,47 @@ def test_the_bounds_of_a_scalar_loop_are_its_largest_values() -> None:
 
 
 def test_the_balls_of_a_late_scalar_loop_follow_the_recursion_by_hand() -> None:
-    """While an update is late, u is up to J away, which moves x by ``late_gain`` · J until the next event."""
+    """While an update is late, u is up to S away, which moves x by ``late_gain`` · S until the next event."""
     phi = math.exp(ALPHA * STEP_S) * float(state_after(np.array(STEP_S)))
     error = math.exp(ALPHA * STEP_S) - phi
     rate = a + ALPHA
     late_gain = b * (math.exp(rate * STEP_S) - math.exp(rate * (STEP_S - DELAY_S))) / rate
     removed = math.exp(ALPHA * DELAY_S) * abs(k)
-    followed, exact = list[_Ball](), _BallHistory.add
-
-    def add(history: _BallHistory, balls: list[_Ball]) -> None:
-        followed.extend(balls)
-        exact(history, balls)
-
     loop = scalar_loop(DELAY_S)
-    with patch.object(_BallHistory, "add", add):
-        loop.constants(1.0)
-    unit = float(abs(loop._gains.shape[0, 0]))
-    centre, rho, J = X0, 0.0, 0.0
-    for ball in followed[:8]:
-        rho, J = (
-            abs(phi) * rho + late_gain * J,
-            removed * (abs(error) * (abs(centre) + rho) + late_gain * J),
+    unit = float(abs(loop.gains.shape[0, 0]))
+    centre, rho, S = X0, 0.0, 0.0
+    for number, (times, balls) in enumerate(islice(loop.balls(), 8), 1):
+        rho, S = (
+            abs(phi) * rho + late_gain * S,
+            removed * (abs(error) * (abs(centre) + rho) + late_gain * S),
         )
         centre *= phi
+        (ball,) = balls
+        assert [ball.time] == [*times] == [number]
         assert abs(ball.centre[0]) / unit == pytest.approx(abs(centre))
-        assert rho <= ball.rho / unit <= 1.02 * rho + 1e-9
-        assert J <= ball.J <= 1.02 * J
+        assert rho <= ball.radius / unit <= 1.02 * rho + 1e-9
+        assert S <= ball.late_effects <= 1.02 * S
 
 
 def test_the_outputs_of_a_ball_are_those_of_its_largest_state_and_late_update() -> None:
-    loop, rho, J = scalar_loop(DELAY_S), 1.0, 0.5
-    unit, theta = float(abs(loop._gains.shape[0, 0])), loop._gains.theta
-    ball = _Ball(np.zeros(1), unit * rho, J, unit * rho + theta * J, theta)
-    bound = loop._until_next_delivery([ball])[[*loop._loop.outputs].index(Output.STATE)]
+    deliveries, rho, S = scalar_loop(DELAY_S), 1.0, 0.5
+    unit, theta = float(abs(deliveries.gains.shape[0, 0])), deliveries.gains.theta
+    ball = Ball(np.zeros(1), unit * rho, S, unit * rho + theta * S, theta)
+    bounds = dict(zip(deliveries.loop.outputs, deliveries.outputs_until_next_delivery([ball]), strict=True))
     r_s, rate = np.linspace(0.0, STEP_S + DELAY_S, 2001), a + ALPHA
     by_late_input = b * (np.exp(rate * r_s) - np.exp(rate * (r_s - DELAY_S).clip(min=0.0))) / rate
-    largest = float((rho * np.abs(np.exp(ALPHA * r_s) * state_after(r_s)) + J * by_late_input).max())
+    largest = float((rho * np.abs(np.exp(ALPHA * r_s) * state_after(r_s)) + S * by_late_input).max())
     # A late input is counted for up to one cell longer.
-    by_one_cell = J * b * loop._loop.grid.cell_s * math.exp(rate * (STEP_S + DELAY_S))
-    assert largest <= bound <= 1.02 * (largest + by_one_cell)
+    by_one_cell = S * b * deliveries.loop.grid.cell_s * math.exp(rate * (STEP_S + DELAY_S))
+    assert largest <= bounds[Output.STATE] <= 1.02 * (largest + by_one_cell)
 
 
 @pytest.mark.parametrize("largest_before", [0.1, 10.0])
 def test_the_bound_of_the_rest_is_that_of_all_later_outputs_of_the_recursion(largest_before: float) -> None:
     """Later outputs are at most κ times an earlier one, plus what the rest causes."""
-    loop, history = scalar_loop(0.0), _BallHistory.without_balls(30, 1)
-    history.add([_Ball(np.full(1, 1e3), 0.0, 0.0, 0.0, 1.0, time) for time in range(30)])
-    kappa, rest = 0.8, 0.2
-    output, of_rest = np.full(5, largest_before), loop._later_outputs(rest, 0.0)
-    with patch.object(_BallHistory, "last_return", lambda history, last: (kappa, rest)):
-        bound = loop._tail(history, 29, output)
+    kappa, of_rest = 0.8, np.array([0.0, 0.03, 0.2, 3.0])
+    output = np.full(len(of_rest), largest_before)
+    bound = outputs_after_return(kappa, output, of_rest)
     later = []
     for _ in range(300):
         output = kappa * output + of_rest
@@ -103,10 +96,10 @@ def test_the_bound_of_the_rest_is_that_of_all_later_outputs_of_the_recursion(lar
 def test_the_return_of_a_decaying_rotation_is_the_best_one_by_hand() -> None:
     """For a delay m, least squares give κ = q^m cos φm, and a rest of |sin φm| ‖c(t)‖."""
     q, phi, size, times = 0.97, 2 * math.pi / 13.4, 0.01, np.arange(50)
-    history = _BallHistory.without_balls(len(times), 2)
+    history = BallHistory.without_balls(len(times), 2)
     for time in times.tolist():
         centre = q**time * np.array([math.cos(phi * time), math.sin(phi * time)])
-        history.add([_Ball(centre, size, 0.0, size, 1.0, time)])
+        history.add([Ball(centre, size, 0.0, size, 1.0, time)])
     delays = np.arange(5, 45)
     kappas = np.abs(q**delays * np.cos(phi * delays))
     rests = np.abs(np.sin(phi * delays)) * q**45 + size
@@ -115,8 +108,8 @@ def test_the_return_of_a_decaying_rotation_is_the_best_one_by_hand() -> None:
 
 
 def test_centres_that_do_not_decay_do_not_return() -> None:
-    history = _BallHistory.without_balls(30, 1)
-    history.add([_Ball(np.array([1.01**time]), 0.0, 0.0, 0.0, 1.0, time) for time in range(30)])
+    history = BallHistory.without_balls(30, 1)
+    history.add([Ball(np.array([1.01**time]), 0.0, 0.0, 0.0, 1.0, time) for time in range(30)])
     assert history.last_return(slice(25, 30)) is None
 
 
@@ -142,7 +135,7 @@ def slow_loop(dropouts: int) -> Deliveries:
 
 
 def without_return(loop: Deliveries) -> Constants:
-    with patch.object(_BallHistory, "last_return", lambda history, last: None):
+    with patch.object(BallHistory, "last_return", lambda history, last: None):
         return loop.constants(1.0)
 
 
@@ -156,7 +149,7 @@ def test_a_return_makes_no_bound_larger(dropouts: int) -> None:
 
 def test_a_return_bounds_the_rest_of_a_slow_loop_before_its_norm_has_decayed() -> None:
     """The bound holds in an exact simulation that is longer than the balls are followed."""
-    with patch.object(due_deliveries, "_MOST_TIMES", 200):
+    with patch.object(due_deliveries, "MOST_TIMES", 200):
         with_return, alone = slow_loop(0).constants(1.0), without_return(slow_loop(0))
     assert with_return.mismatch < 0.9 * alone.mismatch
     drift = np.block([[MODES, INPUT @ GAIN], [np.zeros((4, 8))]])

@@ -1,0 +1,132 @@
+"""Balls that contain x at the delivered events, and a return of their centres.
+
+A delivered event at a time t, in steps of the gaps, has ‖ξ − c‖ ≤ ρ in coordinates ξ = Λx, and late
+effects S of the updates in flight (``delivery_gaps.py``). Besides both, the largest ρ + θS is kept.
+What follows is linear in ρ and S and does not fall, so it is largest at one of two corners of what
+all three permit.
+
+A return: as the loop is linear, what follows from ξ(t) = κ c(t − m) + r is κ times what followed
+from c(t − m), and what follows from r.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.stacked_norms import ROUNDING, Stack
+
+_DELAYS = 64
+"""So many m are tried."""
+
+
+class Ball(NamedTuple):
+    """Bounds of ρ, S, and ρ + θS at a delivered event."""
+
+    centre: Vector
+    """c, (n,)."""
+    radius: float
+    """ρ"""
+    late_effects: float
+    """S"""
+    weighted_sum: float
+    """ρ + θS"""
+    theta: float
+    time: int = 0
+    """In steps of the gaps."""
+
+    @property
+    def corners(self) -> Matrix:
+        """ρ and S where linear functions of both, that do not fall, are largest, (2, corners)."""
+        radius = min(self.radius, self.weighted_sum)
+        late_effects = min(self.late_effects, self.weighted_sum / self.theta)
+        late_effects_at_radius = max(min(late_effects, (self.weighted_sum - radius) / self.theta), 0.0)
+        radius_at_late_effects = max(min(radius, self.weighted_sum - self.theta * late_effects), 0.0)
+        corners = [[radius, radius_at_late_effects], [late_effects_at_radius, late_effects]]
+        return np.array(corners) * ROUNDING
+
+
+class BallHistory(NamedTuple):
+    """The balls of all times; NaN where there is none."""
+
+    centres: Matrix
+    late_effects: Vector
+    weighted_sums: Vector
+
+    @classmethod
+    def without_balls(cls, times: int, n: int) -> "BallHistory":
+        """Return a history of some times without a ball."""
+        return cls(*(np.full(shape, np.nan) for shape in ((times, n), times, times)))
+
+    def add(self, balls: Sequence[Ball]) -> None:
+        """Add balls at their times."""
+        for ball in balls:
+            self.centres[ball.time] = ball.centre
+            self.late_effects[ball.time] = ball.late_effects
+            self.weighted_sums[ball.time] = ball.weighted_sum
+
+    def last_return(self, last: slice) -> tuple[float, float] | None:
+        """Return |κ|, and ‖r‖ + ρ + θS at most, of ξ(t) = κ c(t − m) + r at the last times t.
+
+        Of the m that are tried, it is that with the smallest (‖r‖ + ρ + θS)/(1 − |κ|); None if there is none.
+        """
+        times = np.arange(last.start, last.stop)[~np.isnan(self.weighted_sums[last])]
+        delays = np.unique(np.linspace(len(self.centres[last]), last.start - 1, _DELAYS).astype(int))
+        # κ of least squares for each m, and its largest rest.
+        earlier = self.centres[times - delays[delays > 0, None]]  # (m, times, n)
+        now = self.centres[times]
+        kappas = (earlier * now).sum(axis=(1, 2)) / np.square(earlier).sum(axis=(1, 2))
+        residuals = lengths(now - kappas[:, None, None] * earlier) + 1e-12 * lengths(now)
+        rests = (residuals + self.weighted_sums[times]).max(axis=1)
+        kappas = np.abs(kappas)
+        bounds = np.where(kappas < 1, rests / (1 - kappas), np.nan)
+        if np.isnan(bounds).all():
+            return None
+        best = int(np.nanargmin(bounds))
+        return float(kappas[best]), float(rests[best])
+
+
+class BallsAfterGaps(NamedTuple):
+    """The balls after each gap, for delivered events at some times."""
+
+    centres: Stack
+    """c, (times, gaps, n)."""
+    extents: Stack
+    """ρ, S, and ρ + θS, (times, gaps, 3)."""
+
+
+class RecentBalls:
+    """The balls after each gap from the last times, as far back as the longest gap."""
+
+    def __init__(self, counts: NDArray[np.int64], start_balls: BallsAfterGaps) -> None:
+        self._counts = counts
+        slots = int(counts[-1]) + 1
+        self._balls = BallsAfterGaps(*(np.zeros((slots, *array.shape[1:])) for array in start_balls))
+        """By their time modulo the number of slots."""
+        self._has_balls = np.zeros(slots, dtype=bool)
+        self.store([0], start_balls)
+
+    def leading_to(self, time: int) -> tuple[Matrix, Matrix] | None:
+        """Return centres and extents of the balls at a time, one for each gap; None if there is none."""
+        slots = (time - self._counts) % len(self._has_balls)
+        gaps = np.flatnonzero(self._has_balls[slots])
+        if not len(gaps):
+            return None
+        return self._balls.centres[slots[gaps], gaps], self._balls.extents[slots[gaps], gaps]
+
+    def forget(self, times: range) -> None:
+        """Remove the balls after gaps from some times."""
+        self._has_balls[np.array(times) % len(self._has_balls)] = False
+
+    def store(self, times: list[int], balls: BallsAfterGaps) -> None:
+        """Store the balls after gaps from some times."""
+        slots = np.array(times) % len(self._has_balls)
+        self._balls.centres[slots], self._balls.extents[slots] = balls
+        self._has_balls[slots] = True
+
+
+def lengths(vectors: Stack) -> Stack:
+    """Return ‖·‖ of vectors, (…, n)."""
+    return np.asarray(np.sqrt(np.einsum("...n,...n->...", vectors, vectors)))
