@@ -75,7 +75,7 @@ class LossCheck:
         if losses <= allowed:
             return ""
         return (
-            f"MANSD violated: {losses} successive dropouts before update {sequence}, at most "
+            f"MANSD violated: {losses} consecutive losses before update {sequence}, at most "
             f"{allowed} assumed"
         )
 

@@ -239,8 +239,8 @@ class RunProcess:
     def _spool(self) -> OwnSpool:
         """The recorder reads it, or `noack collect` on another host."""
         ticket = self.ticket
-        kept_of = None if ticket.remote is None else run_name(ticket.run_id)
-        return OwnSpool(Path(ticket.run_dir), self.role, self.plane.secret, kept_of)
+        remote_run_name = None if ticket.remote is None else run_name(ticket.run_id)
+        return OwnSpool(Path(ticket.run_dir), self.role, self.plane.secret, remote_run_name)
 
     def _telemetry(self) -> TelemetryBuffer:
         tables = run_tables(self.scenario)

@@ -60,7 +60,7 @@ class ClocksSection(ScenarioSection):
 
 
 class RecoverySection(ScenarioSection):
-    """What happens to a run when one of its processes dies."""
+    """Whether a run continues after one of its processes has ended unexpectedly."""
 
     rejoin_within_s: Annotated[FiniteFloat, Field(ge=0, le=86_400)] | None = None
     """Wall time for which the run continues without its sensor, controller, network or recorder.

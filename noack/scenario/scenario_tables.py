@@ -271,15 +271,15 @@ class MessageSizes:
         return self.outputs + self.inputs_reported
 
     @property
-    def is_predictive(self) -> bool:
+    def carries_model(self) -> bool:
         """Whether actuations carry the controller's model state."""
         return self.scenario.plant.watchdog.policy == "model"
 
     @property
     def actuation_entries(self) -> int:
-        """Number of entries of an actuation: its inputs, with x_c if it is predictive."""
+        """Number of entries of an actuation: its inputs, with x_c if it carries the model state."""
         n, m = self.scenario.model.dimensions
-        return m * self.scenario.controller.predictions + n * self.is_predictive
+        return m * self.scenario.controller.predictions + n * self.carries_model
 
     def entries(self, flow: Flow) -> int:
         """Number of entries of a message of a flow."""

@@ -376,7 +376,7 @@ class NetworkSection(DirectionSection):
     """The lossy network between sensor and controller."""
 
     mansd: Mansd
-    """M − 1, the maximum allowable number of successive dropouts; for the paper's M = 5 it is 4."""
+    """M − 1, the maximum of consecutive losses (MANSD); for the paper's M = 5 it is 4."""
     loss: Loss
     """Loss of updates, before the guarantee is applied."""
     enforce_mansd: bool = True
