@@ -2,7 +2,7 @@
 
 Read ``join_run.py`` first, then ``run_process.py`` from top to bottom. They use, in this order:
 
-* ``command_line.py`` and ``join_ticket.py``, with which a process starts,
+* ``command_line.py`` and ``run_descriptor.py``, with which a process starts,
 * ``control_plane.py``, its messages (``control_messages.py``) and the life cycle that they change
   (``life_cycle.py``); on another host ``connections`` and ``host_clocks``, too,
 * ``udp_sockets.py`` with ``address.py``,

@@ -45,7 +45,7 @@ class AdmissionRequest(ControlMessage):
     """A process asks for admission to the run."""
 
     instance: str  # random name of this process
-    admission_pass: str = ""
+    join_token: str = ""
 
 
 class Admission(ControlMessage):

@@ -35,8 +35,8 @@ from noack.runtime.control_messages import (
     message_json,
     parse_message,
 )
-from noack.runtime.join_ticket import RemoteAccess, Ticket
 from noack.runtime.private_folder import LockFile, live_lock_files, lock_file, open_private
+from noack.runtime.run_descriptor import RemoteAccess, RunDescriptor
 from noack.runtime.spool import writer_of
 from noack.scenario.runtime_parameters import require_finite
 from noack.scenario.scenario_tables import MOST_CHANGES
@@ -210,17 +210,17 @@ class ControlPlane:
     CallerError if other users have access to the user's runtime directory.
     """
 
-    def __init__(self, ticket: Ticket, role: str, *, listen: bool = False) -> None:
-        self._prefix = f"noack/{run_name(ticket.run_id)}"
+    def __init__(self, descriptor: RunDescriptor, role: str, *, listen: bool = False) -> None:
+        self._prefix = f"noack/{run_name(descriptor.run_id)}"
         self.role = role
         self.secret = secrets.token_hex(32)
         self.instance = writer_of(self.secret)
         self._resources = ExitStack()
         try:
             self.session = (
-                open_session(RUNS, run_name(ticket.run_id), listen=listen)
-                if ticket.remote is None
-                else self._resources.enter_context(open_remote_session(ticket.remote, ticket.key))
+                open_session(RUNS, run_name(descriptor.run_id), listen=listen)
+                if descriptor.remote is None
+                else self._resources.enter_context(open_remote_session(descriptor.remote, descriptor.key))
             )
         except zenoh.ZError as error:
             task = "start the control plane" if listen else "reach the run's coordinator"
@@ -423,9 +423,9 @@ _OPEN_RUN = TypeAdapter(OpenRun, config=ConfigDict(defer_build=True))
 
 
 @contextmanager
-def registered_run(ticket: Ticket, session: str | None) -> Iterator[Path]:
+def registered_run(descriptor: RunDescriptor, session: str | None) -> Iterator[Path]:
     """Keep a run's lock file while the context lasts."""
-    run = OpenRun(run_name(ticket.run_id), ticket.run_dir, session)
+    run = OpenRun(run_name(descriptor.run_id), descriptor.run_dir, session)
     with lock_file(RUNS, run.name, run._asdict()) as path:
         yield path
 

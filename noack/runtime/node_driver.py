@@ -76,7 +76,7 @@ class NodeDriver(LiveDriver):
         super().__init__(machines, process.wire, admitted_ns=process.admitted_ns)
         # The file's name alone: the process is given a copy in the run directory.
         self._label = f"controller.file ({Path(settings.file).name})"
-        self._key, self._sockets = process.ticket.key, list[socket.socket]()
+        self._key, self._sockets = process.descriptor.key, list[socket.socket]()
         self._clock, self._sent_clock = RunClock(0), b""
         self._to_send, self._received = bytearray(), bytearray()
         self._foreign, self._tick_s = 0, time.monotonic()

@@ -153,8 +153,8 @@ def driver_of(program: Path, content: dict[str, Any]) -> NodeDriver:
     """The driver of a program, without a run."""
     settings = located(ProgramControllerSettings(kind="program", file=str(program)), Path(), "here")
     assert isinstance(settings, ProgramControllerSettings)
-    ticket = SimpleNamespace(key=KEY)
-    process: Any = SimpleNamespace(wire=Wire(RUN_ID, KEY), admitted_ns=0, ticket=ticket)
+    descriptor = SimpleNamespace(key=KEY)
+    process: Any = SimpleNamespace(wire=Wire(RUN_ID, KEY), admitted_ns=0, descriptor=descriptor)
     return NodeDriver(process, controllers_of([scenario(content)]), settings)
 
 

@@ -374,7 +374,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the recorder; ``--live`` also opens a viewer."""
     live = "--live" in (sys.argv[1:] if arguments is None else arguments)
     with join_run(RECORDER, ()) as process, ExitStack() as stack:
-        stack.enter_context(active_run(Path(process.ticket.run_dir)))
+        stack.enter_context(active_run(Path(process.descriptor.run_dir)))
         live_view = None
         if live and not process.start.is_restart:
             live_view = live_viewer.LiveView()
@@ -385,7 +385,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     """Record a run to its end."""
-    run_dir = Path(process.ticket.run_dir)
+    run_dir = Path(process.descriptor.run_dir)
     # A live view is ready when the run begins. The libraries of a recording take half a second to
     # load: the other processes do not wait for them.
     view = _open_view(process, live_view) if live_view else None
@@ -431,8 +431,8 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
 
 
 def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunRecording":
-    ticket = process.ticket
-    return run_recording.open_recording(process.scenario, Path(ticket.run_dir), ticket.run_id, live_view)
+    run_dir, run_id = Path(process.descriptor.run_dir), process.descriptor.run_id
+    return run_recording.open_recording(process.scenario, run_dir, run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
