@@ -20,6 +20,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.core.process_limits import cores
 from noack.impairments.loss_prediction import found_probabilities
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES, ROLES
+from noack.runtime.connections.zenoh_session import header_of, next_payload
 from noack.runtime.control_messages import (
     Admission,
     AdmissionRequest,
@@ -31,7 +32,7 @@ from noack.runtime.control_messages import (
     RunStart,
     parse_message,
 )
-from noack.runtime.control_plane import ControlPlane, header_of, next_payload
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.life_cycle import HORIZON, LAUNCHED_LOST_S, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario.parameter_changes import (

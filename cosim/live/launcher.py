@@ -40,9 +40,9 @@ from noack.core.number_format import byte_size
 from noack.core.process_limits import cores as usable_cores
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import PLANT, RECORDER, ROLES
+from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, stop_reason
-from noack.runtime.control_plane import registered_run, run_name
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, invitation_file, new_descriptor
 from noack.scenario.resolution import resolve_run, resolved_loops, tables_of

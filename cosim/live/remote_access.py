@@ -27,9 +27,10 @@ from cosim.live.coordinator import Coordinator, TokenScope
 from cosim.live.processes.child_processes import Host, load_hosts
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.roles import LOOP_ROLES
+from noack.runtime.active_runs import RUNS, run_name
 from noack.runtime.address import Address, address_text, family_of, parse_address
 from noack.runtime.connections.coordinator_link import InvitationProof, Protection, forwarding, tls_context
-from noack.runtime.control_plane import RUNS, run_name, socket_path
+from noack.runtime.connections.zenoh_session import socket_path
 from noack.runtime.host_clocks.time_exchange import TimeReference, answering
 from noack.runtime.run_descriptor import RemoteAccess, RunDescriptor, new_join_token, own_host
 from noack.scenario.run_sections import ClocksSection

@@ -33,6 +33,7 @@ from noack.protocol.roles import (
     Start,
 )
 from noack.protocol.wire_format import Wire
+from noack.runtime.active_runs import run_name
 from noack.runtime.address import Address
 from noack.runtime.command_line import Signals, print_to_stderr
 from noack.runtime.control_messages import (
@@ -44,11 +45,12 @@ from noack.runtime.control_messages import (
     RunStart,
     parse_message,
 )
-from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
+from noack.runtime.control_plane import ControlPlane, ParameterUpdates
+from noack.runtime.drivers.real_time_loop import Driver, ProcessSockets, run_loop
+from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.host_clocks.clock_offset import SlewedRunClock
 from noack.runtime.host_clocks.reference_clock import ClockRecord, ReferenceClock, reference_clock
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
-from noack.runtime.real_time_loop import Driver, ProcessSockets, realtime, run_loop
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer

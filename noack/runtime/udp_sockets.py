@@ -22,7 +22,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.protocol.roles import Notice
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES
 from noack.runtime.address import LOOPBACK, Address, SocketName, address_text, family_of
-from noack.runtime.real_time_loop import RecordSink
+from noack.runtime.drivers.real_time_loop import RecordSink
 
 _UNKNOWN_BYTES = 128 * 1024
 """Receive buffer for datagrams from unknown sources; the kernel doubles it. It holds about 300

@@ -24,7 +24,7 @@ from netem.fates import FateRecorder
 from netem.relay.relay_links import LinkSpec
 from noack.core.errors import CallerError, NoackError
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime import control_plane
+from noack.runtime import active_runs
 from noack.runtime.run_descriptor import (
     RunDescriptor,
     descriptor_file,
@@ -79,8 +79,8 @@ Use = Callable[[RunDescriptor], object]
 USES: dict[str, Use] = {
     "publish a run descriptor": lambda descriptor: descriptor_file(descriptor, "default").__enter__(),
     "join a run": lambda _: join(),
-    "publish a run": lambda descriptor: control_plane.registered_run(descriptor, None).__enter__(),
-    "find a run": lambda _: control_plane.find_run(),
+    "publish a run": lambda descriptor: active_runs.registered_run(descriptor, None).__enter__(),
+    "find a run": lambda _: active_runs.find_run(),
     "publish an emulator": lambda _: emulator_session.registered_emulator(EMULATOR).__enter__(),
     "list emulators": lambda _: emulator_session.running(),
 }
@@ -180,7 +180,7 @@ def test_only_regular_files_are_read(shared: Path) -> None:
 def test_a_run_without_a_usable_folder_is_refused(shared: Path) -> None:
     assert find_descriptor("default") is None
     with pytest.raises(CallerError, match="no run is active"):
-        control_plane.find_run()
+        active_runs.find_run()
     assert emulator_session.running() == []
     assert not (shared / OWN).exists()
 

@@ -37,8 +37,9 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.roles import BEGINNING, LOOP_ROLES, RECORDER, RESTART, Notice, Start
 from noack.runtime.command_line import print_to_stderr
+from noack.runtime.connections.zenoh_session import header_of
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
-from noack.runtime.control_plane import ControlPlane, header_of
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_run import join_run
 from noack.runtime.life_cycle import LAUNCHED_LOST_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess

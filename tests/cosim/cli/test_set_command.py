@@ -13,7 +13,7 @@ from cosim.cli.commands.run_commands import parsed
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
 from noack.core.errors import CallerError
-from noack.runtime import control_plane
+from noack.runtime import active_runs
 from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
 from noack.scenario.parameter_changes import changed
 from noack.scenario.resolution import resolve
@@ -82,25 +82,25 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
     descriptor: RunDescriptor, capsys: pytest.CaptureFixture[str]
 ) -> None:
     second_descriptor = new_descriptor(descriptor.scenario, Path("elsewhere"), launched=True)
-    with control_plane.registered_run(second_descriptor, "lab"):
-        assert control_plane.find_run().run_dir == "elsewhere"
+    with active_runs.registered_run(second_descriptor, "lab"):
+        assert active_runs.find_run().run_dir == "elsewhere"
         warn_of_other_runs()
         assert "elsewhere is active, too" in capsys.readouterr().err
     with (
-        control_plane.registered_run(second_descriptor, "lab"),
-        control_plane.registered_run(descriptor, None) as path,
+        active_runs.registered_run(second_descriptor, "lab"),
+        active_runs.registered_run(descriptor, None) as path,
     ):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
         assert descriptor.key.hex() not in path.read_text()
         with pytest.raises(CallerError, match="several runs are active: "):
-            control_plane.find_run()
-        assert control_plane.find_run(session="lab").run_dir == "elsewhere"
-        assert control_plane.find_run(run_dir=Path(descriptor.run_dir)).run_dir == descriptor.run_dir
+            active_runs.find_run()
+        assert active_runs.find_run(session="lab").run_dir == "elsewhere"
+        assert active_runs.find_run(run_dir=Path(descriptor.run_dir)).run_dir == descriptor.run_dir
         with pytest.raises(CallerError, match="no run is active in session 'none'; active: "):
-            control_plane.find_run(session="none")
+            active_runs.find_run(session="none")
         with pytest.raises(CallerError, match="probability = nan: expected a finite number"):
-            control_plane.request_change(control_plane.find_run(session="lab"), parsed(["loss.p", "nan"]))
+            active_runs.request_change(active_runs.find_run(session="lab"), parsed(["loss.p", "nan"]))
     assert list(path.parent.iterdir()) == []
 
 

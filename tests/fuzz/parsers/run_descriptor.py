@@ -11,7 +11,7 @@ from cosim.live import coordinator
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
 from noack.protocol.roles import ROLES
-from noack.runtime import control_plane, run_descriptor
+from noack.runtime import active_runs, run_descriptor
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.private_folder import open_private
 from noack.scenario.parameter_changes import ChangeSchedule, settings_bytes, settings_of
@@ -189,7 +189,7 @@ def _find(data: bytes) -> None:
         with path.open() as lock:  # locked as by the launcher
             fcntl.flock(lock, fcntl.LOCK_EX)
             with refusal(str(path)):
-                run = control_plane.find_run()
+                run = active_runs.find_run()
                 assert all(isinstance(field, str) for field in run if field is not None)
 
 

@@ -14,14 +14,17 @@ import pytest
 import zenoh
 from zenoh.handlers import FifoChannel
 
+import noack.runtime.connections.zenoh_session
 import noack.runtime.control_plane
 import noack.runtime.join_run
 from cosim.live.coordinator import Coordinator
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.roles import LOOP_ROLES
+from noack.runtime.active_runs import RUNS, run_name
 from noack.runtime.command_line import Signals
+from noack.runtime.connections.zenoh_session import cause_of, label
 from noack.runtime.control_messages import RunStart, parse_message
-from noack.runtime.control_plane import RUNS, ControlPlane, cause_of, label, run_name
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_run import _admitted
 from noack.runtime.private_folder import private_folder
 from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
@@ -118,7 +121,7 @@ def test_another_user_can_neither_connect_nor_listen(
 def test_a_process_without_a_coordinator_says_so(
     descriptor: RunDescriptor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(noack.runtime.control_plane, "_CONNECT_MS", 200)
+    monkeypatch.setattr(noack.runtime.connections.zenoh_session, "_CONNECT_MS", 200)
     with pytest.raises(NoAnswerError, match="cannot reach the run's coordinator: Unable"):
         ControlPlane(descriptor, "plant")
     error = zenoh.ZError("Timeout! at /home/builder/.cargo/git/zenoh/orchestrator.rs:388.")

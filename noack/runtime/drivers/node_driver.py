@@ -30,8 +30,8 @@ from noack.core.errors import CallerError, PeerError, shortened
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.roles import SENDS
 from noack.runtime.address import Address, SocketName
-from noack.runtime.live_driver import LiveDriver, LoopChannel, ends_of
-from noack.runtime.real_time_loop import RecordSink
+from noack.runtime.drivers.live_driver import LiveDriver, LoopChannel, ends_of
+from noack.runtime.drivers.real_time_loop import RecordSink
 from noack.runtime.run_process import RunProcess
 from noack.settings.user_files import unchanged
 
