@@ -1,10 +1,9 @@
 """Compiles the vehicle models of CommonRoad that have tyres, with their integrator.
 
-Their equations are compiled, and integrated by compiled code, which also locates their
-jumps: a tyre's lateral force jumps where the wheel's camber changes its sign. The small models run
-as Python code, with scipy's integrator. For them a call of compiled code costs more time than it
-saves, because it needs more of the processor's caches, which other code overwrites between two
-steps.
+Compiled code integrates them, and locates their jumps: a tyre's lateral force jumps where the wheel's
+camber changes its sign. The small models run as Python code, with scipy's integrator. For them a
+call of compiled code costs more time than it saves, because it needs more of the processor's caches,
+which other code overwrites between two steps.
 """
 
 import inspect
@@ -46,8 +45,8 @@ Rates = Callable[[Vector, float, float], Vector]
 class CompiledVehicle:
     """A vehicle's compiled equations and their integrator."""
 
-    def __init__(self, advance: Compiled, parameters: Parameters) -> None:
-        self._advance = advance
+    def __init__(self, integrator: Compiled, parameters: Parameters) -> None:
+        self._integrator = integrator
         self._parameters = _record(parameters)
         self._work = buffers(0, _WHEELS)
 
@@ -76,7 +75,7 @@ class CompiledVehicle:
         """
         if len(self._work.point) != len(z):
             self._work = buffers(len(z), _WHEELS)
-        code: int = self._advance(z, v, self._parameters, duration_s, tolerances, self._work)
+        code: int = self._integrator(z, v, self._parameters, duration_s, tolerances, self._work)
         return code
 
 
@@ -95,8 +94,8 @@ def model_rates(model: str, parameters: Parameters) -> Rates:
 
 def compiled_vehicle(model: str, parameters: Parameters) -> CompiledVehicle | None:
     """Return a vehicle's compiled equations; None if they run as Python code."""
-    advance = compiled_dynamics(model)
-    return None if advance is None else CompiledVehicle(advance, parameters)
+    integrator = compiled_dynamics(model)
+    return None if integrator is None else CompiledVehicle(integrator, parameters)
 
 
 @cache
