@@ -32,6 +32,7 @@ from noack.theory.certificates.scenario_certificates import (
 )
 from noack.theory.certificates.solution import completed
 from tests.noack.theory.certificates.certificate_kinds.policies import exceeded_by, scenario_with
+from tests.noack.theory.certificates.certified_loops import conditions_of
 from tests.oracles.lossy_loops import SEARCH, STEPS, System, Trace, networks, seeds, simulate, systems
 
 ROOT = Path(__file__).parents[4]
@@ -47,7 +48,7 @@ def scenario(system: System, *, floor: float = 0.0) -> Scenario:
 
 
 def certified(system: System, floor: float = 0.0) -> tuple[ScenarioCertificate, Constants]:
-    certificate = certify(scenario(system, floor=floor), system.conditions)
+    certificate = certify(scenario(system, floor=floor), conditions_of(system))
     if certificate.constants is None:
         assume(False)
     assert certificate.constants is not None
