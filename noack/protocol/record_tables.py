@@ -47,7 +47,7 @@ NO_SEQUENCE = -1  # stands for "none" in a column of sequence numbers
 
 
 class Fate(IntEnum):
-    """What the network emulator did with a datagram."""
+    """The network emulator's treatment of a datagram."""
 
     DELIVERED = 0
     DROPPED = 1

@@ -32,7 +32,7 @@ def run_name(run_id: int) -> str:
 
 
 class OpenRun(NamedTuple):
-    """How to reach a run."""
+    """The names by which a run is reached."""
 
     name: str  # of its socket, and in the keys of its control plane
     run_dir: str

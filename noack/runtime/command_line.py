@@ -1,4 +1,4 @@
-"""What all programs of noack share: errors as text and JSON, JSON Lines on standard error, signals.
+"""Shared by all programs of noack: errors as text and JSON, JSON Lines on standard error, signals.
 
 As JSON Lines, for log collectors, each line of text is an object with ``time`` (UTC), ``level``
 (info, warning, error), ``source`` (the program, e.g. ``noack netem``) and ``message``. An event has

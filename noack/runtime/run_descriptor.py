@@ -38,7 +38,7 @@ _MOST_BYTES = 64 * 2**20
 
 
 class RemoteAccess(ScenarioSection):
-    """How a process on another host reaches the coordinator: by TLS, with keys made for the run."""
+    """Access of a process on another host to the coordinator: by TLS, with keys made for the run."""
 
     host: NumericHost
     port: Annotated[int, Field(ge=1, le=65_535)]
@@ -49,7 +49,7 @@ class RemoteAccess(ScenarioSection):
 
 
 class RunDescriptor(ScenarioSection):
-    """What a process needs to join a run; its JSON has the key in hexadecimal."""
+    """All that a process needs to join a run; its JSON has the key in hexadecimal."""
 
     model_config = ConfigDict(val_json_bytes="hex", ser_json_bytes="hex")
 
@@ -64,7 +64,8 @@ class RunDescriptor(ScenarioSection):
     clock: str
     """The coordinator's monotonic clock, of which the run's epoch is a reading."""
     time_reference: SocketAddress | None = None
-    """Where processes with another clock compare it with the coordinator's, under the run's key."""
+    """Address at which processes with another clock compare it with the coordinator's, under the run's
+    key."""
     target_losses: Annotated[dict[str, FiniteFloat], AfterValidator(remember)] = Field({})
     """Probabilities that the check of the scenario needs."""
     scenario: Scenario  # resolved

@@ -75,7 +75,7 @@ stall of 7 s. The kernel takes what is in use."""
 
 
 class Reconfigurable(Protocol):
-    """What accepts changes of settings during the run."""
+    """Accepts changes of settings during the run."""
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Process the announcement of a change."""
@@ -98,7 +98,7 @@ class RunProcess:
         self.admitted_ns = 0
         self._address: Address | None = None
         self.start: Start = BEGINNING
-        """Where in the run its work begins."""
+        """The point of the run at which its work begins."""
         self.replaces: str | None = None
         """Of a restarted process: how the one before it ended."""
         self.report: dict[str, object] = {}
@@ -164,18 +164,18 @@ class RunProcess:
 
     @property
     def wire(self) -> Wire:
-        """What the datagrams of the run have in common."""
+        """The common part of the run's datagrams."""
         encrypted = self.scenario.network.encrypted
         return Wire(self.descriptor.run_id, self.descriptor.key, encrypted=encrypted)
 
     @property
     def spin_ns(self) -> int:
-        """How long to busy-wait before a deadline."""
+        """Time of busy waiting before a deadline."""
         return round(self.scenario.realtime.spin_us * 1000)
 
     @property
     def coalescing_ns(self) -> int:
-        """How long to gather the ticks of many loops."""
+        """Time for which the ticks of many loops are gathered."""
         if len(self.phases_ns) <= _FEW_LOOPS:
             return 0
         period_ns = min(loop.timing.plant_period_ns for loop in loops_of(self.scenario))
@@ -305,7 +305,7 @@ class RunProcess:
 
     @property
     def ended(self) -> str:
-        """Why the process ended."""
+        """The reason why the process ended."""
         return self.life.reason or HORIZON
 
     @property

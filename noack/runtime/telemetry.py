@@ -75,7 +75,7 @@ class ReceivedRows:
 
     @property
     def count(self) -> int:
-        """How many have arrived."""
+        """Number of those that have arrived."""
         return sum(end - first for first, end in self.ranges)
 
     def add(self, first: int, end: int) -> None:

@@ -274,7 +274,7 @@ class FloodWatch:
 
     def __init__(self) -> None:
         self.left = IN_AN_INTERVAL
-        """How many may still be read in this interval; the reader decrements it."""
+        """Number of those that may still be read in this interval; the reader decrements it."""
         self.is_flood = False
         self._allowed = IN_AN_INTERVAL
         self._dropped = 0

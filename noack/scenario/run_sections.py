@@ -111,13 +111,13 @@ class PortsSection(ScenarioSection):
     """UDP ports on the loopback interface; 0 takes a free one."""
 
     plant: Port = 0
-    """Where the plant receives actuation."""
+    """Port at which the plant receives actuation."""
     sensor: Port = 0
-    """Where the sensor receives measurements."""
+    """Port at which the sensor receives measurements."""
     netem: Port = 0
-    """Where the network receives the sensor's updates."""
+    """Port at which the network receives the sensor's updates."""
     controller: Port = 0
-    """Where the controller receives the delivered updates."""
+    """Port at which the controller receives the delivered updates."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -47,7 +47,7 @@ class ScenarioTables(ScenarioSection):
     name: Annotated[str, Field(pattern=NAME_PATTERN)]
     """Names the run's directory: letters, digits, _ and -."""
     description: str = ""
-    """What the scenario shows."""
+    """The purpose of the scenario."""
     mode: Literal["model", "zoh"] = "model"
     """model: x_s and x_c follow Â + B̂K between updates; zoh: they hold the last update."""
     horizon_s: Annotated[FiniteFloat, Field(gt=0, le=1e7)]
@@ -62,7 +62,7 @@ class ScenarioTables(ScenarioSection):
     trigger: AnyTrigger
     """When the sensor transmits."""
     observer: AnyObserver | None = None
-    """How the sensor estimates the state from the measurements: a table with ``kind``. Without it,
+    """The sensor's estimate of the state from the measurements: a table with ``kind``. Without it,
     the measurement must be the state."""
     network: NetworkSection
     controller: AnyController = LinearFeedbackSettings.model_construct()
@@ -80,7 +80,7 @@ class ScenarioTables(ScenarioSection):
 
     @property
     def between_updates(self) -> str:
-        """What the controller does between updates, in words."""
+        """The controller's input between updates, in words."""
         words = "model-based" if self.mode == "model" else "zero-order hold"
         if self.controller.update_timeout_s is None:
             return words
@@ -236,7 +236,7 @@ class Timing:
 
     @property
     def acknowledgement_timeout_ns(self) -> int:
-        """How long the sensor waits for an acknowledgement before it transmits again."""
+        """Time for which the sensor waits for an acknowledgement before it transmits again."""
         network = self.scenario.network
         if network.reverse.timeout_s is not None:
             return round(network.reverse.timeout_s * NS_PER_S)
@@ -295,12 +295,12 @@ UNCERTIFIED_ACKNOWLEDGEMENTS = (
     "x_s is reset only when an acknowledgement returns, so ‖e_s‖ exceeds the threshold while the "
     "sensor waits, and (I1), on which every bound rests, does not hold"
 )
-"""Why the baseline with acknowledgements has no certificate."""
+"""The reason why the baseline with acknowledgements has no certificate."""
 
 
 @dataclass(frozen=True)
 class TheoryCoverage:
-    """Which of the paper's theorems, the certificates and the exact simulation cover a scenario."""
+    """The theorems of the paper, certificates and exact simulation that cover a scenario."""
 
     scenario: ScenarioTables
 
@@ -361,7 +361,7 @@ class TheoryCoverage:
 
     @property
     def _beyond_actuation(self) -> str | None:
-        """Why the age of the applied input has no bound, or the watchdog replaces the input."""
+        """The reason why the age of the applied input has no bound, or the watchdog replaces the input."""
         timing, policy = self.scenario.timing, self.scenario.plant.watchdog.policy
         if (gap_ns := timing.actuation_gap_ns) is None:
             return (

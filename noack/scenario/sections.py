@@ -383,7 +383,7 @@ class NetworkSection(DirectionSection):
     """false: the network ignores mansd and the constraints, to show the effect of a violated
     assumption."""
     initial_sync: Literal["first_packet", "known_state"] = "first_packet"
-    """How the paper's assumption of a delivered t_0 is met. first_packet: the network passes the
+    """The means by which t_0 is delivered, as the paper assumes. first_packet: the network passes the
     first packet of a flow. known_state: sensor and controller start from x(0)."""
     protocol: Literal["none", "ack"] = "none"
     """none: updates are not acknowledged, the paper's loop. ack: the baseline for comparison; the
@@ -415,7 +415,7 @@ class NetworkSection(DirectionSection):
 
     @property
     def flows(self) -> tuple[Flow, ...]:
-        """What crosses the network; the place of a flow here is the number of its direction."""
+        """Flows that cross the network; the place of a flow here is the number of its direction."""
         if self.protocol == "ack":
             return Flow.UPDATE, Flow.ACKNOWLEDGEMENT
         return (Flow.UPDATE,) if self.actuation is None else (Flow.UPDATE, Flow.ACTUATION)
@@ -456,5 +456,5 @@ class NetworkSection(DirectionSection):
     @property
     @cached_method
     def guarantee(self) -> LossGuarantee:
-        """What mansd and the constraints say, also if the network does not enforce it."""
+        """The guarantee by mansd and the constraints, also if the network does not enforce it."""
         return join_guarantee(self.mansd, self.constraints)

@@ -25,14 +25,14 @@ done."""
 
 
 class RowSink(Protocol):
-    """Where rows of the record go."""
+    """Receives rows of the record."""
 
     def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
         """Add rows of a table."""
 
 
 class RecordSink(RowSink, Protocol):
-    """Where a machine's records and notices go."""
+    """Receives a machine's records and notices."""
 
     def append(self, record: Record) -> None:
         """Add a row."""

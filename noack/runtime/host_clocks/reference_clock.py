@@ -47,7 +47,7 @@ class ClockReport(NamedTuple):
     """Largest difference to the reference from ``since_ns`` to ``now_ns``; None: it is lost."""
     exchanges: int = 0
     lost: str | None = None
-    """Why it is lost."""
+    """The reason why it is lost."""
 
 
 class ReferenceClock:
