@@ -9,9 +9,9 @@ with stoppable_imports():
     from controller_node.controller import controllers_of
     from noack.controllers.program_controller import ProgramControllerSettings
     from noack.core.errors import ExitStatus
+    from noack.runtime.drivers.live_driver import run_machines
+    from noack.runtime.drivers.node_driver import run_program
     from noack.runtime.join_run import join_run
-    from noack.runtime.live_driver import run_machines
-    from noack.runtime.node_driver import run_program
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:

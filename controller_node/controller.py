@@ -1,11 +1,8 @@
 """The controller: runs the model x_c, which only a delivered update resets (eq:ModCont).
 
-This file turns a scenario into the core's controller, whose steps are in native/loop/controller.c.
-At an update x_c ← e^{H(t−t_i)} x(t_i), so that a late update still restores x_c = x_s. At every
-tick the controller sends the input of its control law: u = K(x_c − x_r) + u_r, unless the scenario
-names another law. Before its first update it sends a declared safe input, unless x(0) is given.
-If the newest update is too old, it sends the safe input, or its last input again.
-Losses are compared with the network's guarantee from the recorded rows.
+This file turns a scenario into the core's controller. native/loop/controller.c has its steps, and
+explains them. Losses are compared with the network's guarantee from the recorded
+rows.
 """
 
 from collections.abc import Callable, Sequence
@@ -57,7 +54,7 @@ class Controller(MachinePart):
         acknowledges: whether it acknowledges each update, as the acknowledgement baseline does.
         start: the beginning of the run, or a restart during the run.
         safe_input: the input before the first update, shape (m,); by default 0.
-        predictive: whether an actuation also carries x_c, for the plant's watchdog.
+        carries_model: whether an actuation also carries x_c, for the plant's watchdog.
         predictions: number of inputs of an actuation: that of the tick, and those for the
             following ticks if no update arrives until then; only with a linear law.
         timeout_ns: age from which on the newest update is too old; only with a linear law.
@@ -77,7 +74,7 @@ class Controller(MachinePart):
     acknowledges: bool = False
     start: Start = BEGINNING
     safe_input: Vector | None = None
-    predictive: bool = False
+    carries_model: bool = False
     predictions: int = 1
     timeout_ns: int = NEVER_NS
     holds_input: bool = False
@@ -139,7 +136,7 @@ class Controller(MachinePart):
                 "predictions": self.predictions,
                 "timeout_ns": self.timeout_ns,
                 "holds_input": self.holds_input,
-                "carries_model": self.predictive,
+                "carries_model": self.carries_model,
                 "x_c": np.zeros(n) if self.x0 is None else self.x0,
                 # A model without a state starts at the first tick, which is recorded.
                 "model_ns": self.first_ns + step * period_ns if start.is_restart else 0,
@@ -264,7 +261,7 @@ def _part(start: Start, resolved: Scenario) -> Controller:
         acknowledges=acknowledges,
         start=start,
         safe_input=None if safe_input is None else np.array(safe_input),
-        predictive=resolved.message_sizes.is_predictive,
+        carries_model=resolved.message_sizes.carries_model,
         predictions=resolved.controller.predictions,
         timeout_ns=resolved.timing.update_timeout_ns,
         holds_input=resolved.controller.timeout_input == "hold",

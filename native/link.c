@@ -191,7 +191,7 @@ static int64_t hold_back(
     if (link->scheduler < 0)
         decision->makes_stale = make_stale(link, row, decision->packet, needed_ns);
     else if (!decision->waits)
-        link->flows[row].first_release_ns = needed_ns; /* of what waits, see waiting.c */
+        link->flows[row].first_release_ns = needed_ns; /* of waiting packets, see waiting.c */
     return needed_ns;
 }
 

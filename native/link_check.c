@@ -44,7 +44,7 @@ static const char *check_bottleneck(const noack_stage *stage) {
 static const char *check_scheduler(const noack_link *link, const noack_stage *stage) {
     const noack_bottleneck *own = &stage->bottleneck;
     if (link->scheduler != stage - link->stages)
-        return "a queue that chooses when the link is free is not that of the link";
+        return "a stage is a scheduler, but not that of the link";
     if (!is_between(1, own->flows, link->integer_count)
         || !is_between(0, own->begin, link->integer_count - own->flows))
         return "the numbers of flows are outside the table of integers";
@@ -217,6 +217,6 @@ const char *noack_link_check(const noack_link *link) {
         wrong = check_stage(link, &link->stages[i]);
     if (wrong == NULL && link->scheduler >= 0
         && (link->scheduler >= link->stage_count || !is_scheduler(&link->stages[link->scheduler])))
-        wrong = "the link has no queue that chooses when it is free";
+        wrong = "the scheduler of the link is not a stage that chooses";
     return wrong;
 }

@@ -34,12 +34,13 @@ typedef struct { /* the decision for a packet; the stages modify it one after th
     int64_t arrival_ns;
     int64_t size_bytes; /* of the payload */
     int64_t must_pass;  /* 1: the guarantee requires its delivery */
-    int64_t loss_suppressed;     /* 1: it must pass, and a stage would have lost it */
-    int64_t waits;      /* 1: it waits in a queue that chooses when the link is free, so that its
-                           departure is not known: release_ns is the earliest time */
-    int64_t key;        /* what waits: the smallest key leaves first */
-    int64_t after_ns;   /* what waits: the time from the end of its transmission to its departure;
-                           before the last stage: minus the earliest begin of its transmission */
+    int64_t loss_suppressed; /* 1: it must pass, and a stage would have lost it */
+    int64_t waits;           /* 1: it waits in the scheduler's queue, so that its departure is not
+                                known: release_ns is the earliest time */
+    int64_t key;             /* of a waiting packet: the smallest key leaves first */
+    int64_t after_ns;        /* of a waiting packet: time from the end of its transmission to its
+                                departure; before the last stage: minus the earliest begin of its
+                                transmission */
 } noack_decision;
 
 typedef struct { /* a recorded decision, which a flow repeats */
@@ -195,8 +196,8 @@ typedef struct { /* a link's state of a flow */
     int64_t packets;            /* packets that have arrived */
     int64_t consecutive_losses; /* up to the last packet */
     int64_t first_release_ns;   /* no packet leaves before: departure time of the first one, if it had
-                                   to be delivered; in a queue that chooses, of the last one; of the
-                                   last one in flight at a change */
+                                   to be delivered; with a scheduler, of the last one; of the last one
+                                   in flight at a change */
     double score;               /* normal score of the link's state for the last packet */
     int64_t newest;             /* greatest number among the packets that have left intact */
     int64_t since;              /* number of the first packet under the present settings */
@@ -251,7 +252,8 @@ typedef struct { /* one direction of a link */
     int64_t mansd;    /* maximum of consecutive losses, M - 1; -1: none */
     int64_t limit;    /* maximum number of packets delayed at once */
     int64_t tracks;   /* 1: packets can be delivered out of order */
-    int64_t scheduler; /* the stage whose queue chooses when the link is free; -1: none */
+    int64_t scheduler; /* the stage that chooses, when the link is free, which packet of its queue it
+                          sends; -1: none */
     /* state */
     int64_t rows;               /* flows that have room */
     int64_t recent_width;       /* a power of 2, of mansd + 1 at least if it tracks */
@@ -298,7 +300,7 @@ int64_t noack_link_leave(
 int64_t noack_link_touch(const noack_link *link, int64_t row);
 
 /* Transfer the state of a link to one with other settings, which has as many rows and shares the
-   array of flows. Nothing waits in a queue that chooses. latest_ns: (rows,) last departure time of
+   array of flows. No packet waits in a scheduler's queue. latest_ns: (rows,) last departure time of
    the packets in flight; -1: none. */
 void noack_link_change(const noack_link *before, noack_link *after, const int64_t *latest_ns);
 
@@ -408,7 +410,7 @@ enum noack_question { /* what Python must do before a step goes on; the step is 
 typedef struct { /* a message of the loop, decoded */
     int64_t flow, loop, sequence, t_ns, entries;
     int64_t error_level; /* of an update: docs/wire.md; 0: none */
-    double vector[64];
+    double vector[NOACK_MAX_ENTRIES];
 } noack_message;
 
 typedef struct { /* what a machine receives of a flow */
@@ -418,7 +420,7 @@ typedef struct { /* what a machine receives of a flow */
     int64_t not_before_ns; /* earlier messages are stale */
     int64_t not_after_ns;  /* later messages are out of range: no run has them */
     int64_t accepted;
-    int64_t rejected[10]; /* by noack.protocol.wire_format.Rejection */
+    int64_t rejected[NOACK_REJECTIONS]; /* by noack.protocol.wire_format.Rejection */
 } noack_reception;
 
 typedef struct { /* a table of numbers that depend on a step's number only */
@@ -575,7 +577,7 @@ typedef struct { /* what a machine does at an input: it writes a row, and may se
     int64_t notes;     /* 1: a plant has written a note */
     int64_t table;     /* enum noack_table_number, of the row */
     int64_t words;     /* of the row */
-    int64_t row[1024]; /* integers, and the bits of doubles */
+    int64_t row[NOACK_MAX_ROW_WORDS]; /* integers, and the bits of doubles */
 } noack_output;
 
 typedef struct { /* plant: actuations are missing, or arrive again */
@@ -620,7 +622,7 @@ typedef struct { /* the machines of one role, of all loops */
     noack_controller *controllers;
     noack_heap_entry *heap; /* (loops,) the next tick of each machine that has one, in the run's time */
     int64_t heap_count;
-    noack_table tables[3];
+    noack_table tables[NOACK_TABLES];
     noack_note *notes;
     int64_t note_places, note_count;
     noack_output output;
@@ -640,7 +642,7 @@ int64_t noack_process_due_ns(const noack_process *process);
    NOACK_DONE, or a noack_question: after the answer the call is repeated. */
 int64_t noack_process_handle(
     noack_process *process, const noack_message *message, int64_t now_ns);
-/* Do the first tick; noack_process_due_ns tells whether there is one. */
+/* Do the first tick; noack_process_due_ns shows whether there is one. */
 int64_t noack_process_tick(noack_process *process, int64_t now_ns);
 
 /* The machine of a loop. */
@@ -705,7 +707,7 @@ enum {
     NOACK_HEADER_BYTES = 32,
     NOACK_TAG_BYTES = 16,
     NOACK_KEY_BYTES = 32,
-    NOACK_DATAGRAM_BYTES = 560 /* of 64 entries */
+    NOACK_DATAGRAM_BYTES = NOACK_HEADER_BYTES + 8 * NOACK_MAX_ENTRIES + NOACK_TAG_BYTES
 };
 
 enum noack_examination { /* what a datagram is; first noack.protocol.wire_format.Rejection */
@@ -730,14 +732,15 @@ typedef struct { /* what the datagrams of a run have in common */
 } noack_wire;
 
 /* Set the key. */
-void noack_wire_key(noack_wire *wire, const uint8_t key[32]);
+void noack_wire_key(noack_wire *wire, const uint8_t key[NOACK_KEY_BYTES]);
 
 /* The tag of at least one byte of content. */
 void noack_wire_tag(
-    const noack_wire *wire, int64_t size_bytes, const uint8_t *content, uint8_t tag[16]);
+    const noack_wire *wire, int64_t size_bytes, const uint8_t *content,
+    uint8_t tag[NOACK_TAG_BYTES]);
 
-/* Write the datagram of a message of at most 64 entries; return its size in bytes. If it is to be
-   encrypted, its vector is still readable, and its tag missing. */
+/* Write the datagram of a message of at most NOACK_MAX_ENTRIES entries; return its size in bytes. If
+   it is to be encrypted, its vector is still readable, and its tag missing. */
 int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, uint8_t *datagram);
 
 /* The number in a header, not verified; -1: the datagram is too short. */
@@ -755,7 +758,8 @@ int64_t noack_wire_examine(
     noack_message *message);
 
 /* Count a datagram as accepted or rejected. */
-void noack_wire_count(noack_reception *reception, int64_t found, const noack_message *message);
+void noack_wire_count(
+    noack_reception *reception, int64_t examination, const noack_message *message);
 
 /* ---- The live driver: waits, receives, drives the machines of a process, sends ------------------- */
 
@@ -768,11 +772,16 @@ enum noack_driver_reason { /* why noack_drive returned; after what Python does, 
     NOACK_DRIVER_NOTHING   /* within the driver only */
 };
 
+enum {
+    NOACK_NAME_BYTES = 40, /* room for a socket address (IPv6: 28 bytes), or a 5-tuple */
+    NOACK_ERRNOS = 256
+};
+
 enum noack_opened { NOACK_NOT_OPENED, NOACK_OPENED, NOACK_NOT_AUTHENTIC };
 
 typedef struct { /* where messages come from */
     int64_t name_bytes; /* 0: there is none */
-    uint8_t name[40];
+    uint8_t name[NOACK_NAME_BYTES];
     int64_t received; /* datagrams from this address */
 } noack_peer;
 
@@ -790,9 +799,9 @@ typedef struct { /* place 0 is the flow of every run, place 1 that of the acknow
     noack_peer sources[2];
     int64_t foreign; /* datagrams from other addresses */
     int64_t sent;
-    int64_t errors[256]; /* datagrams that could not be sent, by errno */
-    int64_t question;    /* a noack_question */
-    int64_t opened;      /* a noack_opened, of the datagram: */
+    int64_t errors[NOACK_ERRNOS]; /* datagrams that could not be sent, by errno */
+    int64_t question;             /* a noack_question */
+    int64_t opened;               /* a noack_opened, of the datagram: */
     uint8_t *datagram;
     int64_t datagram_bytes;
     void *scratch; /* noack_driver_scratch_bytes() bytes, which are 0 at first */
@@ -815,7 +824,8 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns);
 
 /* Add a datagram as if it had just been received; then noack_drive must be called. */
 void noack_driver_add_datagram(
-    noack_driver *driver, const uint8_t name[40], const uint8_t *data, int64_t size_bytes);
+    noack_driver *driver, const uint8_t name[NOACK_NAME_BYTES], const uint8_t *data,
+    int64_t size_bytes);
 
 /* Let woken processes run before the calling thread, whose time slice becomes 100 ms, where Linux has
    time slices of threads (since 6.12). */
@@ -824,10 +834,8 @@ void noack_prefer_others(void);
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 
 enum {
-    NOACK_NAME_BYTES = 40,    /* room for a socket address (IPv6: 28 bytes), or a 5-tuple */
     NOACK_HEADERS_BYTES = 28, /* of IPv4 and UDP; what follows in a packet is its payload */
     NOACK_HEAD_BYTES = 32,    /* of a payload, that a record has */
-    NOACK_ERRNOS = 256,
     NOACK_BLOCK_BYTES = 512,  /* payloads of delayed datagrams are kept in chained blocks */
     NOACK_CHUNK_BLOCKS = 4096, /* number of blocks per allocation */
     NOACK_BUCKETS = 1280      /* of a histogram of times */
@@ -866,8 +874,8 @@ typedef struct { /* what a datagram needs is in the first 64 bytes, a cache line
     int32_t place; /* row of its flows in the link's two states */
     int32_t name_bytes;
     int64_t number; /* number of its flows; -1: the row is free */
-    uint8_t name[40];
-    uint8_t local[40]; /* address of its return path */
+    uint8_t name[NOACK_NAME_BYTES];
+    uint8_t local[NOACK_NAME_BYTES]; /* address of its return path */
 } noack_client;
 
 typedef struct { /* one direction of a link in the relay */
@@ -875,14 +883,15 @@ typedef struct { /* one direction of a link in the relay */
     int64_t keeps; /* 1: datagrams can be delayed or changed */
     int64_t sends;
     int64_t name_bytes;
-    uint8_t name[40];   /* forward: the server's */
-    uint8_t listen[40]; /* the link's address */
-    int64_t full;       /* forward: 1: further clients are refused */
+    uint8_t name[NOACK_NAME_BYTES];   /* forward: the server's */
+    uint8_t listen[NOACK_NAME_BYTES]; /* the link's address */
+    int64_t full;                     /* forward: 1: further clients are refused */
     int64_t refused;
-    int64_t port_unreachable; /* forward: ICMP port-unreachable errors */
-    int64_t delays[1280];     /* histogram of the time from arrival to departure */
-    int64_t lateness[1280];   /* of the time from a delayed datagram's release time to its departure */
-    int64_t errors[256];      /* datagrams that could not be sent or stored, by errno */
+    int64_t port_unreachable;        /* forward: ICMP port-unreachable errors */
+    int64_t delays[NOACK_BUCKETS];   /* histogram of the time from arrival to departure */
+    int64_t lateness[NOACK_BUCKETS]; /* of the time from a delayed datagram's release time to its
+                                        departure */
+    int64_t errors[NOACK_ERRNOS];    /* datagrams that could not be sent or stored, by errno */
 } noack_direction;
 
 typedef struct { /* a datagram that is stored, or about to be sent */
@@ -932,7 +941,7 @@ typedef struct {    /* a datagram that arrives or departs; a tap receives it */
 typedef struct { /* a row of the record's table netem_packet */
     int64_t input, sequence, t_ns, now_ns, flow, fate, consecutive_losses;
     int64_t release_ns, copy_ns, bit, size_bytes;
-    uint8_t head[32];
+    uint8_t head[NOACK_HEAD_BYTES];
 } noack_packet_row;
 
 typedef struct { /* a row of the record's table netem_release */
@@ -1000,7 +1009,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns);
 
 /* Add a datagram as if a socket had just received it; noack_relay_run decides for it. */
 void noack_relay_add_datagram(
-    noack_relay *relay, int64_t socket, const uint8_t name[40], const uint8_t *data,
+    noack_relay *relay, int64_t socket, const uint8_t name[NOACK_NAME_BYTES], const uint8_t *data,
     int64_t size_bytes);
 
 /* The sender of the current datagram, and the place of the socket that received it. */
@@ -1011,7 +1020,8 @@ int64_t noack_relay_receiver(const noack_relay *relay);
 void noack_relay_latest(noack_relay *relay, int64_t direction, int64_t *latest_ns);
 
 /* The table of clients: find the row of a name (-1: none), insert a row, remove it. */
-int64_t noack_client_find(const noack_relay *relay, const uint8_t name[40], int64_t link);
+int64_t noack_client_find(
+    const noack_relay *relay, const uint8_t name[NOACK_NAME_BYTES], int64_t link);
 void noack_client_insert(noack_relay *relay, int64_t row);
 void noack_client_remove(noack_relay *relay, int64_t row);
 
@@ -1052,7 +1062,7 @@ enum noack_node_frame {  /* first, rows of enum noack_table_number, from the nod
 typedef struct { /* of a controller; then H (n, n), K (m, n), x_r (n,), u_r (m,), safe_input (m,) and
                     x_c (n,), as in noack_controller */
     int64_t run_id;
-    uint8_t key[32];
+    uint8_t key[NOACK_KEY_BYTES];
     noack_clock clock;
     noack_machine machine;
     int64_t is_static, has_point, acknowledges, predictions, carries_model;
@@ -1062,7 +1072,7 @@ typedef struct { /* of a controller; then H (n, n), K (m, n), x_r (n,), u_r (m,)
 
 typedef struct { /* datagrams so far */
     int64_t sent, received, foreign; /* foreign: not from the peer's address */
-    int64_t accepted, rejected[10];
+    int64_t accepted, rejected[NOACK_REJECTIONS];
 } noack_node_counts;
 
 /* ---- The network of a run, without sockets ----------------------------------------------------- */
@@ -1072,8 +1082,8 @@ typedef struct { /* a datagram in the network */
     int64_t size_bytes;
     int64_t arrival_ns; /* at the socket; later than its handling: unknown */
     int64_t bit;        /* the bit that the network has flipped; -1: none */
-    uint8_t head[32];   /* its first bytes */
-    noack_message message; /* what it carries, in a simulation */
+    uint8_t head[NOACK_HEAD_BYTES]; /* its first bytes */
+    noack_message message;          /* what it carries, in a simulation */
 } noack_datagram;
 
 typedef struct { /* a delayed datagram or copy */
@@ -1246,7 +1256,7 @@ typedef struct { /* the replay of a machine, or of the network */
     int64_t difference;   /* enum noack_difference: the first one */
     int64_t difference_at; /* at which input */
     int64_t other_ns;      /* the time before, or the deadline; INT64_MAX: there is none */
-    uint8_t replayed[8192]; /* the row that the machine wrote then */
+    uint8_t replayed[8 * NOACK_MAX_ROW_WORDS]; /* the row that the machine wrote then */
     /* What was sent. Of a message: flow, sequence number, time, vector and error level. Of a datagram:
        flow and head. There is room for a message of each input, or for two datagrams. */
     int64_t sent_width, sent_count;
@@ -1297,13 +1307,13 @@ typedef struct {
 } noack_fmu_pointer;
 
 typedef struct { /* begins an image */
-    uint8_t tag[16];   /* check sum of all that follows: noack_wire_tag with the key 0 */
-    char sources[32];  /* noack_sources() of the library that it is for */
-    int64_t bytes;     /* of the image */
+    uint8_t tag[NOACK_TAG_BYTES]; /* check sum of all that follows: noack_wire_tag with the key 0 */
+    char sources[32];             /* noack_sources() of the library that it is for */
+    int64_t bytes;                /* of the image */
     int64_t pointer_count, pointers_at; /* (pointer_count,) of noack_fmu_pointer */
     int64_t channel_at, controller_at;  /* one of them is 0 */
     int64_t n, packets;                 /* packets: most of them that can arrive in a step */
-    noack_fmu_values values[17];
+    noack_fmu_values values[NOACK_FMU_VARIABLES];
     int64_t mode, now_ns;
     int64_t taken;  /* packets that have been sent, or of those that have arrived */
     int64_t before; /* arrivals before this step */

@@ -1,10 +1,10 @@
-/* A bottleneck that chooses, whenever its link is free, which of the waiting packets it sends next:
-   that with the smallest key. So a departure depends on later arrivals.
+/* The scheduler of a bottleneck: whenever the link is free, it sends the waiting packet with the
+   smallest key. So a departure depends on later arrivals.
 
    Whether a packet is lost is decided at its arrival all the same, and so is the earliest time at
-   which it can leave. What is not lost waits in a heap (a skew heap: Sleator and Tarjan, 1986),
-   whose nodes the relay or the channel has, one for each place of a stored datagram. The packet
-   that is being sent has left the heap; its departure is known. At its departure, and at each
+   which it can leave. A packet that is not lost waits in a heap (a skew heap: Sleator and Tarjan,
+   1986), whose nodes the relay or the channel has, one for each place of a stored datagram. The
+   packet being sent has left the heap; its departure is known. At its departure, and at each
    arrival, what could begin until then begins (serve). This is soon enough: what begins at a time
    depends on earlier arrivals only; and no packet leaves before it has been sent, so that while
    packets wait, there will be a departure. (If a clock ran backward, so that there is none, the
@@ -13,8 +13,8 @@
 
    The guarantee needs none of these times, only an order: a flow's packets leave in the order of
    their arrival. A packet that arrives with a smaller key than those of its flow that wait gives it
-   to them. So the keys of what waits do not decrease along a flow: its packets begin in this order,
-   and none is given a departure before that of an earlier one (first_release_ns, the last departure
+   to them. So the keys of a flow's waiting packets do not decrease: they begin in this order, and
+   none is given a departure before that of an earlier one (first_release_ns, the last departure
    of the flow). So no packet is ever stale, whatever the other stages do: the losses are those that
    are decided at the arrivals, which noack_must_pass allows, and no packet needs to be held back
    for others. */
@@ -48,7 +48,7 @@ static int64_t merge(noack_waiting *waiting, int64_t a, int64_t b) {
     return root;
 }
 
-/* Give what waits at a place a smaller key. */
+/* Give the waiting packet at a place a smaller key. */
 static void lower_key(noack_queue *queue, noack_waiting *waiting, int64_t place, int64_t key) {
     noack_waiting *waiter = &waiting[place];
     waiter->key = key;

@@ -167,11 +167,11 @@ static int64_t examine_header(
 }
 
 static int has_tag(const noack_wire *wire, const uint8_t *datagram, int64_t content_bytes) {
-    uint64_t tag[2], found[2];
+    uint64_t tag[2], received[2];
     noack_wire_tag(wire, content_bytes, datagram, (uint8_t *)tag);
-    memcpy(found, datagram + content_bytes, sizeof found);
+    memcpy(received, datagram + content_bytes, sizeof received);
     /* Both words are compared in any case: the time must not depend on the first. */
-    return ((tag[0] ^ found[0]) | (tag[1] ^ found[1])) == 0;
+    return ((tag[0] ^ received[0]) | (tag[1] ^ received[1])) == 0;
 }
 
 int64_t wire_examine_message(
@@ -192,9 +192,9 @@ int64_t wire_examine_message(
 int64_t noack_wire_examine(
     const noack_wire *wire, const noack_reception *reception, int64_t loop, const uint8_t *datagram,
     int64_t size_bytes, int64_t from_peer, int64_t opened, noack_message *message) {
-    int64_t found = examine_header(wire, reception, loop, datagram, size_bytes);
-    if (found != NOACK_ACCEPTED)
-        return found;
+    int64_t examination = examine_header(wire, reception, loop, datagram, size_bytes);
+    if (examination != NOACK_ACCEPTED)
+        return examination;
     if (wire->encrypted && !opened)
         return NOACK_ENCRYPTED;
     if (!wire->encrypted && !has_tag(wire, datagram, size_bytes - NOACK_TAG_BYTES))
@@ -209,11 +209,12 @@ int64_t noack_wire_examine(
     return wire_examine_message(reception, from_peer, message);
 }
 
-void noack_wire_count(noack_reception *reception, int64_t found, const noack_message *message) {
-    if (found == NOACK_ACCEPTED) {
+void noack_wire_count(
+    noack_reception *reception, int64_t examination, const noack_message *message) {
+    if (examination == NOACK_ACCEPTED) {
         reception->newest = message->sequence;
         reception->accepted++;
-    } else if (0 <= found && found < NOACK_REJECTIONS) {
-        reception->rejected[found]++;
+    } else if (0 <= examination && examination < NOACK_REJECTIONS) {
+        reception->rejected[examination]++;
     }
 }

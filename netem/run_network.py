@@ -19,7 +19,7 @@ from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETT
 from noack.protocol.roles import Notice, Record, Start
 from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName, packed_name
-from noack.runtime.real_time_loop import RecordSink, RowSink
+from noack.runtime.drivers.real_time_loop import RecordSink, RowSink
 from noack.runtime.udp_sockets import MAX_UDP_BYTES, CountingSocket, errors_by_text
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario

@@ -38,7 +38,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import address_text
 from noack.runtime.command_line import LogFormat, Signals, failed, log_event, log_format
 from noack.runtime.connections.metrics_server import OPTION, metrics_server, require_package
-from noack.runtime.real_time_loop import realtime
+from noack.runtime.drivers.realtime_settings import realtime
 
 _FIFO_PRIORITY = 50
 _SPIN_NS = 50_000

@@ -108,7 +108,7 @@ class Watchdog:
     K: Matrix | None = None  # Its gain, (m, n)
 
     @property
-    def is_predictive(self) -> bool:
+    def carries_model(self) -> bool:
         """Whether actuations carry the controller's model state."""
         return self.policy == "model"
 
@@ -120,7 +120,7 @@ class Watchdog:
                 "watchdog": _POLICIES[self.policy],
                 "timeout_ns": self.timeout_ns,
                 "notice_ns": max(self.notice_ns, self.timeout_ns),
-                "carries_model": self.is_predictive,
+                "carries_model": self.carries_model,
                 "K": self.K,
             },
         )
@@ -162,7 +162,7 @@ class Plant(MachinePart):
         predictions: number of inputs of an actuation.
         input_period_ns: time between them, the period of the controller.
         disturbance: is added to u and to ẋ; None if there is none.
-        measuring: the measurement model; None if y = x.
+        measurement: the measurement model; None if y = x.
         reports_inputs: whether a measurement also carries the inputs of the steps since the last
             measurement. These are the latched inputs, without the disturbance.
         section: the scenario's table of it, by which loops with the same plant are known.
@@ -177,7 +177,7 @@ class Plant(MachinePart):
     predictions: int = 1
     input_period_ns: int = 1
     disturbance: Disturbance | None = None
-    measuring: MeasurementModel | None = None
+    measurement: MeasurementModel | None = None
     reports_inputs: bool = False
     section: PlantSection | None = None
 
@@ -190,7 +190,7 @@ class Plant(MachinePart):
         return RecordShape(
             len(self.system.x),
             self.inputs,
-            predictive=self.watchdog.is_predictive,
+            carries_model=self.watchdog.carries_model,
             predictions=self.predictions,
             internal=len(self.system.z),
             disturbed_input=d > 0,
@@ -210,12 +210,12 @@ class Plant(MachinePart):
             n=n,
             m=m,
             flow=Flow.ACTUATION,
-            entries=m * self.predictions + n * self.watchdog.is_predictive,
+            entries=m * self.predictions + n * self.watchdog.carries_model,
             period_ns=self.period_ns,
             horizon_ns=self.horizon_ns,
         )
         sources, reported = m + n * shape.disturbed_state, self.measure_every * self.reports_inputs
-        C = None if self.measuring is None else self.measuring.C
+        C = None if self.measurement is None else self.measurement.C
         memory.fill(plant, {
             "internal": shape.internal, "system": core.NOACK_USER, "sources": sources,
             "C": C, "p": n if C is None else len(C),
@@ -239,7 +239,7 @@ class Plant(MachinePart):
         self.set_drawn_values(plant, memory)
         self.watchdog.fill(plant, memory, self.period_ns)
         widths = (0, 0) if self.disturbance is None else self.disturbance.widths
-        noisy = self.measuring is not None and self.measuring.is_noisy
+        noisy = self.measurement is not None and self.measurement.is_noisy
         for name, width in (
             ("at_input", widths[0]),
             ("at_state", widths[1]),
@@ -290,10 +290,10 @@ class Plant(MachinePart):
                 if signal.width:
                     signal.first = first
                     reals_at(signal.values, BLOCK, signal.width)[:] = values
-        if self.measuring is not None and plant.noise.width:
+        if self.measurement is not None and plant.noise.width:
             number = plant.measurements - plant.measurements % BLOCK
             plant.noise.first = number
-            reals_at(plant.noise.values, BLOCK, plant.noise.width)[:] = self.measuring.noise(number)
+            reals_at(plant.noise.values, BLOCK, plant.noise.width)[:] = self.measurement.noise(number)
 
 
 def plants_of(
@@ -318,7 +318,7 @@ def _part(resolved: Scenario) -> Plant:
         predictions=resolved.controller.predictions,
         input_period_ns=resolved.timing.controller_period_ns,
         disturbance=disturbance_of(resolved),
-        measuring=measurement_model_of(resolved),
+        measurement=measurement_model_of(resolved),
         reports_inputs=resolved.observer is not None,
         section=resolved.plant,
     )
@@ -326,13 +326,13 @@ def _part(resolved: Scenario) -> Plant:
 
 def _with_draws_of(plant: Plant, resolved: Scenario) -> Plant:
     is_repeated = isinstance(plant.system, LinearSystem) and resolved.plant is plant.section
-    if is_repeated and plant.disturbance is None and plant.measuring is None:
+    if is_repeated and plant.disturbance is None and plant.measurement is None:
         return plant
     return replace(
         plant,
         system=system_of(resolved),
         disturbance=disturbance_of(resolved),
-        measuring=measurement_model_of(resolved),
+        measurement=measurement_model_of(resolved),
     )
 
 

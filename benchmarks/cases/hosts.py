@@ -26,9 +26,9 @@ from typing import NamedTuple
 from benchmarks.programs import in_new_process
 from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, quantiles_us, say
 from noack.runtime.address import Address
+from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.host_clocks.clock_offset import ClockOffset
 from noack.runtime.host_clocks.time_exchange import TimeClient, TimeReference, answering
-from noack.runtime.real_time_loop import realtime
 from tests.attacks.attacked import Run
 from tests.attacks.kinds import enter_namespace
 from tests.helpers.two_hosts import DrivenClocks, TwoHosts, two_hosts

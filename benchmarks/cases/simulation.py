@@ -47,7 +47,7 @@ from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.wire_format import Flow
-from noack.runtime.real_time_loop import realtime
+from noack.runtime.drivers.realtime_settings import realtime
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate

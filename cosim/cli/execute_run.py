@@ -28,7 +28,7 @@ with lazy_modules():
     from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
     from noack.core import core_library
     from noack.protocol import roles
-    from noack.runtime import address, control_plane
+    from noack.runtime import active_runs, address
     from noack.runtime.connections import metrics_server
     from noack.scenario import link_load, resolution, scenario
     from noack.theory.certificates import assumptions
@@ -170,7 +170,7 @@ def warn_of_violations(loaded: "scenario.Scenario") -> None:
 def warn_of_other_runs() -> None:
     """Print on standard error which runs are active: each may make the others late."""
     try:
-        other_runs = control_plane.active_runs()
+        other_runs = active_runs.active_runs()
     except PeerError:  # a damaged file of another run must not prevent this one
         return
     for run in other_runs:

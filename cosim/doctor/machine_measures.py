@@ -28,8 +28,9 @@ from cosim.record.run_directory import environment
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
 from noack.core.process_limits import python_command
+from noack.runtime.active_runs import RUNS
 from noack.runtime.address import LOOPBACK
-from noack.runtime.control_plane import RUNS, answer_to, cause_of, open_session
+from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 from noack.runtime.private_folder import open_private
 from noack.runtime.udp_sockets import bind
 from noack.scenario.scenario import Scenario

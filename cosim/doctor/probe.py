@@ -13,8 +13,9 @@ from noack.core.clock import NS_PER_S, RunClock
 from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Wire
 from noack.runtime.address import LOOPBACK
-from noack.runtime.live_driver import LiveDriver
-from noack.runtime.real_time_loop import RecordSink, realtime, run_loop
+from noack.runtime.drivers.live_driver import LiveDriver
+from noack.runtime.drivers.real_time_loop import RecordSink, run_loop
+from noack.runtime.drivers.realtime_settings import realtime
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from plant_server.plant import plants_of

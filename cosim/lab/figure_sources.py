@@ -21,7 +21,7 @@ from cosim.lab.recorded_views import RunView, compared, recorded_view, replayed
 from cosim.output.run_verdict import DOUBTFUL, NEUTRAL, VerdictLine, transmission_line
 from noack.core.errors import NoackError
 from noack.core.number_format import number
-from noack.runtime.control_plane import find_run, request_change
+from noack.runtime.active_runs import find_run, request_change
 
 Changed = Callable[[], Awaitable[None]]
 _REJOIN_S = 5.0

@@ -20,6 +20,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.core.process_limits import cores
 from noack.impairments.loss_prediction import found_probabilities
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES, ROLES
+from noack.runtime.connections.zenoh_session import header_of, next_payload
 from noack.runtime.control_messages import (
     Admission,
     AdmissionRequest,
@@ -31,9 +32,9 @@ from noack.runtime.control_messages import (
     RunStart,
     parse_message,
 )
-from noack.runtime.control_plane import ControlPlane, header_of, next_payload
-from noack.runtime.join_ticket import Ticket
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.life_cycle import HORIZON, LAUNCHED_LOST_S, LOST_AFTER_S, Event, LifeCycle, Side, State
+from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
@@ -59,8 +60,8 @@ _START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
 longer one is for processes on other hosts, and for a loaded machine."""
 
 
-class AdmissionPass(NamedTuple):
-    """Which roles a pass admits, and until when on the monotonic clock."""
+class TokenScope(NamedTuple):
+    """The roles that a join token admits, and until when on the monotonic clock."""
 
     roles: Collection[str] = ROLES
     until_s: float = float("inf")
@@ -90,16 +91,16 @@ class Coordinator:
     """Admission, start barrier, liveliness and stop of one run.
 
     Args:
-        ticket: the run's ticket.
+        descriptor: of the run.
         launched: roles of the processes that the launcher has started.
 
     Raises:
         PeerError: the control plane cannot be started.
     """
 
-    def __init__(self, ticket: Ticket, launched: Collection[str] = ()) -> None:
+    def __init__(self, descriptor: RunDescriptor, launched: Collection[str] = ()) -> None:
         self._launched = launched
-        self.plane = ControlPlane(ticket, COORDINATOR, listen=True)
+        self.plane = ControlPlane(descriptor, COORDINATOR, listen=True)
         session, key = self.plane.session, self.plane.key
         self._admissions = session.declare_queryable(key("admit", "*"), FifoChannel(64))
         self._joins = session.declare_queryable(key("join", "*"), FifoChannel(64))
@@ -107,9 +108,9 @@ class Coordinator:
         self._ends = session.declare_subscriber(key("ended", "*", "*"), RingChannel(256))
         self._progress = session.declare_subscriber(key("progress"), RingChannel(1))
         self._change_queries = session.declare_queryable(key("runtime_parameters"), FifoChannel(64))
-        self._changes = ChangeRequests(ticket, self.plane)
-        self._speed = ticket.scenario.speed
-        self.passes = {ticket.admission_pass: AdmissionPass()}
+        self._changes = ChangeRequests(descriptor, self.plane)
+        self._speed = descriptor.scenario.speed
+        self.join_tokens = {descriptor.join_token: TokenScope()}
         self._clock: RunClock | None = None
         self._admitted: dict[tuple[str, str], _Member] = {}
         """By role and instance."""
@@ -273,7 +274,7 @@ class Coordinator:
         request = parse_message(AdmissionRequest, _payload(query))
         if role not in ROLES:
             raise PeerError("a run has no such process")
-        self._require_pass(role, request.admission_pass)
+        self._require_token(role, request.join_token)
         before, failure = self._vacant(role), self._replaceable.get(role)
         if self._clock is not None and (before is None or failure is None):
             raise PeerError("the run has started without it")
@@ -284,14 +285,14 @@ class Coordinator:
         self._admitted[role, request.instance] = member
         self.plane.answer(query, admission)
 
-    def _require_pass(self, role: str, shown: str) -> None:
-        """Raise PeerError unless a pass admits a role now."""
-        admission = self.passes.get(shown)
-        if admission is None:
-            raise PeerError("its ticket or invitation is not of this run")
-        if role not in admission.roles:
-            raise PeerError(f"its invitation is for the {', '.join(admission.roles)} only")
-        if time.monotonic() > admission.until_s:
+    def _require_token(self, role: str, shown: str) -> None:
+        """Raise PeerError unless a join token admits a role now."""
+        scope = self.join_tokens.get(shown)
+        if scope is None:
+            raise PeerError("its run descriptor or invitation is not of this run")
+        if role not in scope.roles:
+            raise PeerError(f"its invitation is for the {', '.join(scope.roles)} only")
+        if time.monotonic() > scope.until_s:
             raise PeerError("its invitation has expired")
 
     def _join(self, role: str, query: zenoh.Query) -> None:
@@ -381,18 +382,18 @@ def _payload(query: zenoh.Query) -> bytes:
 class ChangeRequests:
     """The changes of a run."""
 
-    def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
-        self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
+    def __init__(self, descriptor: RunDescriptor, plane: ControlPlane) -> None:
+        self._scenario, self._run_dir = descriptor.scenario, descriptor.run_dir
         self._plane = plane
-        self._schedule = ChangeSchedule[None](ticket.scenario)
+        self._schedule = ChangeSchedule[None](descriptor.scenario)
         self._entries = {
-            section.name: ChangeSchedule[None](loop_scenario(ticket.scenario, section))
-            for section in loop_sections(ticket.scenario)
+            section.name: ChangeSchedule[None](loop_scenario(descriptor.scenario, section))
+            for section in loop_sections(descriptor.scenario)
         }
         """The changes of the loops of each entry of [[loops]], by its name."""
         self.announced: tuple[ChangeAnnouncement, ...] = ()
         """Announcements of all changes so far."""
-        for change in scheduled(ticket.scenario):
+        for change in scheduled(descriptor.scenario):
             self._add(change, 0, "in the scenario")
 
     def answer(self, request: bytes, clock: Callable[[], int], obstacle: str | None) -> ChangeReply:

@@ -40,11 +40,11 @@ from noack.core.number_format import byte_size
 from noack.core.process_limits import cores as usable_cores
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import PLANT, RECORDER, ROLES
+from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, stop_reason
-from noack.runtime.control_plane import registered_run, run_name
-from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, ticket_file
 from noack.runtime.life_cycle import HORIZON
+from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, invitation_file, new_descriptor
 from noack.scenario.resolution import resolve_run, resolved_loops, tables_of
 from noack.scenario.scenario import Scenario
 
@@ -99,31 +99,31 @@ def launch(
         signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
-        ticket = new_ticket(resolved, run_dir.resolve(), launched=True)
+        descriptor = new_descriptor(resolved, run_dir.resolve(), launched=True)
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
-        _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
+        _publish_run(stack, descriptor, session)  # first: its file leads to a killed run's socket
         away = {} if listening is None else listening.hosts
-        coordinator = Coordinator(ticket, [role for role in spawn if role not in away])
+        coordinator = Coordinator(descriptor, [role for role in spawn if role not in away])
         stack.callback(coordinator.close)
         helpers = stack.enter_context(lasting_helpers(resolved))
         watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
         with _no_directory_if_refused(run_dir):
-            listener = _open_to_others(stack, ticket, session, listening, coordinator)
+            listener = _open_to_others(stack, descriptor, session, listening, coordinator)
         remote = None
         if listening is not None and listener is not None:
-            ticket = ticket.model_copy(update={"host": listening.address[0]})
+            descriptor = descriptor.model_copy(update={"host": listening.address[0]})
             remote = RemoteStart(away, listener.invitation.model_dump_json())
             watcher.listening(address_text(listener.address), listening)
-        children = ChildProcesses(ticket, run_dir, spawn, server, remote)
+        children = ChildProcesses(descriptor, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
-        run = _Run(ticket, run_dir, coordinator, children, watcher, listener and listener.notices)
+        run = _Run(descriptor, run_dir, coordinator, children, watcher, listener and listener.notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
-    return RunEndingWithHelpers(run_dir, ticket.run_id, status, reason, startup_s, helpers)
+    return RunEndingWithHelpers(run_dir, descriptor.run_id, status, reason, startup_s, helpers)
 
 
 def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str]) -> Scenario:
@@ -139,7 +139,7 @@ def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str]) -> Scenario:
 
 def _open_to_others(
     stack: contextlib.ExitStack,
-    ticket: Ticket,
+    descriptor: RunDescriptor,
     session: str | None,
     listening: "remote_access.ListenSettings | None",
     coordinator: Coordinator,
@@ -147,11 +147,11 @@ def _open_to_others(
     """Let processes join that are started by hand; return how those of other hosts join."""
     listener = None
     if listening is not None:
-        ticket = ticket.model_copy(update={"host": listening.address[0]})
-        listener = stack.enter_context(remote_access.open_to_hosts(listening, ticket, coordinator))
+        descriptor = descriptor.model_copy(update={"host": listening.address[0]})
+        listener = stack.enter_context(remote_access.open_to_hosts(listening, descriptor, coordinator))
     if session is not None:
-        by_hand = ticket.model_copy(update={"launched": False})
-        stack.enter_context(ticket_file(by_hand, session))
+        by_hand = descriptor.model_copy(update={"launched": False})
+        stack.enter_context(descriptor_file(by_hand, session))
     if listener is not None and listening is not None and listening.invitation is not None:
         # last: it replaces that of an earlier run
         stack.enter_context(invitation_file(listening.invitation, listener.invitation))
@@ -168,10 +168,10 @@ def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
         raise
 
 
-def _publish_run(stack: contextlib.ExitStack, ticket: Ticket, session: str | None) -> None:
+def _publish_run(stack: contextlib.ExitStack, descriptor: RunDescriptor, session: str | None) -> None:
     """Let `noack set` find the run; without that the run goes on."""
     try:
-        stack.enter_context(registered_run(ticket, session))
+        stack.enter_context(registered_run(descriptor, session))
     except NoackError as error:
         print(f"noack: warning: `noack set` cannot reach this run: {error}", file=sys.stderr)
 
@@ -181,7 +181,7 @@ class _Run:
 
     def __init__(
         self,
-        ticket: Ticket,
+        descriptor: RunDescriptor,
         run_dir: Path,
         coordinator: Coordinator,
         children: ChildProcesses,
@@ -189,7 +189,7 @@ class _Run:
         notices: "SimpleQueue[str] | None" = None,
     ) -> None:
         self._notices = notices
-        self._scenario, self._run_id = ticket.scenario, ticket.run_id
+        self._scenario, self._run_id = descriptor.scenario, descriptor.run_id
         self._run_dir = run_dir
         self._coordinator = coordinator
         self._children = children
@@ -200,7 +200,7 @@ class _Run:
         self._joined = 0
         self._limit = WaitLimit(self._start_within_s())
         """How long the launcher still waits: for the start, for the end, or for the stop."""
-        self._policy = RestartPolicy(ticket.scenario, coordinator, children, watcher)
+        self._policy = RestartPolicy(descriptor.scenario, coordinator, children, watcher)
 
     def watch(self, signals: Signals, store: Callable[[ExitStatus, str], None]) -> Failure:
         """Follow the run to its end; return its exit status and the reason of the end.

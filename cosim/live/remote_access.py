@@ -23,15 +23,16 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from cosim.live.coordinator import AdmissionPass, Coordinator
+from cosim.live.coordinator import Coordinator, TokenScope
 from cosim.live.processes.child_processes import Host, load_hosts
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.roles import LOOP_ROLES
+from noack.runtime.active_runs import RUNS, run_name
 from noack.runtime.address import Address, address_text, family_of, parse_address
 from noack.runtime.connections.coordinator_link import InvitationProof, Protection, forwarding, tls_context
-from noack.runtime.control_plane import RUNS, run_name, socket_path
+from noack.runtime.connections.zenoh_session import socket_path
 from noack.runtime.host_clocks.time_exchange import TimeReference, answering
-from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass, own_host
+from noack.runtime.run_descriptor import RemoteAccess, RunDescriptor, new_join_token, own_host
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario import Scenario
 
@@ -39,7 +40,7 @@ _BACKLOG = 4096
 _FLOOD_PER_S = 100
 """Connections without an invitation that are a flood."""
 _VALID = datetime.timedelta(days=3650)
-"""A run may be long, and the hosts' dates may differ; an invitation ends by its pass."""
+"""A run may be long, and the hosts' dates may differ; an invitation ends with its join token."""
 _CALM_S, _MOST_CALM_S = 3, 60
 """Time without a flood, after which it is over; and the longest such time."""
 
@@ -61,7 +62,7 @@ class RunListener(NamedTuple):
     """A run that is open to other hosts."""
 
     address: Address
-    invitation: Ticket
+    invitation: RunDescriptor
     notices: SimpleQueue[str]
     """Lines for the person who watches the run: floods."""
 
@@ -120,20 +121,21 @@ def _listen(address: Address) -> socket.socket:
 
 @contextmanager
 def open_to_hosts(
-    listening: ListenSettings, ticket: Ticket, coordinator: Coordinator
+    listening: ListenSettings, descriptor: RunDescriptor, coordinator: Coordinator
 ) -> Iterator[RunListener]:
     """Listen for processes of other hosts meanwhile, and make their invitation.
 
     Raise CallerError if the address cannot be used.
     """
-    keys, path = new_tls_keys(listening.address[0]), socket_path(RUNS, run_name(ticket.run_id))
+    keys, path = new_tls_keys(listening.address[0]), socket_path(RUNS, run_name(descriptor.run_id))
     with ExitStack() as stack:
         endpoint = stack.enter_context(_listen(listening.address))
         host, port = endpoint.getsockname()[:2]
         floods = ConnectionFloodWatch()
-        protection = Protection(coordinator_context(keys), InvitationProof(ticket.key), floods.next_interval)
+        proof = InvitationProof(descriptor.key)
+        protection = Protection(coordinator_context(keys), proof, floods.next_interval)
         stack.enter_context(forwarding(endpoint, lambda: asyncio.open_unix_connection(path), protection))
-        times = TimeReference((host, listening.address[1]), ticket.key)
+        times = TimeReference((host, listening.address[1]), descriptor.key)
         stack.callback(times.close)
         stack.enter_context(answering(times))
         until = datetime.datetime.now().astimezone() + datetime.timedelta(seconds=listening.valid_s)
@@ -144,16 +146,16 @@ def open_to_hosts(
             **keys.joining._asdict(),
             valid_until=until.isoformat(timespec="seconds"),
         )
-        admission_pass = new_admission_pass()
+        join_token = new_join_token()
         roles = LOOP_ROLES if listening.role is None else (listening.role,)
-        coordinator.passes[admission_pass] = AdmissionPass(roles, time.monotonic() + listening.valid_s)
+        coordinator.join_tokens[join_token] = TokenScope(roles, time.monotonic() + listening.valid_s)
         invited = {
             "launched": False,
-            "admission_pass": admission_pass,
+            "join_token": join_token,
             "remote": remote,
             "time_reference": times.address,
         }
-        yield RunListener((host, port), ticket.model_copy(update=invited), floods.lines)
+        yield RunListener((host, port), descriptor.model_copy(update=invited), floods.lines)
 
 
 class ConnectionFloodWatch:

@@ -43,7 +43,7 @@ const char *noack_driver_check(const noack_driver *driver) {
         return "receiver_count: not from 0 to 2";
     for (int k = 0; k < 2; k++)
         if (!is_name(&driver->sources[k]))
-            return "name_bytes: not from 0 to 32";
+            return "name_bytes: below 0 or above NOACK_NAME_BYTES";
     return NULL;
 }
 
@@ -98,16 +98,16 @@ static int64_t examine(noack_driver *driver) {
     noack_machine *machine = noack_process_machine(driver->process, max_of(loop, 0));
     noack_reception *reception = is_answer ? &machine->acknowledgements : &machine->received;
     own->now_ns = run_time_ns(&driver->clock);
-    int64_t found = NOACK_BAD_TAG;
+    int64_t examination = NOACK_BAD_TAG;
     if (driver->opened != NOACK_NOT_AUTHENTIC)
-        found = noack_wire_examine(
+        examination = noack_wire_examine(
             &driver->wire, reception, max_of(loop, 0), datagram, size_bytes,
             is_peer(current->name, &driver->sources[is_answer]), driver->opened, &own->message);
-    if (found == NOACK_ENCRYPTED)
+    if (examination == NOACK_ENCRYPTED)
         return NOACK_DRIVER_OPEN;
     driver->opened = NOACK_NOT_OPENED;
-    noack_wire_count(reception, found, &own->message);
-    own->is_accepted = found == NOACK_ACCEPTED;
+    noack_wire_count(reception, examination, &own->message);
+    own->is_accepted = examination == NOACK_ACCEPTED;
     return NOACK_DRIVER_NOTHING;
 }
 

@@ -74,7 +74,7 @@ static void load(noack_segments *segments, int64_t run) {
     copy(n, segments->x_c + run * n, controller->x_c);
     controller->model_ns = t_ns;
     controller->machine.step = first_tick(&controller->machine, t_ns);
-    /* The update of the first step tells the controller a state. */
+    /* The controller has a state from the update of the first step on. */
     controller->knows_state =
         segments->known_start || segments->sent[run * segments->places] != 0.0;
 }

@@ -136,9 +136,9 @@ static void examine_flipped(
     int64_t loop = noack_wire_loop(data, size_bytes);
     loop = loop < simulation->loops ? loop : 0; /* its receiver rejects a datagram of no loop */
     noack_reception *reception = reception_of(simulation, role, datagram->message.flow, loop);
-    int64_t found = noack_wire_examine(
+    int64_t examination = noack_wire_examine(
         &simulation->wire, reception, loop, data, size_bytes, FROM_PEER, OPENED, &message);
-    noack_wire_count(reception, found, &message);
+    noack_wire_count(reception, examination, &message);
 }
 
 /* Let a machine receive the first datagram. */
@@ -150,20 +150,20 @@ static int64_t receive(noack_simulation *simulation, int64_t role, noack_datagra
         return NOACK_DONE;
     }
     noack_reception *reception = reception_of(simulation, role, message->flow, message->loop);
-    int64_t found = wire_examine_message(reception, FROM_PEER, message);
+    int64_t examination = wire_examine_message(reception, FROM_PEER, message);
     if (message->entries != reception->entries)
-        found = NOACK_BAD_LENGTH;
-    if (found == NOACK_ACCEPTED) {
+        examination = NOACK_BAD_LENGTH;
+    if (examination == NOACK_ACCEPTED) {
         noack_process *process = simulation->processes[role];
         int64_t question = noack_process_handle(process, message, simulation->now_ns);
         if (question != NOACK_DONE)
             return ask(simulation, role, question);
-        noack_wire_count(reception, found, message);
+        noack_wire_count(reception, examination, message);
         remove_first(simulation);
         send(simulation, &process->output);
         return NOACK_DONE;
     }
-    noack_wire_count(reception, found, message);
+    noack_wire_count(reception, examination, message);
     remove_first(simulation);
     return NOACK_DONE;
 }

@@ -98,15 +98,15 @@ int is_quadratic(const noack_exact *exact) {
 }
 
 /* noack_exact_check() checks the numbers once: all that the other files assume. */
-static int is_positive(double number) { return number >= 0.0 && number < INFINITY; }
+static int is_finite_nonnegative(double number) { return number >= 0.0 && number < INFINITY; }
 
 static const char *check_exact_rule(const noack_exact *exact) {
     const noack_trigger_rule *rule = &exact->rule;
     const char *wrong = check_rule(rule, NEVER_NS);
     if (wrong != NULL)
         return wrong;
-    if (!is_positive(rule->level) || !is_positive(rule->rate_per_s) || !is_positive(rule->floor)
-        || !is_positive(rule->decay_per_s))
+    if (!is_finite_nonnegative(rule->level) || !is_finite_nonnegative(rule->rate_per_s)
+        || !is_finite_nonnegative(rule->floor) || !is_finite_nonnegative(rule->decay_per_s))
         return "a trigger rule has a threshold or a rate below 0";
     if (rule->longest_ns < rule->shortest_ns)
         return "a trigger rule has times out of range";
@@ -121,8 +121,8 @@ const char *noack_exact_check(const noack_exact *exact) {
         return "a loop has no state or input, or more than 64";
     if (exact->H == NULL || exact->K == NULL || exact->scratch == NULL)
         return "a simulation has no matrix or no memory";
-    if (!is_positive(exact->horizon_s) || !is_positive(exact->settle)
-        || !is_positive(exact->fading_per_s) || !(exact->fading_until_s >= 0.0))
+    if (!is_finite_nonnegative(exact->horizon_s) || !is_finite_nonnegative(exact->settle)
+        || !is_finite_nonnegative(exact->fading_per_s) || !(exact->fading_until_s >= 0.0))
         return "a simulation has a time, a share or a rate below 0";
     if (!is_between(0, exact->most_events, INT64_MAX)
         || !is_between(NOACK_EXACT_ROW, exact->measure, NOACK_EXACT_TIMES))

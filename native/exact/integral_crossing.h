@@ -31,7 +31,7 @@ static double first_excess(
     const double *curve, int p, const level_search *search, double *integral) {
     const double tolerance = 1e-13, shortest = 1e-9; /* shortest interval: share of the piece */
     const int most_intervals = 100000, bisections = 60;
-    double end_s = search->end_s, s = 0.0, step = end_s, low_s, high_s;
+    double end_s = search->end_s, s = 0.0, step = end_s;
     if (*integral > search->level)
         return 0.0;
     for (int i = 0; i < most_intervals; i++) {
@@ -43,7 +43,8 @@ static double first_excess(
         if (error > tolerance * (*integral + gained) && step > shortest * end_s) {
             step = 0.5 * (next_s - s);
         } else if (*integral + gained > search->level * fixed_exp(-search->rate * next_s)) {
-            for (int turn = (low_s = s, high_s = next_s, 0); turn < bisections; turn++) {
+            double low_s = s, high_s = next_s;
+            for (int turn = 0; turn < bisections; turn++) {
                 middle = 0.5 * (low_s + high_s);
                 if (!(low_s < middle && middle < high_s))
                     break;

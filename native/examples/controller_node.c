@@ -1,7 +1,7 @@
 /* A controller of noack without Python: the core's steps, and what a board has to provide, here by
    POSIX: a UDP socket in each direction, a monotonic clock, and a stream to noack (docs/node.md).
 
-   It sends the version of the settings, takes them with its sockets, and works until its standard
+   It sends the version of the settings, reads them with its sockets, and works until its standard
    input ends. Its memory is fixed. Nothing here computes: that is in ../loop and ../wire.c. */
 #define _GNU_SOURCE
 #include <errno.h>
@@ -57,7 +57,7 @@ static int64_t wall_ns(void) {
 static void flush(int flags) {
     ssize_t sent = send(STDOUT_FILENO, pending, pending_bytes, MSG_NOSIGNAL | flags);
     if (sent < 0 && errno != EAGAIN && errno != EINTR)
-        exit(0); /* nobody reads it any more */
+        exit(0); /* noack has closed the stream */
     sent = sent > 0 ? sent : 0;
     pending_bytes -= (size_t)sent;
     memmove(pending, pending + sent, pending_bytes);
@@ -82,38 +82,38 @@ static void put_counts(void) {
 }
 
 /* Read all bytes; at the end of the stream, the run has ended. */
-static void take(void *content, int64_t bytes) {
+static void read_exactly(void *content, int64_t bytes) {
     for (uint8_t *place = content; bytes > 0;) {
-        ssize_t taken = read(STDIN_FILENO, place, (size_t)bytes);
-        if (taken == 0) {
+        ssize_t received = read(STDIN_FILENO, place, (size_t)bytes);
+        if (received == 0) {
             put_counts();
             while (pending_bytes > 0)
                 flush(0);
             exit(0);
         }
-        if (taken < 0 && errno != EINTR)
+        if (received < 0 && errno != EINTR)
             fail(strerror(errno));
-        place += taken < 0 ? 0 : taken;
-        bytes -= taken < 0 ? 0 : taken;
+        place += received < 0 ? 0 : received;
+        bytes -= received < 0 ? 0 : received;
     }
 }
 
 /* ---- The settings ---- */
 
-static double *room(int64_t count) {
+static double *allocate(int64_t count) {
     double *place = numbers + used;
     used += count;
     return place;
 }
 
-static double *taken(int64_t count) {
-    double *place = room(count);
-    take(place, count * 8);
+static double *read_reals(int64_t count) {
+    double *place = allocate(count);
+    read_exactly(place, count * 8);
     return place;
 }
 
 /* They come with the first byte of the stream. */
-static void take_sockets(void) {
+static void read_sockets(void) {
     _Alignas(struct cmsghdr) uint8_t control[CMSG_SPACE(sizeof sockets)];
     uint8_t head[16];
     struct iovec vector = {head, 1};
@@ -129,12 +129,12 @@ static void take_sockets(void) {
         fail("it is started by noack, see docs/node.md");
     memcpy(sockets, CMSG_DATA(first), sizeof sockets);
     getpeername(sockets[0], (struct sockaddr *)&peer, &peer_bytes);
-    take(head + 1, sizeof head - 1);
+    read_exactly(head + 1, sizeof head - 1);
 }
 
-static void take_settings(void) {
-    take_sockets();
-    take(&settings, sizeof settings);
+static void read_settings(void) {
+    read_sockets();
+    read_exactly(&settings, sizeof settings);
     int64_t n = settings.machine.n, m = settings.machine.m;
     if (n > STATES || m > INPUTS)
         fail("the loop has more states or inputs than its STATES or INPUTS");
@@ -152,21 +152,21 @@ static void take_settings(void) {
     controller.newest = settings.newest;
     transitions.n = n;
     transitions.is_static = settings.is_static;
-    transitions.H = taken(n * n);
+    transitions.H = read_reals(n * n);
     transitions.places = PLACES;
     transitions.steps_ns = steps_ns;
-    transitions.matrices = room(PLACES * n * n);
-    transitions.scratch = room(10 * n * n + 3 * n);
-    controller.K = taken(m * n);
-    controller.x_r = taken(n);
-    controller.u_r = taken(m);
-    controller.safe_input = taken(m);
-    controller.x_c = taken(n);
+    transitions.matrices = allocate(PLACES * n * n);
+    transitions.scratch = allocate(10 * n * n + 3 * n);
+    controller.K = read_reals(m * n);
+    controller.x_r = read_reals(n);
+    controller.u_r = read_reals(m);
+    controller.safe_input = read_reals(m);
+    controller.x_c = read_reals(n);
     controller.model =
         (noack_model){&transitions, 0, &no_change, &settings.has_point, controller.x_r};
-    controller.x = room(n);
-    controller.u = room(m);
-    controller.scratch = room(3 * n + m);
+    controller.x = allocate(n);
+    controller.u = allocate(m);
+    controller.scratch = allocate(3 * n + m);
 }
 
 /* ---- The loop ---- */
@@ -183,7 +183,7 @@ static int64_t due_ns(void) {
 static void report_step(void) {
     static uint8_t datagram[NOACK_DATAGRAM_BYTES];
     put_frame(output.table, output.row, output.words * 8);
-    flush(MSG_DONTWAIT); /* the row is on its way before what it tells of */
+    flush(MSG_DONTWAIT); /* noack receives the row before the message is sent */
     if (!output.sends)
         return;
     output.message.loop = 0;
@@ -200,10 +200,10 @@ static void report_step(void) {
 
 static void handle(const uint8_t *datagram, int64_t bytes, int64_t from_peer) {
     static noack_message message;
-    int64_t found = noack_wire_examine(
+    int64_t examination = noack_wire_examine(
         &wire, &machine->received, 0, datagram, bytes, from_peer, NOACK_NOT_OPENED, &message);
-    noack_wire_count(&machine->received, found, &message);
-    if (found != NOACK_ACCEPTED)
+    noack_wire_count(&machine->received, examination, &message);
+    if (examination != NOACK_ACCEPTED)
         return;
     noack_controller_handle(&controller, &message, now_ns() - machine->phase_ns, &output);
     report_step();
@@ -237,17 +237,17 @@ static void do_ticks(void) {
 }
 
 /* A frame from noack, during the run. */
-static void take_frame(void) {
+static void read_frame(void) {
     static struct {
         int64_t from_peer;
         uint8_t datagram[1024];
     } other;
     int64_t head[2];
-    take(head, sizeof head);
+    read_exactly(head, sizeof head);
     if (head[0] == NOACK_NODE_CLOCK && head[1] == sizeof settings.clock) {
-        take(&settings.clock, head[1]);
+        read_exactly(&settings.clock, head[1]);
     } else if (head[0] == NOACK_NODE_DATAGRAM && 8 <= head[1] && head[1] <= (int64_t)sizeof other) {
-        take(&other, head[1]);
+        read_exactly(&other, head[1]);
         handle(other.datagram, head[1] - 8, other.from_peer);
     } else {
         fail("noack has sent an unknown frame");
@@ -257,7 +257,7 @@ static void take_frame(void) {
 int main(void) {
     printf("noack node %d %zu\n", NOACK_NODE_VERSION, sizeof settings);
     fflush(stdout);
-    take_settings();
+    read_settings();
     struct pollfd files[2] = {{sockets[0], POLLIN, 0}, {STDIN_FILENO, POLLIN, 0}};
     for (int64_t report_ns = 0;;) {
         receive();
@@ -276,6 +276,6 @@ int main(void) {
         wait_ns = wait_ns > 0 ? wait_ns : 0;
         struct timespec wait = {wait_ns / NS_PER_S, wait_ns % NS_PER_S};
         if (ppoll(files, 2, &wait, NULL) > 0 && files[1].revents != 0)
-            take_frame();
+            read_frame();
     }
 }

@@ -73,7 +73,7 @@ int64_t noack_relay_receiver(const noack_relay *relay) { return scratch_of(relay
 
 /* Queue the datagram in the first free row of leaving for sending, behind those of the same socket;
    record its departure. */
-static void line_up(noack_relay *relay) {
+static void enqueue_departure(noack_relay *relay) {
     relay_scratch *own = scratch_of(relay);
     int32_t number = (int32_t)own->leaving_count++;
     departure *leaving = &own->leaving[number];
@@ -123,7 +123,7 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
             .slot = (int32_t)entry.slot,
             .delayed = 1,
         };
-        line_up(relay);
+        enqueue_departure(relay);
         serve(
             relay->directions[slot->direction].link, relay->waiting, entry.due_ns, relay->heap,
             &relay->heap_length);
@@ -219,7 +219,7 @@ static void release(
     if (delayed || datagram->bit >= 0)
         leaving->slot = (int32_t)store_payload(relay, data, datagram);
     if (!delayed) {
-        line_up(relay);
+        enqueue_departure(relay);
         return;
     }
     relay->put++;

@@ -26,7 +26,7 @@ from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import with_target_loss
 from noack.runtime import private_folder
-from noack.runtime.control_plane import cause_of, open_session
+from noack.runtime.connections.zenoh_session import cause_of, open_session
 from noack.runtime.private_folder import require_name
 from noack.scenario.toml_file import brief
 

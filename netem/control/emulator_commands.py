@@ -26,7 +26,7 @@ from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import read_files
 from noack.runtime.command_line import Parser, Signals, failed
-from noack.runtime.control_plane import answer_to, cause_of, open_session
+from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
 _SILENCE_S = 3.0

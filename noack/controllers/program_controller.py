@@ -1,7 +1,7 @@
 """A controller that is a program of its own, such as native/examples/controller_node.c.
 
 In a live run the program is started in the place of the core's controller, with its sockets
-(:mod:`noack.runtime.node_driver`). It makes the same steps, so simulation and replay do without it.
+(:mod:`noack.runtime.drivers.node_driver`). It makes the same steps, so simulation and replay do without it.
 """
 
 from typing import Annotated, ClassVar, Literal

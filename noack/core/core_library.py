@@ -108,7 +108,7 @@ def pointer_to(array: Array, kind: str) -> CData:
     """
     if not array.flags.c_contiguous:
         raise ValueError("the core takes contiguous arrays")
-    return ffi.cast(kind, ffi.from_buffer(array))  # faster than the address that numpy tells
+    return ffi.cast(kind, ffi.from_buffer(array))  # faster than numpy's address
 
 
 def address_of(pointer: CData) -> int:
@@ -224,7 +224,7 @@ class CoreMemory:
 
     def _pointer(self, array: Array, kind: str) -> CData:
         self._kept.append(array)
-        return ffi.cast(kind, ffi.from_buffer(array))  # faster than the address that numpy tells
+        return ffi.cast(kind, ffi.from_buffer(array))  # faster than numpy's address
 
 
 @cache

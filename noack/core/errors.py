@@ -37,7 +37,7 @@ class CallerError(NoackError):
 
 
 class PeerError(NoackError):
-    """Another process failed: it died, was not ready, or broke the protocol."""
+    """Another process failed: it ended unexpectedly, was not ready, or broke the protocol."""
 
 
 class NoAnswerError(PeerError):

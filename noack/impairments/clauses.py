@@ -39,7 +39,7 @@ class Part:
     key: str
     """The key of the value; if it has several parts, their keys, with spaces between them."""
     quantity: Quantity[Any] | None = None
-    """What the value is; None: the word alone implies the settings."""
+    """Name of the value; None: the word alone implies the settings."""
     symbol: str = ""
     """The value, in ``--help``."""
     word: str = ""

@@ -37,7 +37,7 @@ LONGEST_NS = 10**18
 """Longest trace: 31 years."""
 _MOST_SHOWN = 12
 TC_CORRELATION = "its correlation changes the probability, or the spread, of what it is given"
-"""What ``tc netem`` does differently."""
+"""The difference to ``tc netem``."""
 
 
 class Stage(NamedTuple):
@@ -320,7 +320,7 @@ OFFSET = Quantity(
     _offset,
     lambda offset: offset if isinstance(offset, str) else time_text(offset),
 )
-"""Where in a trace a feature begins."""
+"""The place in a trace at which a feature begins."""
 
 
 def offset_meaning(offset: float | str) -> str:

@@ -164,7 +164,7 @@ class LossGuarantee:
 
     @property
     def windows(self) -> tuple[LossWindow, ...]:
-        """What the rules say about the number of losses in windows; each follows from them.
+        """Bounds of the number of losses in windows; each follows from the rules.
 
         With at most b consecutive losses and h deliveries between bursts, b + h packets contain one
         burst, or parts of two with h deliveries between them: at most b losses.

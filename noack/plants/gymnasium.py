@@ -120,7 +120,7 @@ class Environment:
     def __init__(self, settings: GymnasiumSettings) -> None:
         self._settings = settings
         self.place = f'plant.system.id = "{settings.id}"'
-        """What messages begin with."""
+        """The prefix of messages."""
         arguments = dict(settings.parameters)
         if settings.file is not None:
             arguments["xml_file"] = str(unchanged(settings, "plant.system"))

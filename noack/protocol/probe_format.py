@@ -43,7 +43,7 @@ MAX_PROBE_BYTES = 65_507
 
 
 class ProbeKind(IntEnum):
-    """What a datagram of the prober is."""
+    """Kinds of datagrams of the prober."""
 
     PROBE = 1
     """One way: it is not answered."""

@@ -47,7 +47,7 @@ NO_SEQUENCE = -1  # stands for "none" in a column of sequence numbers
 
 
 class Fate(IntEnum):
-    """What the network emulator did with a datagram."""
+    """The network emulator's treatment of a datagram."""
 
     DELIVERED = 0
     DROPPED = 1
@@ -86,7 +86,7 @@ class RecordShape:
     n: int  # states
     m: int  # inputs
     acknowledged: bool = False  # whether updates are acknowledged
-    predictive: bool = False  # whether actuations carry the controller's model state
+    carries_model: bool = False  # whether actuations carry the controller's model state
     predictions: int = 1  # inputs in an actuation
     internal: int = 0  # entries of the plant's own state z
     disturbed_input: bool = False
@@ -196,7 +196,7 @@ TABLES = (
         _input("u", "input"),
         _vector("predicted", lambda shape: shape.m * (shape.predictions - 1),
                 "inputs for the following ticks, with `controller.predictions` only"),
-        _vector("x_c", lambda shape: shape.n * shape.predictive,
+        _vector("x_c", lambda shape: shape.n * shape.carries_model,
                 "the model's state, with `plant.watchdog.policy = \"model\"` only"),
     )),
     Table(SENSOR_MEASUREMENT, "sensor", "measurement received by the sensor", (

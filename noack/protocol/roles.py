@@ -26,7 +26,7 @@ SENDS: Mapping[str, Flow] = {
 }
 """The flow that each process sends in every run."""
 PAPER = (Flow.UPDATE,)
-"""What crosses the network in the paper's loop."""
+"""Flows that cross the network in the paper's loop."""
 LOOP_ROLES = tuple(RECEIVES)
 PLANT = "plant"
 WITH_DEADLINES = ("plant", "controller")  # processes that act at nominal times
@@ -103,10 +103,10 @@ GENERATION = 2**40
 
 
 class Start(NamedTuple):
-    """Where in a run a machine begins its work."""
+    """The point of a run at which a machine begins its work."""
 
     generation: int = 0
-    """How often its process was restarted in this run; a restarted process knows no state."""
+    """Number of restarts of its process in this run; a restarted process knows no state."""
     from_ns: int = 0  # no timer is due before
 
     @property

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 JOINT_STATE, LOG = "sensor_msgs/msg/JointState", "rcl_interfaces/msg/Log"
 _LATEST_NS = (2**31 - 1) * NS_PER_S
 DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
-"""Where the router of rmw_zenoh listens by default, as zenoh writes it."""
+"""Default address of the router of rmw_zenoh, as zenoh writes it."""
 TOPICS = {
     PLANT_STEP: ("state", "input"),
     CONTROLLER_DELIVERY: ("update",),

@@ -123,7 +123,7 @@ VERSIONS = VERSION, EncryptedSeal.version
 
 
 class Flow(IntEnum):
-    """What a datagram carries, and so between which processes."""
+    """The content of a datagram, which determines its sender and its receiver."""
 
     MEASUREMENT = 1
     """plant → sensor: the plant state x(t_k), shape (n,); with an observer what is measured of it,
@@ -151,7 +151,7 @@ class Message(NamedTuple):
 
 
 class Rejection(StrEnum):
-    """Why a datagram was counted and ignored."""
+    """Reasons for which a datagram is counted and ignored."""
 
     LENGTH = "length"
     VERSION = "version"
@@ -196,7 +196,7 @@ def loop_number(datagram: bytes) -> int | None:
 
 
 class Wire:
-    """What the datagrams of a run have in common: its number, and its secret key of 32 bytes.
+    """The common part of a run's datagrams: its number, and its secret key of 32 bytes.
 
     Raises:
         ValueError: the key has another length.
@@ -207,7 +207,7 @@ class Wire:
         self.core = ffi.new("noack_wire *", {"run_id": _signed(run_id), "encrypted": int(encrypted)})
         core.noack_wire_key(self.core, key)
         self.seal = EncryptedSeal(key) if encrypted else None
-        """What encrypts and decrypts."""
+        """The cipher."""
 
 
 class Encoder:

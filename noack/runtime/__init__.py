@@ -2,10 +2,12 @@
 
 Read ``join_run.py`` first, then ``run_process.py`` from top to bottom. They use, in this order:
 
-* ``command_line.py`` and ``join_ticket.py``, with which a process starts,
+* ``command_line.py`` and ``run_descriptor.py``, with which a process starts,
 * ``control_plane.py``, its messages (``control_messages.py``) and the life cycle that they change
-  (``life_cycle.py``); on another host ``connections`` and ``host_clocks``, too,
+  (``life_cycle.py``), over sessions of ``connections``; on another host ``host_clocks``, too,
 * ``udp_sockets.py`` with ``address.py``,
-* ``real_time_loop.py``, whose driver is ``live_driver.py`` or ``node_driver.py``,
+* ``drivers``, with the real-time loop,
 * ``telemetry.py`` and ``spool.py`` for the rows; ``private_folder.py`` for files of the user.
+
+Other programs of the user find a run and change its settings by ``active_runs.py``.
 """

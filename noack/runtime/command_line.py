@@ -1,4 +1,4 @@
-"""What all programs of noack share: errors as text and JSON, JSON Lines on standard error, signals.
+"""Shared by all programs of noack: errors as text and JSON, JSON Lines on standard error, signals.
 
 As JSON Lines, for log collectors, each line of text is an object with ``time`` (UTC), ``level``
 (info, warning, error), ``source`` (the program, e.g. ``noack netem``) and ``message``. An event has
@@ -29,8 +29,8 @@ from noack.core.errors import CallerError, ExitStatus, printable
 
 _LINE = re.compile(r"(?P<source>noack(?: [a-z]+)?): (?P<warning>warning: )?(?P<message>.*)")
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
-TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
-"""Environment variable of a launched process: its first line of input is its ticket."""
+DESCRIPTOR_ON_STDIN = "NOACK_DESCRIPTOR_ON_STDIN"
+"""Environment variable of a launched process: its first line of input is its run descriptor."""
 _ECHO_NS = 500_000_000  # a parent may pass on a signal that the process group has received already
 _HANGUP: int | None = getattr(signal, "SIGHUP", None)  # not on Windows
 _ENDING: dict[int, tuple[ExitStatus, str]] = {  # exit status and reason after a signal

@@ -45,7 +45,7 @@ class AdmissionRequest(ControlMessage):
     """A process asks for admission to the run."""
 
     instance: str  # random name of this process
-    admission_pass: str = ""
+    join_token: str = ""
 
 
 class Admission(ControlMessage):
@@ -175,8 +175,8 @@ class RunProgress(ControlMessage):
     x_norm: float | None
     live: str | None
     warnings: list[str] = Field([])
-    """Which claims are void so far, and why; which loops diverge; what cannot be checked or shown
-    during the run."""
+    """The claims that are void so far, with reasons; loops that diverge; what cannot be checked or
+    shown during the run."""
     changes: list[str] = Field([])  # changes of runtime parameters during the run
 
 

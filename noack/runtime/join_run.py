@@ -1,7 +1,7 @@
-"""How a process becomes part of a run, from its command line to its exit status.
+"""A process becomes part of a run, from its command line to its exit status.
 
-It waits for a ticket or an invitation, and is admitted to the run. ``run_process.py`` has what it
-does then. Read :func:`join_run` first.
+It waits for a run descriptor or an invitation, and is admitted to the run. ``run_process.py`` has
+the rest. Read :func:`join_run` first.
 """
 
 import argparse
@@ -20,22 +20,22 @@ from setproctitle import setproctitle
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
 from noack.core.process_limits import exhausted_limit, require_limits
 from noack.runtime.address import address_text
-from noack.runtime.command_line import TICKET_ON_STDIN, Parser, Signals, failed
+from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, failed
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.join_ticket import (
+from noack.runtime.life_cycle import HORIZON, Event
+from noack.runtime.run_descriptor import (
     DEFAULT_SESSION,
     STANDARD_INPUT,
-    Ticket,
-    find_ticket,
+    RunDescriptor,
+    find_descriptor,
     loads,
     read_invitation,
 )
-from noack.runtime.life_cycle import HORIZON, Event
 from noack.runtime.run_process import RunProcess, launcher_has_ended
 
 _RUNS = Path("runs")
 _POLL_S = 0.1
-_TICKET_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctrl-C ends the wait
+_DESCRIPTOR_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctrl-C ends the wait
 T = TypeVar("T")
 
 
@@ -82,12 +82,12 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
         with signals.handled():
             require_limits()
             if options.invitation is None:
-                ticket = _ticket(role, options.session, signals)
+                descriptor = _descriptor(role, options.session, signals)
             else:
-                ticket = _invited(role, options.invitation, options.runs, signals)
-            if ticket.launched:
+                descriptor = _invited(role, options.invitation, options.runs, signals)
+            if descriptor.launched:
                 setproctitle(f"noack {role}")  # in lists of processes
-            process = _admitted(role, ticket, signals)
+            process = _admitted(role, descriptor, signals)
             with process.plane:
                 try:
                     yield process
@@ -99,7 +99,7 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
                     process.plane.report_end(process.ended)
         if options.json:
             print(json.dumps(process.report, indent=2))
-        if signals.received is None and not ticket.launched:
+        if signals.received is None and not descriptor.launched:
             print(f"noack {role}: ended: {process.ended}", file=sys.stderr)
             if process.ended != HORIZON:
                 sys.exit(ExitStatus.FAILED)
@@ -124,37 +124,40 @@ def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None
         sys.exit(signals.status)
 
 
-def _ticket(role: str, session: str, signals: Signals) -> Ticket:
-    if os.environ.pop(TICKET_ON_STDIN, None):
+def _descriptor(role: str, session: str, signals: Signals) -> RunDescriptor:
+    if os.environ.pop(DESCRIPTOR_ON_STDIN, None):
         return loads(sys.stdin.buffer.readline().decode())
-    ticket = _wait_for(
-        lambda: find_ticket(session),
+    descriptor = _wait_for(
+        lambda: find_descriptor(session),
         signals,
         f"noack {role}: waiting for `noack record SCENARIO` on this host (session {session!r}); of "
         "a run on another host, give its --invitation; Ctrl-C ends",
     )
-    if ticket is None:
+    if descriptor is None:
         raise PeerError(f"no run to join in session {session!r}: start `noack record SCENARIO` first")
-    print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
-    return ticket
+    print(f"noack {role}: joining run of {descriptor.scenario.name!r}", file=sys.stderr)
+    return descriptor
 
 
-def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> Ticket:
-    """Wait for an invitation and return its ticket; raise CallerError or PeerError without one."""
+def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> RunDescriptor:
+    """Wait for an invitation and return its run descriptor.
+
+    Raise CallerError or PeerError without one.
+    """
     if invitation != STANDARD_INPUT and invitation.parent.is_dir():
         waiting = f"noack {role}: waiting for {invitation}; Ctrl-C ends"
         if not _wait_for(invitation.exists, signals, waiting):
             raise PeerError("no invitation")
-    ticket = read_invitation(invitation, runs)
-    assert ticket.remote is not None  # else it is no invitation
-    host_port = address_text((ticket.remote.host, ticket.remote.port))
-    print(f"noack {role}: joining run of {ticket.scenario.name!r} at {host_port}", file=sys.stderr)
-    return ticket
+    descriptor = read_invitation(invitation, runs)
+    assert descriptor.remote is not None  # else it is no invitation
+    host_port = address_text((descriptor.remote.host, descriptor.remote.port))
+    print(f"noack {role}: joining run of {descriptor.scenario.name!r} at {host_port}", file=sys.stderr)
+    return descriptor
 
 
 def _wait_for(find: Callable[[], T], signals: Signals, waiting: str) -> T:
     """Return what is found once it is true; after a signal, or a day, what is found then."""
-    until_s = time.monotonic() + _TICKET_TIMEOUT_S
+    until_s = time.monotonic() + _DESCRIPTOR_TIMEOUT_S
     if not find():
         print(waiting, file=sys.stderr)
     while not (result := find()) and signals.received is None and time.monotonic() < until_s:
@@ -162,7 +165,7 @@ def _wait_for(find: Callable[[], T], signals: Signals, waiting: str) -> T:
     return result
 
 
-def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:
+def _admitted(role: str, descriptor: RunDescriptor, signals: Signals) -> RunProcess:
     """Connect to a run and request admission; raise PeerError without an admission.
 
     A launched process tries again while its launcher lives. On a busy machine a connection may
@@ -171,11 +174,11 @@ def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:
     while True:
         try:
             with ExitStack() as stack:
-                plane = stack.enter_context(ControlPlane(ticket, role))
-                process = RunProcess(role, ticket, plane, signals)
+                plane = stack.enter_context(ControlPlane(descriptor, role))
+                process = RunProcess(role, descriptor, plane, signals)
                 process.request_admission()
                 stack.pop_all()
                 return process
         except NoAnswerError:
-            if not ticket.launched or signals.received or launcher_has_ended():
+            if not descriptor.launched or signals.received or launcher_has_ended():
                 raise

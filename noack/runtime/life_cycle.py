@@ -19,14 +19,14 @@ LAUNCHED_LOST_S = 30.0
 
 
 class Side(Enum):
-    """Who causes an event."""
+    """The side that causes an event."""
 
     PROCESS = "the process"
     COORDINATOR = "the coordinator"
 
 
 class State(Enum):
-    """Where a process is in its life cycle."""
+    """States of a process's life cycle."""
 
     REQUESTED = "admission requested"
     ADMITTED = "admitted"
@@ -41,7 +41,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What happens to a process."""
+    """Events of a process's life cycle."""
 
     ADMIT = "is admitted"
     JOIN = "asks to join"
@@ -55,7 +55,7 @@ class Event(Enum):
 
     @property
     def side(self) -> Side:
-        """Who causes it; the coordinator causes what it observes itself."""
+        """The side that causes it; the coordinator causes what it observes itself."""
         return Side.PROCESS if self in (Event.JOIN, Event.END) else Side.COORDINATOR
 
 
@@ -96,7 +96,7 @@ class LifeCycle:
         self.since_s = time.monotonic()
         """Reading of the monotonic clock when it entered the state."""
         self.reason: str | None = None
-        """Why it stops or has ended; the first reason stays."""
+        """The reason why it stops or has ended; the first reason stays."""
 
     def apply(self, event: Event, reason: str | None = None) -> None:
         """Enter the next state; ``reason`` says why, for STOP and END.
@@ -119,5 +119,5 @@ class LifeCycle:
         return self.state in (State.LOST, State.GONE)
 
     def age_s(self) -> float:
-        """How long it has been in its state, in seconds of wall time."""
+        """Time in its state, in seconds of wall time."""
         return time.monotonic() - self.since_s

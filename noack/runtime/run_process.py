@@ -3,7 +3,7 @@
 It asks for admission, waits at the start barrier, runs its loop and reports. It ends at the
 horizon, on the coordinator's stop, when its launcher has ended, or on SIGINT and SIGTERM. Its rows
 go to the recorder, or else to the run directory's spool. Read ``join_run.py`` first, which gets the
-ticket, then :class:`RunProcess` from top to bottom.
+run descriptor, then :class:`RunProcess` from top to bottom.
 """
 
 import os
@@ -33,6 +33,7 @@ from noack.protocol.roles import (
     Start,
 )
 from noack.protocol.wire_format import Wire
+from noack.runtime.active_runs import run_name
 from noack.runtime.address import Address
 from noack.runtime.command_line import Signals, print_to_stderr
 from noack.runtime.control_messages import (
@@ -44,12 +45,13 @@ from noack.runtime.control_messages import (
     RunStart,
     parse_message,
 )
-from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
+from noack.runtime.control_plane import ControlPlane, ParameterUpdates
+from noack.runtime.drivers.real_time_loop import Driver, ProcessSockets, run_loop
+from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.host_clocks.clock_offset import SlewedRunClock
 from noack.runtime.host_clocks.reference_clock import ClockRecord, ReferenceClock, reference_clock
-from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
-from noack.runtime.real_time_loop import Driver, ProcessSockets, realtime, run_loop
+from noack.runtime.run_descriptor import RunDescriptor
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer
 from noack.scenario.parameter_changes import ParameterChange
@@ -73,7 +75,7 @@ stall of 7 s. The kernel takes what is in use."""
 
 
 class Reconfigurable(Protocol):
-    """What accepts changes of settings during the run."""
+    """Accepts changes of settings during the run."""
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Process the announcement of a change."""
@@ -82,11 +84,11 @@ class Reconfigurable(Protocol):
 class RunProcess:
     """A process of a run."""
 
-    def __init__(self, role: str, ticket: Ticket, plane: ControlPlane, signals: Signals) -> None:
+    def __init__(self, role: str, descriptor: RunDescriptor, plane: ControlPlane, signals: Signals) -> None:
         self.role = role
-        self.ticket = ticket
-        self.scenario = ticket.scenario
-        self.phases_ns = phases_ns(ticket.scenario)
+        self.descriptor = descriptor
+        self.scenario = descriptor.scenario
+        self.phases_ns = phases_ns(descriptor.scenario)
         """When each loop begins."""
         self.plane = plane
         self._reference: ReferenceClock | None = None
@@ -96,7 +98,7 @@ class RunProcess:
         self.admitted_ns = 0
         self._address: Address | None = None
         self.start: Start = BEGINNING
-        """Where in the run its work begins."""
+        """The point of the run at which its work begins."""
         self.replaces: str | None = None
         """Of a restarted process: how the one before it ended."""
         self.report: dict[str, object] = {}
@@ -108,7 +110,7 @@ class RunProcess:
 
         Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses.
         """
-        request = AdmissionRequest(instance=self.plane.instance, admission_pass=self.ticket.admission_pass)
+        request = AdmissionRequest(instance=self.plane.instance, join_token=self.descriptor.join_token)
         admission = self._request("admit", request, Admission, _ADMISSION_TIMEOUT_S)
         self.life.apply(Event.ADMIT)
         self.start = Start(admission.generation, admission.from_ns)
@@ -121,7 +123,7 @@ class RunProcess:
         ``address`` is None for the recorder, which is not in the loop. Raise PeerError if the run
         never started, or if the coordinator's clock is another one and remains unknown.
         """
-        self._reference = reference_clock(self.ticket)
+        self._reference = reference_clock(self.descriptor)
         if self._reference is not None:
             self._reference.wait_until_known(lambda: self.stopping)
         prepare_changes()
@@ -135,7 +137,7 @@ class RunProcess:
         if not begin.addresses.keys() >= set(LOOP_ROLES):
             raise PeerError("the coordinator did not send the addresses of all processes")
         self.life.apply(Event.START)
-        if not self.ticket.launched:
+        if not self.descriptor.launched:
             verb = f"replaces a process ({self.replaces})" if self.replaces else "started"
             print_to_stderr(f"noack {self.role}: {verb}")
         return begin.addresses
@@ -162,18 +164,18 @@ class RunProcess:
 
     @property
     def wire(self) -> Wire:
-        """What the datagrams of the run have in common."""
+        """The common part of the run's datagrams."""
         encrypted = self.scenario.network.encrypted
-        return Wire(self.ticket.run_id, self.ticket.key, encrypted=encrypted)
+        return Wire(self.descriptor.run_id, self.descriptor.key, encrypted=encrypted)
 
     @property
     def spin_ns(self) -> int:
-        """How long to busy-wait before a deadline."""
+        """Time of busy waiting before a deadline."""
         return round(self.scenario.realtime.spin_us * 1000)
 
     @property
     def coalescing_ns(self) -> int:
-        """How long to gather the ticks of many loops."""
+        """Time for which the ticks of many loops are gathered."""
         if len(self.phases_ns) <= _FEW_LOOPS:
             return 0
         period_ns = min(loop.timing.plant_period_ns for loop in loops_of(self.scenario))
@@ -189,7 +191,7 @@ class RunProcess:
         port = port if self._address is None else self._address[1]
         place = LOOP_ROLES.index(self.role) if settings.pin_cores else None
         with (
-            closing(bind(port, f"ports.{self.role}", self.ticket.host)) as endpoint,
+            closing(bind(port, f"ports.{self.role}", self.descriptor.host)) as endpoint,
             # Before the barrier: locking memory may take a tenth of a second.
             realtime(settings.enabled, settings.fifo_priority, place) as self._applied,
         ):
@@ -238,9 +240,9 @@ class RunProcess:
     @cached_property
     def _spool(self) -> OwnSpool:
         """The recorder reads it, or `noack collect` on another host."""
-        ticket = self.ticket
-        kept_of = None if ticket.remote is None else run_name(ticket.run_id)
-        return OwnSpool(Path(ticket.run_dir), self.role, self.plane.secret, kept_of)
+        descriptor = self.descriptor
+        remote_run_name = None if descriptor.remote is None else run_name(descriptor.run_id)
+        return OwnSpool(Path(descriptor.run_dir), self.role, self.plane.secret, remote_run_name)
 
     def _telemetry(self) -> TelemetryBuffer:
         tables = run_tables(self.scenario)
@@ -303,7 +305,7 @@ class RunProcess:
 
     @property
     def ended(self) -> str:
-        """Why the process ended."""
+        """The reason why the process ended."""
         return self.life.reason or HORIZON
 
     @property
@@ -318,10 +320,10 @@ class RunProcess:
             return signal.Signals(self._signals.received).name
         if (reason := self.plane.stop_requested()) is not None:
             return reason
-        if self.ticket.launched:
+        if self.descriptor.launched:
             return LAUNCHER_GONE if launcher_has_ended() else None
-        # A running loop does not need the control plane. A launched process has its lifeline: on
-        # a busy machine the coordinator may only seem to be gone.
+        # A running loop does not need the control plane. A launched process ends with its launcher
+        # only: on a busy machine the coordinator may only seem to be gone.
         waiting = self.life.state in (State.REQUESTED, State.AT_BARRIER)
         if waiting and self.plane.coordinator_gone(for_s=LOST_AFTER_S):
             return "lost the connection to the run's coordinator"
@@ -348,7 +350,7 @@ class RunProcess:
         if not delivered:
             telemetry.store_all()
             self._spool.keep_report(self.report)
-        if self.ticket.remote is not None and (not delivered or any(telemetry.stored().values())):
+        if self.descriptor.remote is not None and (not delivered or any(telemetry.stored().values())):
             reason = "the recorder was too slow" if delivered else "cannot reach the recorder"
             print_to_stderr(
                 f"noack {self.role}: {reason}; rows are kept in {self._spool.folder} until "

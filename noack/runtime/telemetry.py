@@ -75,7 +75,7 @@ class ReceivedRows:
 
     @property
     def count(self) -> int:
-        """How many have arrived."""
+        """Number of those that have arrived."""
         return sum(end - first for first, end in self.ranges)
 
     def add(self, first: int, end: int) -> None:
@@ -272,24 +272,25 @@ class OwnSpool:
         run_dir: the run's directory.
         role: the process.
         secret: the process's; its files are named after it by `writer_of`.
-        kept_of: on another host than the recorder's, the name of the run. The secret is kept there,
-            too: it shows that the rows are those of this process.
+        remote_run_name: on another host than the recorder's, the name of the run. The secret is
+            kept there, too: it shows that the rows are those of this process.
     """
 
-    def __init__(self, run_dir: Path, role: str, secret: str, kept_of: str | None = None) -> None:
-        self._run_dir, self._role, self._secret, self._kept_of = run_dir, role, secret, kept_of
+    def __init__(self, run_dir: Path, role: str, secret: str, remote_run_name: str | None = None) -> None:
+        self._run_dir, self._role, self._secret = run_dir, role, secret
+        self._remote_run_name = remote_run_name
 
     @cached_property
     def folder(self) -> Path:
         """The folder with the spool."""
-        if self._kept_of is None:
+        if self._remote_run_name is None:
             return self._run_dir
-        return _kept_folder(self._run_dir, self._kept_of)
+        return _kept_folder(self._run_dir, self._remote_run_name)
 
     @cached_property
     def _files(self) -> SpoolWriter:
         files = SpoolWriter(self.folder / SPOOL, writer_of(self._secret))
-        if self._kept_of is not None:
+        if self._remote_run_name is not None:
             files.append(KEPT_KEY, 0, self._secret.encode())
         return files
 

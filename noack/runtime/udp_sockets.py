@@ -22,7 +22,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.protocol.roles import Notice
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES
 from noack.runtime.address import LOOPBACK, Address, SocketName, address_text, family_of
-from noack.runtime.real_time_loop import RecordSink
+from noack.runtime.drivers.real_time_loop import RecordSink
 
 _UNKNOWN_BYTES = 128 * 1024
 """Receive buffer for datagrams from unknown sources; the kernel doubles it. It holds about 300
@@ -274,7 +274,7 @@ class FloodWatch:
 
     def __init__(self) -> None:
         self.left = IN_AN_INTERVAL
-        """How many may still be read in this interval; the reader decrements it."""
+        """Number of those that may still be read in this interval; the reader decrements it."""
         self.is_flood = False
         self._allowed = IN_AN_INTERVAL
         self._dropped = 0
@@ -324,21 +324,21 @@ class SourceCount:
     def __init__(self, peers: Iterable[Address] = ()) -> None:
         self._peers = dict.fromkeys(peers, 0)
         self._others: Counter[Address] = Counter()
-        self._more = 0
-        self._last: Address | None = None
-        self._run = 0
+        self._unnamed_count = 0
+        self._pending_source: Address | None = None
+        self._pending_count = 0
 
     def add(self, source: Address, datagrams: int = 1) -> None:
         """Count datagrams."""
-        if source == self._last:
-            self._run += datagrams
+        if source == self._pending_source:
+            self._pending_count += datagrams
             return
         self._fold()
-        self._last, self._run = source, datagrams
+        self._pending_source, self._pending_count = source, datagrams
 
     def add_others(self, datagrams: int) -> None:
         """Count datagrams of sources that are not named."""
-        self._more += datagrams
+        self._unnamed_count += datagrams
 
     def report(self) -> dict[str, int]:
         """Datagrams by source; the rare sources together are ``others``."""
@@ -346,21 +346,21 @@ class SourceCount:
         self._forget(_REPORTED_SOURCES)
         sources = [*self._peers.items(), *self._others.most_common()]
         counts = {address_text(source): n for source, n in sources if n}
-        return counts | ({"others": self._more} if self._more else {})
+        return counts | ({"others": self._unnamed_count} if self._unnamed_count else {})
 
     def _fold(self) -> None:
-        if self._last is None:
+        if self._pending_source is None:
             return
-        if self._last in self._peers:
-            self._peers[self._last] += self._run
+        if self._pending_source in self._peers:
+            self._peers[self._pending_source] += self._pending_count
         else:
-            self._others[self._last] += self._run
+            self._others[self._pending_source] += self._pending_count
             if len(self._others) > _KNOWN_SOURCES:
                 self._forget(_KNOWN_SOURCES // 2)
-        self._last, self._run = None, 0
+        self._pending_source, self._pending_count = None, 0
 
     def _forget(self, most: int) -> None:
         """Keep the ``most`` frequent sources: forged ones must not fill the memory."""
         frequent = Counter(dict(self._others.most_common(most)))
-        self._more += self._others.total() - frequent.total()
+        self._unnamed_count += self._others.total() - frequent.total()
         self._others = frequent

@@ -305,7 +305,7 @@ def shape_of(resolved: Scenario) -> RecordShape:
         n,
         m,
         acknowledged=resolved.protocol.acknowledges,
-        predictive=resolved.message_sizes.is_predictive,
+        carries_model=resolved.message_sizes.carries_model,
         internal=len(resolved.plant.system.internal_names),
         predictions=resolved.controller.predictions,
         disturbed_input="input" in disturbed,

@@ -60,7 +60,7 @@ class ClocksSection(ScenarioSection):
 
 
 class RecoverySection(ScenarioSection):
-    """What happens to a run when one of its processes dies."""
+    """Whether a run continues after one of its processes has ended unexpectedly."""
 
     rejoin_within_s: Annotated[FiniteFloat, Field(ge=0, le=86_400)] | None = None
     """Wall time for which the run continues without its sensor, controller, network or recorder.
@@ -111,13 +111,13 @@ class PortsSection(ScenarioSection):
     """UDP ports on the loopback interface; 0 takes a free one."""
 
     plant: Port = 0
-    """Where the plant receives actuation."""
+    """Port at which the plant receives actuation."""
     sensor: Port = 0
-    """Where the sensor receives measurements."""
+    """Port at which the sensor receives measurements."""
     netem: Port = 0
-    """Where the network receives the sensor's updates."""
+    """Port at which the network receives the sensor's updates."""
     controller: Port = 0
-    """Where the controller receives the delivered updates."""
+    """Port at which the controller receives the delivered updates."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -98,7 +98,7 @@ def check_setpoint(scenario: ScenarioTables) -> None:
         raise ValueError(f'{key}: not with network.protocol = "ack"')
     if not scenario.controller.is_linear:
         raise ValueError(f'{key}: not with controller.kind = "{scenario.controller.kind}"')
-    if scenario.message_sizes.is_predictive:
+    if scenario.message_sizes.carries_model:
         raise ValueError(
             f'{key}: the plant\'s watchdog does not have it; use plant.watchdog.policy = "hold" or "zero"'
         )
@@ -209,16 +209,16 @@ def _check_watchdog(scenario: ScenarioTables) -> None:
             "controller.update_timeout_s: needs u = K x_c; "
             f'not with controller.kind = "{scenario.controller.kind}"'
         )
-    if scenario.message_sizes.is_predictive and not scenario.controller.is_linear:
+    if scenario.message_sizes.carries_model and not scenario.controller.is_linear:
         raise ValueError(
             'plant.watchdog.policy: "model" predicts u = K x_c; '
             f'not with controller.kind = "{scenario.controller.kind}"'
         )
     if scenario.message_sizes.actuation_entries <= MAX_DIMENSION:
         return
-    predictive = scenario.message_sizes.is_predictive
+    carries_model = scenario.message_sizes.carries_model
     if (predictions := scenario.controller.predictions) > 1:
-        state_text = f" and {n} of x_c" if predictive else ""
+        state_text = f" and {n} of x_c" if carries_model else ""
         raise ValueError(
             f"controller.predictions: an actuation carries {predictions} x {m} inputs{state_text}; "
             f"at most {MAX_DIMENSION} numbers fit"

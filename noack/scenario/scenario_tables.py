@@ -47,7 +47,7 @@ class ScenarioTables(ScenarioSection):
     name: Annotated[str, Field(pattern=NAME_PATTERN)]
     """Names the run's directory: letters, digits, _ and -."""
     description: str = ""
-    """What the scenario shows."""
+    """The purpose of the scenario."""
     mode: Literal["model", "zoh"] = "model"
     """model: x_s and x_c follow Â + B̂K between updates; zoh: they hold the last update."""
     horizon_s: Annotated[FiniteFloat, Field(gt=0, le=1e7)]
@@ -62,7 +62,7 @@ class ScenarioTables(ScenarioSection):
     trigger: AnyTrigger
     """When the sensor transmits."""
     observer: AnyObserver | None = None
-    """How the sensor estimates the state from the measurements: a table with ``kind``. Without it,
+    """The sensor's estimate of the state from the measurements: a table with ``kind``. Without it,
     the measurement must be the state."""
     network: NetworkSection
     controller: AnyController = LinearFeedbackSettings.model_construct()
@@ -271,15 +271,15 @@ class MessageSizes:
         return self.outputs + self.inputs_reported
 
     @property
-    def is_predictive(self) -> bool:
+    def carries_model(self) -> bool:
         """Whether actuations carry the controller's model state."""
         return self.scenario.plant.watchdog.policy == "model"
 
     @property
     def actuation_entries(self) -> int:
-        """Number of entries of an actuation: its inputs, with x_c if it is predictive."""
+        """Number of entries of an actuation: its inputs, with x_c if it carries the model state."""
         n, m = self.scenario.model.dimensions
-        return m * self.scenario.controller.predictions + n * self.is_predictive
+        return m * self.scenario.controller.predictions + n * self.carries_model
 
     def entries(self, flow: Flow) -> int:
         """Number of entries of a message of a flow."""
@@ -295,7 +295,7 @@ UNCERTIFIED_ACKNOWLEDGEMENTS = (
     "x_s is reset only when an acknowledgement returns, so ‖e_s‖ exceeds the threshold while the "
     "sensor waits, and (I1), on which every bound rests, does not hold"
 )
-"""Why the baseline with acknowledgements has no certificate."""
+"""The reason why the baseline with acknowledgements has no certificate."""
 
 
 @dataclass(frozen=True)
@@ -361,7 +361,7 @@ class TheoryCoverage:
 
     @property
     def _beyond_actuation(self) -> str | None:
-        """Why the age of the applied input has no bound, or the watchdog replaces the input."""
+        """The reason why the age of the applied input has no bound, or the watchdog replaces the input."""
         timing, policy = self.scenario.timing, self.scenario.plant.watchdog.policy
         if (gap_ns := timing.actuation_gap_ns) is None:
             return (

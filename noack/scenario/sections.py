@@ -376,14 +376,14 @@ class NetworkSection(DirectionSection):
     """The lossy network between sensor and controller."""
 
     mansd: Mansd
-    """M − 1, the maximum allowable number of successive dropouts; for the paper's M = 5 it is 4."""
+    """M − 1, the maximum of consecutive losses (MANSD); for the paper's M = 5 it is 4."""
     loss: Loss
     """Loss of updates, before the guarantee is applied."""
     enforce_mansd: bool = True
     """false: the network ignores mansd and the constraints, to show the effect of a violated
     assumption."""
     initial_sync: Literal["first_packet", "known_state"] = "first_packet"
-    """How the paper's assumption of a delivered t_0 is met. first_packet: the network passes the
+    """The means by which t_0 is delivered, as the paper assumes. first_packet: the network passes the
     first packet of a flow. known_state: sensor and controller start from x(0)."""
     protocol: Literal["none", "ack"] = "none"
     """none: updates are not acknowledged, the paper's loop. ack: the baseline for comparison; the

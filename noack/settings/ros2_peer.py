@@ -28,7 +28,7 @@ Topic = Annotated[str, AfterValidator(_require_topic)]
 
 
 class Ros2Settings(ScenarioSection):
-    """Where the node is, and how long it may take."""
+    """The node's address, and the time that it may take."""
 
     router: str = DEFAULT_ROUTER
     """Address of the router of ROS 2, as zenoh writes it."""

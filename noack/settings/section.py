@@ -1,4 +1,4 @@
-"""What every table of a settings file is made of: base class, numbers, vectors, matrices, kinds.
+"""Parts of every table of a settings file: base class, numbers, vectors, matrices, kinds.
 
 A kind of settings is one module: a module in the kind's folder adds it (:func:`kinds_in`).
 """

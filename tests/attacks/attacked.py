@@ -1,4 +1,4 @@
-"""A run under attack, one process at a time, so that this user can read its ticket and key.
+"""A run under attack, one process at a time, so that this user can read its run descriptor and key.
 
 The checks of such a run each yield one line per failure.
 """
@@ -29,7 +29,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.roles import LOOP_ROLES, RECEIVES, sender_to
 from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.address import LOOPBACK
-from noack.runtime.join_ticket import Ticket, loads
+from noack.runtime.run_descriptor import RunDescriptor, loads
 from noack.runtime.udp_sockets import SHED
 from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Plan, Sent, Target, carry_out
@@ -107,22 +107,22 @@ class Run:
 
     def targets(self) -> list[Target]:
         """Wait until the loop runs; return its processes with their ports."""
-        ticket = self._ticket()
-        run_dir = Path(ticket.run_dir)
+        descriptor = self._descriptor()
+        run_dir = Path(descriptor.run_dir)
         for table in (PLANT_ACTUATION, SENSOR_MEASUREMENT, CONTROLLER_DELIVERY):
             spooled = run_dir / "spool" / f"{table}.recorder"
             self._wait(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 0)
         ports = {
-            role: getattr(ticket.scenario.ports, role) or udp_port(psutil.Process(process.pid))
+            role: getattr(descriptor.scenario.ports, role) or udp_port(psutil.Process(process.pid))
             for role, process in self.processes.items()
         }
-        loop = loop_of(ticket.scenario)
+        loop = loop_of(descriptor.scenario)
         one_host = self._hosts is None
         home, away = (LOOPBACK, LOOPBACK) if self._hosts is None else _addresses(self._hosts)
         return [
             Target(
                 role, ports[role], ports[sender_to(role, flow)], flow,
-                loop.m if flow is Flow.ACTUATION else loop.n, ticket.run_id, ticket.key,
+                loop.m if flow is Flow.ACTUATION else loop.n, descriptor.run_id, descriptor.key,
                 away if role == AWAY else home, one_host or sender_to(role, flow) == AWAY,
             )
             for role, flow in RECEIVES.items()
@@ -137,7 +137,7 @@ class Run:
         record = load_record((self._folder / "runs" / "latest").resolve())
         return Attacked(max(statuses), json.loads(stdout), stderr, record, sent)
 
-    def _ticket(self) -> Ticket:
+    def _descriptor(self) -> RunDescriptor:
         path = self._folder / f"noack-{os.getuid()}" / "default.json"
         self._wait(path.exists)
         return loads(path.read_text())

@@ -24,15 +24,21 @@ from netem.fates import FateRecorder
 from netem.relay.relay_links import LinkSpec
 from noack.core.errors import CallerError, NoackError
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime import control_plane
-from noack.runtime.join_ticket import Ticket, find_ticket, new_ticket, ticket_file, write_invitation
+from noack.runtime import active_runs
+from noack.runtime.run_descriptor import (
+    RunDescriptor,
+    descriptor_file,
+    find_descriptor,
+    new_descriptor,
+    write_invitation,
+)
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.matrix_files import write_matrices
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import NOBODY, needs_root
 from tests.command_line import invoke
-from tests.noack.runtime.test_join_ticket import INVITED
+from tests.noack.runtime.test_run_descriptor import INVITED
 
 OWN = f"noack-{os.getuid()}"
 EMULATOR = "lab"
@@ -58,23 +64,23 @@ def shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def ticket(content: dict[str, Any]) -> Ticket:
+def descriptor(content: dict[str, Any]) -> RunDescriptor:
     scenario = resolve(validate(content, "small"))
-    return new_ticket(scenario, Path("run"), launched=False)
+    return new_descriptor(scenario, Path("run"), launched=False)
 
 
-def join() -> Ticket:
-    ticket = find_ticket("default")
-    assert ticket is not None
-    return ticket
+def join() -> RunDescriptor:
+    descriptor = find_descriptor("default")
+    assert descriptor is not None
+    return descriptor
 
 
-Use = Callable[[Ticket], object]
+Use = Callable[[RunDescriptor], object]
 USES: dict[str, Use] = {
-    "publish a ticket": lambda ticket: ticket_file(ticket, "default").__enter__(),
+    "publish a run descriptor": lambda descriptor: descriptor_file(descriptor, "default").__enter__(),
     "join a run": lambda _: join(),
-    "publish a run": lambda ticket: control_plane.registered_run(ticket, None).__enter__(),
-    "find a run": lambda _: control_plane.find_run(),
+    "publish a run": lambda descriptor: active_runs.registered_run(descriptor, None).__enter__(),
+    "find a run": lambda _: active_runs.find_run(),
     "publish an emulator": lambda _: emulator_session.registered_emulator(EMULATOR).__enter__(),
     "list emulators": lambda _: emulator_session.running(),
 }
@@ -88,7 +94,7 @@ INSIDE = [
 
 @pytest.mark.parametrize(("place", "use"), [*INSIDE, *(("", use) for use in USES)])
 def test_a_symbolic_link_instead_of_a_folder_is_refused(
-    place: str, use: str, shared: Path, ticket: Ticket
+    place: str, use: str, shared: Path, descriptor: RunDescriptor
 ) -> None:
     """Even a link to this user's own folder: its owner can change the target at any time."""
     own = shared / "own"
@@ -96,16 +102,18 @@ def test_a_symbolic_link_instead_of_a_folder_is_refused(
         folder.mkdir(mode=0o700)
     if not place:
         (shared / OWN).rmdir()
-    (own / "default.json").write_text(ticket.model_dump_json())
+    (own / "default.json").write_text(descriptor.model_dump_json())
     (shared / OWN / place).symlink_to(own)
     with pytest.raises(CallerError, match="closed to others"):
-        USES[use](ticket)
+        USES[use](descriptor)
     if not place:
         assert "closed to others" in str(_runtime_folder_problem())  # the doctor reports it
     assert [file.name for file in own.rglob("*") if file.is_file()] == ["default.json"]
 
 
-def test_a_ticket_is_not_written_into_a_folder_swapped_in_meanwhile(shared: Path, ticket: Ticket) -> None:
+def test_a_descriptor_is_not_written_into_a_folder_swapped_in_meanwhile(
+    shared: Path, descriptor: RunDescriptor
+) -> None:
     """The swap happens after the folder is checked and before the file is opened."""
     theirs = shared / "theirs"
     theirs.mkdir()
@@ -115,21 +123,23 @@ def test_a_ticket_is_not_written_into_a_folder_swapped_in_meanwhile(shared: Path
         (shared / OWN).symlink_to(theirs)
         (theirs / f"default.{os.getpid()}").touch(mode=0o666)  # theirs if opened, not created
 
-    with ticket_file(ticket, "other"):
+    with descriptor_file(descriptor, "other"):
         pass  # creates the folder, as an earlier run does
     _swaps.append(swap)
-    with ticket_file(ticket, "default"):
+    with descriptor_file(descriptor, "default"):
         assert not _swaps
         assert not any(file.read_text() for file in theirs.iterdir())
 
 
-def test_a_ticket_is_not_read_from_a_folder_swapped_in_meanwhile(
-    shared: Path, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
+def test_a_descriptor_is_not_read_from_a_folder_swapped_in_meanwhile(
+    shared: Path, descriptor: RunDescriptor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Even if the other user swaps the folder back, noack does not use the planted ticket."""
+    """Even if the other user swaps the folder back, noack does not use the planted run descriptor."""
     theirs, away = shared / "theirs", shared / "away"
     theirs.mkdir()
-    (theirs / "default.json").write_text(ticket.model_copy(update={"run_dir": "theirs"}).model_dump_json())
+    (theirs / "default.json").write_text(
+        descriptor.model_copy(update={"run_dir": "theirs"}).model_dump_json()
+    )
 
     def swap(_: str) -> None:
         (shared / OWN).rename(away)
@@ -143,17 +153,17 @@ def test_a_ticket_is_not_read_from_a_folder_swapped_in_meanwhile(
             away.rename(path)
         return real(path, **options)
 
-    with ticket_file(ticket, "default"):
+    with descriptor_file(descriptor, "default"):
         _swaps.append(swap)
         monkeypatch.setattr(Path, "stat", swap_back)
-        assert join().run_dir == ticket.run_dir
+        assert join().run_dir == descriptor.run_dir
     assert not _swaps
 
 
 @needs_root
 @pytest.mark.parametrize("theirs", ["folder", "file"])
-def test_a_file_of_another_user_is_not_read(theirs: str, shared: Path, ticket: Ticket) -> None:
-    with ticket_file(ticket, "default") as path:
+def test_a_file_of_another_user_is_not_read(theirs: str, shared: Path, descriptor: RunDescriptor) -> None:
+    with descriptor_file(descriptor, "default") as path:
         os.chown(path if theirs == "file" else path.parent, NOBODY, NOBODY)
         with pytest.raises(CallerError, match="of yours"):
             join()
@@ -168,9 +178,9 @@ def test_only_regular_files_are_read(shared: Path) -> None:
 
 
 def test_a_run_without_a_usable_folder_is_refused(shared: Path) -> None:
-    assert find_ticket("default") is None
+    assert find_descriptor("default") is None
     with pytest.raises(CallerError, match="no run is active"):
-        control_plane.find_run()
+        active_runs.find_run()
     assert emulator_session.running() == []
     assert not (shared / OWN).exists()
 

@@ -50,10 +50,10 @@ def test_further_constraints_are_checked_over_all_updates_so_far(delivered: list
         (False, 0, None),
         (False, 1, "no delivered t_0: 1 "),
         (False, 2, "no delivered t_0: 2 "),
-        (False, 3, "MANSD violated: 3 successive dropouts"),
+        (False, 3, "MANSD violated: 3 consecutive losses"),
         (True, 0, None),
         (True, 2, None),
-        (True, 3, "MANSD violated: 3 successive dropouts"),
+        (True, 3, "MANSD violated: 3 consecutive losses"),
     ],
 )
 def test_lost_first_updates_are_a_violation_without_a_known_start(

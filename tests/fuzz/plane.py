@@ -5,8 +5,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from noack.runtime.connections.zenoh_session import label
 from noack.runtime.control_messages import message_json
-from noack.runtime.control_plane import label
 
 
 class Payload:

@@ -17,7 +17,7 @@ import pytest
 from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
 from noack.protocol.roles import LOOP_ROLES
-from noack.runtime.join_ticket import loads
+from noack.runtime.run_descriptor import loads
 from tests.integration import conftest as live
 
 Start = Callable[..., live.Running]
@@ -126,10 +126,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> ByHandRun:
         early = {role: by_hand(role) for role in LOOP_ROLES[:2]}
         values = live.settings(speed=2.0, horizon_s=1000.0, recovery__rejoin_within_s=60)
         recording = start(*live.AT_RATE, *values, command=RECORD)
-        ticket = private / "default.json"
-        live.wait_for(ticket.exists)
-        assert (stat.S_IMODE(ticket.stat().st_mode), stat.S_IMODE(private.stat().st_mode)) == (0o600, 0o700)
-        key = loads(ticket.read_text()).key
+        descriptor = private / "default.json"
+        live.wait_for(descriptor.exists)
+        assert (stat.S_IMODE(descriptor.stat().st_mode), stat.S_IMODE(private.stat().st_mode)) == (
+            0o600,
+            0o700,
+        )
+        key = loads(descriptor.read_text()).key
         processes = early | {role: by_hand(role) for role in LOOP_ROLES[2:]}
         recording.wait_recording()
         twice = by_hand("sensor")
@@ -138,7 +141,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> ByHandRun:
         assert len(seen) == 3 * 7  # with the fork server
         run_dir = (recording.runs / "latest").resolve()
         seen |= files(run_dir) | files(private)
-        del seen[str(ticket)]  # the ticket contains the key
+        del seen[str(descriptor)]  # the run descriptor contains the key
         processes["sensor"].send_signal(signal.SIGINT)
         assert processes["sensor"].wait(live.PATIENCE_S) == 130
         again = by_hand("sensor")
@@ -170,7 +173,7 @@ def test_a_process_may_be_restarted_by_hand(run: ByHandRun) -> None:
     assert [run.statuses[role] for role in ("plant", "sensor")] == [130, 130]
 
 
-def test_the_key_of_a_run_by_hand_is_visible_in_its_ticket_only(run: ByHandRun) -> None:
+def test_the_key_of_a_run_by_hand_is_visible_in_its_descriptor_only(run: ByHandRun) -> None:
     for where, content in run.seen.items():
         assert run.key not in content, where
         assert run.key.hex().encode() not in content, where

@@ -26,15 +26,15 @@ from noack.core.clock import RunClock
 from noack.core.errors import PeerError
 from noack.protocol.roles import SENDS
 from noack.protocol.wire_format import Wire
-from noack.runtime.live_driver import LoopChannel
-from noack.runtime.node_driver import NodeDriver
+from noack.runtime.drivers.live_driver import LoopChannel
+from noack.runtime.drivers.node_driver import NodeDriver
 from noack.runtime.udp_sockets import bind
 from noack.settings.user_files import located
 from tests.command_line import invoke
 from tests.helpers.approved import lines_of_error
 from tests.integration import conftest as live
 from tests.integration.test_restarts import goes_on, spooled
-from tests.noack.runtime.live_loops import KEY, RUN_ID, Rows, scenario
+from tests.noack.runtime.drivers.live_loops import KEY, RUN_ID, Rows, scenario
 
 Start = Callable[..., live.Running]
 BUILD = Path(__file__).parents[2] / "native" / "build.py"
@@ -153,8 +153,8 @@ def driver_of(program: Path, content: dict[str, Any]) -> NodeDriver:
     """The driver of a program, without a run."""
     settings = located(ProgramControllerSettings(kind="program", file=str(program)), Path(), "here")
     assert isinstance(settings, ProgramControllerSettings)
-    ticket = SimpleNamespace(key=KEY)
-    process: Any = SimpleNamespace(wire=Wire(RUN_ID, KEY), admitted_ns=0, ticket=ticket)
+    descriptor = SimpleNamespace(key=KEY)
+    process: Any = SimpleNamespace(wire=Wire(RUN_ID, KEY), admitted_ns=0, descriptor=descriptor)
     return NodeDriver(process, controllers_of([scenario(content)]), settings)
 
 

@@ -24,7 +24,7 @@ from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
 from noack.protocol.roles import BEGINNING, Notice, Record, Start
 from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.runtime.address import address_text
-from noack.runtime.real_time_loop import run_loop
+from noack.runtime.drivers.real_time_loop import run_loop
 from noack.runtime.telemetry import TelemetryBuffer
 from noack.runtime.udp_sockets import bind
 from noack.scenario.resolution import resolve, tables_of

@@ -36,6 +36,7 @@ class ContinuousTrace(NamedTuple):
 
 def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> ContinuousTrace:
     """Simulate the outcomes (runs, events) of the updates; a run ends when it has no more."""
+    # z = (x, x_s, x_c) with dz/dt = F z between events, and what is measured of it.
     n, A, H = len(system.A), system.A, system.H
     BK, none = system.B @ system.K, np.zeros((n, n))
     F = np.block([[A, none, BK], [none, H, none], [none, none, H]])
@@ -51,6 +52,7 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
     ]
     e_s = signals[0].T
     rows, begins = np.vstack(signals).T, np.cumsum([0, *(len(one) for one in signals[:-1])])
+    # A run is a row of each array; ``running`` are those that have outcomes left.
     leap, step_s = expm(F * system.step_s).T, system.step_s
     z, events = np.tile(system.x0, (len(delivered), 3)), np.zeros(len(delivered), dtype=np.int64)
     largest, last_s = np.zeros((len(z), len(signals))), np.full(len(z), -np.inf)
@@ -67,10 +69,12 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
         largest[which] = np.maximum(largest[which], grown)
 
     for step in range(STEPS):
+        # Propagate over a step; runs whose error is above the threshold at its end have an event in it.
         following, end_s = z @ leap, (step + 1) * step_s
         begin_s = np.full(len(z), step * step_s)
         crossing = running[is_above(following[running] @ e_s, end_s)]
         while len(crossing):
+            # Find the event times: the first part in which the error crosses, divided again and again.
             series, low_s = _series(F, z[crossing]), np.zeros(len(crossing))
             errors = series @ e_s
             width_s = end_s - begin_s[crossing]
@@ -82,6 +86,7 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
             now_s = begin_s[crossing] + low_s
             z[crossing], begin_s[crossing] = _at(series, low_s[None])[0], now_s
             note(crossing, now_s)
+            # A run without further outcomes ends at its event.
             more = events[crossing] < delivered.shape[1]
             running = np.setdiff1d(running, crossing[~more])
             crossing, now_s = crossing[more], now_s[more]
@@ -89,6 +94,7 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
             last_s[crossing] = now_s
             e_c = norms(z[crossing] @ signals[1].T)
             at_events[crossing, events[crossing]] = e_c * np.exp(system.alpha * now_s)
+            # Reset x_s, and x_c where the update is delivered; go on to the end of the step.
             z[crossing, n : 2 * n] = z[crossing, :n]
             received = crossing[delivered[crossing, events[crossing]]]
             z[received, 2 * n :] = z[received, :n]

@@ -8,28 +8,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from hypothesis import HealthCheck, Phase, assume, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.impairments.loss_guarantee import (
-    DeliveriesBetweenBursts,
-    LongestBurst,
-    LossesInWindow,
-    LossGuarantee,
-    LossRule,
-)
-from noack.theory.bounds.certificate_terms import (
-    Constants,
-    NetworkConditions,
-    NoCertificateError,
-    TriggerBound,
-)
-from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.certificates.solution import solve
-
+Matrix = NDArray[np.float64]
+Vector = NDArray[np.float64]
 Reals = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Steps = NDArray[np.int64]
@@ -73,62 +58,13 @@ class System:
     """Least number of deliveries between two bursts of losses."""
 
     @property
-    def conditions(self) -> NetworkConditions:
-        """The conditions of :func:`simulate` that the certificate may assume."""
-        applied_input = self.delay_steps
-        applied_input += self.hold_steps - 1 + self.lag if self.hold_steps else 0
-        sampling_s = self.sample_steps * self.step_s
-        return NetworkConditions(
-            dropouts=self.guarantee.longest_burst,
-            constraints=self.guarantee.rules[1:],
-            sampling_s=sampling_s,
-            spacing_s=sampling_s,
-            delay_s=applied_input * self.step_s,
-            hold_s=(self.hold_steps + self.lag) * self.step_s,
-            start_s=applied_input * self.step_s,
-        )
-
-    @property
     def events(self) -> int:
         """More than the number of tests in a run."""
         return STEPS // self.sample_steps + 2
 
     @property
-    def guarantee(self) -> LossGuarantee:
-        """The rules of the network's losses."""
-        rules: list[LossRule] = [LongestBurst(self.mansd)]
-        rules += [LossesInWindow(*self.window)] if self.window[0] < self.window[1] else []
-        rules += [DeliveriesBetweenBursts(self.recovery)] if self.recovery else []
-        return LossGuarantee(tuple(rules))
-
-    @property
     def lag(self) -> int:
         return self.lag_steps if self.hold_steps else 0
-
-    def gains(self, error: type[ErrorGains] = ErrorGains, plant: type[PlantGains] = PlantGains) -> PlantGains:
-        models = error(self.H, self.K, self.weight, self.alpha)
-        return plant(models, self.A, self.B, self.x0[:, None], self.alpha)
-
-    def certify(
-        self,
-        conditions: NetworkConditions | None = None,
-        plant: PlantGains | None = None,
-        *,
-        structured: bool = True,
-    ) -> Constants:
-        plant, level = plant or self.gains(), TriggerBound(self.beta, self.beta)
-        conditions = conditions or self.conditions
-        return solve(plant.error, plant, conditions, level, structured=structured)
-
-
-def certified_or_skipped(
-    system: System, conditions: NetworkConditions | None = None, *, structured: bool = True
-) -> Constants:
-    try:
-        return system.certify(conditions, structured=structured)
-    except NoCertificateError:
-        assume(False)
-        raise
 
 
 class Trace(NamedTuple):
@@ -148,24 +84,6 @@ class Trace(NamedTuple):
     is_event: Flags
     received: Steps
     """Number of the newest update that the controller has received, from 1 on; 0 for none."""
-
-    def shares(self, system: System, certified: Constants) -> dict[str, Reals]:
-        """Each signal divided by its bound, (runs, STEPS) or a number; at most 1 if it holds."""
-        growth, beta = np.exp(system.alpha * times_s(system)), system.beta
-        assert certified.inter_event_s is not None
-        return {
-            "sensor error": growth * self.sensor_error / (certified.overshoot * beta),
-            "controller error": growth * self.controller_error / (certified.delta * beta),
-            "state": growth * self.state / certified.state,
-            "weighted state": growth * self.state_weighted / certified.state_weighted,
-            "input error": growth * self.input_error / certified.input_error,
-            "inter-event time": np.array(certified.inter_event_s / self.inter_event_s),
-        }
-
-    def exceeded(self, system: System, certified: Constants) -> list[str]:
-        """The bounds that some run exceeds."""
-        shares = self.shares(system, certified)
-        return [name for name, share in shares.items() if share.max() > ROUNDING]
 
 
 def times_s(system: System) -> Reals:
@@ -221,74 +139,119 @@ def simulate(
         estimate: what the sensor knows of x; errors are the larger of those to it and to x.
         rule: replaces the decaying threshold.
     """
-    runs, (n, m), K, W = len(delivered), system.B.shape, system.K.T, system.weight.T
-    pool = [(system.A, system.B)] if plants is None else plants.pool
-    steps = [_Propagators(system, A, B) for A, B in pool]
+    loops = _Loops(system, len(delivered), plants, estimate is exact_state)
     threshold = np.maximum(system.beta * np.exp(-system.alpha * times_s(system)), floor)
-    x = np.tile(system.x0, (runs, 1))
-    x_s, x_c = x.copy(), x.copy() if system.known_start else np.zeros_like(x)
-    # An update in flight is its value on arrival; 0 in ``arrives``: no update.
-    slots, every = system.delay_steps + 1, np.arange(runs)
-    arriving, arrives = np.zeros((slots, runs, n)), np.zeros((slots, runs), dtype=np.int64)
-    newest, events, last_event = (np.zeros(runs, dtype=np.int64) for _ in range(3))
-    synchronised = np.full(runs, system.known_start)
-    commands: list[tuple[Reals, Flags]] = []
-    inputs = np.zeros((STEPS, runs, m))
-    xs, x_ss, x_cs = (np.empty((STEPS, runs, n)) for _ in range(3))
-    knowns = xs if estimate is exact_state else np.empty_like(xs)
-    is_event, has_input, has_state = (np.zeros((STEPS, runs), bool) for _ in range(3))
-    received = np.zeros((STEPS, runs), dtype=np.int64)
     for step in range(STEPS):
-        x_ss[step], known = x_s, x
+        loops.x_ss[step], known = loops.x_s, loops.x
         if step % system.sample_steps == 0:
             since = max(step - system.sample_steps, 0)
-            known = estimate(step, x, list(inputs[since:step]))
+            known = estimate(step, loops.x, list(loops.inputs[since:step]))
             if rule is None:
-                event = norms((x_s - known) @ W) > threshold[step]
+                event = norms((loops.x_s - known) @ system.weight.T) > threshold[step]
             else:
-                event = rule(step, step - last_event, known, x_s - known)
+                event = rule(step, step - loops.last_event, known, loops.x_s - known)
             event = event | (step == 0 and not system.known_start)
-            x_s, last_event = (
-                np.where(event[:, None], known, x_s),
-                np.where(event, step, last_event),
-            )
-            sent = np.flatnonzero(event & delivered[every, events])
-            delay = delays[sent, events[sent]]
-            slot = (step + delay) % slots
-            arriving[slot, sent] = np.einsum("ri,rij->rj", known[sent], steps[0].late[delay])
-            arrives[slot, sent] = events[sent] + 1
-            events, is_event[step] = events + event, event
-        now = step % slots
-        fresh = arrives[now] > newest
-        x_c = np.where(fresh[:, None], arriving[now], x_c)
-        newest, arrives[now] = np.where(fresh, arrives[now], newest), 0
-        synchronised = synchronised | fresh
+            loops.transmit(step, known, event, delivered, delays)
+        loops.receive(step)
+        loops.apply_inputs(step)
+        loops.knowns[step] = known
+        loops.advance(step, None if pushes is None else pushes[:, step])
+    return loops.trace()
+
+
+class _Loops:
+    """The state of all runs at a step, and their trace; a run is a row of each array."""
+
+    def __init__(self, system: System, runs: int, plants: Plants | None, is_exact: bool) -> None:
+        n, m = system.B.shape
+        self.system, self.plants, self.every = system, plants, np.arange(runs)
+        pool = [(system.A, system.B)] if plants is None else plants.pool
+        self.propagators = [_Propagators(system, A, B) for A, B in pool]
+        self.x = np.tile(system.x0, (runs, 1))
+        self.x_s = self.x.copy()
+        self.x_c = self.x.copy() if system.known_start else np.zeros_like(self.x)
+        # An update in flight is its value on arrival; 0 in ``arrives``: no update.
+        self.slots = system.delay_steps + 1
+        self.arriving = np.zeros((self.slots, runs, n))
+        self.arrives = np.zeros((self.slots, runs), dtype=np.int64)
+        self.newest, self.events, self.last_event = (np.zeros(runs, dtype=np.int64) for _ in range(3))
+        self.synchronised = np.full(runs, system.known_start)
+        self.commands: list[tuple[Reals, Flags]] = []
+        # The trace, (STEPS, runs, ...)
+        self.inputs = np.zeros((STEPS, runs, m))
+        self.xs, self.x_ss, self.x_cs = (np.empty((STEPS, runs, n)) for _ in range(3))
+        self.knowns = self.xs if is_exact else np.empty_like(self.xs)
+        self.is_event, self.has_input, self.has_state = (np.zeros((STEPS, runs), bool) for _ in range(3))
+        self.received = np.zeros((STEPS, runs), dtype=np.int64)
+
+    def transmit(
+        self, step: int, known: Reals, event: Flags, delivered: Flags, delays: NDArray[np.int64]
+    ) -> None:
+        """Reset x_s where there is an event, and send the updates that are delivered."""
+        self.x_s = np.where(event[:, None], known, self.x_s)
+        self.last_event = np.where(event, step, self.last_event)
+        sent = np.flatnonzero(event & delivered[self.every, self.events])
+        delay = delays[sent, self.events[sent]]
+        slot = (step + delay) % self.slots
+        self.arriving[slot, sent] = np.einsum("ri,rij->rj", known[sent], self.propagators[0].late[delay])
+        self.arrives[slot, sent] = self.events[sent] + 1
+        self.events, self.is_event[step] = self.events + event, event
+
+    def receive(self, step: int) -> None:
+        """Reset x_c where an update arrives that is newer than the last one."""
+        now = step % self.slots
+        fresh = self.arrives[now] > self.newest
+        self.x_c = np.where(fresh[:, None], self.arriving[now], self.x_c)
+        self.newest, self.arrives[now] = np.where(fresh, self.arrives[now], self.newest), 0
+        self.synchronised = self.synchronised | fresh
+        self.has_state[step], self.received[step] = self.synchronised, self.newest
+
+    def apply_inputs(self, step: int) -> None:
+        """Compute u = K x_c, or hold it; it reaches the plant after the lag."""
+        system = self.system
         is_new = system.hold_steps == 0 or step % system.hold_steps == 0
-        commands.append((x_c @ K, synchronised) if is_new else commands[-1])
+        self.commands.append((self.x_c @ system.K.T, self.synchronised) if is_new else self.commands[-1])
         if step >= system.lag:
-            u, has_input[step] = commands[step - system.lag]
-            inputs[step] = u * has_input[step][:, None]
-        xs[step], knowns[step], x_cs[step] = x, known, x_c
-        has_state[step], received[step] = synchronised, newest
-        push = None if pushes is None else pushes[:, step]
-        following = [one.advance(x, x_c, inputs[step], has_input[step], push) for one in steps]
-        x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
-        x_s, x_c = x_s @ steps[0].model, x_c @ steps[0].model
+            u, self.has_input[step] = self.commands[step - system.lag]
+            self.inputs[step] = u * self.has_input[step][:, None]
 
-    def errors(estimates: Reals) -> Reals:
-        to_x = norms((estimates - xs) @ W)
-        return to_x if knowns is xs else np.maximum(to_x, norms((estimates - knowns) @ W))
+    def advance(self, step: int, push: Reals | None) -> None:
+        """Note the states, and propagate them over the step."""
+        self.xs[step], self.x_cs[step] = self.x, self.x_c
+        following = [
+            one.advance(self.x, self.x_c, self.inputs[step], self.has_input[step], push)
+            for one in self.propagators
+        ]
+        if self.plants is None:
+            self.x = following[0]
+        else:
+            self.x = np.array(following)[self.plants.which[:, step], self.every]
+        model = self.propagators[0].model
+        self.x_s, self.x_c = self.x_s @ model, self.x_c @ model
 
-    seen = (
-        errors(x_ss), errors(x_cs) * has_state, norms(xs), norms(xs @ W),
-        norms(inputs - xs @ K) * has_input,
-    )  # fmt: skip
-    event_run, event_step = np.nonzero(is_event.T)
-    shortest = np.diff(event_step)[np.diff(event_run) == 0].min(initial=10**9)
-    return Trace(
-        *(one.T for one in seen), float(shortest * system.step_s),
-        xs.transpose(1, 0, 2), knowns.transpose(1, 0, 2), is_event.T, received.T,
-    )  # fmt: skip
+    def trace(self) -> Trace:
+        """The norms of the errors and signals."""
+        K, W, xs = self.system.K.T, self.system.weight.T, self.xs
+        event_run, event_step = np.nonzero(self.is_event.T)
+        shortest = np.diff(event_step)[np.diff(event_run) == 0].min(initial=10**9)
+        return Trace(
+            self._errors(self.x_ss).T,
+            (self._errors(self.x_cs) * self.has_state).T,
+            norms(xs).T,
+            norms(xs @ W).T,
+            (norms(self.inputs - xs @ K) * self.has_input).T,
+            float(shortest * self.system.step_s),
+            xs.transpose(1, 0, 2),
+            self.knowns.transpose(1, 0, 2),
+            self.is_event.T,
+            self.received.T,
+        )
+
+    def _errors(self, estimates: Reals) -> Reals:
+        """The larger of the errors to x and to what the sensor knows of it, (STEPS, runs)."""
+        W = self.system.weight.T
+        to_x = norms((estimates - self.xs) @ W)
+        return to_x if self.knowns is self.xs else np.maximum(to_x, norms((estimates - self.knowns) @ W))
 
 
 def norms(rows: Reals) -> Reals:
@@ -357,6 +320,11 @@ def systems(**fixed: Any) -> st.SearchStrategy[System]:
 
 DRIFTING = {"n": 1, "m": 1, "alpha_share": 0.2, "drifts": 1.5}
 """One state that decays more slowly than its model, so e_s grows in one direction: near many bounds."""
+
+
+def spectral_abscissa(matrix: Matrix) -> float:
+    """The largest real part of the eigenvalues."""
+    return float(np.linalg.eigvals(matrix).real.max())
 
 
 def random_system(rng: np.random.Generator, **fixed: Any) -> System:

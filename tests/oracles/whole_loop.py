@@ -305,6 +305,8 @@ def run(s: Settings, chance: Chance) -> Rows:
     order, packets = itertools.count(), [0, 0]
     newest: dict[Callable[..., None], int] = defaultdict(lambda: NONE)  # by receiver
 
+    # The event queue and the network.
+
     def at(t_ns: int, rank: int, action: Callable[..., None], *arguments: Any) -> None:
         heapq.heappush(queue, (t_ns, rank, next(order), action, arguments))
 
@@ -327,6 +329,8 @@ def run(s: Settings, chance: Chance) -> Rows:
 
     def leave(t_ns: int, *datagram: Any) -> None:
         at(t_ns, DATAGRAM, deliver, *datagram)
+
+    # What each machine does at its ticks and datagrams.
 
     def plant_steps(t_ns: int, k: int) -> None:
         if (measurement := plant.step(k)) is not None:
@@ -356,6 +360,7 @@ def run(s: Settings, chance: Chance) -> Rows:
     def plant_receives(t_ns: int, number: int, *actuation: Any) -> None:
         plant.receive(number, *actuation)
 
+    # The first ticks, and then all events in the order of time.
     at(0, PLANT, plant_steps, 0)
     if s.controller_phase_ns <= s.horizon_ns:
         at(s.controller_phase_ns, TICK, controller_ticks, 0)

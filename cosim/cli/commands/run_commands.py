@@ -23,7 +23,7 @@ with lazy_modules():
     from cosim.live.monitoring import progress, ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict, terminal_output
     from cosim.simulation import continuous, virtual_time
-    from noack.runtime import control_messages, control_plane
+    from noack.runtime import active_runs, control_messages
     from noack.scenario import link_load, resolution, runtime_parameters, scenario, scenario_file
 
 if TYPE_CHECKING:
@@ -268,7 +268,7 @@ def set_(
         noack set mansd 2 trigger.beta 0.3 --json   change M − 1 and β at once
     """
     changes = parsed(settings or ())
-    answer = control_plane.request_change(control_plane.find_run(session, run), changes)
+    answer = active_runs.request_change(active_runs.find_run(session, run), changes)
     if json:
         cli.print_json(answer.fields())
     elif changes:

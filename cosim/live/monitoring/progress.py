@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from cosim.live.monitoring.run_watcher import Watcher
 from noack.core.clock import NS_PER_S
 from noack.runtime.control_messages import RunProgress
-from noack.runtime.join_ticket import DEFAULT_SESSION
+from noack.runtime.run_descriptor import DEFAULT_SESSION
 from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:

@@ -24,16 +24,9 @@ from noack.core.process_limits import python_command
 from noack.protocol import ros2_messages as ros2
 from noack.protocol.record_tables import LOOP
 from noack.protocol.ros2_node import Node, Publisher
+from noack.runtime.active_runs import RUNS, OpenRun, active_runs, find_run
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.control_plane import (
-    RUNS,
-    OpenRun,
-    active_runs,
-    cause_of,
-    find_run,
-    header_of,
-    open_session,
-)
+from noack.runtime.connections.zenoh_session import cause_of, header_of, open_session
 from noack.scenario import scenario_file
 from noack.scenario.resolution import loop_of, resolve_run, resolved_loops, run_tables
 from noack.scenario.scenario import phases_ns

@@ -27,7 +27,7 @@ from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import open_append
 from noack.core.process_limits import python_command
 from noack.protocol.roles import LOOP_ROLES, PLANT, RECORDER
-from noack.runtime.join_ticket import Ticket
+from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario
 from noack.settings.section import ScenarioSection
@@ -140,13 +140,14 @@ _NOT_EXECUTABLE, _NOT_FOUND = 126, 127
 class ChildProcesses:
     """The launched processes of a run, by role.
 
-    Each receives the ticket on its standard input, which stays open as a lifeline. One on another
-    host receives an invitation and has no lifeline, because it outlives a broken connection.
+    Each receives the run descriptor on its standard input, which stays open until the
+    launcher ends. One on another host receives an invitation instead, and outlives a broken
+    connection.
     """
 
     def __init__(
         self,
-        ticket: Ticket,
+        descriptor: RunDescriptor,
         run_dir: Path,
         roles: Sequence[str],
         server: ForkServer | None = None,
@@ -155,7 +156,7 @@ class ChildProcesses:
         self._server = server
         self._invitation = "" if remote is None else remote.invitation
         self._hosts = {} if remote is None else remote.hosts
-        self._ticket = ticket
+        self._descriptor = descriptor
         self._run_dir = run_dir
         self._roles = [role for role in MODULES if role in roles]
         self._children: dict[str, Child] = {}
@@ -217,7 +218,7 @@ class ChildProcesses:
             raise MachineError(f"{role} cannot be started: {error}") from None
         assert child.stdin is not None
         with contextlib.suppress(BrokenPipeError):
-            child.stdin.write(self._ticket.model_dump_json() + "\n")
+            child.stdin.write(self._descriptor.model_dump_json() + "\n")
             child.stdin.flush()
         return child
 

@@ -27,12 +27,12 @@ from typing import IO, TYPE_CHECKING
 from cosim.lazy_modules import lazy_modules, load_module
 from noack.core.errors import MachineError
 from noack.core.process_limits import python_command, require_limits
-from noack.runtime.command_line import TICKET_ON_STDIN
+from noack.runtime.command_line import DESCRIPTOR_ON_STDIN
 
 with lazy_modules():
     import noack.impairments.kinds.loss as loss
     from noack.impairments import link_settings
-    from noack.runtime import control_messages, join_ticket
+    from noack.runtime import control_messages, run_descriptor
     from noack.scenario import scenario, scenario_checks
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _COMMON = (
     "noack.runtime.control_plane",
-    "noack.runtime.join_ticket",
+    "noack.runtime.run_descriptor",
     "noack.scenario.scenario_file",
     "noack.scenario.resolution",
     "noack.core.random_streams",
@@ -62,7 +62,7 @@ QUICK_IMPORTS = {
     "PYDANTIC_DISABLE_PLUGINS": "__all__",  # no search among all installed packages
 }
 ENVIRONMENT = {
-    TICKET_ON_STDIN: "1",
+    DESCRIPTOR_ON_STDIN: "1",
     **QUICK_IMPORTS,
     "PYTHONUTF8": "1",
     # Return memory to the system after a busy moment. Unless they are set, glibc raises these
@@ -283,7 +283,7 @@ def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
     models: list[type[BaseModel]] = [
         scenario.Scenario,
-        join_ticket.Ticket,
+        run_descriptor.RunDescriptor,
         link_settings.LinkSettings,
         loss.LossOf,
         *control_messages.ControlMessage.__subclasses__(),

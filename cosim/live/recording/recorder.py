@@ -37,8 +37,9 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.roles import BEGINNING, LOOP_ROLES, RECORDER, RESTART, Notice, Start
 from noack.runtime.command_line import print_to_stderr
+from noack.runtime.connections.zenoh_session import header_of
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
-from noack.runtime.control_plane import ControlPlane, header_of
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_run import join_run
 from noack.runtime.life_cycle import LAUNCHED_LOST_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess
@@ -374,7 +375,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the recorder; ``--live`` also opens a viewer."""
     live = "--live" in (sys.argv[1:] if arguments is None else arguments)
     with join_run(RECORDER, ()) as process, ExitStack() as stack:
-        stack.enter_context(active_run(Path(process.ticket.run_dir)))
+        stack.enter_context(active_run(Path(process.descriptor.run_dir)))
         live_view = None
         if live and not process.start.is_restart:
             live_view = live_viewer.LiveView()
@@ -385,7 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     """Record a run to its end."""
-    run_dir = Path(process.ticket.run_dir)
+    run_dir = Path(process.descriptor.run_dir)
     # A live view is ready when the run begins. The libraries of a recording take half a second to
     # load: the other processes do not wait for them.
     view = _open_view(process, live_view) if live_view else None
@@ -431,8 +432,8 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
 
 
 def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunRecording":
-    ticket = process.ticket
-    return run_recording.open_recording(process.scenario, Path(ticket.run_dir), ticket.run_id, live_view)
+    run_dir, run_id = Path(process.descriptor.run_dir), process.descriptor.run_id
+    return run_recording.open_recording(process.scenario, run_dir, run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:

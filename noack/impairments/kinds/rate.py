@@ -61,7 +61,7 @@ class Rate(Impairment):
     cell_overhead_bytes: Annotated[int, Field(ge=0, le=1000)] = 0
     """Header of a cell, e.g. 5."""
     discipline: Discipline = TailDrop.model_construct()
-    """Which packets the queue drops."""
+    """The rule by which the queue drops packets."""
 
     clauses: ClassVar = (
         Clause(

@@ -34,7 +34,7 @@ _SMALLEST = 1e-14
 """Smallest step, relative to the duration of a call."""
 _LOCATIONS = 20
 _BEYOND = 1e-9
-"""How far beyond 0 a located value is, relative to its change in the step; afterwards its sign is
+"""Distance of a located value beyond 0, relative to its change in the step; afterwards its sign is
 certain."""
 _PAIR = np.array(
     [

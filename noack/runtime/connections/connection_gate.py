@@ -17,7 +17,7 @@ from typing import Any
 
 _MOST_WAITING = 512
 _ROOM = _MOST_WAITING // 4
-"""How many connections end when there are too many: choosing them together costs less."""
+"""Number of connections that end when there are too many: choosing them together costs less."""
 _MOST_AT_ONCE = 128
 """Connections accepted before others are served."""
 _NO_DESCRIPTOR_PAUSE_S = 0.05
@@ -29,7 +29,7 @@ Begin = Callable[[socket.socket, bytes, str], Coroutine[Any, Any, None]]
 
 @dataclass(frozen=True)
 class FirstBytes:
-    """What a connection must send before it is served."""
+    """The first bytes that a connection must send before it is served."""
 
     accept: Callable[[bytes, Any], bool | None]
     """Given the bytes and the other end's address: whether it is served; None: more are needed."""

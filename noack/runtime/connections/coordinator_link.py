@@ -141,7 +141,7 @@ def _file_in_memory(secret: str) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Protection:
-    """What accepted connections must have."""
+    """Requirements of accepted connections."""
 
     context: ssl.SSLContext
     proof: InvitationProof
@@ -182,7 +182,7 @@ def forwarding(
 
 
 class _Forwarder:
-    """What happens to accepted connections."""
+    """Treatment of accepted connections."""
 
     def __init__(self, target: OpenTarget, protection: Protection | None) -> None:
         self._target, self._protection = target, protection
@@ -247,7 +247,7 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 
 
 class Destination(NamedTuple):
-    """Where a coordinator is, its certificate, and the keys of those that join, as PEM text.
+    """A coordinator's address, its certificate, and the keys of those that join, as PEM text.
 
     The run's key is in hexadecimal.
     """

@@ -65,7 +65,7 @@ class OffsetInterval(NamedTuple):
 
 
 class RestartCause(StrEnum):
-    """Why a bound began again."""
+    """Reasons for which a bound begins again."""
 
     CONTRADICTION = "contradiction"
     """No offset agrees with all exchanges and the assumed rate."""
@@ -172,7 +172,7 @@ def _intersection(first: _Limits, second: _Limits) -> _Limits:
 
 
 class Slew(NamedTuple):
-    """How the applied offset moves from a time on: native/clock.c computes the same from it."""
+    """The motion of the applied offset from a time on: native/clock.c computes the same from it."""
 
     slew_ppb: int
     """Largest change of the offset, in parts per 10⁹ of the own time."""
@@ -215,7 +215,7 @@ class SlewedClock:
 
     @property
     def slew(self) -> Slew:
-        """How the offset moves until the next call of :meth:`follow`."""
+        """The motion of the offset until the next call of :meth:`follow`."""
         return Slew(self.slew_ppb, self._since_ns, self._begun_at_ns, self._target_ns)
 
     def now_ns(self, own_ns: int) -> int:

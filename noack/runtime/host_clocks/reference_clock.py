@@ -15,7 +15,7 @@ from noack.protocol.roles import Notice, Record, Start
 from noack.runtime.address import Address, address_text
 from noack.runtime.host_clocks.clock_offset import SLEW_PPB, ClockOffset, Restart, RestartCause, SlewedClock
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient
-from noack.runtime.join_ticket import Ticket
+from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario.run_sections import ClocksSection
 
 LOST_AFTER_NS = 500_000_000
@@ -47,7 +47,7 @@ class ClockReport(NamedTuple):
     """Largest difference to the reference from ``since_ns`` to ``now_ns``; None: it is lost."""
     exchanges: int = 0
     lost: str | None = None
-    """Why it is lost."""
+    """The reason why it is lost."""
 
 
 class ReferenceClock:
@@ -168,20 +168,20 @@ class ReferenceClock:
         return None
 
 
-def reference_clock(ticket: Ticket) -> ReferenceClock | None:
+def reference_clock(descriptor: RunDescriptor) -> ReferenceClock | None:
     """Return the clock of the run's coordinator; None if this process reads that clock itself.
 
     Raise PeerError if it is another clock, and nobody answers requests for its time.
     """
-    if ticket.clock == clock_identity():
+    if descriptor.clock == clock_identity():
         return None
-    if ticket.time_reference is None:
+    if descriptor.time_reference is None:
         raise PeerError(
             "this process and the run's coordinator have different clocks, and the coordinator's "
             "host answers no requests for the time; it does with `noack record --listen`"
         )
-    settings = ticket.scenario.clocks or ClocksSection()
-    return ReferenceClock(ticket.time_reference, ticket.key, settings)
+    settings = descriptor.scenario.clocks or ClocksSection()
+    return ReferenceClock(descriptor.time_reference, descriptor.key, settings)
 
 
 LOST, FOUND = "clock lost", "clock found"

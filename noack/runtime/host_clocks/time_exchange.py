@@ -72,7 +72,7 @@ _STOP_CHECK_S = 0.2
 
 
 class TimeKind(IntEnum):
-    """What a datagram is."""
+    """Kinds of datagrams."""
 
     REQUEST = 1
     REPLY = 2
@@ -134,7 +134,7 @@ class HostClocks:
 
 
 class ClockDifference(NamedTuple):
-    """What readings of real-time minus monotonic clock say; each reading is an interval.
+    """A bound from readings of real-time minus monotonic clock; each reading is an interval.
 
     While the real-time clock is not set, the difference is the same at all readings, and is from
     ``lower_ns`` to ``upper_ns``.

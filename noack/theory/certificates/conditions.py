@@ -49,9 +49,9 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     common_ns = math.gcd(sample_ns, tick_ns)
     wait_ns = tick_ns - common_ns + phase_ns % common_ns
     late_ns = late_periods * step_ns
-    under_way_ns = network_delay_ns(resolved, late_periods)
-    if under_way_ns > 0:  # an update in flight for up to this time may just miss a tick
-        wait_ns = under_way_ns + tick_ns - 1
+    in_flight_ns = network_delay_ns(resolved, late_periods)
+    if in_flight_ns > 0:  # an update in flight for up to this time may just miss a tick
+        wait_ns = in_flight_ns + tick_ns - 1
     gap_ns = resolved.timing.actuation_gap_ns
     if gap_ns is None:
         gap_ns = resolved.timing.horizon_ns
@@ -60,7 +60,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     oldest_ns = gap_ns + (newest_ns if gap_ns % tick_ns == 0 else tick_ns)
     predicted_ns = resolved.timing.predicted_ns - tick_ns
     age_ns = max(min(oldest_ns, tick_ns), oldest_ns - predicted_ns)
-    start_ns = first_ns if under_way_ns == 0 else max(first_ns + late_ns, delay_ns)
+    start_ns = first_ns if in_flight_ns == 0 else max(first_ns + late_ns, delay_ns)
     return ideal_conditions(resolved)._replace(
         sampling_s=sample_ns / NS_PER_S,
         spacing_s=sample_ns / NS_PER_S,

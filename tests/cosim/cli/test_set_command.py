@@ -13,8 +13,8 @@ from cosim.cli.commands.run_commands import parsed
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
 from noack.core.errors import CallerError
-from noack.runtime import control_plane
-from noack.runtime.join_ticket import Ticket, new_ticket
+from noack.runtime import active_runs
+from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
 from noack.scenario.parameter_changes import changed
 from noack.scenario.resolution import resolve
 from noack.scenario.runtime_parameters import SHORT
@@ -25,15 +25,15 @@ from tests.helpers.approved import compare_lines, lines_of_error
 
 
 @pytest.fixture
-def ticket(content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ticket:
+def descriptor(content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunDescriptor:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     scenario = resolve(validate(content, "here"))
-    return new_ticket(scenario, tmp_path / "run", launched=True)
+    return new_descriptor(scenario, tmp_path / "run", launched=True)
 
 
 @pytest.fixture
-def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
-    running = Coordinator(ticket)
+def coordinator(descriptor: RunDescriptor) -> Iterator[Coordinator]:
+    running = Coordinator(descriptor)
     try:
         yield running
     finally:
@@ -71,36 +71,36 @@ def test_both_names_of_a_parameter_work_in_noack_set_in_the_option_and_in_change
     assert values[1:] == values[:-1]
 
 
-def test_a_mistake_in_the_words_gives_the_approved_line(ticket: Ticket) -> None:
+def test_a_mistake_in_the_words_gives_the_approved_line(descriptor: RunDescriptor) -> None:
     compare_lines(
         Path(__file__).with_name("set_mistakes.txt"),
-        lambda line: lines_of_error(lambda: changed(ticket.scenario, parsed(line.split()))),
+        lambda line: lines_of_error(lambda: changed(descriptor.scenario, parsed(line.split()))),
     )
 
 
 def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
-    ticket: Ticket, capsys: pytest.CaptureFixture[str]
+    descriptor: RunDescriptor, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    second_ticket = new_ticket(ticket.scenario, Path("elsewhere"), launched=True)
-    with control_plane.registered_run(second_ticket, "lab"):
-        assert control_plane.find_run().run_dir == "elsewhere"
+    second_descriptor = new_descriptor(descriptor.scenario, Path("elsewhere"), launched=True)
+    with active_runs.registered_run(second_descriptor, "lab"):
+        assert active_runs.find_run().run_dir == "elsewhere"
         warn_of_other_runs()
         assert "elsewhere is active, too" in capsys.readouterr().err
     with (
-        control_plane.registered_run(second_ticket, "lab"),
-        control_plane.registered_run(ticket, None) as path,
+        active_runs.registered_run(second_descriptor, "lab"),
+        active_runs.registered_run(descriptor, None) as path,
     ):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
-        assert ticket.key.hex() not in path.read_text()
+        assert descriptor.key.hex() not in path.read_text()
         with pytest.raises(CallerError, match="several runs are active: "):
-            control_plane.find_run()
-        assert control_plane.find_run(session="lab").run_dir == "elsewhere"
-        assert control_plane.find_run(run_dir=Path(ticket.run_dir)).run_dir == ticket.run_dir
+            active_runs.find_run()
+        assert active_runs.find_run(session="lab").run_dir == "elsewhere"
+        assert active_runs.find_run(run_dir=Path(descriptor.run_dir)).run_dir == descriptor.run_dir
         with pytest.raises(CallerError, match="no run is active in session 'none'; active: "):
-            control_plane.find_run(session="none")
+            active_runs.find_run(session="none")
         with pytest.raises(CallerError, match="probability = nan: expected a finite number"):
-            control_plane.request_change(control_plane.find_run(session="lab"), parsed(["loss.p", "nan"]))
+            active_runs.request_change(active_runs.find_run(session="lab"), parsed(["loss.p", "nan"]))
     assert list(path.parent.iterdir()) == []
 
 

@@ -9,11 +9,11 @@ import pytest
 import zenoh
 
 from cosim.live import coordinator
-from cosim.live.coordinator import AdmissionPass, ChangeRequests, Coordinator
+from cosim.live.coordinator import ChangeRequests, Coordinator, TokenScope
 from noack.core.errors import CallerError
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.scenario_file import load
-from tests.fuzz.parsers.ticket import _TICKET
+from tests.fuzz.parsers.run_descriptor import _DESCRIPTOR
 from tests.fuzz.plane import FakePlane, Query, Sample
 
 JUNK: list[bytes | None] = [
@@ -32,7 +32,7 @@ def plane() -> FakePlane:
 def barrier(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
     monkeypatch.setattr(coordinator, "ControlPlane", lambda *_, **__: plane)
     monkeypatch.setattr(coordinator, "_REPORT_GRACE_S", -1.0)  # do not wait for reports
-    return Coordinator(_TICKET)
+    return Coordinator(_DESCRIPTOR)
 
 
 def ask(
@@ -41,10 +41,10 @@ def ask(
     what: str,
     instance: str = "one",
     role: str = "sensor",
-    shown: str = _TICKET.admission_pass,
+    shown: str = _DESCRIPTOR.join_token,
 ) -> Query:
     address = None if role == RECORDER else ["127.0.0.1", 5 + ROLES.index(role)]
-    hello: dict[str, Any] = {"instance": instance, "address": address, "admission_pass": shown}
+    hello: dict[str, Any] = {"instance": instance, "address": address, "join_token": shown}
     plane.put(what, query := Query(f"noack/0/{what}/{role}", json.dumps(hello).encode()))
     barrier.poll()
     return query
@@ -131,19 +131,19 @@ def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
 @pytest.mark.parametrize(
     ("known", "shown", "role", "reason"),
     [
-        (AdmissionPass(), "ab" * 16, "sensor", None),
-        (AdmissionPass(), "", "sensor", "its ticket or invitation is not of this run"),
-        (AdmissionPass(), "cd" * 16, "sensor", "its ticket or invitation is not of this run"),
-        (AdmissionPass(["plant"]), "ab" * 16, "plant", None),
-        (AdmissionPass(["plant"]), "ab" * 16, "sensor", "its invitation is for the plant only"),
-        (AdmissionPass(until_s=-1.0), "ab" * 16, "sensor", "its invitation has expired"),
+        (TokenScope(), "ab" * 16, "sensor", None),
+        (TokenScope(), "", "sensor", "its run descriptor or invitation is not of this run"),
+        (TokenScope(), "cd" * 16, "sensor", "its run descriptor or invitation is not of this run"),
+        (TokenScope(["plant"]), "ab" * 16, "plant", None),
+        (TokenScope(["plant"]), "ab" * 16, "sensor", "its invitation is for the plant only"),
+        (TokenScope(until_s=-1.0), "ab" * 16, "sensor", "its invitation has expired"),
     ],
 )
 def test_a_pass_admits_its_roles_until_it_expires(
-    plane: FakePlane, barrier: Coordinator, known: AdmissionPass, shown: str, role: str,
+    plane: FakePlane, barrier: Coordinator, known: TokenScope, shown: str, role: str,
     reason: str | None,
 ) -> None:  # fmt: skip
-    barrier.passes["ab" * 16] = known
+    barrier.join_tokens["ab" * 16] = known
     asked = ask(plane, barrier, "admit", role=role, shown=shown)
     assert asked.error == (None if reason is None else f"cannot join: {reason}")
     joined = ask(plane, barrier, "join", role=role)
@@ -154,9 +154,9 @@ def test_a_pass_admits_its_roles_until_it_expires(
 
 
 def requests_of(loops: str, *settings: str) -> ChangeRequests:
-    ticket = SimpleNamespace(scenario=load(SHARED, [f"loops=[{loops}]", *settings]), run_dir="here")
+    descriptor = SimpleNamespace(scenario=load(SHARED, [f"loops=[{loops}]", *settings]), run_dir="here")
     plane = SimpleNamespace(announce_change=lambda announcement: None)
-    return ChangeRequests(cast("Any", ticket), cast("Any", plane))
+    return ChangeRequests(cast("Any", descriptor), cast("Any", plane))
 
 
 def requested(requests: ChangeRequests, settings: dict[str, Any]) -> dict[str, Any]:

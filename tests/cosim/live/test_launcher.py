@@ -16,7 +16,7 @@ from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime.command_line import Signals
-from noack.runtime.join_ticket import new_ticket, ticket_file
+from noack.runtime.run_descriptor import descriptor_file, new_descriptor
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 
@@ -77,8 +77,8 @@ class FakeCoordinator:
 class FakeChildren(ChildProcesses):
     """All processes run except the sensor, which has exited."""
 
-    def __init__(self, ticket: Any, run_dir: Path, code: int | None) -> None:
-        super().__init__(ticket, run_dir, ROLES)
+    def __init__(self, descriptor: Any, run_dir: Path, code: int | None) -> None:
+        super().__init__(descriptor, run_dir, ROLES)
         self._children = cast(Any, {role: Child() for role in ROLES} | {"sensor": Child(code)})
         self.can_start = True
 
@@ -96,18 +96,18 @@ class Case:
 
     def __init__(self, content: dict[str, Any], run_dir: Path) -> None:
         resolved = resolve(validate(content | {"recovery": {"rejoin_within_s": 60}}, ""))
-        self.ticket = new_ticket(resolved, run_dir, launched=True)
+        self.descriptor = new_descriptor(resolved, run_dir, launched=True)
         self.run_dir = run_dir
         (run_dir / "logs").mkdir()
         self.log = run_dir / "logs" / "sensor.log"
         self.log.write_text(LOG)
 
     def children(self, code: int | None) -> FakeChildren:
-        return FakeChildren(self.ticket, self.run_dir, code)
+        return FakeChildren(self.descriptor, self.run_dir, code)
 
     def run(self, children: FakeChildren, coordinator: FakeCoordinator, **watch: Any) -> _Run:
         watcher = Watcher(**watch)
-        return _Run(self.ticket, self.run_dir, cast(Any, coordinator), children, watcher, SimpleQueue())
+        return _Run(self.descriptor, self.run_dir, cast(Any, coordinator), children, watcher, SimpleQueue())
 
 
 @pytest.fixture
@@ -238,8 +238,8 @@ def test_a_refused_session_leaves_no_run_directory(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     scenario = validate(content | {"ports": {}}, "")
-    ticket = new_ticket(resolve(scenario), tmp_path, launched=False)
-    with ticket_file(ticket, "lab"), pytest.raises(CallerError, match="another run is open in it"):
+    descriptor = new_descriptor(resolve(scenario), tmp_path, launched=False)
+    with descriptor_file(descriptor, "lab"), pytest.raises(CallerError, match="another run is open in it"):
         launch(scenario, tmp_path / "runs", spawn=(), session="lab")
     assert list((tmp_path / "runs").iterdir()) == []
 

@@ -22,7 +22,7 @@ from netem.control.statistics_view import Screen
 from netem.fates import FateRecorder
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, ExitStatus
-from noack.runtime.control_plane import open_session
+from noack.runtime.connections.zenoh_session import open_session
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.conftest import Emulate
 from tests.netem.control import fake_relay as relays

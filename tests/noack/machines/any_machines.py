@@ -48,7 +48,7 @@ class Sizes(NamedTuple):
     """0: no observer."""
     measure_every: int = 1
     predictions: int = 1
-    predictive: bool = False
+    carries_model: bool = False
     acknowledged: bool = False
     internal: int = 0
     """Above 0: the user's system."""
@@ -58,13 +58,13 @@ class Sizes(NamedTuple):
 @st.composite
 def sizes(draw: st.DrawFn, most: int = 4) -> Sizes:
     n, m = draw(st.integers(1, most)), draw(st.integers(1, most))
-    predictive = draw(st.booleans()) and n + m <= 64
+    carries_model = draw(st.booleans()) and n + m <= 64
     outputs = draw(st.integers(0, min(n, 64 - m)))
     return Sizes(
         n, m, outputs,
         draw(st.integers(1, min((64 - outputs) // m, 3))),
-        draw(st.integers(1, min((64 - n * predictive) // m, 3))),
-        predictive, draw(st.booleans()), draw(st.integers(0, 3)),
+        draw(st.integers(1, min((64 - n * carries_model) // m, 3))),
+        carries_model, draw(st.booleans()), draw(st.integers(0, 3)),
         draw(st.tuples(st.booleans(), st.booleans())),
     )  # fmt: skip
 
@@ -150,7 +150,7 @@ def plant(seed: int, of: Sizes, scale: float = 1.0, period_ns: int = 10 * MS) ->
         system, m, period_ns, 10**12,
         Watchdog(int(rng.choice([30 * MS, NEVER_NS])), "model", 35 * MS,
                  matrix(rng, scale, n, n) * chance(rng), matrix(rng, scale, m, n))
-        if of.predictive else
+        if of.carries_model else
         Watchdog(int(rng.choice([0, 30 * MS])), str(rng.choice(["hold", "zero"])), 35 * MS),
         of.measure_every, of.predictions, int(rng.integers(1, 20)) * MS,
         Disturbance(*waves, (m * d, n * w)) if d or w else None,
@@ -206,7 +206,7 @@ def controller(
         int(rng.integers(0, 10)) * MS if first_ns is None else first_ns, 10**12,
         LossGuarantee(tuple(chosen)), matrix(rng, scale, n) if chance(rng) else None,
         of.acknowledged, Start(int(chance(rng)), 33 * MS), matrix(rng, scale, m),
-        of.predictive, of.predictions,
+        of.carries_model, of.predictions,
         int(rng.integers(1, 60)) * MS if chance(rng) else NEVER_NS, chance(rng), point,
     )  # fmt: skip
 

@@ -139,7 +139,7 @@ def test_a_change_that_a_later_loop_refuses_changes_no_loop(content: dict[str, A
 
 SOURCE = Path(__file__).parents[3] / "native" / "loop" / "machine_check.c"
 NULL, FAR, HUGE = ffi.NULL, 2**60 + 1, 2**63 - 1
-OF = Sizes(3, 2, 2, 2, 2, predictive=True, acknowledged=True, disturbed=(True, True))
+OF = Sizes(3, 2, 2, 2, 2, carries_model=True, acknowledged=True, disturbed=(True, True))
 
 WRONG = Path(__file__).with_name("wrong_numbers.txt")
 """Machines of any numbers are in tests/native."""
@@ -165,8 +165,8 @@ def machines_of(role: str) -> LoopMachines:
 def _full_plants() -> Any:
     for seed in range(100):
         part = plant(seed, OF)
-        assert part.measuring is not None
-        if part.measuring.is_noisy and part.watchdog.is_predictive:
+        assert part.measurement is not None
+        if part.measurement.is_noisy and part.watchdog.carries_model:
             yield seed
 
 

@@ -8,11 +8,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from noack.core.errors import CallerError
-from noack.plants import vehicle as compiled
 from noack.plants.linear import single_track_lane
 from noack.plants.plant_settings import OdeSystem
+from noack.plants.systems import vehicle_compilation as compiled
 from noack.plants.systems.linearisation import linearise
-from noack.plants.vehicle import VehicleSettings, equations, library
+from noack.plants.systems.vehicle_compilation import library, model_rates
+from noack.plants.vehicle import VehicleSettings
 from tests.noack.plants.motion import H_NS, motion
 
 X0 = np.array([0.2, -0.1, 0.05, 3.0])
@@ -101,7 +102,7 @@ def driving_states(model: str, p: Any) -> np.ndarray:
 @pytest.mark.parametrize("model", WIDTHS)
 def test_the_equations_give_the_librarys_values(model: str, car: str) -> None:
     p = parameters(car)
-    rates, dynamics = equations(model, p), library(f"vehicle_dynamics_{model}")
+    rates, dynamics = model_rates(model, p), library(f"vehicle_dynamics_{model}")
     compared = 0
     for z in driving_states(model, p):
         for inputs in ([0.1, -1.0], [-5.0, 30.0], [0.0, 0.0]):
@@ -128,7 +129,7 @@ def test_equations_that_cannot_be_compiled_are_run_in_python(
     monkeypatch.setattr(compiled, "_COMPILED", ("other",))
     uncached = compiled.compiled_dynamics.__wrapped__
     monkeypatch.setattr(compiled, "compiled_dynamics", uncached)
-    rates = equations("other", parameters("bmw_320i"))
+    rates = model_rates("other", parameters("bmw_320i"))
     assert rates(np.array([1.0, 3.0]), 0.0, 0.0).tolist() == [2.0, 6.0]
     lines = capsys.readouterr().err.splitlines()
     assert lines[-1].startswith("noack: warning: the vehicle's equations stay slow")

@@ -14,17 +14,20 @@ import pytest
 import zenoh
 from zenoh.handlers import FifoChannel
 
+import noack.runtime.connections.zenoh_session
 import noack.runtime.control_plane
 import noack.runtime.join_run
 from cosim.live.coordinator import Coordinator
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.roles import LOOP_ROLES
+from noack.runtime.active_runs import RUNS, run_name
 from noack.runtime.command_line import Signals
+from noack.runtime.connections.zenoh_session import cause_of, label
 from noack.runtime.control_messages import RunStart, parse_message
-from noack.runtime.control_plane import RUNS, ControlPlane, cause_of, label, run_name
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_run import _admitted
-from noack.runtime.join_ticket import Ticket, new_ticket
 from noack.runtime.private_folder import private_folder
+from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import needs_root, output_of_another_user
@@ -33,26 +36,26 @@ from tests.helpers.waiting import wait_for
 
 
 @pytest.fixture
-def ticket(content: dict[str, Any], tmp_path: Path) -> Ticket:
-    return new_ticket(resolve(validate(content, "")), tmp_path, launched=True)
+def descriptor(content: dict[str, Any], tmp_path: Path) -> RunDescriptor:
+    return new_descriptor(resolve(validate(content, "")), tmp_path, launched=True)
 
 
 @pytest.fixture
-def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
-    coordinator = Coordinator(ticket)
+def coordinator(descriptor: RunDescriptor) -> Iterator[Coordinator]:
+    coordinator = Coordinator(descriptor)
     yield coordinator
     coordinator.close()
 
 
-def changed(ticket: Ticket, **update: Any) -> Ticket:
-    return ticket.model_copy(update=update)
+def changed(descriptor: RunDescriptor, **update: Any) -> RunDescriptor:
+    return descriptor.model_copy(update=update)
 
 
 def test_a_message_that_arrives_under_another_key_is_ignored(
-    coordinator: Coordinator, ticket: Ticket
+    coordinator: Coordinator, descriptor: RunDescriptor
 ) -> None:
     """zenoh once delivered a confirmation of rows as a request to stop."""
-    with ControlPlane(ticket, "plant") as plant:
+    with ControlPlane(descriptor, "plant") as plant:
         listener, sent_as = coordinator.plane, label(plant.key("persisted", "plant"))
 
         def arrives() -> bool:
@@ -72,10 +75,10 @@ def test_a_message_that_arrives_under_another_key_is_ignored(
         wait_for(lambda: plant.stop_requested() == "enough")
 
 
-def test_the_coordinator_listens_on_no_port(ticket: Ticket) -> None:
+def test_the_coordinator_listens_on_no_port(descriptor: RunDescriptor) -> None:
     own = psutil.Process()
     before = set(own.net_connections("inet"))
-    coordinator = Coordinator(ticket)
+    coordinator = Coordinator(descriptor)
     assert set(own.net_connections("inet")) <= before
     coordinator.close()
 
@@ -98,31 +101,35 @@ except PermissionError:
 
 
 @needs_root
-def test_another_user_can_neither_connect_nor_listen(ticket: Ticket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_user_can_neither_connect_nor_listen(
+    descriptor: RunDescriptor, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with tempfile.TemporaryDirectory() as short:
         Path(short).chmod(0o777)  # its users may come in, and make files
         monkeypatch.setenv("XDG_RUNTIME_DIR", short)
-        coordinator = Coordinator(ticket)
-        path = private_folder() / RUNS / f"{run_name(ticket.run_id)}.sock"
+        coordinator = Coordinator(descriptor)
+        path = private_folder() / RUNS / f"{run_name(descriptor.run_id)}.sock"
         assert path.is_socket()
         said = output_of_another_user(REACH, str(path))
         assert said.splitlines() == ["connect refused", "bind refused", "unlink refused"]
-        with ControlPlane(ticket, "plant"):  # its user can
+        with ControlPlane(descriptor, "plant"):  # its user can
             pass
         coordinator.close()
         assert not path.exists()
 
 
-def test_a_process_without_a_coordinator_says_so(ticket: Ticket, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(noack.runtime.control_plane, "_CONNECT_MS", 200)
+def test_a_process_without_a_coordinator_says_so(
+    descriptor: RunDescriptor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(noack.runtime.connections.zenoh_session, "_CONNECT_MS", 200)
     with pytest.raises(NoAnswerError, match="cannot reach the run's coordinator: Unable"):
-        ControlPlane(ticket, "plant")
+        ControlPlane(descriptor, "plant")
     error = zenoh.ZError("Timeout! at /home/builder/.cargo/git/zenoh/orchestrator.rs:388.")
     assert cause_of(error) == "Timeout!"
 
 
 def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives_unchanged(
-    coordinator: Coordinator, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
+    coordinator: Coordinator, descriptor: RunDescriptor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(noack.runtime.control_plane, "_REQUEST_AGAIN_S", 0.2)
     answer = {"epoch_ns": 7, "addresses": dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5)), "more": [1]}
@@ -136,7 +143,7 @@ def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives
                 ControlPlane.answer(queries.recv(), answer)
 
     threading.Thread(target=serve, daemon=True).start()
-    with ControlPlane(ticket, "plant") as plant:
+    with ControlPlane(descriptor, "plant") as plant:
         received = parse_message(RunStart, plant.request("ask", {}, timeout_s=30))
         assert received.epoch_ns == 7
         assert received.addresses == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
@@ -148,13 +155,13 @@ def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives
 
 @pytest.mark.parametrize("launched", [True, False])
 def test_a_launched_process_connects_again_until_it_is_admitted(
-    ticket: Ticket, monkeypatch: pytest.MonkeyPatch, launched: bool
+    descriptor: RunDescriptor, monkeypatch: pytest.MonkeyPatch, launched: bool
 ) -> None:
     """A connection without answers does not recover; started by a person, a process reports it."""
     tries: list[FakePlane] = []
 
     class Silent(FakePlane):
-        def __init__(self, _ticket: Ticket, role: str) -> None:
+        def __init__(self, _descriptor: RunDescriptor, role: str) -> None:
             super().__init__()
             tries.append(self)
             if len(tries) == 1:
@@ -168,7 +175,7 @@ def test_a_launched_process_connects_again_until_it_is_admitted(
 
     monkeypatch.setattr(noack.runtime.join_run, "ControlPlane", Silent)
     monkeypatch.setattr(noack.runtime.join_run, "launcher_has_ended", lambda: False)
-    asking = partial(_admitted, "plant", changed(ticket, launched=launched), Signals())
+    asking = partial(_admitted, "plant", changed(descriptor, launched=launched), Signals())
     if launched:
         assert asking().plane is cast(Any, tries[2])
         assert [one.is_closed for one in tries] == [False, True, False]

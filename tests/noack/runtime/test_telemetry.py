@@ -168,8 +168,8 @@ def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> No
     """Runs of two recorders that began in one second, with processes on one host."""
     header = json.dumps({"first": 0}).encode()
     one, again, other = (
-        OwnSpool(tmp_path / "run", "sensor", writer, kept_of)
-        for writer, kept_of in [("a", "0001"), ("b", "0001"), ("c", "0002")]
+        OwnSpool(tmp_path / "run", "sensor", writer, remote_run_name)
+        for writer, remote_run_name in [("a", "0001"), ("b", "0001"), ("c", "0002")]
     )
     assert not (tmp_path / "run").exists()  # nothing is left of a run that kept nothing
     for spool in (one, again, other):

@@ -14,9 +14,9 @@ from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow
 from noack.runtime import udp_sockets
 from noack.runtime.address import LOOPBACK, Address, address_text, family_of, parse_address, parse_destination
-from noack.runtime.live_driver import LoopChannel
+from noack.runtime.drivers.live_driver import LoopChannel
 from noack.runtime.udp_sockets import SHED, SourceCount, bind, enlarge_buffer, open_beside
-from tests.noack.runtime.live_loops import Live, measurement, scenario
+from tests.noack.runtime.drivers.live_loops import Live, measurement, scenario
 
 
 def opened() -> socket.socket:

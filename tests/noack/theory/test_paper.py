@@ -26,17 +26,9 @@ from noack.trigger.trigger_rule import TriggerRule
 from tests.helpers.example_rules import decaying_rule
 from tests.helpers.shipped import resolved
 from tests.noack.theory.certificates.certificate_kinds.policies import INSTANT
+from tests.noack.theory.certificates.certified_loops import certified_or_skipped
 from tests.oracles.continuous_loops import simulate_continuous_time
-from tests.oracles.lossy_loops import (
-    ROUNDING,
-    SEARCH,
-    System,
-    certified_or_skipped,
-    networks,
-    seeds,
-    systems,
-    times_s,
-)
+from tests.oracles.lossy_loops import ROUNDING, SEARCH, System, networks, seeds, systems, times_s
 
 
 def norm(matrix: Matrix) -> float:

@@ -36,12 +36,12 @@ def started(server: ForkServer, folder: Path, *arguments: str) -> Iterator[Forke
 
 
 def test_the_standard_input_of_a_process_ends_with_the_launcher(server: ForkServer, tmp_path: Path) -> None:
-    """No other process, and not the server, may hold a lifeline open."""
+    """No other process, and not the server, may hold a process's standard input open."""
     with ExitStack() as stack:
         processes = [stack.enter_context(started(server, tmp_path)) for _ in range(3)]
         for process in processes:
             process.stdin.close()
-            assert process.wait() == ExitStatus.CALLER  # an empty ticket
+            assert process.wait() == ExitStatus.CALLER  # an empty run descriptor
 
 
 def test_a_process_is_a_child_in_a_session_of_its_own(server: ForkServer, tmp_path: Path) -> None:
@@ -62,9 +62,9 @@ signal.signal(signal.SIGTERM, lambda *_: print("no"))
 with closing(ForkServer(of_itself=True)) as server, open(sys.argv[1], "a") as log:
     process = server.start("plant_server.__main__", [], log)
     print(os.getsid(process.pid) == os.getsid(0), flush=True)
-    process.stdin.write("no ticket\\n")
+    process.stdin.write("no run descriptor\\n")
     process.stdin.close()
-    print(process.wait(), type(server._process).__name__, "NOACK_TICKET_ON_STDIN" in os.environ)
+    print(process.wait(), type(server._process).__name__, "NOACK_DESCRIPTOR_ON_STDIN" in os.environ)
 """
 
 
@@ -72,7 +72,7 @@ def test_a_command_forks_the_server_of_itself(tmp_path: Path) -> None:
     command = [sys.executable, "-c", _OF_ITSELF, str(tmp_path / "log")]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=150)
     assert done.stdout.splitlines() == ["False", f"{ExitStatus.CALLER} ForkedProcess False"]
-    assert "not a valid ticket" in (tmp_path / "log").read_text()
+    assert "not a valid run descriptor" in (tmp_path / "log").read_text()
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ from noack.runtime.host_clocks.time_exchange import (
     TimeReference,
     answering,
 )
-from noack.runtime.join_ticket import new_ticket
+from noack.runtime.run_descriptor import new_descriptor
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import validate
 from tests.helpers.two_hosts import DrivenClocks
@@ -325,10 +325,10 @@ def test_a_reference_clock_does_not_begin_without_an_answer_or_with_a_wide_bound
 
 def test_a_process_with_another_clock_needs_a_reference(content: dict[str, Any]) -> None:
     scenario = validate(content | {"loops": [{"name": "one", "count": 2}]}, "small")
-    ticket = new_ticket(scenario, Path("run"), launched=False)
-    assert reference_clock(ticket) is None
+    descriptor = new_descriptor(scenario, Path("run"), launched=False)
+    assert reference_clock(descriptor) is None
     with pytest.raises(PeerError, match="answers no requests for the time"):
-        reference_clock(ticket.model_copy(update={"clock": "another"}))
+        reference_clock(descriptor.model_copy(update={"clock": "another"}))
 
 
 class Scripted(ReferenceClock):

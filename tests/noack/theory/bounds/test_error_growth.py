@@ -8,6 +8,7 @@ import pytest
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.error_growth import first_passage_s
 from noack.theory.bounds.gains import PlantGains
+from tests.noack.theory.certificates.certified_loops import certify_loop, gains_of
 from tests.oracles.lossy_loops import System
 
 
@@ -22,9 +23,9 @@ def test_without_mismatch_or_push_the_threshold_is_never_reached() -> None:
         weight=np.eye(1), x0=np.ones(1), alpha=1.0, beta=0.1, known_start=True, mansd=0,
         step_s=0.01, sample_steps=1, delay_steps=0, hold_steps=0, lag_steps=0,
     )  # fmt: skip
-    plant = system.gains()
+    plant = gains_of(system)
     assert passage_s(plant, 0.1, 0.0, 0.0, 0.0) >= 1e6
-    found = system.certify(NetworkConditions(0))
+    found = certify_loop(system, NetworkConditions(0))
     assert found.inter_event_s is not None
     assert found.inter_event_s >= 1e6
     # ρ = π'(1 − e^{−t}): never above π', and half of it at ln 2.

@@ -19,6 +19,7 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.persistent_bounds import solve_two_parts
 from noack.theory.certificates.scenario_certificates import own_plant
 from noack.theory.certificates.solution import completed_alone
+from tests.noack.theory.certificates.certified_loops import conditions_of, gains_of
 from tests.oracles.lossy_loops import (
     DRIFTING,
     RUNS,
@@ -63,13 +64,13 @@ class DisturbedLoop:
 
     def certify(self) -> "Sum":
         system, floor = self.system, self.floor
-        decaying, pushed = system.gains(), self.pushed()
+        decaying, pushed = gains_of(system), self.pushed()
         models = pushed.error
         estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ self.noise)))
         first, rest = completed_alone(solve_two_parts(
             CertificatePart(decaying.error, decaying, TriggerBound(system.beta, None)),
             CertificatePart(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
-            system.conditions,
+            conditions_of(system),
         ))  # fmt: skip
         return Sum(self.system, first, rest)
 
@@ -230,7 +231,7 @@ class ObservedLoop:
         )  # fmt: skip
 
     def certificate(self) -> ScenarioCertificate:
-        return own_plant(resolve(self.scenario)).certificate(self.system.conditions)
+        return own_plant(resolve(self.scenario)).certificate(conditions_of(self.system))
 
 
 class Filter:

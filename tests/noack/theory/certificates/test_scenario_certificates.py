@@ -24,6 +24,7 @@ from noack.theory.certificates.conditions import allowed_conditions, ideal_condi
 from noack.theory.certificates.scenario_certificates import box, certify, certify_box, own_plant
 from noack.theory.certificates.solution import completed
 from tests.noack.theory.certificates.certificate_kinds.policies import exceeded_by, scenario_with
+from tests.noack.theory.certificates.certified_loops import conditions_of
 from tests.oracles.lossy_loops import SEARCH, STEPS, System, Trace, networks, seeds, simulate, systems
 
 ROOT = Path(__file__).parents[4]
@@ -39,7 +40,7 @@ def scenario(system: System, *, floor: float = 0.0) -> Scenario:
 
 
 def certified(system: System, floor: float = 0.0) -> tuple[ScenarioCertificate, Constants]:
-    certificate = certify(scenario(system, floor=floor), system.conditions)
+    certificate = certify(scenario(system, floor=floor), conditions_of(system))
     if certificate.constants is None:
         assume(False)
     assert certificate.constants is not None

@@ -8,6 +8,7 @@ from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.random_losses.stochastic_lyapunov import KnownRms, LossyFlow, quadratic_functions
 from tests.noack.theory.certificates.certificate_kinds.random_losses import draw
+from tests.noack.theory.certificates.certified_loops import gains_of
 
 
 @pytest.mark.parametrize("late", [False, True], ids=["paper", "schedule"])
@@ -17,7 +18,7 @@ def test_no_event_and_no_flow_raises_the_mean_of_a_quadratic_function(late: bool
     conditions = NetworkConditions(0, 0.01, 0.01, 0.1, 0.05, 0.1) if late else NetworkConditions(0)
     for _ in range(4):
         loop = draw(rng, alpha_share=0.3, probability=p)
-        gains, H, K, W = loop.system.gains(), loop.system.H, loop.system.K, loop.system.weight
+        gains, H, K, W = gains_of(loop.system), loop.system.H, loop.system.K, loop.system.weight
         n, flow = len(H), LossyFlow(gains.error, gains, conditions, p)
         one, zero = np.eye(n), np.zeros((n, n))
         x, q, e_s, w, v_f, v_h = np.split(np.eye(6 * n), 6)  # v is B (w + v_f + v_h) of the derivation

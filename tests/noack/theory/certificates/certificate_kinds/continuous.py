@@ -30,6 +30,7 @@ from tests.noack.theory.certificates.certificate_kinds.decaying import (
     dominated_by_errors,
     search,
 )
+from tests.noack.theory.certificates.certified_loops import certify_loop, guarantee_of
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time
 from tests.oracles.lossy_loops import DRIFTING, System, random_system
 
@@ -97,7 +98,7 @@ def _draw(rng: np.random.Generator, **fixed: Any) -> System:
 
 
 def _conditions(system: System) -> NetworkConditions:
-    return NetworkConditions(system.guarantee.longest_burst, constraints=system.guarantee.rules[1:])
+    return NetworkConditions(guarantee_of(system).longest_burst, constraints=guarantee_of(system).rules[1:])
 
 
 def constants_of(found: Constants, beta: float) -> Bounds:
@@ -108,7 +109,7 @@ def constants_of(found: Constants, beta: float) -> Bounds:
 
 def _bounds(system: System) -> Bounds | None:
     try:
-        return constants_of(system.certify(_conditions(system)), system.beta)
+        return constants_of(certify_loop(system, _conditions(system)), system.beta)
     except (NoCertificateError, NotDecayingError):
         return None
 
@@ -157,7 +158,7 @@ CONTINUOUS = Kind(
 )  # fmt: skip
 
 
-_certified = certified_by(System.certify)
+_certified = certified_by(certify_loop)
 
 
 def _sampled(rng: np.random.Generator, far: bool) -> System:

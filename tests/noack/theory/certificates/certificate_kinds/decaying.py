@@ -19,6 +19,7 @@ from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, consta
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.certificates.inequalities import ErrorInequalities
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certified_loops import certify_loop, conditions_of, gains_of
 from tests.oracles.lossy_loops import (
     DRIFTING,
     Flags,
@@ -34,15 +35,15 @@ from tests.oracles.lossy_loops import (
 
 
 def without_condition(field: str) -> Callable[[System], Constants]:
-    return lambda system: system.certify(system.conditions._replace(**{field: 0.0}))
+    return lambda system: certify_loop(system, conditions_of(system)._replace(**{field: 0.0}))
 
 
 def without_one_loss(system: System) -> Constants:
-    return system.certify(system.conditions._replace(dropouts=system.mansd - 1))
+    return certify_loop(system, conditions_of(system)._replace(dropouts=system.mansd - 1))
 
 
 def with_gains(error: type[ErrorGains], plant: type[PlantGains]) -> Callable[[System], Constants]:
-    return lambda system: system.certify(plant=system.gains(error, plant))
+    return lambda system: certify_loop(system, plant=gains_of(system, error, plant))
 
 
 class NoForcedResponse(PlantGains):
@@ -81,7 +82,7 @@ def inputs_of_no_missing_event(system: System) -> Constants:
         return found and found._replace(inputs=np.broadcast_to(found.inputs[:1], found.inputs.shape))
 
     with patch.object(ErrorInequalities, "_stages", wrong):
-        return system.certify()
+        return certify_loop(system)
 
 
 def _grown_by_losses(rng: np.random.Generator) -> System:
@@ -258,7 +259,7 @@ def _worst(system: System, trace: Trace) -> dict[str, float]:
 
 
 DECAYING = Kind(
-    "decaying", random_system, certified_by(System.certify), search,
+    "decaying", random_system, certified_by(certify_loop), search,
     {
         name: Broken(certified_by(certify), partial(random_system, **where))
         for name, (certify, where) in MUTANTS.items()

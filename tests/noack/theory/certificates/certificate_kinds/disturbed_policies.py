@@ -24,6 +24,7 @@ from tests.noack.theory.certificates.certificate_kinds.policies import (
     scenario_with,
 )
 from tests.noack.theory.certificates.certificate_kinds.shares import Case, drawn, shares_of
+from tests.noack.theory.certificates.certified_loops import conditions_of
 from tests.noack.theory.certificates.disturbed_loops import (
     DisturbedLoop,
     ObservedLoop,
@@ -70,7 +71,7 @@ class DisturbedPolicy:
 
     def certificate(self) -> ScenarioCertificate:
         """The certificate of the box, or of the plant if there is no box."""
-        resolved, conditions = self.scenario, self.system.conditions
+        resolved, conditions = self.scenario, conditions_of(self.system)
         return certify_box(resolved, conditions) or certify(resolved, conditions)
 
     def simulated(self, certificate: ScenarioCertificate, rng: np.random.Generator) -> dict[str, float]:

@@ -29,6 +29,7 @@ from noack.theory.certificates.scenario_certificates import certify, trigger_bou
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.decaying import search
 from tests.noack.theory.certificates.certificate_kinds.shares import Case, shares_of
+from tests.noack.theory.certificates.certified_loops import conditions_of
 from tests.oracles.lossy_loops import (
     DRIFTING,
     EventRule,
@@ -498,7 +499,7 @@ def _draw(kind: str, where: dict[str, Any], rng: np.random.Generator) -> Case:
 def _bounds(certify: _Certify) -> Callable[[Case], Bounds | None]:
     def certified(case: Case) -> ScenarioCertificate | None:
         resolved, _, system = case.loop
-        found = certify(resolved, system.conditions)
+        found = certify(resolved, conditions_of(system))
         return None if found.constants is None else found
 
     return shares_of(("e_s", "e_c", "x", "1/δ"), certified)

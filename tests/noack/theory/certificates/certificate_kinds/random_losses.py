@@ -19,6 +19,7 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.random_losses.mean_square_bounds import mean_squares
 from noack.theory.random_losses.unlimited_losses import BurstCertificate, moment_at_events, moments_of_runs
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificates.certified_loops import certify_loop, conditions_of, gains_of
 from tests.oracles.continuous_loops import simulate_continuous_time
 from tests.oracles.lossy_loops import DRIFTING, STEPS, Reals, System, random_system, simulate, times_s
 
@@ -52,7 +53,7 @@ def draw(rng: np.random.Generator, **fixed: Any) -> RandomLoop:
 def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds | None:
     """The bounds, or those of a broken copy: fewer losses, other conditions."""
     system = loop.system
-    gains, conditions = system.gains(), system.conditions._replace(**changes)
+    gains, conditions = gains_of(system), conditions_of(system)._replace(**changes)
     network = conditions, system.beta, share * loop.probability
     try:
         found = mean_squares(gains.error, gains, *network, refined=True)
@@ -128,7 +129,7 @@ def _certify_runs(loop: RandomLoop, *, share: float = 1.0) -> Bounds | None:
     bursts: list[BurstCertificate] = []
     try:
         for most in range(loop.most_lost + 1):
-            found = system.certify(NetworkConditions(most))
+            found = certify_loop(system, NetworkConditions(most))
             events = int(STEPS * system.step_s / (found.inter_event_s or np.inf)) + 1
             probability = losses.keeps(LossGuarantee((LongestBurst(most),)), events)
             e_c = found.delta * system.beta
@@ -136,7 +137,7 @@ def _certify_runs(loop: RandomLoop, *, share: float = 1.0) -> Bounds | None:
                 BurstCertificate(most, probability, events, found.delta, system.alpha, e_c, found.state)
             )
         at_events = [
-            moment_at_events(system.gains().error, losses, 0.0, order) * system.beta for order in _MEANS
+            moment_at_events(gains_of(system).error, losses, 0.0, order) * system.beta for order in _MEANS
         ]
     except (NoCertificateError, NotDecayingError):
         return None

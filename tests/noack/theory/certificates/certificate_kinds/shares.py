@@ -20,6 +20,7 @@ from noack.theory.certificates.certified_bounds import KnownStateBounds, KnownSt
 from tests.noack.theory.certificates import disturbed_loops
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.decaying import search
+from tests.noack.theory.certificates.certified_loops import certify_loop, conditions_of, gains_of
 from tests.noack.theory.certificates.disturbed_loops import (
     DisturbedLoop,
     ObservedLoop,
@@ -58,13 +59,13 @@ class KnownStateLoop:
 
     def bounds(self) -> KnownStateBounds:
         """The bounds; raises what the certificate raises."""
-        system, delay_s = self.system, self.system.conditions.delay_s
+        system, delay_s = self.system, conditions_of(self.system).delay_s
         if not isinstance(self.loop, DisturbedLoop):
-            part = KnownStatePart(system.gains(), system.certify(), system.beta)
+            part = KnownStatePart(gains_of(system), certify_loop(system), system.beta)
             return KnownStateBounds((part,), delay_s, np.zeros((len(system.A), 0)))
         found = self.loop.certify()
         parts = (
-            KnownStatePart(system.gains(), found.first, system.beta),
+            KnownStatePart(gains_of(system), found.first, system.beta),
             KnownStatePart(self.loop.pushed(), found.rest, 1.0),
         )
         return KnownStateBounds(parts, delay_s, self.loop.columns)

@@ -1,4 +1,4 @@
-"""Invitations and tickets: who can read them, errors without the key, one ticket per session."""
+"""Invitations and run descriptors: who can read them, errors without the key, one per session."""
 
 import json
 import os
@@ -13,28 +13,28 @@ from typing import Any
 import pytest
 
 from noack.core.errors import CallerError, PeerError
-from noack.runtime.join_ticket import (
+from noack.runtime.private_folder import private_folder
+from noack.runtime.run_descriptor import (
     RemoteAccess,
-    Ticket,
-    find_ticket,
+    RunDescriptor,
+    descriptor_file,
+    find_descriptor,
     invitation_file,
     loads,
-    new_ticket,
+    new_descriptor,
     own_host,
     read_invitation,
-    ticket_file,
     write_invitation,
 )
-from noack.runtime.private_folder import private_folder
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
-from tests.fuzz.parsers.ticket import _TICKET
+from tests.fuzz.parsers.run_descriptor import _DESCRIPTOR
 
 REMOTE = RemoteAccess(
     host="127.0.0.1", port=7000, coordinator="A", certificate="C", private_key="K",
     valid_until="2030-01-01T00:00:00+00:00",
 )  # fmt: skip
-INVITED: Ticket = _TICKET.model_copy(update={"remote": REMOTE, "run_dir": "/elsewhere/runs/one"})
+INVITED: RunDescriptor = _DESCRIPTOR.model_copy(update={"remote": REMOTE, "run_dir": "/elsewhere/runs/one"})
 INVITED_AS = INVITED.model_dump_json()
 
 
@@ -68,7 +68,7 @@ def _fifo(path: Path) -> None:
             "other users can read or change it; make it yours alone: chmod 600 ",
         ),
         (lambda path: path.write_bytes(b"\xff\xfe"), "not an invitation: it is no text"),
-        (lambda path: path.write_text("{"), "not an invitation: not a valid ticket: "),
+        (lambda path: path.write_text("{"), "not an invitation: not a valid run descriptor: "),
         (_fifo, "cannot be read: not a regular file"),
         (lambda path: os.truncate(path, 10**9), "not an invitation: larger than 64 MiB"),
         (
@@ -76,8 +76,8 @@ def _fifo(path: Path) -> None:
             "not an invitation: its run directory has no name",
         ),
         (
-            lambda path: path.write_text(_TICKET.model_dump_json()),
-            "not an invitation, but a ticket for this host",
+            lambda path: path.write_text(_DESCRIPTOR.model_dump_json()),
+            "not an invitation, but a run descriptor for this host",
         ),
     ],
 )
@@ -135,8 +135,8 @@ KEY = "ab" * 32
 @pytest.fixture
 def fields(content: dict[str, Any]) -> dict[str, Any]:
     scenario = resolve(validate(content, "small"))
-    ticket = new_ticket(scenario, Path("run"), launched=True)
-    return ticket.model_copy(update={"key": bytes.fromhex(KEY)}).model_dump(mode="json")
+    descriptor = new_descriptor(scenario, Path("run"), launched=True)
+    return descriptor.model_copy(update={"key": bytes.fromhex(KEY)}).model_dump(mode="json")
 
 
 @pytest.mark.parametrize(
@@ -148,13 +148,13 @@ def fields(content: dict[str, Any]) -> dict[str, Any]:
         ("scenario", None), ("scenario", {}), ("more", 0),
     ],
 )  # fmt: skip
-def test_an_invalid_ticket_gives_one_line_without_the_key(
+def test_an_invalid_descriptor_gives_one_line_without_the_key(
     fields: dict[str, Any], key: str, value: object
 ) -> None:
     with pytest.raises(CallerError) as caught:
         loads(json.dumps(fields | {key: value}))
     line = str(caught.value)
-    assert line.startswith(f"not a valid ticket: {key}")
+    assert line.startswith(f"not a valid run descriptor: {key}")
     assert "\n" not in line
     assert KEY[:8] not in line
 
@@ -164,17 +164,17 @@ def test_exactly_one_of_many_concurrent_runs_opens_a_session(
     fields: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_behind: bool
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    ticket, at_once = loads(json.dumps(fields)), 8
+    descriptor, at_once = loads(json.dumps(fields)), 8
     together = Barrier(at_once)
     if left_behind:  # left by a process that was killed
-        with ticket_file(ticket, "lab") as path:
+        with descriptor_file(descriptor, "lab") as path:
             text = path.read_text()
         path.write_text(text)
 
     def opened(number: int, stack: ExitStack) -> str:
         together.wait()
         try:
-            stack.enter_context(ticket_file(ticket.model_copy(update={"run_id": number}), "lab"))
+            stack.enter_context(descriptor_file(descriptor.model_copy(update={"run_id": number}), "lab"))
         except CallerError as error:
             return str(error)
         return ""
@@ -184,7 +184,7 @@ def test_exactly_one_of_many_concurrent_runs_opens_a_session(
         winner = errors.index("")
         refusal = "session 'lab': another run is open in it; choose --session NAME"
         assert sorted(errors) == ["", *[refusal] * (at_once - 1)]
-        found = find_ticket("lab")
+        found = find_descriptor("lab")
         assert found is not None
         assert found.run_id == winner
     assert list(private_folder().iterdir()) == []

@@ -1,4 +1,4 @@
-"""Tickets, and messages to the coordinator: join requests, ends, progress, changes."""
+"""Run descriptors, and messages to the coordinator: join requests, ends, progress, changes."""
 
 import fcntl
 import json
@@ -11,7 +11,7 @@ from cosim.live import coordinator
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
 from noack.protocol.roles import ROLES
-from noack.runtime import control_plane, join_ticket
+from noack.runtime import active_runs, run_descriptor
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.private_folder import open_private
 from noack.scenario.parameter_changes import ChangeSchedule, settings_bytes, settings_of
@@ -24,35 +24,35 @@ from tests.fuzz.edits import EDITS, Choices, Vocabulary, bases, damaged, edited,
 from tests.fuzz.harness import Harness, refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample
 
-_TICKET = join_ticket.new_ticket(
+_DESCRIPTOR = run_descriptor.new_descriptor(
     resolve(validate(bases("scenarios")[0], "base")), Path("run"),
     launched=True,
 ).model_copy(
-    update={"run_id": 7, "key": bytes(32), "admission_pass": "0" * 32, "clock": "one"}
+    update={"run_id": 7, "key": bytes(32), "join_token": "0" * 32, "clock": "one"}
 )  # fmt: skip
-TICKET: dict[str, Any] = json.loads(_TICKET.model_dump_json())
+DESCRIPTOR: dict[str, Any] = json.loads(_DESCRIPTOR.model_dump_json())
 _SCENARIO = vocabulary(json_schema(Scenario))
-TICKET_KNOWN = Vocabulary((*TICKET, *_SCENARIO.keys), (*_SCENARIO.words, "00" * 31, "0g"))
-SEEDS = [json.dumps(TICKET).encode(), *EDITS]
-WORDS = [json.dumps(word).encode() for word in TICKET]
+DESCRIPTOR_KNOWN = Vocabulary((*DESCRIPTOR, *_SCENARIO.keys), (*_SCENARIO.words, "00" * 31, "0g"))
+SEEDS = [json.dumps(DESCRIPTOR).encode(), *EDITS]
+WORDS = [json.dumps(word).encode() for word in DESCRIPTOR]
 
 
-def ticket_input(data: bytes) -> None:
+def descriptor_input(data: bytes) -> None:
     if data[:1] == b"\0":
         choices = Choices(data[1:])
-        content = edited(choices, TICKET, TICKET_KNOWN)
+        content = edited(choices, DESCRIPTOR, DESCRIPTOR_KNOWN)
         data = json.dumps(content).encode()
-    with refusal("not a valid ticket"):
-        found = join_ticket.loads(data.decode("utf-8", "replace"))
-        assert join_ticket.loads(found.model_dump_json()) == found
+    with refusal("not a valid run descriptor"):
+        found = run_descriptor.loads(data.decode("utf-8", "replace"))
+        assert run_descriptor.loads(found.model_dump_json()) == found
         assert len(found.key) == 32
         assert 0 <= found.run_id < 2**64
         assert isinstance(found.run_dir, str)
         assert isinstance(found.launched, bool)
 
 
-PASS = _TICKET.admission_pass
-HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001], "admission_pass": PASS}
+TOKEN = _DESCRIPTOR.join_token
+HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001], "join_token": TOKEN}
 PROGRESS = {
     "t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None, "live": None,
 }  # fmt: skip
@@ -63,7 +63,7 @@ def barrier_input(data: bytes) -> None:
     choices = Choices(data)
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
-        barrier = coordinator.Coordinator(_TICKET)
+        barrier = coordinator.Coordinator(_DESCRIPTOR)
     queries: dict[str, list[Query]] = {}
     admissions: list[Query] = []
     for _ in range(choices.below(12)):
@@ -151,7 +151,7 @@ def _request(content: bytes) -> None:
     """The coordinator replies, and every process can apply the announced changes."""
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
-        centre = coordinator.Coordinator(_TICKET)
+        centre = coordinator.Coordinator(_DESCRIPTOR)
     centre._clock = RunClock(0, 1.0, lambda: 0)
     query = Query("noack/0/runtime_parameters", content)
     plane.put("runtime_parameters", query)
@@ -160,7 +160,7 @@ def _request(content: bytes) -> None:
     assert query.error is None or query.error.strip()
     for announced in plane.announced:
         one = parse_message(ChangeAnnouncement, json.dumps(announced))
-        ChangeSchedule(_TICKET.scenario).announce("t", one.change, 0, 0, -1)
+        ChangeSchedule(_DESCRIPTOR.scenario).announce("t", one.change, 0, 0, -1)
     try:
         settings = parse_message(ChangeRequest, content).settings
     except PeerError:
@@ -173,12 +173,12 @@ def _announce(content: bytes) -> None:
     """A process applies the change, or refuses it in one line and stays unchanged."""
     with refusal("not a valid change announcement"):
         one = parse_message(ChangeAnnouncement, content)
-        schedule = ChangeSchedule(_TICKET.scenario)
+        schedule = ChangeSchedule(_DESCRIPTOR.scenario)
         with refusal(("the change", "a change"), lines=True):
             schedule.announce("t", one.change, 0, 0, -1)
             assert settings_of(settings_bytes(one.settings)) == one.settings
             return
-        assert schedule.last is _TICKET.scenario
+        assert schedule.last is _DESCRIPTOR.scenario
 
 
 def _find(data: bytes) -> None:
@@ -189,7 +189,7 @@ def _find(data: bytes) -> None:
         with path.open() as lock:  # locked as by the launcher
             fcntl.flock(lock, fcntl.LOCK_EX)
             with refusal(str(path)):
-                run = control_plane.find_run()
+                run = active_runs.find_run()
                 assert all(isinstance(field, str) for field in run if field is not None)
 
 
@@ -199,7 +199,7 @@ def _changes_bytes(choices: Choices, content: Any) -> bytes:
 
 
 PARSERS = {
-    "ticket": Harness(ticket_input, seeds=SEEDS, words=WORDS),
+    "run_descriptor": Harness(descriptor_input, seeds=SEEDS, words=WORDS),
     "barrier": Harness(barrier_input),
     "changes": Harness(changes_input),
 }

@@ -13,7 +13,7 @@ from noack.core.clock import RunClock
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.roles import SENDS, Notice, Record
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
-from noack.runtime.live_driver import LiveDriver, LoopChannel
+from noack.runtime.drivers.live_driver import LiveDriver, LoopChannel
 from noack.runtime.udp_sockets import bind
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario

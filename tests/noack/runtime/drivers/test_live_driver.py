@@ -19,9 +19,9 @@ from noack.core.core_library import core
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import Record
 from noack.protocol.wire_format import Flow, Message
-from noack.runtime.live_driver import LiveDriver
+from noack.runtime.drivers.live_driver import LiveDriver
 from tests.helpers.wire_decoder import NO_VECTOR
-from tests.noack.runtime.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
+from tests.noack.runtime.drivers.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NOW = "now_ns"

@@ -28,7 +28,7 @@ from noack.protocol.wire_format import (
     rejected_of,
 )
 from noack.runtime.address import Address, SocketName, packed_name
-from noack.runtime.real_time_loop import RecordSink
+from noack.runtime.drivers.real_time_loop import RecordSink
 from noack.runtime.run_process import RunProcess
 from noack.runtime.udp_sockets import CountingSocket, errors_by_text
 

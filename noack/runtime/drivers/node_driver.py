@@ -30,8 +30,8 @@ from noack.core.errors import CallerError, PeerError, shortened
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.roles import SENDS
 from noack.runtime.address import Address, SocketName
-from noack.runtime.live_driver import LiveDriver, LoopChannel, ends_of
-from noack.runtime.real_time_loop import RecordSink
+from noack.runtime.drivers.live_driver import LiveDriver, LoopChannel, ends_of
+from noack.runtime.drivers.real_time_loop import RecordSink
 from noack.runtime.run_process import RunProcess
 from noack.settings.user_files import unchanged
 
@@ -76,7 +76,7 @@ class NodeDriver(LiveDriver):
         super().__init__(machines, process.wire, admitted_ns=process.admitted_ns)
         # The file's name alone: the process is given a copy in the run directory.
         self._label = f"controller.file ({Path(settings.file).name})"
-        self._key, self._sockets = process.ticket.key, list[socket.socket]()
+        self._key, self._sockets = process.descriptor.key, list[socket.socket]()
         self._clock, self._sent_clock = RunClock(0), b""
         self._to_send, self._received = bytearray(), bytearray()
         self._foreign, self._tick_s = 0, time.monotonic()

@@ -1,4 +1,4 @@
-"""The ticket: what a process needs to join a run. An invitation is a ticket for another host.
+"""The run descriptor: what a process needs to join a run. An invitation is one for another host.
 
 It contains the run's secret key, so it is never on a command line or in the environment. The
 launcher writes it to the standard input of launched processes. For processes started by hand it is
@@ -38,7 +38,7 @@ _MOST_BYTES = 64 * 2**20
 
 
 class RemoteAccess(ScenarioSection):
-    """How a process on another host reaches the coordinator: by TLS, with keys made for the run."""
+    """Access of a process on another host to the coordinator: by TLS, with keys made for the run."""
 
     host: NumericHost
     port: Annotated[int, Field(ge=1, le=65_535)]
@@ -48,58 +48,59 @@ class RemoteAccess(ScenarioSection):
     valid_until: str  # for people; the coordinator measures the time itself
 
 
-class Ticket(ScenarioSection):
-    """What a process needs to join a run; its JSON has the key in hexadecimal."""
+class RunDescriptor(ScenarioSection):
+    """All that a process needs to join a run; its JSON has the key in hexadecimal."""
 
     model_config = ConfigDict(val_json_bytes="hex", ser_json_bytes="hex")
 
     run_id: Seed
     key: Annotated[bytes, Field(min_length=KEY_BYTES, max_length=KEY_BYTES)]
     run_dir: str
-    launched: bool  # whether a launcher holds the process's standard input open as its lifeline
-    admission_pass: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
+    launched: bool  # by a launcher, whose end closes the process's standard input
+    join_token: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
     """The coordinator knows which roles it admits, and until when."""
     host: str = LOOPBACK  # where the sockets of loop data listen
     remote: RemoteAccess | None = None  # of an invitation
     clock: str
     """The coordinator's monotonic clock, of which the run's epoch is a reading."""
     time_reference: SocketAddress | None = None
-    """Where processes with another clock compare it with the coordinator's, under the run's key."""
+    """Address at which processes with another clock compare it with the coordinator's, under the run's
+    key."""
     target_losses: Annotated[dict[str, FiniteFloat], AfterValidator(remember)] = Field({})
     """Probabilities that the check of the scenario needs."""
     scenario: Scenario  # resolved
 
 
-def new_ticket(scenario: Scenario, run_dir: Path, *, launched: bool) -> Ticket:
-    """Return a ticket with a fresh run id and key."""
-    return Ticket(
+def new_descriptor(scenario: Scenario, run_dir: Path, *, launched: bool) -> RunDescriptor:
+    """Return a run descriptor with a fresh run id and key."""
+    return RunDescriptor(
         run_id=secrets.randbits(64),
         key=secrets.token_bytes(KEY_BYTES),
         run_dir=str(run_dir),
         launched=launched,
-        admission_pass=new_admission_pass(),
+        join_token=new_join_token(),
         clock=clock_identity(),
         target_losses=found_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
         scenario=scenario,
     )
 
 
-def new_admission_pass() -> str:
-    """Return a random pass."""
+def new_join_token() -> str:
+    """Return a random join token."""
     return secrets.token_hex(16)
 
 
-def loads(text: str) -> Ticket:
-    """Parse a ticket; raise CallerError if the text is not one."""
+def loads(text: str) -> RunDescriptor:
+    """Parse a run descriptor; raise CallerError if the text is not one."""
     try:
-        return Ticket.model_validate_json(text)
+        return RunDescriptor.model_validate_json(text)
     except ValidationError as error:
-        raise CallerError(f"not a valid ticket: {brief(error)}") from None
+        raise CallerError(f"not a valid run descriptor: {brief(error)}") from None
 
 
 @contextmanager
-def ticket_file(ticket: Ticket, session: str) -> Iterator[Path]:
-    """Publish the ticket in a file that only its owner can read, while the context lasts.
+def descriptor_file(descriptor: RunDescriptor, session: str) -> Iterator[Path]:
+    """Publish the run descriptor in a file that only its owner can read, while the context lasts.
 
     The file is locked: if several runs use a session's name, one succeeds. Raise CallerError if
     another run is open in the session, or the folder is not the user's own.
@@ -107,54 +108,54 @@ def ticket_file(ticket: Ticket, session: str) -> Iterator[Path]:
     require_name(session, "session")
     with ExitStack() as stack:
         try:
-            yield stack.enter_context(lock_file("", session, ticket.model_dump(mode="json")))
+            yield stack.enter_context(lock_file("", session, descriptor.model_dump(mode="json")))
         except FileExistsError:
             raise CallerError(
                 f"session {session!r}: another run is open in it; choose --session NAME"
             ) from None
 
 
-def find_ticket(session: str) -> Ticket | None:
-    """Return the ticket that a recorder or launcher has published in a session; None without."""
+def find_descriptor(session: str) -> RunDescriptor | None:
+    """Return the run descriptor published in a session by a recorder or launcher, or None."""
     require_name(session, "session")
     files = live_lock_files("", session)
     return loads(files[0].content.decode()) if files else None
 
 
 @contextmanager
-def invitation_file(path: Path, ticket: Ticket) -> Iterator[None]:
+def invitation_file(path: Path, descriptor: RunDescriptor) -> Iterator[None]:
     """Write an invitation that only its owner can read; replace an older one.
 
     At the end it is removed, unless that of another run has replaced it. Raise CallerError if it
     cannot be written.
     """
-    write_invitation(path, ticket)
+    write_invitation(path, descriptor)
     try:
         yield
     finally:
         with suppress(OSError, ValueError):
-            if read_regular(path, _MOST_BYTES) == _content(ticket):
+            if read_regular(path, _MOST_BYTES) == _content(descriptor):
                 path.unlink()
 
 
-def write_invitation(path: Path, ticket: Ticket) -> None:
+def write_invitation(path: Path, descriptor: RunDescriptor) -> None:
     """Write an invitation that only its owner can read; replace an older one.
 
     Raise CallerError if it cannot be written.
     """
     try:
         with new_file(path, make_folder=False, mode=0o600) as file:
-            file.write(_content(ticket))
+            file.write(_content(descriptor))
     except (OSError, ValueError) as error:
         raise CallerError(f"{path}: the invitation cannot be written: {why(error)}") from None
 
 
-def _content(ticket: Ticket) -> bytes:
-    return (ticket.model_dump_json(indent=1) + "\n").encode()
+def _content(descriptor: RunDescriptor) -> bytes:
+    return (descriptor.model_dump_json(indent=1) + "\n").encode()
 
 
-def read_invitation(path: Path, runs: Path) -> Ticket:
-    """Return the ticket of an invitation, as this host uses it.
+def read_invitation(path: Path, runs: Path) -> RunDescriptor:
+    """Return the run descriptor of an invitation, as this host uses it.
 
     Sockets of loop data listen on the address from which this host reaches the coordinator. Rows
     that cannot be sent to the recorder stay below ``runs``, in a folder with the run's name. Raise
@@ -163,18 +164,18 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
     """
     text = _text(path)
     try:
-        ticket = loads(text)
+        descriptor = loads(text)
     except CallerError as error:
         raise CallerError(f"{path}: not an invitation: {error}") from None
-    if ticket.remote is None:
-        raise CallerError(f"{path}: not an invitation, but a ticket for this host")
-    name = Path(ticket.run_dir).name
+    if descriptor.remote is None:
+        raise CallerError(f"{path}: not an invitation, but a run descriptor for this host")
+    name = Path(descriptor.run_dir).name
     if name in ("", "..") or "\0" in name:
         raise CallerError(f"{path}: not an invitation: its run directory has no name")
     _require_writable(runs.resolve())
     run_dir = runs.resolve() / name
-    host = own_host((ticket.remote.host, ticket.remote.port))
-    return ticket.model_copy(update={"host": host, "run_dir": str(run_dir)})
+    host = own_host((descriptor.remote.host, descriptor.remote.port))
+    return descriptor.model_copy(update={"host": host, "run_dir": str(run_dir)})
 
 
 def _text(path: Path) -> str:

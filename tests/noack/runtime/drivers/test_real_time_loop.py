@@ -1,10 +1,7 @@
-"""The real-time loop: turns of housekeeping around a driver, priorities, locked memory."""
+"""The real-time loop: turns of housekeeping around a driver."""
 
-import os
-import threading
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
 from itertools import count
 from typing import Any
 
@@ -14,8 +11,8 @@ from numpy.typing import NDArray
 
 from noack.core.clock import RunClock
 from noack.protocol.roles import Notice, Record
-from noack.runtime import real_time_loop
-from noack.runtime.real_time_loop import RecordSink, _fifo, run_loop
+from noack.runtime.drivers import real_time_loop
+from noack.runtime.drivers.real_time_loop import RecordSink, run_loop
 
 PERIOD_NS = 1_000_000
 STEPS = 200
@@ -142,23 +139,3 @@ def test_a_deadline_after_the_end_is_not_late() -> None:
     late_ns = run_loop(one, one, one.clock, Log(), end_ns=1, stop=never)
     assert late_ns == 0
     assert one.served < STEPS
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux")
-@pytest.mark.parametrize(("priority", "expected"), [(50, [47, 48, 49, 50]), (1, [1, 1, 1, 1])])
-def test_a_receiver_interrupts_its_sender_and_the_loop_the_other_threads(
-    priority: int, expected: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given: list[tuple[int, int]] = []
-
-    def note(thread: int, _policy: int, parameters: os.sched_param) -> None:
-        given.append((thread, parameters.sched_priority))
-
-    monkeypatch.setattr(os, "sched_setscheduler", note)
-    for place, own in enumerate(expected):
-        given.clear()
-        with ExitStack() as undo:
-            _fifo(priority, place, undo)
-        first, *others, last = given
-        assert (first, last) == ((threading.get_native_id(), own), (0, 0))
-        assert {rank for _, rank in others} <= {max(priority - 4, 1)}

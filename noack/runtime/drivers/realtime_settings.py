@@ -1,11 +1,8 @@
-"""The real-time loop: a driver works in the core, and Python keeps house every 50 ms.
+"""Real-time settings of a process: memory, timers, priority, core, idle states.
 
-The driver waits for datagrams and absolute deadlines, and serves them. A missed deadline is served
-late and in order; none is skipped.
-
-Real-time settings of the process are applied where the system permits it, and reported. Measured
-effect on the wake-up lateness of a 1 kHz loop (p50/p99, µs): none 80/184, shortest timer slack
-30/145, SCHED_FIFO 38/106, no deep idle states 16/39.
+They are applied where the system permits it, and reported. Measured effect on the wake-up lateness
+of a 1 kHz loop (p50/p99, µs): none 80/184, shortest timer slack 30/145, SCHED_FIFO 38/106, no deep
+idle states 16/39.
 
 All memory is locked, so that the loop does not wait for a page. Mappings of up to 16 MiB with code,
 or with data that the process may write, are loaded beforehand. The larger ones are mostly unused:
@@ -23,26 +20,13 @@ import re
 import struct
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVarTuple
+from typing import NamedTuple, TypeVarTuple
 
-import numpy as np
-from numpy.typing import NDArray
+from noack.protocol.roles import LOOP_ROLES
 
-from noack.core.clock import NS_PER_S, RunClock
-from noack.protocol.roles import LOOP_ROLES, Notice, Record
-
-_HOUSEKEEPING_S = 0.05
-_OVERLOAD_PAUSE_S = 0.002
-_OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
-_TURNS_TO_CATCH_UP = 20
-"""Of housekeeping, one second: a machine that is late at its end has this time to catch up."""
-_TURNS_TO_WAIT = 2 * _TURNS_TO_CATCH_UP
-"""Of housekeeping, for the others: they may be late, and then need a moment to say that they are
-done."""
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _MADV_POPULATE_READ, _MADV_POPULATE_WRITE = 22, 23
@@ -55,112 +39,7 @@ _LARGE_BYTES = 16 * 2**20
 _MAPPINGS = Path("/proc/self/smaps")
 _MAPPING = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (...)(?s:.*?)^Shared_Dirty: +([0-9]+)", re.MULTILINE)
 
-
 Arguments = TypeVarTuple("Arguments")
-
-
-class RowSink(Protocol):
-    """Where rows of the record go."""
-
-    def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
-        """Add rows of a table."""
-
-
-class RecordSink(RowSink, Protocol):
-    """Where a machine's records and notices go."""
-
-    def append(self, record: Record) -> None:
-        """Add a row."""
-
-    def notice(self, notice: Notice) -> None:
-        """Add a line for the log."""
-
-    def flush(self) -> None:
-        """Publish the collected rows; called every 50 ms."""
-
-
-class Driver(Protocol):
-    """Drives the machines of a process: waits, receives, sends."""
-
-    def set_clock(self, clock: RunClock) -> None:
-        """Read the time as this clock does; called at the start and every 50 ms."""
-
-    def drive(self, until_ns: int, sink: RecordSink) -> None:
-        """Work until about simulated time ``until_ns``; pass on the rows of the record."""
-
-    def next_deadline_ns(self) -> int | None:
-        """When the next work is due; None if there is none."""
-
-
-class ProcessSockets(Protocol):
-    """The sockets of a process."""
-
-    def do_housekeeping(self, now_ns: int, sink: RecordSink) -> None:
-        """Do its own housekeeping, every 50 ms."""
-
-
-def run_loop(
-    driver: Driver,
-    channel: ProcessSockets,
-    clock: RunClock,
-    telemetry: RecordSink,
-    *,
-    end_ns: int | None,
-    stop: Callable[[], bool],
-    turns_after_end: int = 0,
-    all_done: Callable[[bool], bool] = lambda is_done: is_done,
-    external_inputs: Callable[[int], Sequence[Record | Notice]] = lambda now_ns: (),
-) -> int:
-    """Drive until simulated time ``end_ns`` (None: no end), or until ``stop()``.
-
-    Every 50 ms of wall time ``stop`` is asked. Before the first step and every 50 ms,
-    ``external_inputs`` passes what does not come by sockets to the machines, and returns the outputs.
-
-    The computer may not have run for a while before the end. So the loop goes on for up to a second
-    while a deadline is missed, and for up to two seconds until ``all_done`` is true: it is told
-    whether this process has done its work, and returns whether all processes of the run have. Then
-    come ``turns_after_end`` turns of housekeeping, 50 ms each.
-
-    Returns:
-        How late the next deadline was at the end, in ns; 0 if it was not late, or if that
-        deadline is after ``end_ns``.
-    """
-    period_ns = int(_HOUSEKEEPING_S * NS_PER_S * clock.speed)
-    turns = turns_done = 0
-    driver.set_clock(clock)
-    _pass_on(external_inputs(clock.now_ns()), telemetry)
-    channel.do_housekeeping(clock.now_ns(), telemetry)  # datagrams may have arrived before
-    while True:
-        began_s, began_cpu_s = time.monotonic(), time.thread_time()
-        driver.drive(clock.now_ns() + period_ns, telemetry)
-        cpu_s = time.thread_time() - began_cpu_s
-        is_overloaded = cpu_s > _OVERLOAD_SHARE * (time.monotonic() - began_s)
-        channel.do_housekeeping(clock.now_ns(), telemetry)
-        _pass_on(external_inputs(clock.now_ns()), telemetry)
-        driver.set_clock(clock)
-        telemetry.flush()
-        if is_overloaded:
-            # At real-time priority no other thread would get this core, not even the one that
-            # keeps this process's connection to the control plane alive.
-            time.sleep(_OVERLOAD_PAUSE_S)
-        now_ns, deadline_ns = clock.now_ns(), driver.next_deadline_ns()
-        if end_ns is not None and deadline_ns is not None and deadline_ns > end_ns:
-            deadline_ns = None  # not part of the run
-        late_ns = 0 if deadline_ns is None else max(now_ns - deadline_ns, 0)
-        if end_ns is not None and now_ns >= end_ns:
-            turns += 1
-            turns_done += all_done(not late_ns)
-        most = _TURNS_TO_CATCH_UP if late_ns else _TURNS_TO_WAIT
-        if stop() or turns_done > turns_after_end or turns > most:
-            return late_ns
-
-
-def _pass_on(outputs: Sequence[Record | Notice], sink: RecordSink) -> None:
-    for output in outputs:
-        if isinstance(output, Record):
-            sink.append(output)
-        else:
-            sink.notice(output)
 
 
 @contextmanager
