@@ -21,6 +21,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential
 from noack.theory.bounds.enclosure import KernelBounds, response_until
+from noack.theory.bounds.gains import Output
 from noack.theory.bounds.stacked_norms import Stack, larger_ends
 from noack.theory.certificates.deliveries.delivery_flow import FLOW_ROUNDING, bend_rows, bend_terms
 from noack.theory.certificates.deliveries.delivery_reach import Reach, Wanted, largest_outputs
@@ -56,6 +57,11 @@ class SensorErrors(NamedTuple):
     earliest_due_s: float
     """So long after an event the next one may be due without any of this."""
 
+    def since_event(self, r_s: Vector, lost: int) -> Vector:
+        """Bound ‖e_s‖_W at times after an event, while so many events have been lost, (k,)."""
+        tested = np.where(r_s * FLOW_ROUNDING >= self.first_test_s, self.after_test, math.inf)
+        return np.asarray(np.minimum(tested, self.after_losses[lost]))
+
 
 def errors_after_losses(
     reach: Reach,
@@ -63,7 +69,6 @@ def errors_after_losses(
     sensor: SensorErrors,
     outputs: Sequence[Matrix],
     spacing_s: float,
-    kernel: KernelBounds,
     bend: float,
 ) -> tuple[Vector, float]:
     """Bound ‖e_c‖_W while at most 0, 1, … events have been lost since the delivery.
@@ -74,7 +79,6 @@ def errors_after_losses(
         sensor: bounds of e_s.
         outputs: matrices Y with ‖Y z‖ ≤ 1 at all times.
         spacing_s: the least time between events.
-        kernel: of ‖e^{(H+αI)τ}‖_W.
         bend: that of e_s, see :func:`bend_of_error`.
 
     Returns:
@@ -85,10 +89,10 @@ def errors_after_losses(
     most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
     if spacing_s >= most_s or len(without_flow) == 1:
         return errors, spacing_s
-    # The nodes r after an event, e^{Fr}, and ‖e_s‖_W at them after a test.
+    # The nodes r after an event, and e^{Fr}.
+    kernel = flow.error.kernels[Output.WEIGHTED]
     r_s = _nodes_s(spacing_s, kernel, 2 * most_s, sensor.grid_s)
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
-    tested = np.where(r_s * FLOW_ROUNDING >= sensor.first_test_s, sensor.after_test, math.inf)
     first_event_s = float(flow.edges_s[reach.first_cell]) if reach.first_cell else math.inf
     # The delivery, then one lost event after the other.
     since_delivery_s = -reach.effects.acts_within_s
@@ -102,7 +106,7 @@ def errors_after_losses(
         # e_c until the next delivery, if at most so many events are lost.
         if lost:
             summed = sensor_error + kernel.sups(r_s) * error_before
-            largest = event.largest_error(np.minimum(tested, sensor_error), summed)
+            largest = event.largest_error(sensor.since_event(r_s, lost), summed)
             errors[lost] = min(without_flow[lost], largest)
             if lost > 1 and errors[lost] > _NEARLY_SUMMED * float(summed[0]):
                 return errors, spacing_s  # after more losses nothing is gained, either

@@ -170,9 +170,8 @@ class _SharpenedBounds:
             later_s = _next_event_s(at_events, level, self.spacing_s, bend)
             later_s = min(later_s, self._part.bound.times.earliest_due_s)
             self.spacing_s = max(self.spacing_s, self._next_test_s(later_s))
-        kernel = error.kernels[Output.WEIGHTED]
         bounds.after_losses, apart_s = errors_after_losses(
-            reach, bounds.after_losses, sensor, self._unit_outputs, self.spacing_s, kernel, bend
+            reach, bounds.after_losses, sensor, self._unit_outputs, self.spacing_s, bend
         )
         self.spacing_s = self._next_test_s(apart_s)
         # An event comes after the first input has been applied.

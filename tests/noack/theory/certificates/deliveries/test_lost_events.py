@@ -64,7 +64,7 @@ def bounds_of(reach: Reach, spacing_s: float) -> tuple[np.ndarray, np.ndarray, f
     missing = kernel.sups(spacing_s * np.arange(LOSSES))
     without_flow = BETA * (1 + np.append(0.0, np.cumsum(missing)))
     bend = bend_of_error(reach, BETA)
-    bounds, apart_s = errors_after_losses(reach, without_flow, sensor, [], spacing_s, kernel, bend)
+    bounds, apart_s = errors_after_losses(reach, without_flow, sensor, [], spacing_s, bend)
     return bounds, without_flow, apart_s
 
 
