@@ -5,5 +5,6 @@
 2. ``run_evidence.py``: signals, conditions and certificates, against which claims are checked;
    ``trajectory_delta.py``: Theorem 1's Δ from a trajectory.
 3. ``claim_definition.py``: the form of a claim; ``catalogue`` has the claims.
-4. ``claim_evaluation.py``: checks all of them, for each part of a run.
+4. ``claim_evaluation.py``: checks all of them, for each part of a run; ``run_parts.py`` cuts its
+   record into these parts.
 """

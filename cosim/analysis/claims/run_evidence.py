@@ -2,10 +2,9 @@
 
 import math
 import sys
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +23,9 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
+from cosim.analysis.claims.run_parts import RunPart
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
-from cosim.analysis.summary.loop_statistics import SampleFacts, SampleFactsReader, signal_statistics
+from cosim.analysis.summary.signal_statistics import SampleFacts, SampleFactsReader, signal_statistics
 from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import all_entries
@@ -51,26 +51,6 @@ ROUNDING = 1e-9
 """Relative rounding error of an exact computation over a run of 10,000 steps."""
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
-
-
-class RunPart(NamedTuple):
-    """A part of a run that is checked as a run of its own; by default the whole run."""
-
-    whole: RunRecord | None = None
-    """The record of the run, if that of the part is another one."""
-    from_s: float = 0.0
-    """Start of the part, in the run's time."""
-    until_s: float = math.inf
-    """End of the claims, in the part's time; the record of the part continues."""
-    start_error: float | None = None
-    """‖u − Kx‖, scaled, until the plant applied the first input of this part; None if it applied
-    no input before."""
-    void: Mapping[str, str] = {}
-    """By scope: why there is no certificate."""
-    certificates: Sequence[ScenarioCertificate] | None = None
-    """Those of the part's scenario, if they are known."""
-    offset: float = 0.0
-    """‖x_r‖ of the set-point: the part's x is x − x_r, and has the rounding errors of x."""
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cosim.analysis.summary.loop_statistics import (
-    disturbances,
     drops_by_cause,
     from_controller,
     latency,
     lateness,
     missing_rows,
     reported_violations,
-    signal_statistics,
     unintended_losses,
     watchdog_actions,
 )
+from cosim.analysis.summary.signal_statistics import disturbances, signal_statistics
 from cosim.analysis.summary.summary_model import (
     AssumptionPart,
     ChangePart,
