@@ -338,7 +338,7 @@ def in_chosen_norm(
     """
     with contextlib.suppress(CallerError):  # no weight can be chosen for this scenario
         chosen = certificates_of(scenario, "chosen", certificates.late_periods, progress, of_model=True)
-        return chosen if chosen.schedule.constants is not None else None
+        return chosen if chosen.schedule.exists else None
     return None
 
 

@@ -347,13 +347,21 @@ def find_margin(
     if others_read:
         compared = compare_guarantees([network.guarantee, *others_read], examine)
     return MarginResult(
-        resolved.name, resolved.mode, resolved.between_updates, network.mansd,
-        network.guarantee.meaning,
-        margin.shortest_ns / NS_PER_S, margin.longest_ns / NS_PER_S,
-        margin.loop.times.delay_ns / NS_PER_S, tuple(caps), every_m,
-        find_longest_period(resolved, progress) if with_period else None,
-        _without_guarantee(resolved, progress), effort, compared,
-    )  # fmt: skip
+        scenario=resolved.name,
+        mode=resolved.mode,
+        between_updates=resolved.between_updates,
+        mansd=network.mansd,
+        guarantee=network.guarantee.meaning,
+        shortest_s=margin.shortest_ns / NS_PER_S,
+        period_s=margin.longest_ns / NS_PER_S,
+        delay_s=margin.loop.times.delay_ns / NS_PER_S,
+        caps=tuple(caps),
+        every_m=every_m,
+        period=find_longest_period(resolved, progress) if with_period else None,
+        without_guarantee=_without_guarantee(resolved, progress),
+        effort=effort,
+        compared=compared,
+    )
 
 
 def _without_guarantee(resolved: Scenario, progress: MarginProgress) -> RandomGrowth | str:

@@ -323,7 +323,7 @@ def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:
         "conditions": ConditionsPart(**claims.conditions),
         "allowed": _schedule(claims.allowed),
         "certified_for": _schedule(claims.certified_for),
-        "claims": claims.judge(),
+        "claims": claims.evaluate(),
         "judged_until_s": claims.judged_until_s,
         "assumption_violations": list_violations(summary.assumption_violations, claims.violations()),
         "longest_loss_burst": longest,

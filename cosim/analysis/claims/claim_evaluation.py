@@ -26,7 +26,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from cosim.analysis.claims import catalogue
-from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, ClaimDefinition, Envelope, Findings
+from cosim.analysis.claims.claim_definition import (
+    Bound,
+    CertifiedClaim,
+    ClaimBound,
+    ClaimDefinition,
+    Envelope,
+)
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples, late_certificates
 from cosim.analysis.claims.run_parts import RunPart, common_end_ns, cut_part, start_error, up_to_common_end
@@ -149,7 +155,7 @@ def _end_s(part: RunPart) -> float | None:
 class _ClaimInstance(NamedTuple):
     """A claim about a run, by a certificate or without one."""
 
-    find: Callable[[RunEvidence, Samples], Findings]
+    find: Callable[[RunEvidence, Samples], ClaimBound]
     check: ClaimCheck
     curve: list[Envelope]
     """The parts of its curve."""
@@ -175,7 +181,7 @@ class _ClaimInstance(NamedTuple):
 class ClaimEvaluation(RunEvidence):
     """The claims about one run, or about one part of it."""
 
-    def judge(self) -> list[Claim]:
+    def evaluate(self) -> list[Claim]:
         """Return every claim with its verdict, in the run's time."""
         if not self.facts.any_in_common:
             return []
@@ -185,7 +191,7 @@ class ClaimEvaluation(RunEvidence):
             return [void(claimed, "(I1)", why=_ACKNOWLEDGED)]
         claims: list[Claim] = []
         for certificate in (None, *self.certificates):
-            if certificate is not None and certificate.constants is None:
+            if certificate is not None and not certificate.exists:
                 claimed = f"a certificate for {certificate.scope}"
                 claims.append(void(claimed, certificate.source, why=certificate.void or ""))
             claims += [
@@ -242,7 +248,7 @@ class RunClaims:
     """Those of the run's scenario, if they are known."""
 
     @cached_property
-    def _judged(self) -> RunRecord:
+    def _checked_record(self) -> RunRecord:
         return up_to_common_end(self.record)
 
     @property
@@ -253,12 +259,12 @@ class RunClaims:
 
     @cached_property
     def _setpoint(self) -> tuple[Vector, Vector] | None:
-        return setpoint_of(self._judged.scenario)
+        return setpoint_of(self._checked_record.scenario)
 
     @cached_property
     def parts(self) -> list[ClaimEvaluation | Claim]:
         """The claims of each part; for a part without claims, the reason as a void claim."""
-        record = self._judged
+        record = self._checked_record
         changes = [made for made in changes_of(record) if made.touches_claims]
         first_ns = changes[0].first_ns if changes else NEVER_NS
         void = void_at_setpoint(record.scenario, knows_start=True)
@@ -277,7 +283,7 @@ class RunClaims:
         return parts
 
     @property
-    def _is_judged(self) -> bool:
+    def _is_evaluated(self) -> bool:
         """Whether the claims are known already."""
         return "parts" in vars(self)
 
@@ -285,9 +291,9 @@ class RunClaims:
     def conditions(self) -> dict[str, float | None]:
         """Largest observed value of each condition, over the whole run."""
         first = self.parts[0]
-        if isinstance(first, ClaimEvaluation) and first.record is self._judged:
+        if isinstance(first, ClaimEvaluation) and first.record is self._checked_record:
             return first.conditions
-        return ClaimEvaluation(self._judged).conditions
+        return ClaimEvaluation(self._checked_record).conditions
 
     @property
     def allowed(self) -> NetworkConditions | None:
@@ -295,7 +301,7 @@ class RunClaims:
         scenario, first = self.record.scenario, self.parts[0]
         if not scenario.coverage.can_be_certified:
             return None
-        if isinstance(first, ClaimEvaluation) and first.record is self._judged:
+        if isinstance(first, ClaimEvaluation) and first.record is self._checked_record:
             return first.allowed
         return allowed_conditions(scenario)
 
@@ -314,14 +320,14 @@ class RunClaims:
                 violations += [found._replace(t_s=found.t_s + from_s) for found in part.violations()]
         return sorted(violations, key=lambda violation: violation.t_s)
 
-    def judge(self) -> list[Claim]:
-        """Every claim with its verdict, in the run's time."""
-        judged = ([part] if isinstance(part, Claim) else part.judge() for part in self.parts)
-        return [claim for claims in judged for claim in claims]
+    def evaluate(self) -> list[Claim]:
+        """Return every claim with its verdict, in the run's time."""
+        evaluated = ([part] if isinstance(part, Claim) else part.evaluate() for part in self.parts)
+        return [claim for claims in evaluated for claim in claims]
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds, each over its own part of the run."""
-        if self.record.scenario.plant.system.runs_user_code and not self._is_judged:
+        if self.record.scenario.plant.system.runs_user_code and not self._is_evaluated:
             self.certificates = ()  # reading a finished run does not run the code of its plant
         envelopes: list[Envelope] = []
         for evaluation in self.parts:
@@ -334,7 +340,7 @@ class RunClaims:
 
     def _claims_after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
         """The claims about the part of the run that follows a change."""
-        record = self._judged
+        record = self._checked_record
         known = record.events()["event"]
         after = record.columns(
             CONTROLLER_DELIVERY,

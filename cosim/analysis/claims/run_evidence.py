@@ -93,6 +93,10 @@ class RunEvidence:
 
     record: RunRecord
     part: RunPart = field(default_factory=RunPart)
+    _known_states: dict[int, KnownStateBounds | None] = field(default_factory=dict, init=False)
+    """Bounds from the newest event that are known already, by the ``id`` of their certificate."""
+    _violations: dict[int, VoidFrom | None] = field(default_factory=dict, init=False)
+    """First violations that are known already, by the ``id`` of the certificate."""
 
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
@@ -158,7 +162,9 @@ class RunEvidence:
         """
         whole, until_s = self.part.whole or self.record, self.part.until_s
         # Rows that are missing may be later.
-        if not all(map(whole.is_complete, LOOP_ROLES)) or not any(map(_exists, self._scheduled)):
+        if not all(map(whole.is_complete, LOOP_ROLES)) or not any(
+            certificate.exists for certificate in self._scheduled
+        ):
             return None
         allowed = self.allowed
         times_s = [t_s for t_s in self.observed.later_times(allowed) if t_s < until_s]
@@ -166,13 +172,13 @@ class RunEvidence:
         if not times_s or widest == allowed:
             return None
         certificates: Sequence[ScenarioCertificate] = yield widest
-        if any(map(_exists, certificates)):
+        if any(certificate.exists for certificate in certificates):
             return certificates
         best, kept, beyond = None, 0, len(times_s)
         while beyond - kept > 1:
             middle = (kept + beyond) // 2
             certificates = yield self.observed.widened(allowed, times_s[middle])
-            if any(map(_exists, certificates)):
+            if any(certificate.exists for certificate in certificates):
                 best, kept = certificates, middle
             else:
                 beyond = middle
@@ -192,7 +198,7 @@ class RunEvidence:
         """
         certificates, void = [], self.part.void
         for scheduled, late in zip(self._scheduled, self.wider or self._scheduled, strict=True):
-            used = late if _exists(late) else scheduled
+            used = late if late.exists else scheduled
             if scheduled.scope in void:
                 used = replace(scheduled, constants=None, floor_constants=None, void=void[scheduled.scope])
             certificates.append(used)
@@ -201,7 +207,7 @@ class RunEvidence:
     @property
     def certified_for(self) -> NetworkConditions | None:
         """The wider schedule, if a certificate of it is used."""
-        used = [certificate.conditions for certificate in self.certificates if _exists(certificate)]
+        used = [certificate.conditions for certificate in self.certificates if certificate.exists]
         late = [certificate.conditions for certificate in self.wider or () if certificate.conditions in used]
         return late[0] if late else None
 
@@ -303,16 +309,6 @@ class RunEvidence:
         return known[id(certificate)]
 
     @cached_property
-    def _known_states(self) -> dict[int, KnownStateBounds | None]:
-        """Bounds that are known already, by certificate."""
-        return {}
-
-    @cached_property
-    def _violations(self) -> dict[int, VoidFrom | None]:
-        """First violations that are known already, by certificate."""
-        return {}
-
-    @cached_property
     def allowed(self) -> NetworkConditions:
         """The conditions of the scenario's certificates."""
         allowed = allowed_conditions(self.record.scenario)
@@ -340,10 +336,6 @@ class RunEvidence:
         if ideal is None or ideal.rate_per_s != trigger.alpha_per_s:
             return None
         return theorem_2(loop, trigger.beta, trigger.alpha_per_s, ideal.delta)
-
-
-def _exists(certificate: ScenarioCertificate) -> bool:
-    return certificate.constants is not None
 
 
 def late_certificates(runs: Sequence[RunEvidence]) -> list[Sequence[ScenarioCertificate] | None]:

@@ -222,7 +222,7 @@ class SharedNetworkWork(SampledWork):
                 self._measure(record, loop_row)
             if self.judges:
                 have_held = [
-                    all(claim.verdict == ClaimVerdict.HELD for claim in RunClaims(record).judge())
+                    all(claim.verdict == ClaimVerdict.HELD for claim in RunClaims(record).evaluate())
                     for record in records
                 ]
         for name, of_all in _OF_ALL.items():

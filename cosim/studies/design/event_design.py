@@ -102,7 +102,7 @@ class EventSearch:
         self._fresh = box.population(seed, range(draws, 2 * draws))
         self.of_box = False
         certificate = self.certificate(self.original, 1, of_box=True)
-        is_certified = certificate is not None and certificate.constants is not None
+        is_certified = certificate is not None and certificate.exists
         self.of_box = is_certified and outside_box(resolved) is None
         base = self.measured(self.original, self._draws)
         if base.cost == 0:

@@ -141,7 +141,7 @@ def new(
     certificate, _ = build.certified(best)
     notes = tuple(_notes(best, certificate, returns, build.is_linear))
     text = _commented(build.content(best), notes, best)
-    found_certificate = certificate if certificate.constants is not None else None
+    found_certificate = certificate if certificate.exists else None
     return NewScenario(best.gain, build.scenario(best), text, found_certificate, notes)
 
 
@@ -296,7 +296,7 @@ class _Builder:
         except CallerError:
             return None
         weighted = replace(trial, weight=weight)
-        return weighted if self.certified(weighted)[0].constants is not None else None
+        return weighted if self.certified(weighted)[0].exists else None
 
     def returns(self, trial: _Trial) -> bool:
         """Whether ‖x‖ ends below a tenth of its maximum, in virtual time."""

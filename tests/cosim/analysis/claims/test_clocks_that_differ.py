@@ -79,7 +79,7 @@ def test_every_claim_holds_whatever_the_clocks(make: Make, delay_s: float) -> No
         }
         record = simulated(scenario, clocks)
         claims = ClaimEvaluation(record)
-        verdicts = {one.verdict for one in claims.judge() if one.source == "certificate"}
+        verdicts = {one.verdict for one in claims.evaluate() if one.source == "certificate"}
         assert verdicts == {ClaimVerdict.HELD}, clocks
         seen.add(claims.certified_for is not None)
         assert replay(record).bit_exact
@@ -119,7 +119,7 @@ def with_errors(record: RunRecord, errors: Errors, **t_ns: int) -> RunRecord:
 
 
 def judged(record: RunRecord) -> list[Claim]:
-    return ClaimEvaluation(record).judge()
+    return ClaimEvaluation(record).evaluate()
 
 
 def test_small_bounds_change_no_verdict(make: Make, clocked: RunRecord) -> None:
