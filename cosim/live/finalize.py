@@ -14,7 +14,8 @@ from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
-from cosim.analysis.summary.network_summary import LoopOverTime, loop_over_time, summarise_run, worst_loop
+from cosim.analysis.summary.loops_over_time import LoopOverTime, loop_over_time
+from cosim.analysis.summary.network_summary import summarise_run, worst_loop
 from cosim.analysis.summary.run_summary import Outcome, linearisation, summarise
 from cosim.analysis.summary.summary_model import (
     ConditionsPart,

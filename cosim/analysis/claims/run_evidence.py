@@ -161,10 +161,9 @@ class RunEvidence:
         certificate holds for every run that meets its conditions, whenever they were chosen.
         """
         whole, until_s = self.part.whole or self.record, self.part.until_s
-        # Rows that are missing may be later.
-        if not all(map(whole.is_complete, LOOP_ROLES)) or not any(
-            certificate.exists for certificate in self._scheduled
-        ):
+        if not all(map(whole.is_complete, LOOP_ROLES)):  # rows that are missing may be later
+            return None
+        if not any(certificate.exists for certificate in self._scheduled):
             return None
         allowed = self.allowed
         times_s = [t_s for t_s in self.observed.later_times(allowed) if t_s < until_s]

@@ -20,13 +20,12 @@ from cosim.analysis.summary.summary_model import (
     ViolationPart,
     WatchdogPart,
 )
-from cosim.record.run_events import NEVER_NS, PacketOutcome, changes_of, packet_outcomes
+from cosim.record.run_events import NEVER_NS, ActuationTimes, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.impairments.loss_guarantee import LongestBurst
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
-    NO_SEQUENCE,
     PLANT_ACTUATION,
     PLANT_STEP,
     SENSOR_ACKNOWLEDGEMENT,
@@ -271,24 +270,18 @@ def watchdog_actions(record: RunRecord) -> WatchdogPart:
     """Return the watchdog's actions (the newest actuation was too old) from the recorded steps."""
     timing = record.scenario.timing
     names = ("now_ns", "sequence", "t_ns", "actuation")
-    known, known_ns = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    actuations = ActuationTimes()
     trips, steps_old, first_s, was_old = 0, 0, None, False
     for part in record.slices(PLANT_STEP, PLANT_ACTUATION, columns=names):
         steps = part[PLANT_STEP]
-        known = np.append(known, part[PLANT_ACTUATION]["sequence"])
-        known_ns = np.append(known_ns, part[PLANT_ACTUATION]["t_ns"])
-        index = np.searchsorted(known, steps["actuation"])
-        is_recorded = np.append(known, NO_SEQUENCE)[index] == steps["actuation"]
-        newest_ns = np.where(steps["actuation"] != NO_SEQUENCE, np.append(known_ns, 0)[index], 0)
-        # If an actuation is not recorded, its age is unknown.
-        old = is_recorded & too_old(steps["t_ns"], newest_ns, timing.actuation_timeout_ns)
+        actuations.add(part[PLANT_ACTUATION])
+        newest_ns, is_known = actuations.of_newest(steps["actuation"])
+        old = is_known & too_old(steps["t_ns"], newest_ns, timing.actuation_timeout_ns)
         begun = np.flatnonzero(old & ~np.append(was_old, old[:-1])[: len(old)])
         if len(begun) and first_s is None:
             first_s = float(steps["t_ns"][begun[0]]) * 1e-9
         trips, steps_old = trips + len(begun), steps_old + int(old.sum())
-        if len(steps):  # a later step has the newest of these actuations, or a later one
-            was_old, used = bool(old[-1]), int(index[-1])
-            known, known_ns = known[used:], known_ns[used:]
+        was_old = bool(old[-1]) if len(old) else was_old
     return WatchdogPart(
         policy=record.scenario.plant.watchdog.policy,
         timeout_s=timing.actuation_timeout_ns * 1e-9,
