@@ -25,16 +25,9 @@ import numpy as np
 from cosim.lazy_modules import lazy_modules
 from cosim.record.processes import add_kept_reports
 from cosim.record.record_source import BATCH_ROWS, Rows, Segment, concatenate_rows
+from cosim.record.record_writing import record_folder, vector_names
 from cosim.record.run_directory import RECORD
-from cosim.record.run_record import (
-    Notice,
-    RecordedRun,
-    load_run,
-    read_notices,
-    record_folder,
-    scenarios_of,
-    vector_names,
-)
+from cosim.record.run_record import Notice, RecordedRun, load_run, read_notices, scenarios_of
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
 from noack.core.linear_systems import firsts_of_equal

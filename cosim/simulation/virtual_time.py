@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
 from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, concatenate_rows, packed
+from cosim.record.record_writing import write_run
 from cosim.record.run_directory import (
     EndingFile,
     RunEnding,
@@ -25,7 +26,7 @@ from cosim.record.run_directory import (
     write_environment,
     write_scenario,
 )
-from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles, write_run
+from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi
