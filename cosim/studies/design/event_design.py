@@ -31,7 +31,7 @@ from cosim.studies.design.network_search import (
     Progress,
     examined_m,
 )
-from cosim.studies.design.simplex_search import nelder_mead, scaled_steps
+from cosim.studies.design.simplex_search import nelder_mead, step_sizes
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector, spectral_abscissa
 from noack.core.number_format import NONE, at_most
@@ -232,7 +232,7 @@ class EventSearch:
 
     def _improve(self, start: EventLoop, most: int, progress: Progress) -> tuple[EventLoop, float]:
         centre = np.array([*np.ravel(start.K), start.alpha_per_s, start.beta])
-        scale = np.append(scaled_steps(np.array(start.K)), centre[-2:])
+        scale = np.append(step_sizes(np.array(start.K)), centre[-2:])
         best, value, tries = start, math.inf, 0
 
         def objective(steps: Vector) -> float:

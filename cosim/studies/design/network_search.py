@@ -25,7 +25,7 @@ from cosim.studies.design.design_search import Bounds
 from cosim.studies.design.design_space import lqr_gain
 from cosim.studies.design.hold_strategies import HOLDS, Hold, given_hold
 from cosim.studies.design.quick_estimate import PatternGraph, QuickLoop
-from cosim.studies.design.simplex_search import nelder_mead, scaled_steps
+from cosim.studies.design.simplex_search import nelder_mead, step_sizes
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
@@ -405,7 +405,7 @@ class NetworkSearch:
     def _improve(self, start: GainCandidate, level: int, most: int) -> GainCandidate | None:
         """Return a loop near ``start`` whose lower bound at a level is below 1; None: none found."""
         K = np.array(start.K)
-        scale = scaled_steps(K)
+        scale = step_sizes(K)
 
         def moved(steps: Vector) -> GainCandidate:
             return _rounded(start.hold, (K.ravel() + scale * steps).reshape(K.shape))
