@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.text import Text
 
 from cosim.analysis.replay import replay
-from cosim.analysis.replay.replay_result import difference, rows_differ
+from cosim.analysis.replay.replay_result import difference, first_row_difference
 from cosim.analysis.summary.summary_model import ReplayDifference
 from cosim.live.finalize import finalize, reopen
 from cosim.output.result_tables import ResultTable, terminal_table
@@ -388,7 +388,7 @@ def _in_table(table: str, rows_before: int, recorded: Slice, repetition: Slice) 
         return None
     for i, (row, repeated_row) in enumerate(zip(rows, repeated_rows, strict=False)):
         if row.tobytes() != repeated_row.tobytes():
-            return rows_differ(table, rows_before + i, row, repeated_row)
+            return first_row_difference(table, rows_before + i, row, repeated_row)
     common, longer = min(len(rows), len(repeated_rows)), max(rows, repeated_rows, key=len)
     description = "the row is missing in the " + ("repetition" if len(rows) > common else "archive")
     return difference(table, rows_before + common, int(longer[common]["now_ns"]), description)

@@ -104,7 +104,7 @@ def _quantiles(sketch: QuantileSketch) -> dict[str, float | None]:
 
 _ARRIVES_AFTER_END_S = 0.1
 _RECEIVERS = {"measurement": "sensor", "actuation": "plant"}
-"""The receivers of legs that are not named by theirs."""
+"""The receivers of hops that are not named by theirs."""
 _VIOLATION = "violation"
 """Level of a notice: a process detected that an assumption was violated."""
 _DROPOUTS = LongestBurst(0).name
@@ -156,7 +156,7 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
         sent = part[PLANT_STEP]["sequence"]
         measured.take(sent[sent % every == 0] // every, part[SENSOR_MEASUREMENT]["sequence"])
         actuated.take(part[CONTROLLER_STEP]["sequence"], part[PLANT_ACTUATION]["sequence"])
-    legs = {
+    hops = {
         "measurement": measured,
         "update to netem": _Unmatched().take(events, outcomes.sequence),
         "update to controller": _Unmatched().take(_forwarded_until(outcomes, last_ns), received),
@@ -165,19 +165,19 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
     for flow in record.scenario.network.flows[1:]:
         name, answers = flow.name.lower(), packet_outcomes(record, flow)
         sent, arrived = (record.columns(table, "sequence")["sequence"] for table in _SENT_RECEIVED[flow])
-        legs.pop(name, None)
-        legs[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
-        legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
+        hops.pop(name, None)
+        hops[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
+        hops[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
             _forwarded_until(answers, last_ns), arrived
         )
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
-    counts = {leg: unmatched.count(complete=complete) for leg, unmatched in legs.items()}
-    return {leg: max(count - _not_finite(record, leg), 0) for leg, count in counts.items()}
+    counts = {hop: unmatched.count(complete=complete) for hop, unmatched in hops.items()}
+    return {hop: max(count - _not_finite(record, hop), 0) for hop, count in counts.items()}
 
 
-def _not_finite(record: RunRecord, leg: str) -> int:
-    """The number of datagrams that a leg's receiver rejected because an entry is not finite."""
-    receiver = _RECEIVERS.get(leg, leg.rpartition(" ")[2])
+def _not_finite(record: RunRecord, hop: str) -> int:
+    """The number of datagrams that a hop's receiver rejected because an entry is not finite."""
+    receiver = _RECEIVERS.get(hop, hop.rpartition(" ")[2])
     channel = record.reports.get(receiver, {}).get("channel") or {}
     return int((channel.get("rejected") or {}).get(Rejection.NOT_FINITE, 0))
 

@@ -123,7 +123,7 @@ def summarise(
         missing_samples=sum(missing.values()),
         missing_by_table={table: n for table, n in missing.items() if n},
         unintended_losses=sum(lost.values()),
-        unintended_losses_by_leg={leg: n for leg, n in lost.items() if n},
+        unintended_losses_by_leg={hop: n for hop, n in lost.items() if n},
         rejected_datagrams={
             role: rejected
             for role, report in record.reports.items()

@@ -252,7 +252,7 @@ def design(
     result = _trigger_of(loaded, requirements.limits(), weights, feedback, draws, seed)
     written = design_page.write_page(result, page, figure_files)
     written += files.write(scenario_file.dumps(result.scenario)) if result.feasible else []
-    cli.show_with_files(json, result.document(), written, design_page.print_trigger_design, result)
+    cli.show_with_files(json, result.to_json(), written, design_page.print_trigger_design, result)
     if not result.confirmed:
         print_to_stderr(f"noack: {result.verdict()}")
     return ExitStatus.OK if result.confirmed else ExitStatus.FAILED

@@ -146,7 +146,7 @@ def replay(run: opt.LoopOptions, *, json: opt.JsonOption = False) -> int:
     with cli.status("replaying"):
         result = run_replay.replay_run(run_record.load_run(path), run.loop)
     changed = run_directory.changed_since(path)
-    document = result.document() | {"changed_since": changed}
+    document = result.to_json() | {"changed_since": changed}
     cli.show(json, lambda: document, replay_result.print_replay, result, changed)
     return ExitStatus.OK if result.bit_exact else ExitStatus.FAILED
 
@@ -173,7 +173,7 @@ def fidelity(
         result = fidelity_analysis.compute_fidelity(run_record.load_record(run.path, run.loop))
         if out is not None:
             figure_files.save_figure(run_figures.fidelity_figure(result), out, width)
-    cli.show(json, result.as_json, terminal_output.print_fidelity, result)
+    cli.show(json, result.to_json, terminal_output.print_fidelity, result)
     return ExitStatus.OK if result.explained else ExitStatus.FAILED
 
 

@@ -64,7 +64,7 @@ def campaign(
     summary, _, _, new_runs, files = execute_campaign(
         plan, path, start, folder=folder, draws=draws, figure_files=figure_files
     )
-    document = summary.document() | {"made": new_runs}
+    document = summary.to_json() | {"made": new_runs}
     cli.show_with_files(json, document, files, campaign_report.print_summary, summary)
     cli.write_tables(campaign_report.campaign_tables(summary), tables, json=json)
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK
@@ -109,7 +109,7 @@ def paper(
             raise CallerError("--out, --draws: are for `noack paper` without a name; this has --tables FILE")
         with cli.status("computing"):
             result = paper_results.reproduce(name)
-        cli.show(json, result.document, published_result.print_rows, result)
+        cli.show(json, result.to_json, published_result.print_rows, result)
         cli.write_tables([result.table], tables, json=json)
         return ExitStatus.OK if result.as_expected else ExitStatus.FAILED
     out = out or cli.DEFAULT_RUNS / "paper"
@@ -281,7 +281,7 @@ def capacity(
     result = capacity_page.CapacityResult(plan, finished.summary, capacities, points)
     files = [*capacity_page.write(result, folder, figure_files), *finished.files]
     facts = {"thorough": study.thorough, "estimated_s": estimated_s, "made": finished.made}
-    document = result.document() | facts
+    document = result.to_json() | facts
     cli.show_with_files(json, document, files, capacity_page.print_result, result)
     agree = all(point.status == ExitStatus.OK and not point.outside for point in points)
     return ExitStatus.OK if agree else ExitStatus.FAILED

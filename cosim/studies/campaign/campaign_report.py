@@ -46,7 +46,7 @@ def write_report(
     Raises:
         MachineError: they cannot be written.
     """
-    document = to_json(summary.document(), indent=1, inf_nan_mode="null")
+    document = to_json(summary.to_json(), indent=1, inf_nan_mode="null")
     return [
         write_whole(store.folder / PAGE, page(summary, store, base)),
         write_whole(store.folder / SUMMARY, document + b"\n"),

@@ -167,7 +167,7 @@ class CampaignSummary(NamedTuple):
         """Number of runs in which a certified bound is exceeded."""
         return sum(result.breaches for result in self.results)
 
-    def document(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, object]:
         """The content of ``summary.json``."""
         return {
             "name": self.campaign.name,

@@ -86,7 +86,7 @@ class PolicyCapacity(NamedTuple):
         names = [name for name, capacity in self.limits.items() if capacity.median == first]
         return ", ".join(names) if np.isfinite(first) else ""
 
-    def document(self, plan: CapacityPlan) -> dict[str, object]:
+    def to_json(self, plan: CapacityPlan) -> dict[str, object]:
         """Return the capacity for JSON, also as a multiple of the given mixture if it is finite."""
         median = self.any_limit.median
         is_finite = math.isfinite(median)
@@ -177,7 +177,7 @@ class LivePoint(NamedTuple):
         ends = self.simulated.items()
         return [name for name, (low, high) in ends if not low <= self.values[name] <= high]
 
-    def document(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, object]:
         """Return the point for JSON."""
         return {**self._asdict(), "run_dir": str(self.run_dir), "outside": self.outside}
 

@@ -43,7 +43,7 @@ def results(record: RunRecord) -> dict[str, Any]:
     claims = RunClaims(record)
     return {
         "summary": summarise(record, 0, "horizon").model_dump(mode="json"),
-        "replay": replay(record).document(),
+        "replay": replay(record).to_json(),
         "claims": [claim.model_dump(mode="json") for claim in claims.evaluate()],
         "violations": claims.violations(),
         "conditions": claims.conditions,

@@ -200,7 +200,7 @@ def _read(run_dir: Path) -> None:
     json.loads(summarise(record, 0, "finished").model_dump_json())
     found = replay(record)
     found.verdict().model_dump_json()
-    json.dumps(found.document())
+    json.dumps(found.to_json())
     if cut_short:
         again = load_record(run_dir)  # a finalised record can be read
         assert all(record[table].tobytes() == again[table].tobytes() for table in record.tables)

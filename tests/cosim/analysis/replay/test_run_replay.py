@@ -71,13 +71,13 @@ def test_a_run_is_replayed_bit_for_bit() -> None:
     assert found.gaps == []
     assert found.first_difference is None
     assert found.inputs == sum(len(RECORD[table]) for table in RECORD.tables)
-    assert {leg.leg: leg.compared for leg in found.messages} == {
+    assert {hop.hop: hop.compared for hop in found.messages} == {
         "plant → sensor": len(RECORD[SENSOR_MEASUREMENT]),
         "sensor → netem": len(RECORD[NETEM_PACKET]),
         "netem → controller": len(RECORD[CONTROLLER_DELIVERY]),
         "controller → plant": len(RECORD[PLANT_ACTUATION]),
     }
-    assert min(leg.compared for leg in found.messages) > 0
+    assert min(hop.compared for hop in found.messages) > 0
 
 
 @pytest.mark.parametrize(("table", "column"), list(columns()))
@@ -205,7 +205,7 @@ def test_a_delivery_of_a_dropped_update_is_found() -> None:
         deliveries[column][row] = events[column][lost]
     deliveries["sequence"][row] = lost
     found = replay(changed(RECORD, {CONTROLLER_DELIVERY: deliveries}))
-    differences = {leg.leg: leg.difference for leg in found.messages}
+    differences = {hop.hop: hop.difference for hop in found.messages}
     delivery = differences["netem → controller"]
     assert delivery is not None
     assert delivery.what == "netem did not forward it"
@@ -284,6 +284,6 @@ def test_a_record_with_any_numbers_is_replayed(number: int, data: st.DataObject)
         before, words[place] = words[place], data.draw(st.sampled_from(WORDS))
         equal &= bool(before == words[place])
     found = replay(changed(record, rows))
-    assert json.dumps(found.document(), allow_nan=False)
+    assert json.dumps(found.to_json(), allow_nan=False)
     if equal:
         assert found.bit_exact
