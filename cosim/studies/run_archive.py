@@ -271,8 +271,7 @@ def repeat_archive(
             or a long run without ``long``.
         MachineError: a folder cannot be written.
     """
-    with _folder(into) as folder:
-        archived = folder / "archived"
+    with _folder(into) as folder, _naming_archive(path, archived := folder / "archived"):
         manifest = unpack(path, archived)
         scenario = _scenario(path, archived, run_code=run_code)
         if (manifest.scenario, manifest.kind) != (scenario.name, kind_of(archived)):
@@ -282,10 +281,7 @@ def repeat_archive(
                 f"{path}: its run has {steps:,} steps, and would take about "
                 f"{steps * _US_PER_STEP * 1e-6 / 3600:.1f} hours; --long repeats it nevertheless"
             )
-        try:
-            recorded = load_run(archived)
-        except CallerError as error:
-            raise CallerError(f"{path}: {str(error).removeprefix(f'{archived}/')}") from None
+        recorded = load_run(archived)
         ending = simulate_run(scenario, folder / "repeated")
         finalize(ending, report=False, view=False)
         repeated = load_run(ending.run_dir)
@@ -322,6 +318,16 @@ def _folder(into: Path | None) -> Iterator[Path]:
     except OSError as error:
         raise MachineError(f"{into}: {why(error)}") from None
     yield into
+
+
+@contextmanager
+def _naming_archive(path: Path, archived: Path) -> Iterator[None]:
+    """In messages about files of an archive, name the archive and not the folder they are in."""
+    try:
+        yield
+    except CallerError as error:
+        text = str(error).replace(f"{archived}/", f"{path}: ").replace(str(archived), str(path))
+        raise CallerError(text) from None
 
 
 def _scenario(path: Path, archived: Path, *, run_code: bool) -> Scenario:
