@@ -91,7 +91,7 @@ def recorded_loop(record: RunRecord) -> RecordedLoop:
     measured = np.zeros(last + 1, dtype=np.bool_)
     measured[sensor["t_ns"] // period_ns] = True
     origins, accepted = _ticks(ticks, deliveries)
-    latched = _latched(steps["actuation"], origins)
+    latched = _origins_of_steps(steps["actuation"], origins)
     observed = read_conditions(record)
     _require(
         not (len(observed.watchdog.t_s) or len(observed.safe_input.t_s)),
@@ -182,7 +182,7 @@ def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_Origins, set[int]]:
     return _Origins(ticks["model_t_ns"], newest), set(deliveries["sequence"].tolist())
 
 
-def _latched(actuations: NDArray[np.int64], ticks: _Origins) -> _Origins:
+def _origins_of_steps(actuations: NDArray[np.int64], ticks: _Origins) -> _Origins:
     """Return the origin of the input held from each step on; −1 before the first."""
     known = bool(actuations.max(initial=NO_SEQUENCE) < len(ticks.newest))
     _require(known, "the controller's record ends before the plant's")
@@ -344,7 +344,7 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     period_s = schedule.period_ns * 1e-9
     t_s = np.flatnonzero(schedule.measured).astype(np.float64) * period_s
     ideal = _ideal(system, live, float(t_s[-1]), max_events, known_start=known)
-    simulated, event_times_s = _simulated_stages(system, schedule, known)
+    simulated, event_times_s = _simulate_stages(system, schedule, known)
     states = [ideal.at(t_s).x, *simulated, live.x]
     events_s = [ideal.event_s, *event_times_s, live.event_s]
     if not all(np.abs(x).max() < _LARGEST for x in states):
@@ -384,7 +384,7 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     )
 
 
-def _simulated_stages(
+def _simulate_stages(
     system: ContinuousLoop, schedule: StepSchedule, known_start: bool
 ) -> tuple[list[Matrix], list[Vector]]:
     """Return the measured states and the event times with one more effect of the network each."""

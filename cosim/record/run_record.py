@@ -31,7 +31,7 @@ from cosim.record.record_source import (
     RowsInMemory,
     Slice,
     concatenate_rows,
-    packed,
+    pack_rows,
     slices,
     with_columns,
 )
@@ -186,7 +186,7 @@ class RunRecord:
         batches = self.source.batches(table, names)
         chosen = (rows if where is None else rows.compress(where(rows)) for rows in batches)
         dtype = with_columns(self.tables[table], names)
-        return concatenate_rows([packed(rows, dtype) for rows in chosen], dtype)
+        return concatenate_rows([pack_rows(rows, dtype) for rows in chosen], dtype)
 
     @cached_method
     def events(self) -> Rows:

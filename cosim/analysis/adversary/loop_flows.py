@@ -341,13 +341,13 @@ class SampledFlow:
         value = self.objective.nothing
         if self.objective is Objective.STATE:
             value = float(np.linalg.norm(runs.x[0]))
-        return SegmentEnds(self._time(runs.step), _packed(runs), runs.is_event, np.array([value]))
+        return SegmentEnds(self._time(runs.step), _pack(runs), runs.is_event, np.array([value]))
 
     def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
         """As :meth:`PatternFlow.after_events`."""
         runs = self._runs(t_s, z)
         self.loop.update(runs, delivered)
-        return _packed(runs)
+        return _pack(runs)
 
     def __call__(self, t_s: Vector, z: Matrix) -> SegmentEnds:
         """As :meth:`PatternFlow.__call__`."""
@@ -360,7 +360,7 @@ class SampledFlow:
         elif not self.objective.additive:
             of_error = self.objective is Objective.ERROR
             at_s = self._time(runs.error_at if of_error else runs.state_at)
-        return SegmentEnds(end_s, _packed(runs), runs.is_event, value, at_s)
+        return SegmentEnds(end_s, _pack(runs), runs.is_event, value, at_s)
 
     def value_ahead(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
         """As :meth:`PatternFlow.value_ahead`: the value over the window without events.
@@ -422,7 +422,7 @@ def _states(runs: Runs) -> tuple[Matrix, ...]:
     return (runs.x, runs.y, runs.x_s, runs.x_c, runs.u, runs.u_next, runs.sent, runs.updates, runs.auxiliary)
 
 
-def _packed(runs: Runs) -> Matrix:
+def _pack(runs: Runs) -> Matrix:
     """Return the states in rows, (N, entries)."""
     count = len(runs.step)
     return np.hstack([array.reshape(count, math.prod(array.shape[1:])) for array in _states(runs)])

@@ -34,7 +34,7 @@ from cosim.analysis.claims.observed_conditions import (
     SampledSeries,
     causes_of,
     clock_cause,
-    combined,
+    combine,
     lost_cause,
 )
 from cosim.record.run_events import updates_in
@@ -279,10 +279,10 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
     read = [table for table in (*READ, *CLOCK_TABLES) if table in record.tables]
     for i, part in enumerate(record.slices(*read, columns=_COLUMNS)):
         if i:
-            parts.append(combined([reader.observed()]))
+            parts.append(combine([reader.observed()]))
         for table, rows in part.items():
             reader.take(table, rows)
-    return combined([*parts, reader.end()])
+    return combine([*parts, reader.end()])
 
 
 _MOST_WAITING = 100_000

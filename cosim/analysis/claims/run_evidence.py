@@ -167,7 +167,7 @@ class RunEvidence:
             return None
         allowed = self.allowed
         times_s = [t_s for t_s in self.observed.later_times(allowed) if t_s < until_s]
-        widest = self.observed.widened(allowed, until_s)
+        widest = self.observed.widen(allowed, until_s)
         if not times_s or widest == allowed:
             return None
         certificates: Sequence[ScenarioCertificate] = yield widest
@@ -176,7 +176,7 @@ class RunEvidence:
         best, kept, beyond = None, 0, len(times_s)
         while beyond - kept > 1:
             middle = (kept + beyond) // 2
-            certificates = yield self.observed.widened(allowed, times_s[middle])
+            certificates = yield self.observed.widen(allowed, times_s[middle])
             if any(certificate.exists for certificate in certificates):
                 best, kept = certificates, middle
             else:

@@ -26,7 +26,7 @@ def difference(
     replayed: object = None,
 ) -> ReplayDifference:
     """Return a difference with its values formatted."""
-    (first, first_hex), (second, second_hex) = _displayed_value(recorded), _displayed_value(replayed)
+    (first, first_hex), (second, second_hex) = _format_value(recorded), _format_value(replayed)
     return ReplayDifference(
         table=table,
         row=row,
@@ -61,7 +61,7 @@ def first_entry(recorded: ArrayLike, replayed: ArrayLike) -> tuple[int, object, 
     return None
 
 
-def _displayed_value(value: object) -> tuple[Value, str | None]:
+def _format_value(value: object) -> tuple[Value, str | None]:
     if isinstance(value, float):
         if math.isnan(value):  # NaNs may differ in their bits
             return None, f"nan, bits {struct.pack('>d', value).hex()}"

@@ -244,7 +244,7 @@ def design(
         with progress.work_bar("trying gains", lines=True) as bar:
             outcome = event_design.design_for_network(loaded, request, seed, bar)
         written = design_page.write_outcome(outcome, page, figure_files)
-        written += files.write(outcome.written()) if outcome.is_certified else []
+        written += files.write(outcome.scenario_toml()) if outcome.is_certified else []
         cli.show_with_files(json, outcome.to_json(), written, design_page.print_loop_design, outcome)
         return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
     network.refuse()

@@ -14,7 +14,7 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
 from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
-from cosim.analysis.claims.observed_conditions import ObservedConditions, combined
+from cosim.analysis.claims.observed_conditions import ObservedConditions, combine
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.record_source import rows_by_loop
@@ -177,7 +177,7 @@ def test_batches_show_what_the_whole_record_shows(clocked: RunRecord, seed: int)
         for table, rows in zip(CLOCK_TABLES, piece, strict=True):
             reader.take(table, rows)
         parts.append(reader.observed())
-    for cause, series in combined(parts).clocks.items():
+    for cause, series in combine(parts).clocks.items():
         np.testing.assert_array_equal(series, whole.clocks[cause])
 
 

@@ -17,7 +17,7 @@ from cosim.analysis.claims.observed_conditions import (
     CLOCK_CAUSES,
     AssumptionViolation,
     ObservedConditions,
-    combined,
+    combine,
 )
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.summary.summary_model import ClaimVerdict
@@ -140,7 +140,7 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
                 reader.take(*batch)
         whole = read_conditions(record)
         parts.append(reader.end())
-        in_parts = combined(parts)
+        in_parts = combine(parts)
         for name in SERIES:
             np.testing.assert_array_equal(getattr(in_parts, name), getattr(whole, name))
         assert parts[-1].start_s == whole.start_s

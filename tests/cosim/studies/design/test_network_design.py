@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.design.design_page import DesignOutcome
+from cosim.studies.design.design_page import DesignOutcome, periodic_outcome
 from cosim.studies.design.event_design import Certified, EventSearch, design_for_network, event_outcome
 from cosim.studies.design.hold_strategies import read_holds
-from cosim.studies.design.network_outcome import periodic_outcome
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
 from cosim.studies.design.quick_estimate import PatternGraph
 from noack.impairments.loss_guarantee import LossesInWindow
@@ -200,7 +199,7 @@ def test_each_hold_strategy_is_written_decided_and_run_as_claimed(
     """Repeated patterns of the M that is proven vanish in a run, one of the next M grows."""
     scenario = shipped("unstable_pendulum", "mode=zoh", "controller.safe_input=[0.1]")
     found = searched(scenario, DesignRequest(period_s=PERIOD_S, effort=0, holds=read_holds(word), cost=50))
-    best, written = found.best, validate(tomllib.loads(found.shown.written()), "written")
+    best, written = found.best, validate(tomllib.loads(found.shown.scenario_toml()), "written")
     assert best.candidate.hold in read_holds(word)
     assert (written.mode, written.controller.update_timeout_s) == (mode, timeout_s)
     assert (written.controller.timeout_input, written.controller.safe_input) == (timeout_input, None)
@@ -257,7 +256,7 @@ def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
     assert certificate.constants is not None
     assert certificate.constants.state <= 1.6
     assert search.state_bound(best.loop, best.m + 1) > 1.6
-    measured = search.measured(best.loop, search._draws)
+    measured = search.measure(best.loop, search._draws)
     assert measured.cost <= search.limits.cost
     assert measured.transmissions <= search.limits.transmissions
     # Means of fresh draws differ by their own spread.
