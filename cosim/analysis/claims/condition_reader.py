@@ -14,7 +14,6 @@ A row that depends on rows of another process waits for them (:mod:`input_origin
 import math
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -63,22 +62,22 @@ class _ClockErrors:
     """Gathers the recorded bounds of the clocks' errors; each holds from the time of its row on."""
 
     def __init__(self, settings: ClocksSection) -> None:
-        self._largest_s = settings.largest_error_us * 1e-6
+        self.largest_s = settings.largest_error_us * 1e-6
         self._rows: defaultdict[str, Batches] = defaultdict(list)
 
     def add(self, role: str, rows: Rows) -> None:
         """Add rows of the table about a process's clock, in their order."""
         self._rows[role].append((np.maximum(rows["t_ns"], 0), rows["error_ns"]))
 
-    def observed(self) -> dict[str, Any]:
-        """Return what was added since the last call, as fields of ``ObservedConditions``."""
+    def take(self) -> dict[str, SampledSeries]:
+        """Return what was added since the last call, by the name of the assumption."""
         errors: dict[str, SampledSeries] = {}
         for role in LOOP_ROLES:
             t_ns, error_ns = columns(self._rows.pop(role, []), 2)
             t_s, error_s, lost = t_ns * 1e-9, error_ns / NS_PER_S, error_ns == LOST_NS
             errors[clock_cause(role)] = SampledSeries(t_s[~lost], error_s[~lost]).in_order()
             errors[lost_cause(role)] = SampledSeries(t_s[lost], 0 * t_s[lost]).in_order()
-        return {"clocks": errors, "largest_clock_error_s": self._largest_s}
+        return errors
 
 
 class _Measurements:
@@ -268,7 +267,8 @@ class ConditionReader:
             safe_input,
             self._measurements.restarts(),
             self._timeout_s,
-            **({} if self._clocks is None else self._clocks.observed()),
+            {} if self._clocks is None else self._clocks.take(),
+            np.inf if self._clocks is None else self._clocks.largest_s,
         )
 
 
