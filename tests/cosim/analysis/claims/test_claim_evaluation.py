@@ -53,8 +53,8 @@ DOCS = Path(__file__).parents[4] / "docs" / "record.md"
 def test_the_docs_list_every_claim_of_the_catalogue() -> None:
     texts = [path.read_text() for path in Path(catalogue.__path__[0]).glob("*.py")]
     defined = sum(len(re.findall(r"^@(?:claim|certified)\(", text, re.MULTILINE)) for text in texts)
-    rows = {(one.statement, one.source, one.assumes) for one in definitions(ClaimDefinition)}
-    rows |= {(one.statement, "certificate", one.assumes) for one in definitions(CertifiedClaim)}
+    rows = {(claim.statement, claim.source, claim.assumes) for claim in definitions(ClaimDefinition)}
+    rows |= {(claim.statement, "certificate", claim.assumes) for claim in definitions(CertifiedClaim)}
     assert len(rows) == defined
     text = DOCS.read_text(encoding="utf-8")
     section = text[text.index("\n## Claims") : text.index("\n## The summary")]
@@ -266,11 +266,11 @@ def test_the_part_after_a_change_is_judged_as_a_separate_run() -> None:
     assert {(claim.from_s, claim.until_s) for claim in claims} == {(0.0, 2.005), (first_s, None)}
     assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}
     before, after = (
-        [one for one in claims if (one.from_s > 0) is later and one.source == "certificate"]
+        [claim for claim in claims if (claim.from_s > 0) is later and claim.source == "certificate"]
         for later in (False, True)
     )
-    assert [one.what for one in before] == [one.what for one in after]
-    delta = {one.what: one.certified for one in after}["the controller's error is bounded"]
+    assert [claim.what for claim in before] == [claim.what for claim in after]
+    delta = {claim.what: claim.certified for claim in after}["the controller's error is bounded"]
     # βe^{−αt} in the run's own time: the part's certificate starts from the threshold at that time.
     first, own = (part for part in parts.parts if isinstance(part, ClaimEvaluation))
     beta = 0.04 * np.exp(-0.2 * first_s)
@@ -287,20 +287,20 @@ def test_the_part_after_a_change_is_judged_as_a_separate_run() -> None:
 def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance() -> None:
     plant = CONTENT["plant"] | {"uncertainty_A": [[0.0, 0.0], [0.3, 0.0]]}
     record = run_with((2.005, {"controller.setpoint": [3.0, 0.0]}), plant=plant)
-    after = [one for one in RunClaims(record).evaluate() if one.from_s > 0]
-    own = [one for one in after if one.source == "certificate"]
+    after = [claim for claim in RunClaims(record).evaluate() if claim.from_s > 0]
+    own = [claim for claim in after if claim.source == "certificate"]
     assert own
-    assert {one.verdict for one in own} == {ClaimVerdict.HELD}
-    void = [one for one in after if one.verdict is ClaimVerdict.VOID]
-    assert {one.source for one in void} == {"box certificate"}
-    identity = next(one for one in after if one.source == "(I1)")
+    assert {claim.verdict for claim in own} == {ClaimVerdict.HELD}
+    void = [claim for claim in after if claim.verdict is ClaimVerdict.VOID]
+    assert {claim.source for claim in void} == {"box certificate"}
+    identity = next(claim for claim in after if claim.source == "(I1)")
     assert identity.verdict is ClaimVerdict.HELD
 
 
 @pytest.mark.parametrize(("name", "norms"), [("lane_weighted", {"W"}), ("double_integrator", {""})])
 def test_formulas_have_the_weight_of_the_triggers_norm(name: str, norms: set[str]) -> None:
     claims = RunClaims(simulate(resolved(name, "horizon_s=2"))).evaluate()
-    bounded = [re.match(r"‖(W?) ?e_[cs]‖ ≤", one.bound) for one in claims]
+    bounded = [re.match(r"‖(W?) ?e_[cs]‖ ≤", claim.bound) for claim in claims]
     found = [match[1] for match in bounded if match]
     assert len(found) > 5
     assert set(found) == norms
@@ -316,13 +316,13 @@ def test_a_part_is_void_with_the_reason() -> None:
         (deaf, 2.005, "not every process received the change"),
         (far, None, "from Kx"),
     ):
-        after = [one for one in RunClaims(record).evaluate() if one.from_s > 0]
-        void = [one for one in after if since_s or one.source == "certificate"]
+        after = [claim for claim in RunClaims(record).evaluate() if claim.from_s > 0]
+        void = [claim for claim in after if since_s or claim.source == "certificate"]
         assert void
-        for one in void:
-            assert one.verdict is ClaimVerdict.VOID
-            assert one.since_s == since_s or since_s is None
-            assert why in one.why
+        for claim in void:
+            assert claim.verdict is ClaimVerdict.VOID
+            assert claim.since_s == since_s or since_s is None
+            assert why in claim.why
 
 
 # --- stopped runs --------------------------------------------------------------------------------
