@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Goal, Peer, Row, benchmark, option, say
-from cosim.analysis.adversary import Objective, Worst, conditions_of, find_worst
+from cosim.analysis.adversary import Objective, WorstRun, conditions_of, find_worst
 from cosim.cli import find_scenario
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
@@ -179,7 +179,7 @@ def tightness_rows(loop: Scenario, policy: str, trigger: Mapping[str, Any]) -> I
     yield from (row_of(name, search(objective)) for objective in QUANTITIES)
 
 
-def row_of(name: str, worst: Worst) -> Row:
+def row_of(name: str, worst: WorstRun) -> Row:
     """Return the share of a bound that the worst run uses; more than 1 refutes the bound."""
     searched = f"all {worst.runs}" if worst.exact else f"some, {worst.runs} runs"
     return Row(

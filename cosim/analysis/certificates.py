@@ -93,7 +93,7 @@ class Certificates:
         given: Matrix | None = None,
         nonlinear: Scenario | None = None,
     ) -> None:
-        self._given_arguments = (scenario, late_periods, weight, given, nonlinear)
+        self._arguments = (scenario, late_periods, weight, given, nonlinear)
         scenario.coverage.require_constant()
         scenario.coverage.require_certifiable()
         self.setpoint, void = scenario.controller.setpoint, void_at_setpoint(scenario)
@@ -114,13 +114,13 @@ class Certificates:
             for under, assumed in conditions.items()
             for scope in self._scopes
         ]
-        self._given = np.eye(loop_of(scenario).n) if given is None else given
+        self._own_weight = np.eye(loop_of(scenario).n) if given is None else given
         self.theorem_2 = _theorem_2(scenario, self.paper)
         self.unlimited, self.unpredictable = self._unlimited()
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle what they are computed from; it is computed again."""
-        return Certificates, self._given_arguments
+        return Certificates, self._arguments
 
     def __iter__(self) -> Iterator[tuple[str, ScenarioCertificate]]:
         return iter(self._certificates)
@@ -162,8 +162,8 @@ class Certificates:
         if self.weight is None or constants is None or self.schedule.persistent_constants is not None:
             return None
         error = error_gains(loop_of(self.scenario), constants.rate_per_s)
-        kernel = response(error.scaled_H, error.inverse_weight).through(self._given)
-        present_gain = float(norm_bounds(self._given, error.inverse_weight[None])[0])
+        kernel = response(error.scaled_H, error.inverse_weight).through(self._own_weight)
+        present_gain = float(norm_bounds(self._own_weight, error.inverse_weight[None])[0])
         missing = sum_of_sups(kernel, constants.missing_events, constants.inter_event_s or 0.0)
         return min(present_gain * constants.delta, (present_gain + float(missing)) * constants.overshoot)
 
@@ -339,7 +339,7 @@ def in_chosen_norm(
     """
     with contextlib.suppress(CallerError):  # no weight can be chosen for this scenario
         chosen = certificates_of(scenario, "chosen", certificates.late_periods, progress, of_model=True)
-        return chosen if chosen.schedule.constants is not None else None
+        return chosen if chosen.schedule.exists else None
     return None
 
 

@@ -91,7 +91,7 @@ def recorded_loop(record: RunRecord) -> RecordedLoop:
     measured = np.zeros(last + 1, dtype=np.bool_)
     measured[sensor["t_ns"] // period_ns] = True
     origins, accepted = _ticks(ticks, deliveries)
-    latched = _latched(steps["actuation"], origins)
+    latched = _origins_of_steps(steps["actuation"], origins)
     observed = read_conditions(record)
     _require(
         not (len(observed.watchdog.t_s) or len(observed.safe_input.t_s)),
@@ -133,10 +133,14 @@ def _whole_steps(record: RunRecord, steps: Rows, sensor: Rows, ticks: Rows, deli
     )
     last = int(sensor["t_ns"][-1]) // record.scenario.timing.plant_period_ns
     steps = steps[: last + 1]
-    whole = len(steps) > last and np.array_equal(steps["sequence"], np.arange(last + 1))
-    _require(whole, "steps of the plant are missing from the record")
-    whole = np.array_equal(sensor["input"], np.arange(count))
-    _require(whole, "measurements are missing from the sensor's record")
+    _require(
+        len(steps) > last and np.array_equal(steps["sequence"], np.arange(last + 1)),
+        "steps of the plant are missing from the record",
+    )
+    _require(
+        np.array_equal(sensor["input"], np.arange(count)),
+        "measurements are missing from the sensor's record",
+    )
     horizon_ns = record.scenario.timing.horizon_ns
     _require_times(SENSOR_MEASUREMENT, sensor["t_ns"], horizon_ns)
     _require_times(CONTROLLER_STEP, ticks["model_t_ns"], horizon_ns)
@@ -157,7 +161,7 @@ def _require_times(table: str, times_ns: NDArray[np.int64], horizon_ns: int) -> 
     _require(bool(possible), f"the record's {table} has times that no run has")
 
 
-class _InputOrigins(NamedTuple):
+class _Origins(NamedTuple):
     """The origin of the controller's actuations (by sequence number) or of the plant's steps."""
 
     model_ns: NDArray[np.int64]
@@ -165,23 +169,25 @@ class _InputOrigins(NamedTuple):
     """Sequence number of the newest update that they use, −1 for none."""
 
 
-def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_InputOrigins, set[int]]:
+def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_Origins, set[int]]:
     """Return the origin of each actuation, and the updates that the controller accepted."""
     inputs = np.sort(np.concatenate([ticks["input"], deliveries["input"]]))
-    whole = np.array_equal(inputs, np.arange(len(inputs)))
-    whole = whole and np.array_equal(ticks["sequence"], np.arange(len(ticks)))
-    _require(whole, "ticks or deliveries are missing from the controller's record")
+    _require(
+        np.array_equal(inputs, np.arange(len(inputs)))
+        and np.array_equal(ticks["sequence"], np.arange(len(ticks))),
+        "ticks or deliveries are missing from the controller's record",
+    )
     sequences = np.concatenate([[NO_SEQUENCE], deliveries["sequence"]])
     newest = sequences[np.searchsorted(deliveries["input"], ticks["input"])]
-    return _InputOrigins(ticks["model_t_ns"], newest), set(deliveries["sequence"].tolist())
+    return _Origins(ticks["model_t_ns"], newest), set(deliveries["sequence"].tolist())
 
 
-def _latched(actuations: NDArray[np.int64], ticks: _InputOrigins) -> _InputOrigins:
+def _origins_of_steps(actuations: NDArray[np.int64], ticks: _Origins) -> _Origins:
     """Return the origin of the input held from each step on; −1 before the first."""
     known = bool(actuations.max(initial=NO_SEQUENCE) < len(ticks.newest))
     _require(known, "the controller's record ends before the plant's")
-    by_sequence = _InputOrigins(np.append(ticks.model_ns, NO_ACTUATION), np.append(ticks.newest, NO_SEQUENCE))
-    return _InputOrigins(by_sequence.model_ns[actuations], by_sequence.newest[actuations])
+    by_sequence = _Origins(np.append(ticks.model_ns, NO_ACTUATION), np.append(ticks.newest, NO_SEQUENCE))
+    return _Origins(by_sequence.model_ns[actuations], by_sequence.newest[actuations])
 
 
 def _delays(accepted: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]) -> Callable[[int], int]:
@@ -285,7 +291,7 @@ class Fidelity:
             f"{100 * self.explained_relative:.2g} %" + ("" if self.explained else ", too large")
         )
 
-    def as_json(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, object]:
         """All figures, for ``noack fidelity --json``."""
         figures = {k: v for k, v in asdict(self).items() if k not in ("t_s", "stage_norms")}
         return {**figures, "explained": self.explained, "verdict": self.verdict}
@@ -338,7 +344,7 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     period_s = schedule.period_ns * 1e-9
     t_s = np.flatnonzero(schedule.measured).astype(np.float64) * period_s
     ideal = _ideal(system, live, float(t_s[-1]), max_events, known_start=known)
-    simulated, event_times_s = _simulated_stages(system, schedule, known)
+    simulated, event_times_s = _simulate_stages(system, schedule, known)
     states = [ideal.at(t_s).x, *simulated, live.x]
     events_s = [ideal.event_s, *event_times_s, live.event_s]
     if not all(np.abs(x).max() < _LARGEST for x in states):
@@ -378,7 +384,7 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     )
 
 
-def _simulated_stages(
+def _simulate_stages(
     system: ContinuousLoop, schedule: StepSchedule, known_start: bool
 ) -> tuple[list[Matrix], list[Vector]]:
     """Return the measured states and the event times with one more effect of the network each."""

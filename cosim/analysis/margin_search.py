@@ -321,39 +321,50 @@ def find_margin(
     Raises:
         CallerError: the loop is not covered, or a number is out of range.
     """
+    _require_in_range(most_m, accuracy, effort)
+    margin, network = LossMargin(resolved), resolved.network
+    other_rules = uncapped(network.guarantee)
+    others_read = [read_guarantee(words) for words in guarantees]
+
+    def examine(guarantee: LossGuarantee, name: str = "") -> Stability:
+        progress(name or guarantee.meaning)
+        return margin.stability(guarantee, accuracy, effort=effort)
+
+    caps: list[LossCap] = []
+    every_m = False
+    for m in range(1, most_m + 1):
+        caps.append(LossCap(m, examine(capped(other_rules, m - 1), f"M = {m}")))
+        every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
+        if every_m or caps[-1].stability.verdict == "destabilised":
+            break
+    compared = _NOT_COMPARED
+    if others_read:
+        compared = compare_guarantees([network.guarantee, *others_read], examine)
+    return MarginResult(
+        scenario=resolved.name,
+        mode=resolved.mode,
+        between_updates=resolved.between_updates,
+        mansd=network.mansd,
+        guarantee=network.guarantee.meaning,
+        shortest_s=margin.shortest_ns / NS_PER_S,
+        period_s=margin.longest_ns / NS_PER_S,
+        delay_s=margin.loop.times.delay_ns / NS_PER_S,
+        caps=tuple(caps),
+        every_m=every_m,
+        period=find_longest_period(resolved, progress) if with_period else None,
+        without_guarantee=_without_guarantee(resolved, progress),
+        effort=effort,
+        compared=compared,
+    )
+
+
+def _require_in_range(most_m: int, accuracy: float, effort: float) -> None:
     if most_m < 1:
         raise CallerError(f"most_m {most_m}: expected the largest M to examine, 1 or more")
     if not 1e-8 <= accuracy < 1:
         raise CallerError(f"accuracy {accuracy:g}: expected a number from 1e-8 to 1, e.g. 1e-4")
     if not 0 < effort <= _LARGEST_EFFORT:
         raise CallerError(f"effort {effort:g}: expected a factor of the work up to 1e6, e.g. 10")
-    margin, network = LossMargin(resolved), resolved.network
-    others_read = [read_guarantee(words) for words in guarantees]
-    other_rules = uncapped(network.guarantee)
-    caps: list[LossCap] = []
-    every_m = False
-    for m in range(1, most_m + 1):
-        progress(f"M = {m}")
-        caps.append(LossCap(m, margin.stability(capped(other_rules, m - 1), accuracy, effort=effort)))
-        every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
-        if every_m or caps[-1].stability.verdict == "destabilised":
-            break
-
-    def examine(guarantee: LossGuarantee) -> Stability:
-        progress(guarantee.meaning)
-        return margin.stability(guarantee, accuracy, effort=effort)
-
-    compared = _NOT_COMPARED
-    if others_read:
-        compared = compare_guarantees([network.guarantee, *others_read], examine)
-    return MarginResult(
-        resolved.name, resolved.mode, resolved.between_updates, network.mansd,
-        network.guarantee.meaning,
-        margin.shortest_ns / NS_PER_S, margin.longest_ns / NS_PER_S,
-        margin.loop.times.delay_ns / NS_PER_S, tuple(caps), every_m,
-        find_longest_period(resolved, progress) if with_period else None,
-        _without_guarantee(resolved, progress), effort, compared,
-    )  # fmt: skip
 
 
 def _without_guarantee(resolved: Scenario, progress: MarginProgress) -> RandomGrowth | str:

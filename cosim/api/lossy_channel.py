@@ -108,7 +108,7 @@ class LossyChannel(
             self, network=network, step_s=step_s, first_action=first_action, seed=seed
         )
         super().__init__(env)
-        scenario = require_stand_alone(_loaded(network))
+        scenario = require_stand_alone(_load_network(network))
         self._network, self._step_ns = scenario.network, _step_ns(env, step_s)
         if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
             raise CallerError(f"LossyChannel: seed = {seed!r}: must be a whole number, 0 or more")
@@ -182,7 +182,7 @@ class LossyChannel(
                 self._receivers[packet.flow].take(packet.number)
 
 
-def _loaded(network: Source | ReadTable) -> Scenario:
+def _load_network(network: Source | ReadTable) -> Scenario:
     if isinstance(network, Mapping):
         base = toml_file.read(find_shipped("double_integrator", "scenarios"), Scenario)
         try:

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.shipped_files import find_shipped
-from cosim.studies.new_loop import ALPHA_SHARE, BETA_SHARE, LOSS_PROBABILITY, MANSD, SETTLED, rounded
+from cosim.studies.new_loop import ALPHA_SHARE, BETA_SHARE, LOSS_PROBABILITY, MANSD, SETTLED
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
+from noack.core.number_format import to_digits
 from noack.scenario import toml_file
 from noack.scenario.matrix_files import matrices_of, model_of
 from noack.scenario.scenario import Scenario
@@ -43,9 +44,9 @@ def load(source: Source, settings: ReadTable | None = None) -> Scenario:
     if isinstance(source, Scenario):
         return with_settings(source, settings) if settings else source
     if isinstance(source, Mapping):
-        return _completed(plain_table(source), settings, Path("scenario"))
+        return _complete(plain_table(source), settings, Path("scenario"))
     path = find_shipped(str(source), "scenarios")
-    return _completed(toml_file.read(path, Scenario), settings, path)
+    return _complete(toml_file.read(path, Scenario), settings, path)
 
 
 def with_settings(scenario: Scenario, settings: ReadTable) -> Scenario:
@@ -67,7 +68,7 @@ def with_settings(scenario: Scenario, settings: ReadTable) -> Scenario:
         NoackError: one line per mistake, each with key, value and remedy.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
-    return _completed(content, settings, Path("settings"))
+    return _complete(content, settings, Path("settings"))
 
 
 def from_system(
@@ -106,7 +107,7 @@ def from_system(
     model = model_of(system, gain, state_names=state_names, input_names=input_names)
     A, B = model.matrices
     decay_per_s = -spectral_abscissa(A + B @ np.array(model.gain))
-    alpha_per_s = rounded(ALPHA_SHARE * decay_per_s)
+    alpha_per_s = to_digits(ALPHA_SHARE * decay_per_s)
     start = plain(initial_state)
     # If it is no vector, the validation reports the mistake.
     norm = float(np.linalg.norm(start)) if _is_vector(start) else 0.0
@@ -116,12 +117,12 @@ def from_system(
         true_plant |= {"draw": "given", "A": true["A"].tolist(), "B": true["B"].tolist()}
     content: Table = {
         "name": name,
-        "horizon_s": rounded(math.log(1 / SETTLED) / alpha_per_s),
+        "horizon_s": to_digits(math.log(1 / SETTLED) / alpha_per_s),
         "model": model.model_dump(mode="json", exclude_none=True),
         "plant": true_plant,
         "trigger": {
             "policy": "decaying",
-            "beta": rounded(BETA_SHARE * norm or BETA_SHARE),
+            "beta": to_digits(BETA_SHARE * norm or BETA_SHARE),
             "alpha_per_s": alpha_per_s,
         },
         "network": {
@@ -129,10 +130,10 @@ def from_system(
             "loss": {"model": "bernoulli", "probability": LOSS_PROBABILITY},
         },
     }
-    return _completed(content, settings, Path("from_system"))
+    return _complete(content, settings, Path("from_system"))
 
 
-def _completed(content: Table, settings: ReadTable | None, path: Path) -> Scenario:
+def _complete(content: Table, settings: ReadTable | None, path: Path) -> Scenario:
     """Apply settings, validate, and read the named files, relative to ``path``."""
     if not isinstance(settings, Mapping | None):
         raise CallerError(

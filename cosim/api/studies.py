@@ -206,7 +206,7 @@ class CampaignResult:
     @property
     def summary(self) -> dict[str, object]:
         """The results: ``summary.json``; ``docs/campaigns.md`` documents its keys."""
-        return self._finished.summary.document()
+        return self._finished.summary.to_json()
 
     @property
     def breaches(self) -> int:

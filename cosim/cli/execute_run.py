@@ -121,7 +121,7 @@ def run_processes(
                 watchers = [warnings, line, run_watcher.RunLog().watcher()]
                 watchers += [] if watcher is None else [watcher]
                 if options.metrics is not None:
-                    watchers.append(stack.enter_context(_served_metrics(loaded, options.metrics)))
+                    watchers.append(stack.enter_context(_serve_metrics(loaded, options.metrics)))
                 ending = launcher.launch(
                     loaded,
                     options.runs,
@@ -139,7 +139,7 @@ def run_processes(
 
 
 @contextmanager
-def _served_metrics(loaded: "scenario.Scenario", requested_address: str) -> "Iterator[run_watcher.Watcher]":
+def _serve_metrics(loaded: "scenario.Scenario", requested_address: str) -> "Iterator[run_watcher.Watcher]":
     """Serve the metrics of a run within the context; yield what updates them."""
     metrics_server.require_package()
     metrics = run_watcher.RunMetrics(loaded)
@@ -184,7 +184,7 @@ def warn_of_other_runs() -> None:
 _COMPLETING = "replaying the run, checking its claims, writing its report"
 
 
-def reopened(run_dir: Path) -> "Outcome":
+def reopen_run(run_dir: Path) -> "Outcome":
     """Return the outcome of an earlier run; show that its record is completed, if that is necessary."""
     with cli.status(f"{run_dir}: {_COMPLETING}"):
         return finalize.reopen(run_dir)

@@ -12,7 +12,7 @@ from cosim.output.run_verdict import VerdictLine, remarks, verdict
 from cosim.record.record_source import concatenate_rows, rows_by_loop
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_run
-from cosim.record.spool_conversion import merged, spool_segments
+from cosim.record.spool_conversion import merge_segments, spool_segments
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -54,7 +54,7 @@ def live_view(run_dir: Path) -> Exploration | None:
     for table, dtype in own.items():
         rows = np.zeros(0, dtype)
         if table in _READ:
-            batches = merged(spool_segments(run_dir / SPOOL, table, types[table]), types[table])
+            batches = merge_segments(spool_segments(run_dir / SPOOL, table, types[table]), types[table])
             recorded = concatenate_rows([*batches], types[table])
             rows = dict(rows_by_loop(table, recorded, phases_ns(scenario), [own])).get(0, rows)
         tables[table] = rows

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, claims_of
+from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, claims_of, list_violations
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
-from cosim.analysis.summary.loop_statistics import list_violations
-from cosim.analysis.summary.network_summary import LoopOverTime, loop_over_time, summarise_run, worst_loop
+from cosim.analysis.summary.loops_over_time import LoopOverTime, loop_over_time
+from cosim.analysis.summary.network_summary import summarise_run, worst_loop
 from cosim.analysis.summary.run_summary import Outcome, linearisation, summarise
 from cosim.analysis.summary.summary_model import (
     ConditionsPart,
@@ -324,7 +324,7 @@ def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:
         "conditions": ConditionsPart(**claims.conditions),
         "allowed": _schedule(claims.allowed),
         "certified_for": _schedule(claims.certified_for),
-        "claims": claims.judge(),
+        "claims": claims.evaluate(),
         "judged_until_s": claims.judged_until_s,
         "assumption_violations": list_violations(summary.assumption_violations, claims.violations()),
         "longest_loss_burst": longest,

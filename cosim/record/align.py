@@ -125,11 +125,11 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     track, begins = before, firsts_of_equal(generations).tolist()
     for begin, end in pairwise([*begins, len(generations)]):
         own = slice(begin, end)
-        track = _continued(track, int(generations[begin]), model_ns[own], x_c[own], newest[own])
+        track = _extend(track, int(generations[begin]), model_ns[own], x_c[own], newest[own])
     return track
 
 
-def _continued(
+def _extend(
     track: ControllerTrack, generation: int, model_ns: Times, x_c: Reals, newest: NDArray[np.int64]
 ) -> ControllerTrack:
     """Append the states of one generation of the controller to a track."""
@@ -240,16 +240,16 @@ class AlignedPart(NamedTuple):
 
 def aligned_parts(record: RunRecord) -> Iterator[AlignedPart]:
     """Align a run part by part; a run without measurements has one empty part."""
-    yield from _short_run(record) if record.is_short else _aligned(record)
+    yield from _short_run(record) if record.is_short else _align(record)
 
 
 @lru_cache(maxsize=1)
 def _short_run(record: RunRecord) -> Sequence[AlignedPart]:
     """Return the parts of a run that is read several times in turn."""
-    return tuple(_aligned(record))
+    return tuple(_align(record))
 
 
-def _aligned(record: RunRecord) -> Iterator[AlignedPart]:
+def _align(record: RunRecord) -> Iterator[AlignedPart]:
     scenario, loop, flow = record.scenario, record.loop, model_flow_of(record)
     acknowledged = scenario.protocol.acknowledges
     track = initial_track(scenario)
@@ -302,15 +302,15 @@ def bounded_parts(record: RunRecord) -> Iterator[BoundedPart]:
 
     Summary and claims use those of a short run in turn.
     """
-    yield from _short_bounds(record) if record.is_short else _bounded(record)
+    yield from _short_bounds(record) if record.is_short else _add_bounds(record)
 
 
 @lru_cache(maxsize=1)
 def _short_bounds(record: RunRecord) -> Sequence[BoundedPart]:
-    return tuple(_bounded(record))
+    return tuple(_add_bounds(record))
 
 
-def _bounded(record: RunRecord) -> Iterator[BoundedPart]:
+def _add_bounds(record: RunRecord) -> Iterator[BoundedPart]:
     scenario = record.scenario
     period_ns = scenario.timing.measurement_period_ns
     monitor = ErrorMonitor(record.loop.H, policy_of(scenario), period_ns)

@@ -88,7 +88,7 @@ def collect(run_dir: Path, source: str, complete: Callable[[Path], T]) -> tuple[
             merged = Path(scratch) / run_dir.name
             shutil.copytree(run_dir, merged, symlinks=True)
             roles = _take(folder / SPOOL, merged, source)
-            outcome = _completed(complete, merged, run_dir, source)
+            outcome = _complete(complete, merged, run_dir, source)
             _require_consistent(run_dir, merged, source)
             run_dir.rename(Path(scratch) / "before")
             merged.rename(run_dir)
@@ -99,7 +99,7 @@ def collect(run_dir: Path, source: str, complete: Callable[[Path], T]) -> tuple[
     return outcome, roles
 
 
-def _completed(complete: Callable[[Path], T], merged: Path, run_dir: Path, source: str) -> T:
+def _complete(complete: Callable[[Path], T], merged: Path, run_dir: Path, source: str) -> T:
     """Complete the merged record; an error names the run, and not the copy that is removed."""
     try:
         return complete(merged)
@@ -124,7 +124,7 @@ def _take(kept: Path, run_dir: Path, source: str) -> list[str]:
     Raises:
         PeerError: a file is not of a process that kept its secret there.
     """
-    processes = {process.writer: process for process in _joined(run_dir)}
+    processes = {process.writer: process for process in _joined_processes(run_dir)}
     types = run_tables(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
     roles = set()
     for path in sorted(kept.glob("*.*")):
@@ -139,7 +139,7 @@ def _take(kept: Path, run_dir: Path, source: str) -> list[str]:
         _require_own(table, process, types, name)
         out = SpoolWriter(run_dir / SPOOL, writer)
         try:
-            for first, rows in _checked_chunks(path, table, process, types, name):
+            for first, rows in _check_chunks(path, table, process, types, name):
                 out.append(table, first, rows)
         finally:
             out.close()
@@ -147,7 +147,7 @@ def _take(kept: Path, run_dir: Path, source: str) -> list[str]:
     return [role for role in LOOP_ROLES if role in roles]
 
 
-def _joined(run_dir: Path) -> Iterator[_Process]:
+def _joined_processes(run_dir: Path) -> Iterator[_Process]:
     """Yield the processes that joined a run."""
     for writer, entry in read_object(run_dir / PROCESSES_FILE).items():
         if isinstance(entry, dict) and entry.get("process") in LOOP_ROLES:
@@ -184,7 +184,7 @@ def _require_own(table: str, process: _Process, types: Mapping[str, np.dtype[np.
         raise PeerError(f"{name}: the {process.role} has no table of this name")
 
 
-def _checked_chunks(
+def _check_chunks(
     path: Path,
     table: str,
     process: _Process,

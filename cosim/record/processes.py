@@ -200,14 +200,14 @@ def generation_numbers(source: RecordSource, tables: Sequence[str]) -> list[int]
     """
     if all(source.highest_input(table) < GENERATION for table in tables):
         return [0]
-    first, of = 0, np.zeros(0, np.int64)
+    first, generations = 0, np.zeros(0, np.int64)
     for table in tables:
         for rows in source.batches(table, ("input",)):
             inputs = rows["input"]
             begun = inputs[(inputs % GENERATION == 0) & (inputs > 0)] // GENERATION
             first = max(first, int(begun.max(initial=0)))
-            of = np.union1d(of, inputs // GENERATION)
-    return [0, *of[(of > 0) & (of <= first)].tolist()]
+            generations = np.union1d(generations, inputs // GENERATION)
+    return [0, *generations[(generations > 0) & (generations <= first)].tolist()]
 
 
 class _Counts:

@@ -224,7 +224,7 @@ def with_loop(rows: Rows, number: int, dtype: np.dtype[np.void]) -> Rows:
     return converted
 
 
-def packed(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
+def pack_rows(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
     """Return the columns of a type without gaps, of a vector the first entries."""
     if rows.dtype == dtype:
         return rows
@@ -252,7 +252,7 @@ def rows_by_loop(
         types: the row types of the tables of each loop.
     """
     if table in CLOCK_TABLES:
-        yield from enumerate(_shifted(rows, phase_ns) for phase_ns in phases_ns)
+        yield from enumerate(_shift_rows(rows, phase_ns) for phase_ns in phases_ns)
         return
     numbers = np.zeros(len(rows), np.int64)
     if "flow" in (rows.dtype.names or ()):
@@ -267,7 +267,7 @@ def rows_by_loop(
         chosen = rows.take(order[ends[number - 1] if number else 0 : ends[number]])
         if is_of_network(table):
             chosen = _of_loop(chosen, number, phases_ns)
-        yield number, packed(chosen, types[number][table])
+        yield number, pack_rows(chosen, types[number][table])
 
 
 class NetworkRows:
@@ -394,7 +394,7 @@ class LoopTables(RecordSource):
             return
         dtype = with_columns(self.types[table], columns)
         for rows in self._stored.of_loop(table, self._number, dtype):
-            yield _shifted(rows, self._phase_ns) if table in CLOCK_TABLES else rows
+            yield _shift_rows(rows, self._phase_ns) if table in CLOCK_TABLES else rows
 
 
 def _of_loop(rows: Rows, number: int, phases_ns: Sequence[int]) -> Rows:
@@ -405,7 +405,7 @@ def _of_loop(rows: Rows, number: int, phases_ns: Sequence[int]) -> Rows:
     return rows
 
 
-def _shifted(rows: Rows, phase_ns: int) -> Rows:
+def _shift_rows(rows: Rows, phase_ns: int) -> Rows:
     """Return rows with times of a loop in place of those of the run."""
     if not phase_ns:
         return rows

@@ -106,7 +106,7 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
     """
     common = dict(user_files.file_tables(scenario))
 
-    def copied(within: str, within_scenario: "Scenario", folder: str) -> dict[str, "FileSettings"]:
+    def copy_files(within: str, within_scenario: "Scenario", folder: str) -> dict[str, "FileSettings"]:
         copies = {}
         for key, table in user_files.file_tables(within_scenario):
             if within and table == common.get(key):
@@ -119,12 +119,14 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
             copies[key] = table.model_copy(update={"file": f"{folder}{name}"})
         return copies
 
-    def located(folder: str) -> "Scenario":
-        moved = scenarios.with_loop_tables(scenario, lambda entry, loop: copied(f"{entry}.", loop, folder))
-        return user_files.with_tables(moved, copied("", scenario, folder))
+    def scenario_in(folder: str) -> "Scenario":
+        moved = scenarios.with_loop_tables(
+            scenario, lambda entry, loop: copy_files(f"{entry}.", loop, folder)
+        )
+        return user_files.with_tables(moved, copy_files("", scenario, folder))
 
-    write_whole(run_dir / SCENARIO_FILE, scenario_file.dumps(located("")))
-    return located(f"{run_dir.absolute()}/")
+    write_whole(run_dir / SCENARIO_FILE, scenario_file.dumps(scenario_in("")))
+    return scenario_in(f"{run_dir.absolute()}/")
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -224,7 +226,7 @@ def active_run(run_dir: Path) -> Iterator[None]:
     Raises:
         MachineError: the directory cannot be written.
     """
-    with _locked(run_dir, shared=True):
+    with _lock(run_dir, shared=True):
         yield
 
 
@@ -236,14 +238,14 @@ def finished_run(run_dir: Path) -> Iterator[None]:
         CallerError: the run is still active.
         MachineError: the directory cannot be written.
     """
-    with _locked(run_dir) as alone:
+    with _lock(run_dir) as alone:
         if not alone:
             raise CallerError(f"{run_dir}: the run is still under way")
         yield
 
 
 @contextmanager
-def _locked(run_dir: Path, *, shared: bool = False) -> Iterator[bool]:
+def _lock(run_dir: Path, *, shared: bool = False) -> Iterator[bool]:
     with ExitStack() as stack:
         try:
             alone = stack.enter_context(locked(run_dir / _LOCK, shared=shared, wait=shared))

@@ -1,4 +1,4 @@
-"""What happened in a run: changes of settings, the outcome of each packet, divergence.
+"""Events of a run: changes of settings, the outcome of each packet, times of inputs, divergence.
 
 A run diverged if its state is not finite, or far above the run's scale and still growing. The scale
 is the largest of these values, in units of ‖x‖:
@@ -32,6 +32,7 @@ from noack.protocol.record_tables import (
     CONTROLLER_SETTING,
     NETEM_PACKET,
     NETEM_RELEASE,
+    NO_SEQUENCE,
     OWNER,
     SETTINGS,
     direction_of,
@@ -248,6 +249,32 @@ def updates_in(packets: Rows, flow: Flow = Flow.UPDATE) -> tuple[Rows, NDArray[n
 GROWTH = 1000.0
 _STILL_GROWING = 2.0
 _LEAST_SAMPLES = 20
+
+
+class ActuationTimes:
+    """The model times of the actuations that the plant received, part by part of its steps."""
+
+    def __init__(self) -> None:
+        self._sequence, self._t_ns = np.zeros((2, 0), np.int64)
+
+    def add(self, actuations: Rows) -> None:
+        """Add rows of actuations, in their order."""
+        self._sequence = np.append(self._sequence, actuations["sequence"])
+        self._t_ns = np.append(self._t_ns, actuations["t_ns"])
+
+    def of_newest(self, newest: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the model times of the newest actuations of the next steps, and which are known.
+
+        Both have shape (k,), as the sequence numbers ``newest``. The time is 0 before the first
+        actuation, and where it is unknown because the actuation is not recorded.
+        """
+        index = np.searchsorted(self._sequence, newest)
+        is_recorded = np.append(self._sequence, NO_SEQUENCE)[index] == newest
+        is_any = newest != NO_SEQUENCE
+        times_ns = np.where(is_recorded & is_any, np.append(self._t_ns, 0)[index], 0)
+        if len(newest):  # a later step has the newest of these actuations, or a later one
+            self._sequence, self._t_ns = self._sequence[index[-1] :], self._t_ns[index[-1] :]
+        return times_ns, is_recorded | ~is_any
 
 
 class Divergence(NamedTuple):

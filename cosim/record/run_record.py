@@ -1,12 +1,9 @@
-"""The numeric record of a run, of one or more loops: written as Parquet, read batch by batch.
+"""The numeric record of a run, of one or more loops, read batch by batch.
 
 ``RUN/record/TABLE.parquet`` is the authoritative record; ``docs/record.md`` documents the columns.
 """
 
-import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, overload
@@ -21,7 +18,6 @@ from cosim.record.processes import (
     Report,
     entries_of_loop,
     generation_numbers,
-    joint_reports,
     read_generations,
     report_entries,
     valid_reports,
@@ -35,17 +31,14 @@ from cosim.record.record_source import (
     RowsInMemory,
     Slice,
     concatenate_rows,
-    packed,
+    pack_rows,
     slices,
     with_columns,
-    with_loop,
 )
 from cosim.record.record_source import Rows as Rows
-from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE, Kind, kind_of
+from cosim.record.run_directory import RECORD, SCENARIO_FILE, SUMMARY_FILE, Kind, kind_of
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
-from noack.core.file_access import PARTIAL, new_file, write_whole
-from noack.core.process_limits import cores
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     LOOP,
@@ -55,19 +48,18 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
     has_loop,
-    is_of_network,
     network_tables,
 )
 from noack.protocol.roles import LOOP_ROLES, RESTART
 from noack.runtime.control_messages import LogLine, parse_message
-from noack.scenario.resolution import LoopMatrices, loop_of, resolve, resolved_loops, run_tables, tables_of
+from noack.scenario.resolution import LoopMatrices, loop_of, resolved_loops, run_tables, tables_of
 from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, phases_ns
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
     from cosim.record import table_files
 
-_NOTICES_FILE = "notices.jsonl"
+NOTICES_FILE = "notices.jsonl"
 Notice = dict[str, Any]
 """A line of the run's log: t_ns, level, text, process, and the number of a loop if it has one."""
 _ROWS_PER_STEP, _MORE_ROWS = 4, 100_000
@@ -194,7 +186,7 @@ class RunRecord:
         batches = self.source.batches(table, names)
         chosen = (rows if where is None else rows.compress(where(rows)) for rows in batches)
         dtype = with_columns(self.tables[table], names)
-        return concatenate_rows([packed(rows, dtype) for rows in chosen], dtype)
+        return concatenate_rows([pack_rows(rows, dtype) for rows in chosen], dtype)
 
     @cached_method
     def events(self) -> Rows:
@@ -485,69 +477,9 @@ def steps_of(scenario: Scenario) -> int:
     )
 
 
-def write_run(run: RecordedRun, run_dir: Path) -> None:
-    """Write the tables, the notices and the reports of a run into its directory.
-
-    Raises:
-        OSError, NoackError: they cannot be written.
-    """
-    types = run_tables(run.scenario)
-
-    def rows(table: str) -> Iterator[Rows]:
-        if is_of_network(table):
-            yield from run.network.source.batches(table)
-            return
-        # A process's clock is in the record of every loop; only simulated runs have several, and
-        # those compare no clocks.
-        for number, record in enumerate(run.loops[:1] if table in CLOCK_TABLES else run.loops):
-            if table in record.tables:
-                for batch in record.source.batches(table):
-                    yield with_loop(batch, number, types[table])
-
-    common = list(run.network.notices)
-    of_loops = [
-        notice | {LOOP: number}
-        for number, record in enumerate(run.loops)
-        for notice in record.notices
-        if notice not in common
-    ]
-    notices = sorted([*common, *of_loops], key=lambda notice: int(notice["t_ns"]))
-    reports = joint_reports(run.network.reports, [record.reports for record in run.loops])
-    write_whole(run_dir / REPORTS_FILE, json.dumps(reports, indent=2), make_folder=False)
-    folder, names = run_dir / RECORD, vector_names(run.scenario)
-    with record_folder(folder, notices), ThreadPoolExecutor(cores()) as threads:
-        written = [
-            threads.submit(table_files.write_table, folder / f"{table}.parquet", rows(table), dtype, names)
-            for table, dtype in types.items()
-        ]
-        for writing in written:
-            writing.result()
-
-
-def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
-    """Return the names of states and inputs, if they are the same in all loops."""
-    models = [resolve(loop_scenario(scenario, section)).model for section in loop_sections(scenario)]
-    names = {(model.state_names or (), model.input_names or ()) for model in models}
-    if len(names) > 1:
-        return {}
-    ((states, inputs),) = names
-    return {"state_names": states, "input_names": inputs}
-
-
-@contextmanager
-def record_folder(folder: Path, notices: Iterable[Notice]) -> Iterator[None]:
-    """Have a folder for the tables that are written within the context, and for the run's log."""
-    folder.mkdir(exist_ok=True)
-    for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
-        scratch.unlink(missing_ok=True)
-    yield
-    with new_file(folder / _NOTICES_FILE, make_folder=False) as file:
-        file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)
-
-
 def read_notices(folder: Path) -> list[Notice]:
     """Read the run's log from the folder of its record."""
-    path = folder / _NOTICES_FILE
+    path = folder / NOTICES_FILE
     try:
         lines = path.read_bytes().splitlines() if path.is_file() else []
         return [parse_message(_Notice, line).fields() for line in lines]

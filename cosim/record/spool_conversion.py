@@ -25,16 +25,9 @@ import numpy as np
 from cosim.lazy_modules import lazy_modules
 from cosim.record.processes import add_kept_reports
 from cosim.record.record_source import BATCH_ROWS, Rows, Segment, concatenate_rows
+from cosim.record.record_writing import record_folder, vector_names
 from cosim.record.run_directory import RECORD
-from cosim.record.run_record import (
-    Notice,
-    RecordedRun,
-    load_run,
-    read_notices,
-    record_folder,
-    scenarios_of,
-    vector_names,
-)
+from cosim.record.run_record import Notice, RecordedRun, load_run, read_notices, scenarios_of
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
 from noack.core.linear_systems import firsts_of_equal
@@ -102,7 +95,7 @@ def _read(path: Path, begin: int, end: int, dtype: np.dtype[np.void]) -> Rows:
     return concatenate_rows([rows for _, _, rows in spool_parts(path, dtype, begin, end)], dtype)
 
 
-def merged(segments: Iterable[Segment], dtype: np.dtype[np.void]) -> Iterator[Rows]:
+def merge_segments(segments: Iterable[Segment], dtype: np.dtype[np.void]) -> Iterator[Rows]:
     """Yield the rows in the order of the machine's inputs, without duplicates.
 
     Of several rows with the same input of a loop, the first one is taken.
@@ -214,7 +207,7 @@ def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) ->
     segments = [*table_files.TableFile(path, dtype).segments()] if path.is_file() else []
     segments += spool_segments(run_dir / SPOOL, table, dtype)
     if not has_loop(table):
-        yield from merged(segments, dtype)
+        yield from merge_segments(segments, dtype)
         return
     at_once = max(loops * _BLOCK_BYTES // max(_bytes_of(run_dir, table), _BLOCK_BYTES), 1)
     for first in range(0, loops, at_once):
@@ -222,7 +215,7 @@ def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) ->
         if len(block) > 1:
             yield from by_loop(segments, dtype, block)
         else:
-            yield from merged([segment.of_loop(first) for segment in segments], dtype)
+            yield from merge_segments([segment.of_loop(first) for segment in segments], dtype)
 
 
 def remove_spool(run_dir: Path) -> None:
@@ -278,7 +271,7 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
     ended = run_dir / SPOOL / EARLY / EARLY_ENDED
     with ExitStack() as stack:
         with ThreadPoolExecutor(1, initializer=be_idle) as thread:
-            tables = thread.submit(_opened, run_dir, stack).result()
+            tables = thread.submit(_open_tables, run_dir, stack).result()
             thread.submit(_follow, tables, ended).result()
         ended.unlink()
         with ThreadPoolExecutor(cores()) as threads:
@@ -286,7 +279,7 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
     return {table.name: table.bytes for table in tables if table.bytes}
 
 
-def _opened(run_dir: Path, stack: ExitStack) -> "list[_EarlyTable]":
+def _open_tables(run_dir: Path, stack: ExitStack) -> "list[_EarlyTable]":
     """Open the tables of the loops, in a new folder."""
     scenario, loops = scenarios_of(run_dir)
     folder, names = run_dir / SPOOL / EARLY, vector_names(scenario)

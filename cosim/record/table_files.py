@@ -23,7 +23,7 @@ from cosim.record.record_source import (
     Rows,
     Segment,
     concatenate_rows,
-    packed,
+    pack_rows,
     parts_by_loop,
     with_columns,
 )
@@ -94,7 +94,7 @@ class StoredTables(RecordSource):
                 if group not in newest:
                     (newest[group],) = self._files[table].batches(groups=[group])
                 rows = newest[group]
-                yield packed(rows.compress(rows[LOOP] == number), dtype)
+                yield pack_rows(rows.compress(rows[LOOP] == number), dtype)
 
     def of_loops(
         self, table: str, loops: Sequence[int], types: Sequence[RowType]
@@ -309,7 +309,7 @@ def write_table(
         OSError: the file cannot be written.
     """
     with table_writer(path, dtype, names) as write:
-        for rows in _regrouped(batches, dtype):
+        for rows in _regroup(batches, dtype):
             write(rows)
 
 
@@ -318,7 +318,7 @@ def arrow_table(rows: Rows) -> pa.Table:
     return pa.table(_arrays(rows))
 
 
-def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
+def _regroup(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
     """Yield the same rows in batches of at most ``BATCH_ROWS``.
 
     A loop with enough rows begins a batch of its own; so it can be read alone.

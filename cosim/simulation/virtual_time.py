@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, concatenate_rows, packed
+from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, concatenate_rows, pack_rows
+from cosim.record.record_writing import write_run
 from cosim.record.run_directory import (
     EndingFile,
     RunEnding,
@@ -25,7 +26,7 @@ from cosim.record.run_directory import (
     write_environment,
     write_scenario,
 )
-from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles, write_run
+from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi
@@ -377,7 +378,7 @@ class _LoopRows(RecordSource):
         if is_of_network(table):
             yield from self._packets.of_loop(table, self._number)
         elif has_loop(table):  # nothing in virtual time compares clocks
-            yield packed(self._record.of_loop(table, self._number), self.types[table])
+            yield pack_rows(self._record.of_loop(table, self._number), self.types[table])
 
 
 def _split(rows: Rows, loops: int) -> list[Rows]:

@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.text import Text
 
 from cosim.analysis.replay import replay
-from cosim.analysis.replay.replay_result import difference, rows_differ
+from cosim.analysis.replay.replay_result import difference, first_row_difference
 from cosim.analysis.summary.summary_model import ReplayDifference
 from cosim.live.finalize import finalize, reopen
 from cosim.output.result_tables import ResultTable, terminal_table
@@ -271,8 +271,7 @@ def repeat_archive(
             or a long run without ``long``.
         MachineError: a folder cannot be written.
     """
-    with _folder(into) as folder:
-        archived = folder / "archived"
+    with _folder(into) as folder, _naming_archive(path, archived := folder / "archived"):
         manifest = unpack(path, archived)
         scenario = _scenario(path, archived, run_code=run_code)
         if (manifest.scenario, manifest.kind) != (scenario.name, kind_of(archived)):
@@ -282,10 +281,7 @@ def repeat_archive(
                 f"{path}: its run has {steps:,} steps, and would take about "
                 f"{steps * _US_PER_STEP * 1e-6 / 3600:.1f} hours; --long repeats it nevertheless"
             )
-        try:
-            recorded = load_run(archived)
-        except CallerError as error:
-            raise CallerError(f"{path}: {str(error).removeprefix(f'{archived}/')}") from None
+        recorded = load_run(archived)
         ending = simulate_run(scenario, folder / "repeated")
         finalize(ending, report=False, view=False)
         repeated = load_run(ending.run_dir)
@@ -322,6 +318,16 @@ def _folder(into: Path | None) -> Iterator[Path]:
     except OSError as error:
         raise MachineError(f"{into}: {why(error)}") from None
     yield into
+
+
+@contextmanager
+def _naming_archive(path: Path, archived: Path) -> Iterator[None]:
+    """In messages about files of an archive, name the archive and not the folder they are in."""
+    try:
+        yield
+    except CallerError as error:
+        text = str(error).replace(f"{archived}/", f"{path}: ").replace(str(archived), str(path))
+        raise CallerError(text) from None
 
 
 def _scenario(path: Path, archived: Path, *, run_code: bool) -> Scenario:
@@ -388,7 +394,7 @@ def _in_table(table: str, rows_before: int, recorded: Slice, repetition: Slice) 
         return None
     for i, (row, repeated_row) in enumerate(zip(rows, repeated_rows, strict=False)):
         if row.tobytes() != repeated_row.tobytes():
-            return rows_differ(table, rows_before + i, row, repeated_row)
+            return first_row_difference(table, rows_before + i, row, repeated_row)
     common, longer = min(len(rows), len(repeated_rows)), max(rows, repeated_rows, key=len)
     description = "the row is missing in the " + ("repetition" if len(rows) > common else "archive")
     return difference(table, rows_before + common, int(longer[common]["now_ns"]), description)

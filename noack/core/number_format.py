@@ -31,6 +31,11 @@ def number(value: float | None, digits: int = 3) -> str:
     return NONE if value is None or math.isnan(value) else f"{value:.{digits}g}"
 
 
+def to_digits(value: float, digits: int = 3) -> float:
+    """Return a number rounded to ``digits`` significant digits."""
+    return float(f"{value:.{digits}g}")
+
+
 def at_most(value: float | None, digits: int = 4, decimals: int | None = None) -> str:
     """Write an upper bound, rounded up to ``digits`` significant digits, or to ``decimals``."""
     return _bound(value, digits, decimals, ROUND_CEILING)

@@ -30,6 +30,13 @@ SENSOR_SETTING = "sensor_setting"
 NETEM_SETTING = "netem_setting"
 CONTROLLER_SETTING = "controller_setting"
 
+STEP_TABLES = {
+    "plant": PLANT_STEP,
+    "sensor": SENSOR_MEASUREMENT,
+    "netem": NETEM_PACKET,
+    "controller": CONTROLLER_STEP,
+}
+"""By process: the table with a row for each of its regular steps; for netem, each datagram."""
 SETTINGS = (SENSOR_SETTING, NETEM_SETTING, CONTROLLER_SETTING)
 """Tables of the changes of settings that each process received during the run."""
 CHANGE_BYTES = 1024  # width of a change in the record: JSON, padded with zero bytes

@@ -80,7 +80,7 @@ def test_the_loops_of_a_shipped_network_settle_and_keep_what_is_claimed(name: st
         assert summary["final_state_norm"] < 0.1 * summary["initial_state_norm"]
     count = len(shared.loops)
     for number in {0, count // 2, count - 1}:  # of every kind of loop
-        verdicts = [one.verdict for one in RunClaims(shared.loops[number]).judge()]
+        verdicts = [one.verdict for one in RunClaims(shared.loops[number]).evaluate()]
         assert ClaimVerdict.HELD in verdicts
         assert ClaimVerdict.VIOLATED not in verdicts
 

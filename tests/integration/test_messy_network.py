@@ -65,7 +65,7 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished, record
     assert answers["sent"] == finished.loop["deliveries"] > 10
     assert 0 <= answers["sent"] - answers["lost"] - answers["received"] <= 2  # in flight
     found = replay(record)
-    compared = {leg.leg: leg.compared for leg in found.messages}
+    compared = {hop.hop: hop.compared for hop in found.messages}
     assert compared["controller → netem"] == len(record[record_tables.CONTROLLER_DELIVERY])
     assert compared["netem → sensor"] == len(record[record_tables.SENSOR_ACKNOWLEDGEMENT])
     logs = [log.read_text() for log in (finished.run_dir / "logs").iterdir()]

@@ -157,7 +157,7 @@ def test_a_restarted_controller_outputs_zero_until_its_first_update(record: RunR
 
 
 def test_claims_are_void_from_the_first_outage_on(record: RunRecord) -> None:
-    claims = ClaimEvaluation(record).judge()
+    claims = ClaimEvaluation(record).evaluate()
     verdicts = {claim.verdict for claim in claims}  # a late run may have no claim of some kind
     assert "void" in verdicts <= {"void", "not applicable"}
     # The controller dies first. The plant knows its last actuation, of which the row may be lost.

@@ -104,7 +104,7 @@ def test_the_run_is_replayed_bit_for_bit(live: RunRecord, finished: Finished) ->
     assert found.first_difference is None, str(found.first_difference)
     assert found.gaps == []
     assert found.inputs == sum(len(live[table]) for table in tables(1, 1))
-    assert all(leg.compared == leg.received > 0 for leg in found.messages)
+    assert all(hop.compared == hop.received > 0 for hop in found.messages)
     assert finished.loop["replay"] == found.verdict().model_dump()
     assert finished.summary["kind"] == live.kind == "live"
 

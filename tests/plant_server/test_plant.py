@@ -51,6 +51,13 @@ def run(request: pytest.FixtureRequest) -> RunRecord:
     return with_outage(resolved("lane_following", *changes), 1.0, 1.4)
 
 
+def test_a_trip_before_the_first_actuation_is_in_the_summary() -> None:
+    run = with_outage(resolved("lane_following", "horizon_s=2"), 0.0, 0.4)
+    assert next(one["t_ns"] for one in run.notices if one["level"] == "watchdog") == 102_000_000
+    watchdog = summarise(run, 0, "horizon").watchdog
+    assert (watchdog.trips, watchdog.first_s) == (1, pytest.approx(0.102))
+
+
 def test_the_beginning_and_end_of_a_trip_are_reported_and_replayed(run: RunRecord) -> None:
     trips = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
     assert trips == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]

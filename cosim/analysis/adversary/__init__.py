@@ -8,6 +8,6 @@ the result, and reports it.
 
 from cosim.analysis.adversary.loop_flows import Objective
 from cosim.analysis.adversary.scenario_search import conditions_of, find_worst
-from cosim.analysis.adversary.worst_run import Worst
+from cosim.analysis.adversary.worst_run import WorstRun
 
-__all__ = ["Objective", "Worst", "conditions_of", "find_worst"]
+__all__ = ["Objective", "WorstRun", "conditions_of", "find_worst"]

@@ -148,7 +148,7 @@ class PatternFlow(Protocol):
     def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
         """Return the states just after events at times (N,); ``delivered`` updates arrive."""
 
-    def promise(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
+    def value_ahead(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
         """Return how large the objective may become within a window, (N,), on any scale."""
 
     def features(self, t_s: Vector, z: Matrix) -> Matrix:
@@ -163,7 +163,7 @@ _MEASURES = {
 }
 
 
-class Valued(NamedTuple):
+class ObjectiveValue(NamedTuple):
     """The value of a run."""
 
     value: float
@@ -223,8 +223,8 @@ class SegmentFlow:
         scaled = z / self.measure.level(t_s)[:, None]
         return np.asarray(scaled / (np.abs(scaled).max() or 1.0))
 
-    def promise(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
-        """As :meth:`PatternFlow.promise`: the integral of the output's square."""
+    def value_ahead(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
+        """As :meth:`PatternFlow.value_ahead`: the integral of the output's square."""
         if window_s not in self._gramians:
             self._gramians[window_s] = _gramian(self.system, self.measure, window_s)
         scaled = z / self.measure.level(t_s)[:, None]
@@ -251,7 +251,7 @@ class SegmentFlow:
         return SegmentEnds(ends.t_s, z, is_event & ~diverged, value, ends.at_s)
 
 
-def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
+def evaluate(run: ContinuousRun, measure: Measure) -> ObjectiveValue:
     """Return the objective along a run; infinite if the run diverged.
 
     The inter-event time has the sign of the objective: negative, or −∞ with fewer than two events.
@@ -259,21 +259,21 @@ def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
     if measure.output is None:
         between_s = np.diff(run.event_s)
         if not len(between_s):
-            return Valued(-math.inf, None)
+            return ObjectiveValue(-math.inf, None)
         shortest = int(between_s.argmin())
-        return Valued(-float(between_s[shortest]), float(run.event_s[shortest + 1]))
+        return ObjectiveValue(-float(between_s[shortest]), float(run.event_s[shortest + 1]))
     if run.diverged_at_s is not None:
-        return Valued(math.inf, run.diverged_at_s)
+        return ObjectiveValue(math.inf, run.diverged_at_s)
     # With a first packet the run starts at event 0.
     first_event = 1 if len(run.event_s) and run.event_s[0] == 0.0 else 0
     t_s, starts = np.array([0.0, *run.event_s])[first_event:], run.starts[first_event:]
     flow = SegmentFlow(run.system, measure, run.horizon_s, known_start=True)
     segments = flow(t_s, starts.reshape(len(starts), -1))
     if measure.objective is Objective.COST:
-        return Valued(float(segments.value.sum()), None)
+        return ObjectiveValue(float(segments.value.sum()), None)
     highest = int(segments.value.argmax())
     assert segments.at_s is not None
-    return Valued(float(segments.value[highest]), float(segments.at_s[highest]))
+    return ObjectiveValue(float(segments.value[highest]), float(segments.at_s[highest]))
 
 
 def _gramian(system: ContinuousLoop, measure: Measure, window_s: float) -> Matrix:
@@ -341,13 +341,13 @@ class SampledFlow:
         value = self.objective.nothing
         if self.objective is Objective.STATE:
             value = float(np.linalg.norm(runs.x[0]))
-        return SegmentEnds(self._time(runs.step), _packed(runs), runs.is_event, np.array([value]))
+        return SegmentEnds(self._time(runs.step), _pack(runs), runs.is_event, np.array([value]))
 
     def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
         """As :meth:`PatternFlow.after_events`."""
         runs = self._runs(t_s, z)
         self.loop.update(runs, delivered)
-        return _packed(runs)
+        return _pack(runs)
 
     def __call__(self, t_s: Vector, z: Matrix) -> SegmentEnds:
         """As :meth:`PatternFlow.__call__`."""
@@ -360,10 +360,10 @@ class SampledFlow:
         elif not self.objective.additive:
             of_error = self.objective is Objective.ERROR
             at_s = self._time(runs.error_at if of_error else runs.state_at)
-        return SegmentEnds(end_s, _packed(runs), runs.is_event, value, at_s)
+        return SegmentEnds(end_s, _pack(runs), runs.is_event, value, at_s)
 
-    def promise(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
-        """As :meth:`PatternFlow.promise`: the value over the window without events.
+    def value_ahead(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
+        """As :meth:`PatternFlow.value_ahead`: the value over the window without events.
 
         Large errors of the controller lead to early events.
         """
@@ -422,7 +422,7 @@ def _states(runs: Runs) -> tuple[Matrix, ...]:
     return (runs.x, runs.y, runs.x_s, runs.x_c, runs.u, runs.u_next, runs.sent, runs.updates, runs.auxiliary)
 
 
-def _packed(runs: Runs) -> Matrix:
+def _pack(runs: Runs) -> Matrix:
     """Return the states in rows, (N, entries)."""
     count = len(runs.step)
     return np.hstack([array.reshape(count, math.prod(array.shape[1:])) for array in _states(runs)])

@@ -8,7 +8,7 @@
   runs that nearly coincide, one remains. The runs are grouped by the state of the guarantee's
   automaton and their part of the window; from each group first the best run is selected, then the
   second best, and so on. One half of the selection ranks runs by their value so far, the other half
-  by their promise: what the loop would reach over the next window without events.
+  by the value ahead: what the loop would reach over the next window without events.
 * :func:`guess` values given patterns, and :func:`improve` changes single decisions of one.
 """
 
@@ -51,13 +51,13 @@ class Nodes(NamedTuple):
         return Nodes._make(column[selection] for column in self)
 
 
-def root(flow: PatternFlow) -> Nodes:
+def start_nodes(flow: PatternFlow) -> Nodes:
     """Return the start of all runs."""
     start, zero = flow.start(), np.zeros(1, int)
     return Nodes(start.end_s, start.z, zero, start.value, zero + START)
 
 
-def together(groups: Sequence[Nodes]) -> Nodes:
+def concatenate(groups: Sequence[Nodes]) -> Nodes:
     """Return several groups as one."""
     return Nodes(*map(np.concatenate, zip(*groups, strict=True)))
 
@@ -193,7 +193,7 @@ def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None 
         TooManyEventsError: two events at the same time.
     """
     search.step, most_nodes, earlier_runs = "all patterns", most_nodes + search.nodes, search.runs
-    pile = [root(search.flow)]
+    pile = [start_nodes(search.flow)]
     while pile and search.value < float("inf"):
         nodes = _top(pile)
         if ceiling is not None:
@@ -216,12 +216,13 @@ def _top(pile: list[Nodes]) -> Nodes:
             nodes = nodes.take(slice(-room, None))
         blocks.append(nodes)
         room -= len(nodes.t_s)
-    return together(blocks)
+    return concatenate(blocks)
 
 
 _ALIKE = 1e-4
 _PARTS = 2
-_CROWD = 8
+_WIDTH_WITHIN_WINDOW = 8
+"""Runs that continue within a window, for each one that continues to the next window."""
 
 
 def search_beam(search: PatternSearch, width: int, window_s: float) -> None:
@@ -233,8 +234,8 @@ def search_beam(search: PatternSearch, width: int, window_s: float) -> None:
         TooManyEventsError: two events at the same time.
     """
     search.step = "beam search"
-    choice = _Choice(search.flow, window_s)
-    waiting, until_s = root(search.flow), 0.0
+    selection = _RunSelection(search.flow, window_s)
+    waiting, until_s = start_nodes(search.flow), 0.0
     while len(waiting.t_s) and search.value < np.inf:
         until_s = max(until_s, float(waiting.t_s.min())) + window_s
         in_window = waiting.t_s < until_s
@@ -243,11 +244,11 @@ def search_beam(search: PatternSearch, width: int, window_s: float) -> None:
             following = search.successors(active)
             in_window = following.t_s < until_s
             later.append(following.take(~in_window))
-            active = choice.thin(following.take(in_window), _CROWD * width)
-        waiting = choice.thin(together(later), width)
+            active = selection.thin(following.take(in_window), _WIDTH_WITHIN_WINDOW * width)
+        waiting = selection.thin(concatenate(later), width)
 
 
-class _Choice:
+class _RunSelection:
     """The selection of the runs that continue."""
 
     def __init__(self, flow: PatternFlow, window_s: float) -> None:
@@ -259,12 +260,12 @@ class _Choice:
             return nodes
         nodes = nodes.take(self._distinct(nodes))
         kind = self._kind(nodes)
-        promise = self._flow.promise(nodes.t_s, nodes.z, self._window_s)
+        ahead = self._flow.value_ahead(nodes.t_s, nodes.z, self._window_s)
         if self._flow.objective.additive:
-            return nodes.take(_turns(nodes.value + promise, kind)[:width])
-        by_value = _turns(nodes.value, kind, promise)[: width // 2]
-        by_promise = _turns(promise, kind)
-        chosen = np.concatenate([by_value, by_promise[~np.isin(by_promise, by_value)]])
+            return nodes.take(_turns(nodes.value + ahead, kind)[:width])
+        by_value = _turns(nodes.value, kind, ahead)[: width // 2]
+        by_value_ahead = _turns(ahead, kind)
+        chosen = np.concatenate([by_value, by_value_ahead[~np.isin(by_value_ahead, by_value)]])
         return nodes.take(chosen[:width])
 
     def _kind(self, nodes: Nodes) -> Indices:
@@ -314,7 +315,7 @@ def follow(
     planned = np.ones((count, longest + 1), dtype=bool)
     for row, pattern in zip(planned, patterns, strict=True):
         row[: len(pattern)] = pattern
-    nodes = together([root(flow)] * count)
+    nodes = concatenate([start_nodes(flow)] * count)
     run, value, last = np.arange(count), nodes.value.copy(), nodes.entry.copy()
     for event in range(MAX_EVENTS):
         segments = flow(nodes.t_s, nodes.z)

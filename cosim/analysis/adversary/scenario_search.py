@@ -41,7 +41,7 @@ from cosim.analysis.adversary.worst_disturbances import (
     disturbance_bounds,
     worst_disturbances,
 )
-from cosim.analysis.adversary.worst_run import Worst, certified_value, reported
+from cosim.analysis.adversary.worst_run import WorstRun, certified_value, reported_value
 from cosim.simulation.continuous import (
     ContinuousLoop,
     ContinuousRun,
@@ -81,7 +81,7 @@ def find_worst(
     beam: int = BEAM,
     certificate: ScenarioCertificate | None = None,
     report: SearchReport = lambda step, nodes, value: None,
-) -> Worst:
+) -> WorstRun:
     """Find the loss pattern that maximises the objective, of all that the guarantee allows.
 
     The first update is delivered. The same arguments give the same result.
@@ -120,7 +120,7 @@ def _find_sampled(
     beam: int,
     most_nodes: int,
     report: SearchReport,
-) -> Worst:
+) -> WorstRun:
     began_s = time.monotonic()
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
     own_run = run_of(flow, network_fates(resolved))
@@ -139,18 +139,18 @@ def _find_sampled(
         )
         search.nodes += second_search.nodes
         search.runs += second_search.runs
-    return Worst(
+    return WorstRun(
         objective,
         flow.horizon_s,
-        value=reported(worst.value, objective),
+        value=reported_value(worst.value, objective),
         at_s=worst.at_s,
         pattern=worst.delivered,
         event_s=worst.event_s,
         exact=exact,
         nodes=search.nodes,
         runs=search.runs,
-        lossless=reported(lossless.value, objective),
-        own=reported(own_run.value, objective),
+        lossless=reported_value(lossless.value, objective),
+        with_own_network=reported_value(own_run.value, objective),
         certified=flow.certified,
         elapsed_s=time.monotonic() - began_s,
     )
@@ -193,7 +193,7 @@ def _find_continuous(
     beam: int,
     most_nodes: int,
     report: SearchReport,
-) -> Worst:
+) -> WorstRun:
     began_s, horizon_s = time.monotonic(), resolved.horizon_s
     constants = certificate.constants
     system = continuous_loop_of(resolved)
@@ -210,20 +210,20 @@ def _find_continuous(
     search = PatternSearch(flow, resolved.network.guarantee, report)
     exact = _search(search, tuple(own_run.delivered.tolist())[len(first_packet) :], beam, most_nodes)
     run = simulated((*first_packet, *search.pattern))
-    valued = evaluate(run, measure)
-    return Worst(
+    worst = evaluate(run, measure)
+    return WorstRun(
         objective,
         horizon_s,
-        value=reported(valued.value, objective),
-        at_s=valued.at_s,
+        value=reported_value(worst.value, objective),
+        at_s=worst.at_s,
         pattern=tuple(run.delivered.tolist()),
         event_s=tuple(run.event_s.tolist()),
-        exact=exact and math.isclose(valued.value, search.value, rel_tol=_CONFIRMED),
+        exact=exact and math.isclose(worst.value, search.value, rel_tol=_CONFIRMED),
         nodes=search.nodes,
         runs=search.runs,
-        lossless=reported(evaluate(simulated(()), measure).value, objective),
-        own=reported(evaluate(own_run, measure).value, objective),
-        certified=certified_value(certificate, measure, horizon_s, valued),
+        lossless=reported_value(evaluate(simulated(()), measure).value, objective),
+        with_own_network=reported_value(evaluate(own_run, measure).value, objective),
+        certified=certified_value(certificate, measure, horizon_s, worst),
         elapsed_s=time.monotonic() - began_s,
     )
 

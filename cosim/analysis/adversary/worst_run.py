@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cosim.analysis.adversary.loop_flows import Measure, Objective, Pattern, Valued
+from cosim.analysis.adversary.loop_flows import Measure, Objective, ObjectiveValue, Pattern
 from noack.core.number_format import at_least, at_most, number
 from noack.impairments.loss_guarantee import outcome_letters
 from noack.scenario.scenario import Scenario
@@ -20,7 +20,7 @@ _BREACH = 1 + 1e-9
 
 
 @dataclass(frozen=True)
-class Worst:
+class WorstRun:
     """The worst run found, for one objective.
 
     In continuous time the values are Δ, X, ∫‖x‖² dt, and seconds between two events. In the
@@ -45,7 +45,7 @@ class Worst:
     """Runs up to the horizon; if every pattern was covered, those of this search alone."""
     lossless: float | None
     """The value without losses."""
-    own: float | None
+    with_own_network: float | None
     """The value with the losses of the scenario's own network."""
     certified: float | None
     """The certificate's bound; None without a certificate."""
@@ -89,15 +89,15 @@ class Worst:
         return {key: None if value == math.inf else value for key, value in document.items()}
 
 
-def reported(value: float, objective: Objective) -> float | None:
-    """Return the reported quantity of an objective's value."""
+def reported_value(value: float, objective: Objective) -> float | None:
+    """Return an objective's value as it is reported: an inter-event time has its sign reversed."""
     if objective is not Objective.INTER_EVENT:
         return value
     return None if value == -math.inf else -value
 
 
 def certified_value(
-    certificate: ScenarioCertificate, measure: Measure, horizon_s: float, valued: Valued
+    certificate: ScenarioCertificate, measure: Measure, horizon_s: float, value: ObjectiveValue
 ) -> float | None:
     """Return the certificate's bound on the same quantity at the same time."""
     constants, floor = certificate.constants, certificate.floor_constants
@@ -109,7 +109,7 @@ def certified_value(
         until_s = min(horizon_s, certificate.floor_from_s) if floor is not None else horizon_s
         cost = _square_integral(constants, until_s)
         return cost if floor is None else cost + floor.state**2 * (horizon_s - until_s)
-    at_s = np.array([valued.at_s or 0.0])
+    at_s = np.array([value.at_s or 0.0])
     level = float(measure.level(at_s)[0])
     if measure.objective is Objective.STATE:
         return float(certificate.state(at_s)[0]) / level
@@ -123,7 +123,7 @@ def _square_integral(constants: Constants, until_s: float) -> float:
 
 
 def document(
-    results: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate, trigger: str
+    results: Sequence[WorstRun], resolved: Scenario, certificate: ScenarioCertificate, trigger: str
 ) -> dict[str, object]:
     """Return the results as JSON."""
     return {
@@ -141,7 +141,7 @@ def document(
 
 def print_worst(
     console: Console,
-    results: Sequence[Worst],
+    results: Sequence[WorstRun],
     resolved: Scenario,
     certificate: ScenarioCertificate,
     trigger: str,
@@ -158,7 +158,7 @@ def print_worst(
         certified = at_least(worst.certified) if is_lower else at_most(worst.certified)
         table.add_row(
             _quantity(worst.objective, certificate, trigger),
-            *(number(value, 4) for value in (worst.lossless, worst.own, worst.value)),
+            *(number(value, 4) for value in (worst.lossless, worst.with_own_network, worst.value)),
             certified,
             "[bold red]exceeded[/]" if worst.breaches else number(worst.tightness, 4),
         )

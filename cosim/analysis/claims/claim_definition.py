@@ -39,8 +39,8 @@ class Bound(NamedTuple):
     is_lower: bool = False
 
 
-class Findings(NamedTuple):
-    """What a claim says about some samples of a run."""
+class ClaimBound(NamedTuple):
+    """The bound that a claim sets for some samples of a run, and its curve."""
 
     bound: Bound | None = None
     """None if there is no claim about this run."""
@@ -55,7 +55,7 @@ class ClaimDefinition:
     statement: str
     source: str
     assumes: str
-    find: Callable[[RunEvidence, Samples], Findings]
+    find: Callable[[RunEvidence, Samples], ClaimBound]
     needs_ideal_loop: bool
     """A run that exceeds the bound does not refute it."""
 
@@ -65,20 +65,20 @@ class CertifiedClaim:
     """A claim of a certificate with constants; it is evaluated for each one of the scenario."""
 
     statement: str
-    find: Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], Findings]
+    find: Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], ClaimBound]
     assumes: str = "the conditions of the certificate"
 
 
 def claim(
     statement: str, source: str, assumes: str, *, needs_ideal_loop: bool = False
-) -> Callable[[Callable[[RunEvidence, Samples], Findings]], ClaimDefinition]:
+) -> Callable[[Callable[[RunEvidence, Samples], ClaimBound]], ClaimDefinition]:
     """Make a function the definition of a claim."""
     return lambda find: ClaimDefinition(statement, source, assumes, find, needs_ideal_loop)
 
 
 def certified(
     statement: str,
-) -> Callable[[Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], Findings]], CertifiedClaim]:
+) -> Callable[[Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], ClaimBound]], CertifiedClaim]:
     """Make a function the definition of a claim of certificates."""
     return lambda find: CertifiedClaim(statement, find)
 
@@ -119,11 +119,11 @@ def least_inter_event_time(
     void: VoidFrom | None,
     label: str,
     kind: Literal["certified", "printed"] = "certified",
-) -> Findings:
+) -> ClaimBound:
     """Return a lower bound of the inter-event time, and the same as a line over the run."""
     t_s, passed_s = samples.inter_event_s
     formula = "t_(i+1) − t_i ≥ {} s"
     void = earliest([void, run.lost_in_rounding])
     bound = Bound(formula, t_s, least_s / passed_s, void, least_s, is_lower=True)
     ends_s = np.array([0.0, run.record.scenario.horizon_s])
-    return Findings(bound, Envelope(label, "inter_event", ends_s, np.full(2, least_s), kind))
+    return ClaimBound(bound, Envelope(label, "inter_event", ends_s, np.full(2, least_s), kind))

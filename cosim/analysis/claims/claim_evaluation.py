@@ -26,35 +26,30 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from cosim.analysis.claims import catalogue
-from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, ClaimDefinition, Envelope, Findings
+from cosim.analysis.claims.claim_definition import (
+    Bound,
+    CertifiedClaim,
+    ClaimBound,
+    ClaimDefinition,
+    Envelope,
+)
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
-from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, RunPart, Samples, late_certificates
-from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
+from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples, late_certificates
+from cosim.analysis.claims.run_parts import RunPart, common_end_ns, cut_part, start_error, up_to_common_end
+from cosim.analysis.summary.summary_model import Claim, ClaimVerdict, ViolationPart
 from cosim.record.decimation import decimate
 from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
-from cosim.record.run_record import Rows, RunRecord
+from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Vector, row_norms
+from noack.core.linear_systems import Vector
 from noack.core.number_format import at_least, at_most
-from noack.protocol.record_tables import (
-    CLOCK_TABLES,
-    CONTROLLER_DELIVERY,
-    CONTROLLER_STEP,
-    NETEM_PACKET,
-    OWNER,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-    SETTINGS,
-)
-from noack.protocol.roles import LOOP_ROLES
-from noack.runtime.life_cycle import HORIZON
-from noack.scenario.resolution import loop_of, policy_of, setpoint_of
+from noack.protocol.record_tables import CONTROLLER_DELIVERY
+from noack.scenario.resolution import setpoint_of
 from noack.scenario.runtime_parameters import text_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import BOX, about_setpoint, allowed_conditions, void_at_setpoint
+from noack.theory.certificates.conditions import BOX, allowed_conditions, void_at_setpoint
 from noack.theory.certificates.scenario_certificates import outside_box
 
 _IDEAL_LOOP = "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
@@ -160,7 +155,7 @@ def _end_s(part: RunPart) -> float | None:
 class _ClaimInstance(NamedTuple):
     """A claim about a run, by a certificate or without one."""
 
-    find: Callable[[RunEvidence, Samples], Findings]
+    find: Callable[[RunEvidence, Samples], ClaimBound]
     check: ClaimCheck
     curve: list[Envelope]
     """The parts of its curve."""
@@ -186,7 +181,7 @@ class _ClaimInstance(NamedTuple):
 class ClaimEvaluation(RunEvidence):
     """The claims about one run, or about one part of it."""
 
-    def judge(self) -> list[Claim]:
+    def evaluate(self) -> list[Claim]:
         """Return every claim with its verdict, in the run's time."""
         if not self.facts.any_in_common:
             return []
@@ -196,7 +191,7 @@ class ClaimEvaluation(RunEvidence):
             return [void(claimed, "(I1)", why=_ACKNOWLEDGED)]
         claims: list[Claim] = []
         for certificate in (None, *self.certificates):
-            if certificate is not None and certificate.constants is None:
+            if certificate is not None and not certificate.exists:
                 claimed = f"a certificate for {certificate.scope}"
                 claims.append(void(claimed, certificate.source, why=certificate.void or ""))
             claims += [
@@ -244,17 +239,6 @@ class ClaimEvaluation(RunEvidence):
         ]
 
 
-_TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
-_STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
-_PACES = {
-    "plant": (PLANT_STEP, "t_ns"),
-    "sensor": (SENSOR_MEASUREMENT, "t_ns"),
-    "netem": (NETEM_PACKET, "now_ns"),
-    "controller": (CONTROLLER_STEP, "t_ns"),
-}
-"""By process: the table and column with the times of its steps."""
-
-
 @dataclass(eq=False)
 class RunClaims:
     """The claims about a run, part by part; each property is computed once."""
@@ -264,7 +248,7 @@ class RunClaims:
     """Those of the run's scenario, if they are known."""
 
     @cached_property
-    def _judged(self) -> RunRecord:
+    def _checked_record(self) -> RunRecord:
         return up_to_common_end(self.record)
 
     @property
@@ -275,23 +259,23 @@ class RunClaims:
 
     @cached_property
     def _setpoint(self) -> tuple[Vector, Vector] | None:
-        return setpoint_of(self._judged.scenario)
+        return setpoint_of(self._checked_record.scenario)
 
     @cached_property
     def parts(self) -> list[ClaimEvaluation | Claim]:
         """The claims of each part; for a part without claims, the reason as a void claim."""
-        record = self._judged
+        record = self._checked_record
         changes = [made for made in changes_of(record) if made.touches_claims]
         first_ns = changes[0].first_ns if changes else NEVER_NS
         void = void_at_setpoint(record.scenario, knows_start=True)
-        own, certificates, start_error = record, self.certificates, None
+        own, certificates, error = record, self.certificates, None
         if self._setpoint is not None:
-            own, certificates = _part_of(record, record.scenario, 0, None), None
+            own, certificates = cut_part(record, record.scenario, 0, None), None
             if self._setpoint[1].any():  # the input is 0 at first, and not u_r
-                start_error = _start_error(own, ClaimEvaluation(own).started_s)
+                error = start_error(own, ClaimEvaluation(own).started_s)
         offset = _offset(record.scenario)
         until_s = _until_s(first_ns, 0)
-        part = RunPart(record, 0.0, until_s, start_error, void, certificates, offset)
+        part = RunPart(record, 0.0, until_s, error, void, certificates, offset)
         parts: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
@@ -299,7 +283,7 @@ class RunClaims:
         return parts
 
     @property
-    def _is_judged(self) -> bool:
+    def _is_evaluated(self) -> bool:
         """Whether the claims are known already."""
         return "parts" in vars(self)
 
@@ -307,9 +291,9 @@ class RunClaims:
     def conditions(self) -> dict[str, float | None]:
         """Largest observed value of each condition, over the whole run."""
         first = self.parts[0]
-        if isinstance(first, ClaimEvaluation) and first.record is self._judged:
+        if isinstance(first, ClaimEvaluation) and first.record is self._checked_record:
             return first.conditions
-        return ClaimEvaluation(self._judged).conditions
+        return ClaimEvaluation(self._checked_record).conditions
 
     @property
     def allowed(self) -> NetworkConditions | None:
@@ -317,7 +301,7 @@ class RunClaims:
         scenario, first = self.record.scenario, self.parts[0]
         if not scenario.coverage.can_be_certified:
             return None
-        if isinstance(first, ClaimEvaluation) and first.record is self._judged:
+        if isinstance(first, ClaimEvaluation) and first.record is self._checked_record:
             return first.allowed
         return allowed_conditions(scenario)
 
@@ -336,14 +320,14 @@ class RunClaims:
                 violations += [found._replace(t_s=found.t_s + from_s) for found in part.violations()]
         return sorted(violations, key=lambda violation: violation.t_s)
 
-    def judge(self) -> list[Claim]:
-        """Every claim with its verdict, in the run's time."""
-        judged = ([part] if isinstance(part, Claim) else part.judge() for part in self.parts)
-        return [claim for claims in judged for claim in claims]
+    def evaluate(self) -> list[Claim]:
+        """Return every claim with its verdict, in the run's time."""
+        evaluated = ([part] if isinstance(part, Claim) else part.evaluate() for part in self.parts)
+        return [claim for claims in evaluated for claim in claims]
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds, each over its own part of the run."""
-        if self.record.scenario.plant.system.runs_user_code and not self._is_judged:
+        if self.record.scenario.plant.system.runs_user_code and not self._is_evaluated:
             self.certificates = ()  # reading a finished run does not run the code of its plant
         envelopes: list[Envelope] = []
         for evaluation in self.parts:
@@ -356,7 +340,7 @@ class RunClaims:
 
     def _claims_after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
         """The claims about the part of the run that follows a change."""
-        record = self._judged
+        record = self._checked_record
         known = record.events()["event"]
         after = record.columns(
             CONTROLLER_DELIVERY,
@@ -371,16 +355,31 @@ class RunClaims:
             up_to = "" if until_ns == NEVER_NS else f", up to {until_ns / NS_PER_S:.3f} s"
             return _void_after(made, until_ns, f"no update was delivered after it{up_to}")
         origin_ns, sequence = int(after["t_ns"][0]), int(after["sequence"][0])
-        own = _part_of(record, made.scenario, origin_ns, sequence)
+        own = cut_part(record, made.scenario, origin_ns, sequence)
         part = RunPart(
             record,
             origin_ns / NS_PER_S,
             _until_s(until_ns, origin_ns),
-            _start_error(own, ClaimEvaluation(own).started_s),
+            start_error(own, ClaimEvaluation(own).started_s),
             void_at_setpoint(made.scenario, knows_start=True),
             offset=_offset(made.scenario),
         )
         return ClaimEvaluation(own, part)
+
+
+def list_violations(
+    reported: Sequence[ViolationPart], observed: Sequence[AssumptionViolation]
+) -> list[ViolationPart]:
+    """Return all violations of a run: those reported by processes, then those found in the record.
+
+    A violation of M − 1 that a process reported is not repeated.
+    """
+    known = {violation.cause for violation in reported}
+    return [*reported] + [
+        ViolationPart(t_s=violation.t_s, process="recorder", cause=violation.cause, what=violation.text)
+        for violation in observed
+        if violation.cause not in known
+    ]
 
 
 def _offset(scenario: Scenario) -> float:
@@ -419,138 +418,3 @@ def _envelope_until(envelope: Envelope, until_s: float) -> Envelope:
     if envelope.quantity == "inter_event":  # two ends of a line
         return envelope._replace(t_s=np.minimum(envelope.t_s, until_s))
     return envelope._replace(values=np.where(envelope.t_s < until_s, envelope.values, np.nan))
-
-
-def _part_of(record: RunRecord, scenario: Scenario, origin_ns: int, sequence: int | None) -> RunRecord:
-    """Return the part of a run after the event ``sequence``, in the form of a separate record.
-
-    The time of the event becomes time 0. Without an event it is the whole run.
-    """
-    setpoint = setpoint_of(scenario)
-    loop = loop_of(scenario)
-    x_r, u_r = (np.zeros(loop.n), np.zeros(loop.m)) if setpoint is None else setpoint
-
-    def derive(table: str, part: Rows) -> Rows:
-        if table in SETTINGS:
-            part = part[:0]
-        elif table in (SENSOR_MEASUREMENT, PLANT_STEP, CONTROLLER_STEP):
-            part = part.compress(part["t_ns"] >= origin_ns)
-        elif table == NETEM_PACKET or table in CLOCK_TABLES:
-            part = part.compress(part["now_ns"] >= origin_ns)
-        elif table == CONTROLLER_DELIVERY and sequence is not None:
-            part = part[part["sequence"] >= sequence]
-        rows = _shifted(part, origin_ns, x_r, u_r)
-        if sequence is not None:  # the state before the reset belongs to the last part
-            _begin(table, rows, sequence)
-        return rows
-
-    x_0 = np.array(scenario.plant.initial_state) - x_r
-    if sequence is not None:
-        # The part begins with the plant's state at the event, which noise may hide from the sensor.
-        table = SENSOR_MEASUREMENT if scenario.coverage.knows_state else PLANT_STEP
-        derived = filter(len, (derive(table, rows) for rows in record.source.batches(table)))
-        x_0 = next((rows["x"][0] for rows in derived), x_0)
-    scenario = about_setpoint(scenario)
-    update = {
-        "plant": scenario.plant.model_copy(update={"initial_state": tuple(x_0.tolist())}),
-        "horizon_s": max(scenario.horizon_s - origin_ns / NS_PER_S, 1e-9),
-        "changes": (),
-    }
-    if sequence is not None:
-        update["network"] = scenario.network.model_copy(update={"initial_sync": "first_packet"})
-    update["trigger"] = scenario.trigger.at_origin(origin_ns / NS_PER_S)
-    return record.derived(scenario.model_copy(update=update), derive)
-
-
-def _begin(table: str, rows: Rows, sequence: int) -> None:
-    """Change the row of the event at which a part of a run begins: it has no error before it."""
-    if table == SENSOR_MEASUREMENT:
-        first = np.flatnonzero(rows["t_ns"] == 0)[:1]
-        rows["x_s"][first] = rows["x"][first]
-        rows["e_s_norm"][first] = rows["compared"][first] = 0.0
-    elif table == CONTROLLER_DELIVERY:
-        rows["dropouts"][rows["sequence"] == sequence] = 0
-
-
-def _shifted(rows: Rows, origin_ns: int, x_r: Vector, u_r: Vector) -> Rows:
-    shifted = rows.copy()
-    for name in rows.dtype.names or ():
-        if name in _TIMES:
-            shifted[name] -= origin_ns
-        elif name in _STATES:
-            shifted[name] -= x_r
-        elif name == "u":
-            shifted[name] -= u_r
-    return shifted
-
-
-def _start_error(own: RunRecord, started_s: float) -> float:
-    """sup‖u − Kx‖ e^{αt} over the steps until the plant applied the first input of the part.
-
-    u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
-    a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
-    """
-    alpha = policy_of(own.scenario).fading_per_s
-    largest, last = 0.0, np.zeros(0, own.tables[PLANT_STEP])
-    for batch in own.source.batches(PLANT_STEP):
-        steps = np.concatenate([last, batch])
-        ended = int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1
-        if len(steps[:ended]) > 1:
-            largest = max(largest, _input_error(own, steps[:ended], alpha))
-        if ended < len(steps):
-            break
-        last = steps[-1:]
-    return max(largest, float(np.finfo(float).tiny))  # 0 would be that of a run from its start
-
-
-def _input_error(own: RunRecord, steps: Rows, alpha_per_s: float) -> float:
-    """Return the bound of ‖u − Kx‖ e^{αt} over at least two steps."""
-    loop = own.loop
-    x, u, dt_s = steps["x"], steps["u"][:-1], own.scenario.timing.plant_period_ns * 1e-9
-    ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
-    speed = x[:-1] @ loop.A.T + u @ loop.B.T
-    grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
-    forced, forcing = 0.0, bound_forcing(own.scenario, loop.B)
-    if forcing is not None:
-        forced = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
-    bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + forced)
-    return float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
-
-
-def common_end_ns(record: RunRecord) -> int | None:
-    """Return the latest time that every process of a stopped run reached.
-
-    None if the run was not stopped, or if a process did not report its time.
-    """
-    reports = [record.reports.get(role, {}) for role in LOOP_ROLES]
-    if all(report.get("ended") == HORIZON for report in reports):
-        return None
-    reached_ns = [report.get("reached_ns") for report in reports]
-    known_ns = [int(t_ns) for t_ns in reached_ns if t_ns is not None]
-    measured_ns = record.last_ns(SENSOR_MEASUREMENT)
-    if len(known_ns) < len(reports) or measured_ns is None:
-        return None
-    # A sensor has no deadlines, so its time is that of its last measurement.
-    return int(min(*known_ns, measured_ns))
-
-
-def up_to_common_end(record: RunRecord) -> RunRecord:
-    """Return the record of a run up to its common end; the record itself if it has none.
-
-    The rows of each process are cut at its first row beyond that time, in all tables.
-    """
-    end_ns = common_end_ns(record)
-    if end_ns is None:
-        return record
-    before: dict[str, int] = {}
-    for role, (pace, column) in _PACES.items():
-        later = (rows["input"][rows[column] > end_ns] for rows in record.source.batches(pace))
-        first = next(filter(len, later), None)
-        before[role] = int(np.iinfo(np.int64).max if first is None else first[0])
-
-    def derive(table: str, rows: Rows) -> Rows:
-        if table in CLOCK_TABLES:  # their rows have numbers of their own
-            return rows.compress(rows["t_ns"] <= end_ns)
-        return rows.compress(rows["input"] < before[OWNER[table]])
-
-    return record.derived(record.scenario, derive)

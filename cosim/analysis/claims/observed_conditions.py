@@ -233,22 +233,22 @@ class ObservedConditions(NamedTuple):
         peaks = [(series.peaks(), limit_s + _TOLERANCE_S) for series, limit_s in every]
         return sorted({t_s for series, most_s in peaks for t_s in series.t_s[series.value > most_s].tolist()})
 
-    def widened(self, allowed: NetworkConditions, until_s: float = np.inf) -> NetworkConditions:
+    def widen(self, allowed: NetworkConditions, until_s: float = np.inf) -> NetworkConditions:
         """Return conditions that the run's schedule meets up to a time.
 
         Each time of ``SCHEDULE`` is the allowed one, or what the run took, if that was more. It is
         not met where an input never came.
         """
 
-        def wider(limit_s: float, series: SampledSeries) -> float:
+        def larger(limit_s: float, series: SampledSeries) -> float:
             values_s = series.before(until_s).value
             value_s = float(values_s[np.isfinite(values_s)].max(initial=0.0))
             return value_s if value_s > limit_s + _TOLERANCE_S else limit_s
 
         return allowed._replace(
-            delay_s=wider(allowed.delay_s, self.delay),
-            hold_s=wider(allowed.hold_s, self.hold),
-            start_s=wider(allowed.start_s, SampledSeries(np.zeros(1), np.array([self.start_s]))),
+            delay_s=larger(allowed.delay_s, self.delay),
+            hold_s=larger(allowed.hold_s, self.hold),
+            start_s=larger(allowed.start_s, SampledSeries(np.zeros(1), np.array([self.start_s]))),
         )
 
     def summary(self) -> dict[str, float | None]:
@@ -264,24 +264,24 @@ class ObservedConditions(NamedTuple):
         }
 
 
-def combined(parts: Sequence[ObservedConditions]) -> ObservedConditions:
+def combine(parts: Sequence[ObservedConditions]) -> ObservedConditions:
     """Return the conditions of a run from those of its parts, in order; series are peaks."""
     last = parts[-1]
 
-    def joined(series: Iterable[tuple[Reals, Reals]]) -> tuple[Reals, Reals]:
+    def join(series: Iterable[tuple[Reals, Reals]]) -> tuple[Reals, Reals]:
         t_s, values = zip(*series, strict=True)
         return np.concatenate(t_s), np.concatenate(values)
 
     return last._replace(
-        losses=PacketLosses(*joined(part.losses for part in parts)),
-        sampling=SampledSeries(*joined(part.sampling for part in parts)).peaks(),
-        delay=SampledSeries(*joined(part.delay for part in parts)).peaks(),
-        hold=SampledSeries(*joined(part.hold for part in parts)).peaks(),
-        watchdog=SampledSeries(*joined(part.watchdog for part in parts)).peaks(),
-        safe_input=SampledSeries(*joined(part.safe_input for part in parts)).peaks(last.start_s),
-        restarts=SampledSeries(*joined(part.restarts for part in parts)),
+        losses=PacketLosses(*join(part.losses for part in parts)),
+        sampling=SampledSeries(*join(part.sampling for part in parts)).peaks(),
+        delay=SampledSeries(*join(part.delay for part in parts)).peaks(),
+        hold=SampledSeries(*join(part.hold for part in parts)).peaks(),
+        watchdog=SampledSeries(*join(part.watchdog for part in parts)).peaks(),
+        safe_input=SampledSeries(*join(part.safe_input for part in parts)).peaks(last.start_s),
+        restarts=SampledSeries(*join(part.restarts for part in parts)),
         clocks={
-            cause: SampledSeries(*joined(part.clocks[cause] for part in parts)).in_order().peaks()
+            cause: SampledSeries(*join(part.clocks[cause] for part in parts)).in_order().peaks()
             for cause in last.clocks
         },
     )

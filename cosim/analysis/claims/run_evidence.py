@@ -2,10 +2,9 @@
 
 import math
 import sys
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +23,9 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
+from cosim.analysis.claims.run_parts import RunPart
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
-from cosim.analysis.summary.loop_statistics import SampleFacts, SampleFactsReader, signal_statistics
+from cosim.analysis.summary.signal_statistics import SampleFacts, SampleFactsReader, signal_statistics
 from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import all_entries
@@ -51,26 +51,6 @@ ROUNDING = 1e-9
 """Relative rounding error of an exact computation over a run of 10,000 steps."""
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
-
-
-class RunPart(NamedTuple):
-    """A part of a run that is checked as a run of its own; by default the whole run."""
-
-    whole: RunRecord | None = None
-    """The record of the run, if that of the part is another one."""
-    from_s: float = 0.0
-    """Start of the part, in the run's time."""
-    until_s: float = math.inf
-    """End of the claims, in the part's time; the record of the part continues."""
-    start_error: float | None = None
-    """‖u − Kx‖, scaled, until the plant applied the first input of this part; None if it applied
-    no input before."""
-    void: Mapping[str, str] = {}
-    """By scope: why there is no certificate."""
-    certificates: Sequence[ScenarioCertificate] | None = None
-    """Those of the part's scenario, if they are known."""
-    offset: float = 0.0
-    """‖x_r‖ of the set-point: the part's x is x − x_r, and has the rounding errors of x."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +93,10 @@ class RunEvidence:
 
     record: RunRecord
     part: RunPart = field(default_factory=RunPart)
+    _known_states: dict[int, KnownStateBounds | None] = field(default_factory=dict, init=False)
+    """Bounds from the newest event that are known already, by the ``id`` of their certificate."""
+    _violations: dict[int, VoidFrom | None] = field(default_factory=dict, init=False)
+    """First violations that are known already, by the ``id`` of the certificate."""
 
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
@@ -177,22 +161,23 @@ class RunEvidence:
         certificate holds for every run that meets its conditions, whenever they were chosen.
         """
         whole, until_s = self.part.whole or self.record, self.part.until_s
-        # Rows that are missing may be later.
-        if not all(map(whole.is_complete, LOOP_ROLES)) or not any(map(_exists, self._scheduled)):
+        if not all(map(whole.is_complete, LOOP_ROLES)):  # rows that are missing may be later
+            return None
+        if not any(certificate.exists for certificate in self._scheduled):
             return None
         allowed = self.allowed
         times_s = [t_s for t_s in self.observed.later_times(allowed) if t_s < until_s]
-        widest = self.observed.widened(allowed, until_s)
+        widest = self.observed.widen(allowed, until_s)
         if not times_s or widest == allowed:
             return None
         certificates: Sequence[ScenarioCertificate] = yield widest
-        if any(map(_exists, certificates)):
+        if any(certificate.exists for certificate in certificates):
             return certificates
         best, kept, beyond = None, 0, len(times_s)
         while beyond - kept > 1:
             middle = (kept + beyond) // 2
-            certificates = yield self.observed.widened(allowed, times_s[middle])
-            if any(map(_exists, certificates)):
+            certificates = yield self.observed.widen(allowed, times_s[middle])
+            if any(certificate.exists for certificate in certificates):
                 best, kept = certificates, middle
             else:
                 beyond = middle
@@ -212,7 +197,7 @@ class RunEvidence:
         """
         certificates, void = [], self.part.void
         for scheduled, late in zip(self._scheduled, self.wider or self._scheduled, strict=True):
-            used = late if _exists(late) else scheduled
+            used = late if late.exists else scheduled
             if scheduled.scope in void:
                 used = replace(scheduled, constants=None, floor_constants=None, void=void[scheduled.scope])
             certificates.append(used)
@@ -221,7 +206,7 @@ class RunEvidence:
     @property
     def certified_for(self) -> NetworkConditions | None:
         """The wider schedule, if a certificate of it is used."""
-        used = [certificate.conditions for certificate in self.certificates if _exists(certificate)]
+        used = [certificate.conditions for certificate in self.certificates if certificate.exists]
         late = [certificate.conditions for certificate in self.wider or () if certificate.conditions in used]
         return late[0] if late else None
 
@@ -323,16 +308,6 @@ class RunEvidence:
         return known[id(certificate)]
 
     @cached_property
-    def _known_states(self) -> dict[int, KnownStateBounds | None]:
-        """Bounds that are known already, by certificate."""
-        return {}
-
-    @cached_property
-    def _violations(self) -> dict[int, VoidFrom | None]:
-        """First violations that are known already, by certificate."""
-        return {}
-
-    @cached_property
     def allowed(self) -> NetworkConditions:
         """The conditions of the scenario's certificates."""
         allowed = allowed_conditions(self.record.scenario)
@@ -360,10 +335,6 @@ class RunEvidence:
         if ideal is None or ideal.rate_per_s != trigger.alpha_per_s:
             return None
         return theorem_2(loop, trigger.beta, trigger.alpha_per_s, ideal.delta)
-
-
-def _exists(certificate: ScenarioCertificate) -> bool:
-    return certificate.constants is not None
 
 
 def late_certificates(runs: Sequence[RunEvidence]) -> list[Sequence[ScenarioCertificate] | None]:

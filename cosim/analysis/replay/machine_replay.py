@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
+from cosim.analysis.replay.replay_result import ProcessReplay, difference, first_row_difference
 from cosim.analysis.summary.summary_model import ReplayDifference
 from cosim.record.processes import ProcessGeneration, split_by_generation
 from cosim.record.record_source import Rows, Slice
@@ -172,7 +172,7 @@ class InputReplay:
             replayed[LOOP] = recorded[LOOP]
         if replay.difference == core.NOACK_EQUAL and replayed.tobytes() != recorded.tobytes():
             self._explain(place_of)
-            first_difference = rows_differ(table, place_of.number(table, row), recorded, replayed)
+            first_difference = first_row_difference(table, place_of.number(table, row), recorded, replayed)
             self.difference = self.difference or first_difference
         replay.before_ns = int(recorded["now_ns"])
         replay.next += 1
@@ -198,7 +198,7 @@ class InputReplay:
             skipped = _prefix_bytes(rows.dtype)
             own[skipped:] = np.frombuffer(ffi.buffer(replay.replayed), np.uint8)[: len(own) - skipped]
             number = place_of.number(table, row)
-            self.difference = rows_differ(table, number, rows[row], replayed[0])
+            self.difference = first_row_difference(table, number, rows[row], replayed[0])
 
     def _note(self, place_of: "_Places", at: int, text: str, column: str = "", *values: int | None) -> None:
         """Keep a difference at an input, if it is the first one."""

@@ -26,7 +26,7 @@ def difference(
     replayed: object = None,
 ) -> ReplayDifference:
     """Return a difference with its values formatted."""
-    (first, first_hex), (second, second_hex) = _displayed_value(recorded), _displayed_value(replayed)
+    (first, first_hex), (second, second_hex) = _format_value(recorded), _format_value(replayed)
     return ReplayDifference(
         table=table,
         row=row,
@@ -40,8 +40,8 @@ def difference(
     )
 
 
-def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> ReplayDifference:
-    """Name the first column in which two rows of a table differ in any bit."""
+def first_row_difference(table: str, row: int, recorded: np.void, replayed: np.void) -> ReplayDifference:
+    """Return the first column in which two rows of a table differ in any bit."""
     now_ns = int(recorded["now_ns"])
     for name in recorded.dtype.names or ():
         if (entry := first_entry(recorded[name], replayed[name])) is not None:
@@ -61,7 +61,7 @@ def first_entry(recorded: ArrayLike, replayed: ArrayLike) -> tuple[int, object, 
     return None
 
 
-def _displayed_value(value: object) -> tuple[Value, str | None]:
+def _format_value(value: object) -> tuple[Value, str | None]:
     if isinstance(value, float):
         if math.isnan(value):  # NaNs may differ in their bits
             return None, f"nan, bits {struct.pack('>d', value).hex()}"
@@ -107,7 +107,7 @@ class ProcessReplay(SummaryPart):
 class MessagesReplay(SummaryPart):
     """The comparison of one hop: messages sent in the replay, messages received in the run."""
 
-    leg: str
+    hop: str
     received: int
     """Messages in the receiver's record."""
     compared: int
@@ -152,8 +152,8 @@ class ReplayResult(SummaryPart):
             first_difference=self.first_difference,
         )
 
-    def document(self) -> dict[str, object]:
-        """The complete result for JSON."""
+    def to_json(self) -> dict[str, object]:
+        """Return the complete result for JSON."""
         verdict = self.verdict().model_dump(exclude={"error"})
         return verdict | {"gaps": self.gaps} | self.model_dump()
 
@@ -161,10 +161,10 @@ class ReplayResult(SummaryPart):
 def print_replay(console: Console, replay: ReplayResult, changed: Sequence[str]) -> None:
     """Print the result of a replay, and what ``changed`` since the run on its computer."""
     table = Table(title="replay, compared bit for bit")
-    for heading in ("process or link", "recorded", "compared", "verdict"):
-        table.add_column(heading, justify="left" if heading == "process or link" else "right")
-    rows = [(node.process, node.inputs, node.compared, node.difference) for node in replay.processes]
-    rows += [(link.leg, link.received, link.compared, link.difference) for link in replay.messages]
+    for heading in ("process or hop", "recorded", "compared", "verdict"):
+        table.add_column(heading, justify="left" if heading == "process or hop" else "right")
+    rows = [(part.process, part.inputs, part.compared, part.difference) for part in replay.processes]
+    rows += [(part.hop, part.received, part.compared, part.difference) for part in replay.messages]
     for name, recorded, compared, difference in rows:
         table.add_row(name, f"{recorded:,}", f"{compared:,}", _verdict(compared, difference))
     console.print(table)

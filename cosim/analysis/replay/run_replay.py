@@ -61,8 +61,8 @@ class MessageComparison:
         self._record, self._machines = record, machines
         network = record.scenario.network.flows
         self._hops = [
-            _Hop(leg, table, machines[ENDS[flow].sender], flow, record.number, network)
-            for leg, table, flow in _hops(network)
+            _HopComparison(name, table, machines[ENDS[flow].sender], flow, record.number, network)
+            for name, table, flow in _hops(network)
         ]
 
     def take(self, part: Slice) -> None:
@@ -113,7 +113,7 @@ def _compare_changes(record: RunRecord) -> Iterator[MessagesReplay]:
                     first = difference(table, index, at_ns, text, column, value, other)
     received = sum(len(record[table]) for table in SETTINGS)
     if received:
-        yield MessagesReplay(leg="coordinator → all", received=received, compared=compared, difference=first)
+        yield MessagesReplay(hop="coordinator → all", received=received, compared=compared, difference=first)
 
 
 def headers_of(heads: NDArray[np.void]) -> Rows:
@@ -140,19 +140,19 @@ class _Difference(NamedTuple):
     replayed: object
 
 
-class _Hop:
+class _HopComparison:
     """The messages of one hop, as received in the run and as sent in the replay."""
 
     def __init__(
         self,
-        leg: str,
+        name: str,
         table: str,
         sender: MachineReplay,
         flow: Flow,
         loop: int,
         network: Sequence[Flow],
     ) -> None:
-        self._leg, self._table, self._sender, self._flow = leg, table, sender, flow
+        self._name, self._table, self._sender, self._flow = name, table, sender, flow
         self._loop = loop
         self._direction = direction_of(flow)
         self._selects = table == NETEM_PACKET and len(network) > 1
@@ -219,7 +219,7 @@ class _Hop:
         if first is not None:
             first_difference = difference(self._table, *first[1:])
         return MessagesReplay(
-            leg=self._leg, received=self._received, compared=self._compared, difference=first_difference
+            hop=self._name, received=self._received, compared=self._compared, difference=first_difference
         )
 
     def _add(self, sent: Numbers) -> None:
@@ -255,15 +255,15 @@ class _Hop:
         for row in np.flatnonzero(~(known & is_newer & (words == sent).all(axis=1))).tolist():
             sequence, t_ns = words[row, :VECTOR].tolist()
             if not is_newer[row]:
-                self._differs(row, "not newer than the message before", "sequence", sequence)
+                self._note_difference(row, "not newer than the message before", "sequence", sequence)
             if not known[row]:
                 kind = _CONTENT if sequence < 0 else _SENT
-                self._differs(row, "was never sent", "sequence", sequence, kind=kind)
+                self._note_difference(row, "was never sent", "sequence", sequence, kind=kind)
             elif t_ns != (sent_ns := int(sent[row, TIME])):
-                self._differs(row, "differs from the message sent", "t_ns", t_ns, sent_ns)
+                self._note_difference(row, "differs from the message sent", "t_ns", t_ns, sent_ns)
             elif entry := first_entry(*(of[row, VECTOR:].view(np.float64) for of in (words, sent))):
                 index, *values = entry
-                self._differs(row, "differs from the message sent", entries[index], *values)
+                self._note_difference(row, "differs from the message sent", entries[index], *values)
 
     def _compare_heads(self) -> None:
         """Compare the part of a datagram that netem records: its first bytes and its size."""
@@ -293,26 +293,26 @@ class _Hop:
             description = "differs from the message sent"
             if not known[row]:
                 kind = _CONTENT if sequences[row] < 0 else _SENT
-                self._differs(row, "was never sent", "head", head, kind=kind)
+                self._note_difference(row, "was never sent", "head", head, kind=kind)
             elif differs[row].any():
-                self._differs(row, description, "head", head, expected[row].tobytes())
+                self._note_difference(row, description, "head", head, expected[row].tobytes())
             else:
-                self._differs(row, description, "size_bytes", size, size_bytes)
+                self._note_difference(row, description, "size_bytes", size, size_bytes)
 
     def _compare_flows(self) -> None:
         """Check that only the sensor's flow was forwarded."""
         for row, flow in enumerate(self._rows["flow"].tolist()):
             if flow != 0:
-                self._differs(row, "netem serves only the sensor's flow", "flow", flow, 0)
+                self._note_difference(row, "netem serves only the sensor's flow", "flow", flow, 0)
 
     def _compare_with_survivors(self) -> None:
         """Check that the network forwarded every received message."""
         for row, sequence in enumerate(self._rows["sequence"].tolist()):
             if sequence not in self._survivors:
                 description = "netem did not forward it"
-                self._differs(row, description, "sequence", sequence, kind=_FORWARDED)
+                self._note_difference(row, description, "sequence", sequence, kind=_FORWARDED)
 
-    def _differs(
+    def _note_difference(
         self,
         row: int,
         description: str,
@@ -320,7 +320,7 @@ class _Hop:
         recorded: object,
         replayed: object = None,
         *,
-        kind: str = "content",
+        kind: str = _CONTENT,
     ) -> None:
         known = self._first.get(kind)
         if known is None or self._received + row < known.row:
@@ -356,7 +356,7 @@ def replay(record: RunRecord, shared: SharedMachines | None = None) -> ReplayRes
 
 
 def replay_run(run: RecordedRun, loop: str | None = None) -> ReplayResult:
-    """Replay a run, or one of its loops; each process's and link's results are added up.
+    """Replay a run, or one of its loops; the results of each process and each hop are added up.
 
     Raises:
         CallerError: there is no such loop.
@@ -366,11 +366,11 @@ def replay_run(run: RecordedRun, loop: str | None = None) -> ReplayResult:
     replays = [replay(run.network), *map(replay, run.loops)]
     # A restarted process has a result of its own.
     processes = _by_name((result.process, result) for replayed in replays for result in replayed.processes)
-    messages = _by_name((result.leg, result) for replayed in replays for result in replayed.messages)
+    messages = _by_name((result.hop, result) for replayed in replays for result in replayed.messages)
     in_order = sorted(processes, key=lambda name: LOOP_ROLES.index(name.split()[0]))
     return ReplayResult(
-        processes=tuple(_added(processes[name]) for name in in_order),
-        messages=tuple(map(_added, messages.values())),
+        processes=tuple(_add_up(processes[name]) for name in in_order),
+        messages=tuple(map(_add_up, messages.values())),
     )
 
 
@@ -386,8 +386,8 @@ def _by_name(named: Iterable[tuple[str, Result]]) -> dict[str, list[Result]]:
     return by_name
 
 
-def _added(results: Sequence[Result]) -> Result:
-    """Return the results of a process, or of a link, of all loops as one."""
+def _add_up(results: Sequence[Result]) -> Result:
+    """Return the results of a process, or of a hop, of all loops as one."""
     differences = filter(None, (result.difference for result in results))
     sums = {"inputs", "compared", "received"} & vars(results[0]).keys()
     update: dict[str, object] = {name: sum(getattr(result, name) for result in results) for name in sums}

@@ -1,6 +1,7 @@
-"""What a run amounts to: the keys of a summary, for a loop and for the network of all loops.
+"""The summary of a run: its keys, those of a loop, and those of the network of all loops.
 
-``summary_model.py`` has the keys. ``loop_statistics.py`` computes statistics of a loop's record,
-some of them by ``quantiles.py``; ``run_summary.py`` makes the summary of a loop of them, and
-``network_summary.py`` that of the run.
+``summary_model.py`` has the keys. ``loop_statistics.py`` has statistics of a loop's processes and
+messages, ``signal_statistics.py`` those of its signals, some of them by ``quantiles.py``;
+``run_summary.py`` makes the summary of a loop of them, and ``network_summary.py`` that of the run.
+``loops_over_time.py`` has the loops of a run over time.
 """

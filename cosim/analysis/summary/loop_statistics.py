@@ -1,69 +1,43 @@
-"""What the record of a loop says of it: lateness, losses, and the sizes of its signals.
+"""Statistics of a loop's processes and messages, from its record.
 
 * :func:`lateness` and :func:`latency`: wall times of the processes of a live run.
 * Losses: of updates in the network, of datagrams elsewhere (:func:`unintended_losses`), of rows of
-  the record (:func:`missing_rows`); and the violations that the processes reported.
-* :class:`SignalStatistics`: states and errors, in one pass over the aligned run;
-  :func:`disturbances`; :func:`watchdog_actions`.
+  the record (:func:`missing_rows`).
+* :func:`reported_violations` of the processes, and the :func:`watchdog_actions` of the plant.
 """
 
-import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
-from typing import NamedTuple, TypedDict
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.observed_conditions import DROPOUTS, AssumptionViolation
 from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.analysis.summary.summary_model import (
-    DisturbancePart,
-    EstimationPart,
     FlowPart,
     LatencyPart,
     LatenessPart,
     ViolationPart,
     WatchdogPart,
 )
-from cosim.record.align import (
-    AlignedPart,
-    AlignedRun,
-    Reals,
-    SizeStatistics,
-    bounded_parts,
-    expected_rms,
-    shares_update,
-)
-from cosim.record.run_events import NEVER_NS, PacketOutcome, changes_of, packet_outcomes
+from cosim.record.run_events import NEVER_NS, ActuationTimes, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.core.linear_systems import Matrix, row_norms
+from noack.impairments.loss_guarantee import LongestBurst
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
-    NETEM_PACKET,
-    NO_SEQUENCE,
     PLANT_ACTUATION,
     PLANT_STEP,
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
+    STEP_TABLES,
     Fate,
     effective,
 )
 from noack.protocol.roles import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
-from noack.scenario.resolution import loop_of, setpoint_of
-from noack.scenario.scenario import Scenario
 from plant_server.plant import too_old
-
-_STEPS = {
-    "plant": PLANT_STEP,
-    "sensor": SENSOR_MEASUREMENT,
-    "netem": NETEM_PACKET,
-    "controller": CONTROLLER_STEP,
-}
 
 
 def lateness_parts(record: RunRecord, role: str) -> Iterator[NDArray[np.float64]]:
@@ -73,7 +47,7 @@ def lateness_parts(record: RunRecord, role: str) -> Iterator[NDArray[np.float64]
     sensor, and the arrival of the datagram at its socket for the network. A simulated network has
     no socket; its rows have ``now_ns`` there, and are left out.
     """
-    for rows in record.source.batches(_STEPS[role], ("now_ns", "t_ns")):
+    for rows in record.source.batches(STEP_TABLES[role], ("now_ns", "t_ns")):
         late_ns = rows["now_ns"] - rows["t_ns"]
         known = late_ns[late_ns != 0] if role == "netem" else late_ns
         yield np.asarray(known / (1e3 * record.scenario.speed))
@@ -130,9 +104,10 @@ def _quantiles(sketch: QuantileSketch) -> dict[str, float | None]:
 
 _ARRIVES_AFTER_END_S = 0.1
 _RECEIVERS = {"measurement": "sensor", "actuation": "plant"}
-"""The receivers of legs that are not named by theirs."""
-VIOLATION = "violation"
+"""The receivers of hops that are not named by theirs."""
+_VIOLATION = "violation"
 """Level of a notice: a process detected that an assumption was violated."""
+_DROPOUTS = LongestBurst(0).name
 
 
 def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
@@ -181,7 +156,7 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
         sent = part[PLANT_STEP]["sequence"]
         measured.take(sent[sent % every == 0] // every, part[SENSOR_MEASUREMENT]["sequence"])
         actuated.take(part[CONTROLLER_STEP]["sequence"], part[PLANT_ACTUATION]["sequence"])
-    legs = {
+    hops = {
         "measurement": measured,
         "update to netem": _Unmatched().take(events, outcomes.sequence),
         "update to controller": _Unmatched().take(_forwarded_until(outcomes, last_ns), received),
@@ -190,19 +165,19 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
     for flow in record.scenario.network.flows[1:]:
         name, answers = flow.name.lower(), packet_outcomes(record, flow)
         sent, arrived = (record.columns(table, "sequence")["sequence"] for table in _SENT_RECEIVED[flow])
-        legs.pop(name, None)
-        legs[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
-        legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
+        hops.pop(name, None)
+        hops[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
+        hops[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
             _forwarded_until(answers, last_ns), arrived
         )
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
-    counts = {leg: unmatched.count(complete=complete) for leg, unmatched in legs.items()}
-    return {leg: max(count - _not_finite(record, leg), 0) for leg, count in counts.items()}
+    counts = {hop: unmatched.count(complete=complete) for hop, unmatched in hops.items()}
+    return {hop: max(count - _not_finite(record, hop), 0) for hop, count in counts.items()}
 
 
-def _not_finite(record: RunRecord, leg: str) -> int:
-    """The number of datagrams that a leg's receiver rejected because an entry is not finite."""
-    receiver = _RECEIVERS.get(leg, leg.rpartition(" ")[2])
+def _not_finite(record: RunRecord, hop: str) -> int:
+    """The number of datagrams that a hop's receiver rejected because an entry is not finite."""
+    receiver = _RECEIVERS.get(hop, hop.rpartition(" ")[2])
     channel = record.reports.get(receiver, {}).get("channel") or {}
     return int((channel.get("rejected") or {}).get(Rejection.NOT_FINITE, 0))
 
@@ -261,7 +236,7 @@ def reported_violations(record: RunRecord) -> list[ViolationPart]:
             what=notice["text"],
         )
         for notice in record.notices
-        if notice["level"] == VIOLATION
+        if notice["level"] == _VIOLATION
     ]
     outcomes = packet_outcomes(record)
     delivered = np.flatnonzero(~outcomes.lost)
@@ -271,7 +246,7 @@ def reported_violations(record: RunRecord) -> list[ViolationPart]:
     if dropped > mansd:
         text = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
         at_s = float(outcomes.event_ns[first + mansd]) * 1e-9
-        violations.append(ViolationPart(t_s=at_s, process="netem", cause=DROPOUTS, what=text))
+        violations.append(ViolationPart(t_s=at_s, process="netem", cause=_DROPOUTS, what=text))
     return violations
 
 
@@ -280,31 +255,7 @@ def _cause(text: str) -> str:
     if "a change" in text:
         return "change"
     rule, violated, _ = text.partition(" violated: ")
-    return rule if violated and rule != "MANSD" else DROPOUTS
-
-
-def list_violations(
-    reported: Sequence[ViolationPart], observed: Sequence[AssumptionViolation]
-) -> list[ViolationPart]:
-    """Return all violations of a run: those reported by processes, then those found in the record.
-
-    A violation of M − 1 that a process reported is not repeated.
-    """
-    known = {violation.cause for violation in reported}
-    return [*reported] + [
-        ViolationPart(t_s=violation.t_s, process="recorder", cause=violation.cause, what=violation.text)
-        for violation in observed
-        if violation.cause not in known
-    ]
-
-
-def _setpoints(record: RunRecord) -> tuple[list[int], Matrix]:
-    """Return when the set point changed, (k,), and the set points x_r, (k + 1, n); 0 is a row."""
-    changes = changes_of(record)
-    given = (setpoint_of(change) for change in (record.scenario, *(change.scenario for change in changes)))
-    nothing = np.zeros(loop_of(record.scenario).n)
-    points = [nothing if setpoint is None else setpoint[0] for setpoint in given]
-    return [change.first_ns for change in changes], np.array(points)
+    return rule if violated and rule != "MANSD" else _DROPOUTS
 
 
 def _largest_mansd(record: RunRecord, since_ns: int) -> int:
@@ -315,210 +266,22 @@ def _largest_mansd(record: RunRecord, since_ns: int) -> int:
     return max(cap for cap, end_ns in zip(caps, ends_ns, strict=True) if end_ns > since_ns)
 
 
-def _larger(before: float | None, values: Reals) -> float | None:
-    """Return the largest of the values and of those before; NaN if one is NaN."""
-    if not len(values):
-        return before
-    largest = values.max()
-    return float(largest if before is None else np.maximum(before, largest))
-
-
-class SampleFacts(NamedTuple):
-    """What claims need to know about all samples of a run before they are checked."""
-
-    any_in_common: bool = False
-    gap_s: float | None = None
-    """First time at which the controller's error is not known, although it was before."""
-    largest_state: float = 0.0
-    """Largest entry of x_s, and of x_c where it is known, before the end of the claims."""
-    longest_update_ns: int = 0
-    """Longest time between two updates of the controller, or to the end of the run."""
-
-
-class SampleFactsReader:
-    """Reads these facts, part by part of an aligned run; the claims end at ``until_s``."""
-
-    def __init__(self, scenario: Scenario, until_s: float = math.inf) -> None:
-        self._scenario, self._until_s = scenario, until_s
-        self._found = SampleFacts()
-        self._fresh_ns: int | None = None
-        self._newest, self._last_ns = -1, 0
-
-    def take(self, aligned: AlignedRun, common: NDArray[np.bool_] | None = None) -> None:
-        """Add the next measurements; it may be known where sensor and controller share an update."""
-        if not len(aligned.t_ns):
-            return
-        common = shares_update(self._scenario, aligned) if common is None else common
-        facts, t_s = self._found, aligned.t_ns * 1e-9
-        started = np.logical_or.accumulate(common) | facts.any_in_common
-        gaps = np.flatnonzero(started & ~common)
-        gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
-        until = t_s < self._until_s
-        both = np.concatenate(
-            [aligned.x_s.compress(until, axis=0), aligned.x_c.compress(common & until, axis=0)]
-        )
-        largest = float(np.abs(both[np.isfinite(both)]).max(initial=facts.largest_state))
-        changes = aligned.t_ns[np.flatnonzero(np.diff(aligned.received, prepend=self._newest))]
-        ends_ns = changes if self._fresh_ns is None else np.append(self._fresh_ns, changes)
-        longest_ns = int(np.diff(ends_ns).max(initial=facts.longest_update_ns))
-        self._fresh_ns = int(ends_ns[-1]) if len(ends_ns) else None
-        self._newest, self._last_ns = int(aligned.received[-1]), int(aligned.t_ns[-1])
-        self._found = SampleFacts(bool(started[-1]), gap_s, largest, longest_ns)
-
-    @property
-    def facts(self) -> SampleFacts:
-        """What is known after the last part."""
-        if self._fresh_ns is None:
-            return self._found
-        since_ns = self._last_ns - self._fresh_ns
-        longest_ns = max(self._found.longest_update_ns, since_ns)
-        return self._found._replace(longest_update_ns=longest_ns)
-
-
-class SignalFields(TypedDict):
-    """The fields of a loop's summary about its signals."""
-
-    setpoint: list[float] | None
-    initial_state_norm: float | None
-    final_state_norm: float | None
-    sup_state_norm: float | None
-    sup_e_s_norm: float | None
-    sup_e_c_norm: float | None
-    sup_e_c_at_s: float | None
-    identity_residual_max: float | None
-    identity_residual_relative: float | None
-
-
-class SignalStatistics:
-    """Reads the signals of a run once, aligned."""
-
-    def __init__(self, record: RunRecord) -> None:
-        self._record = record
-        self._sup_e_s: float | None = None
-        self._sup_e_c: float | None = None
-        self._sup_e_c_at_s: float | None = None
-        self._residual: float | None = None
-        self._sup_true_e_c: float | None = None
-        self._errors, self._late_errors = SizeStatistics(), SizeStatistics()
-        self._scale, self._read = 0.0, 0
-        self._half = record.count(SENSOR_MEASUREMENT) // 2
-        facts = SampleFactsReader(record.scenario)
-        for bounded in bounded_parts(record):
-            part, left = bounded.part, bounded.residual
-            self._add(part)
-            facts.take(part.aligned, bounded.shared)
-            self._residual = _larger(self._residual, left[~np.isnan(left)])
-            self._estimation_error(part)
-            self._read += len(part.rows)
-        self.facts = facts.facts
-        """What claims need to know before they are checked."""
-
-    def _add(self, part: AlignedPart) -> None:
-        aligned = part.aligned
-        common = aligned.since_delivery(self._record.scenario)
-        t_s, e_c = aligned.t_ns[common] * 1e-9, aligned.e_c_norm[common]
-        self._sup_e_s = _larger(self._sup_e_s, aligned.e_s_norm)
-        if len(e_c) and (self._sup_e_c is None or e_c.max() > self._sup_e_c):
-            self._sup_e_c, self._sup_e_c_at_s = float(e_c.max()), float(t_s[np.argmax(e_c)])
-        self._scale = float(np.maximum(self._scale, np.abs(aligned.x_s).max(initial=0.0)))
-
-    def _estimation_error(self, part: AlignedPart) -> None:
-        if part.true_x is None:
-            return
-        # ‖x_c − x‖_W with the plant's own x, from the controller's first update on
-        aligned, weight = part.aligned, self._record.loop.weight
-        e_c = aligned.x_c - part.true_x
-        norms = row_norms(e_c if weight is None else e_c @ weight.T)
-        counted = np.isfinite(norms) & aligned.since_delivery(self._record.scenario)
-        self._sup_true_e_c = _larger(self._sup_true_e_c, norms[counted])
-        errors = row_norms(part.rows["x"] - part.true_x)
-        self._errors.add(errors)
-        self._late_errors.add(errors[max(self._half - self._read, 0) :])
-
-    def for_summary(self) -> SignalFields:
-        """Return norms of the state, of the errors, and of the residual of (I1)."""
-        first, last, largest = None, None, None
-        since_ns, points = _setpoints(self._record)
-        for steps in self._record.source.batches(PLANT_STEP, ("t_ns", "x")):
-            x = steps["x"]
-            if points.any():
-                x = x - points[np.searchsorted(since_ns, steps["t_ns"], "right")]
-            norms = row_norms(x)
-            first = float(norms[0]) if first is None else first
-            last, largest = float(norms[-1]), _larger(largest, norms)
-        scale = max(self._scale, float(np.finfo(float).tiny))
-        return {
-            "setpoint": points[-1].tolist() if points.any() else None,
-            "initial_state_norm": first,
-            "final_state_norm": last,
-            "sup_state_norm": largest,
-            "sup_e_s_norm": self._sup_e_s,
-            "sup_e_c_norm": self._sup_e_c,
-            "sup_e_c_at_s": self._sup_e_c_at_s,
-            "identity_residual_max": self._residual,
-            "identity_residual_relative": None if self._residual is None else self._residual / scale,
-        }
-
-    def estimation(self) -> EstimationPart | None:
-        """Return the estimation error; None if the sensor measures x itself."""
-        scenario = self._record.scenario
-        if scenario.coverage.knows_state:
-            return None
-        return EstimationPart(
-            observer=None if scenario.observer is None else scenario.observer.kind,
-            outputs=scenario.message_sizes.outputs,
-            noise_std=np.sqrt(scenario.plant.measurement.variance(self._record.loop.n)).tolist(),
-            rms=self._errors.rms,
-            rms_second_half=self._late_errors.rms,
-            expected_rms=expected_rms(scenario),
-            max=self._errors.max,
-            sup_e_c_norm=self._sup_true_e_c,
-        )
-
-
-@lru_cache(maxsize=1)
-@np.errstate(all="ignore")  # a run may diverge
-def signal_statistics(record: RunRecord) -> "SignalStatistics":
-    """Read the signals of a run; the summary and the claims use the same ones."""
-    return SignalStatistics(record)
-
-
-def disturbances(record: RunRecord) -> list[DisturbancePart]:
-    """The disturbances of u and of ẋ."""
-    parts = []
-    for entry, column in (("input", "d"), ("state", "w")):
-        if column not in (record.tables[PLANT_STEP].names or ()):
-            continue
-        sizes = SizeStatistics()
-        for steps in record.source.batches(PLANT_STEP, (column,)):
-            sizes.add(row_norms(steps[column]))
-        kinds = [cause.kind for cause in record.scenario.plant.disturbances if cause.at == entry]
-        parts.append(DisturbancePart(at=entry, kinds=kinds, rms=sizes.rms, max=sizes.max))
-    return parts
-
-
 def watchdog_actions(record: RunRecord) -> WatchdogPart:
     """Return the watchdog's actions (the newest actuation was too old) from the recorded steps."""
     timing = record.scenario.timing
     names = ("now_ns", "sequence", "t_ns", "actuation")
-    known, known_ns = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    actuations = ActuationTimes()
     trips, steps_old, first_s, was_old = 0, 0, None, False
     for part in record.slices(PLANT_STEP, PLANT_ACTUATION, columns=names):
         steps = part[PLANT_STEP]
-        known = np.append(known, part[PLANT_ACTUATION]["sequence"])
-        known_ns = np.append(known_ns, part[PLANT_ACTUATION]["t_ns"])
-        index = np.searchsorted(known, steps["actuation"])
-        is_recorded = np.append(known, NO_SEQUENCE)[index] == steps["actuation"]
-        newest_ns = np.where(steps["actuation"] != NO_SEQUENCE, np.append(known_ns, 0)[index], 0)
-        # If an actuation is not recorded, its age is unknown.
-        old = is_recorded & too_old(steps["t_ns"], newest_ns, timing.actuation_timeout_ns)
+        actuations.add(part[PLANT_ACTUATION])
+        newest_ns, is_known = actuations.of_newest(steps["actuation"])
+        old = is_known & too_old(steps["t_ns"], newest_ns, timing.actuation_timeout_ns)
         begun = np.flatnonzero(old & ~np.append(was_old, old[:-1])[: len(old)])
         if len(begun) and first_s is None:
             first_s = float(steps["t_ns"][begun[0]]) * 1e-9
         trips, steps_old = trips + len(begun), steps_old + int(old.sum())
-        if len(steps):  # a later step has the newest of these actuations, or a later one
-            was_old, used = bool(old[-1]), int(index[-1])
-            known, known_ns = known[used:], known_ns[used:]
+        was_old = bool(old[-1]) if len(old) else was_old
     return WatchdogPart(
         policy=record.scenario.plant.watchdog.policy,
         timeout_s=timing.actuation_timeout_ns * 1e-9,

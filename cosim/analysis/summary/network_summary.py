@@ -1,4 +1,4 @@
-"""The summary of a run: its network, the summaries of its loops, and the loops over time."""
+"""The summary of a run: its network, the summaries of its loops, and which loop is the worst."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.summary.quantiles import quantiles_in
 from cosim.analysis.summary.run_summary import change_parts
 from cosim.analysis.summary.summary_model import (
     Claim,
@@ -19,17 +18,14 @@ from cosim.analysis.summary.summary_model import (
     NetworkPart,
     RunSummary,
 )
-from cosim.record.align import aligned_parts
-from cosim.record.run_record import RecordedRun, Rows, RunRecord
+from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
-from noack.core.linear_systems import firsts_of_equal
 from noack.core.number_format import number as shown
 from noack.impairments.feature import Impairment
 from noack.impairments.kinds.duplicate import Duplicate
 from noack.impairments.kinds.rate import Rate
 from noack.protocol.record_tables import NETEM_PACKET, Fate
-from noack.scenario.scenario import Scenario, phases_ns
 
 _BINS = 200
 _MOST_NAMED = 3
@@ -180,116 +176,6 @@ def _time_since(moments_ns: NDArray[np.int64], at_ns: NDArray[np.float64]) -> ND
     before = np.searchsorted(moments_ns, at_ns, "right")
     sums = np.append(0.0, np.cumsum(moments_ns, dtype=np.float64))
     return np.asarray(before * at_ns - sums[before])
-
-
-INTERVALS = 200
-"""Intervals of equal width into which a run is divided."""
-QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
-"""Quantiles over the loops that are shown if there are too many loops for a curve each."""
-_SHARED_INTERVALS = 8
-"""Intervals over which the shares of the loops are computed: in one interval, few loops send."""
-
-Reals = NDArray[np.float64]
-
-
-class LoopOverTime(NamedTuple):
-    """Two quantities of one loop, (intervals,) each; see :class:`LoopsOverTime`."""
-
-    errors: Reals
-    states: Reals
-
-
-class LoopsOverTime(NamedTuple):
-    """Quantities of L loops in ``INTERVALS`` intervals of the run, each of shape (L, intervals)."""
-
-    edges_s: Reals
-    """(intervals + 1,) where the intervals begin and end, in the time of the run."""
-    errors: Reals
-    """Largest ‖e_c‖ since the first delivery; NaN where unknown."""
-    states: Reals
-    """Largest ‖x‖, measured or estimated by the sensor; NaN where unknown."""
-    link_bytes: Reals
-    """Bytes of the loop's updates that left the network."""
-
-    @property
-    def middles_s(self) -> Reals:
-        """(intervals,) the middle of each interval."""
-        return np.asarray((self.edges_s[1:] + self.edges_s[:-1]) / 2)
-
-    def shares(self) -> tuple[Reals, Reals]:
-        """Return longer intervals' ends in s, (k,), and the share of each loop, (L, k)."""
-        loops = len(self.link_bytes)
-        sums = self.link_bytes.reshape(loops, -1, _SHARED_INTERVALS).sum(axis=2)
-        ends_s = self.edges_s[_SHARED_INTERVALS::_SHARED_INTERVALS]
-        return ends_s, sums / np.where(sums.sum(axis=0) > 0, sums.sum(axis=0), np.nan)
-
-
-def loops_over_time(run: RecordedRun, known: Sequence[LoopOverTime] | None = None) -> LoopsOverTime:
-    """Return how the loops of a run went, from what is ``known`` of each, or from their records."""
-    if known is None:
-        known = [
-            loop_over_time(record, phase_ns)
-            for record, phase_ns in zip(run.loops, phases_ns(run.scenario), strict=True)
-        ]
-    over_time = empty_over_time(run.scenario)
-    for number, (errors, states) in enumerate(known):
-        over_time.errors[number], over_time.states[number] = errors, states
-    add_link_bytes(over_time.link_bytes, run.network[NETEM_PACKET], run.scenario.timing.horizon_ns)
-    return over_time
-
-
-@np.errstate(all="ignore")  # a loop may diverge
-def loop_over_time(record: RunRecord, phase_ns: int) -> LoopOverTime:
-    """Return how a loop went that began at ``phase_ns`` in the time of its run."""
-    horizon_ns = record.scenario.timing.horizon_ns
-    errors, states = np.full((2, INTERVALS), np.nan)
-    for part in aligned_parts(record):
-        aligned = part.aligned
-        columns = places(aligned.t_ns + phase_ns, horizon_ns)
-        common = aligned.since_delivery(record.scenario)
-        _raise(states, columns, aligned.x_norm)
-        _raise(errors, columns[common], aligned.e_c_norm[common])
-    return LoopOverTime(errors, states)
-
-
-def _raise(largest: Reals, columns: NDArray[np.int64], values: Reals) -> None:
-    """Take the largest values at places, which ascend, into account."""
-    if len(columns):
-        first = firsts_of_equal(columns)
-        at = columns[first]
-        largest[at] = np.fmax(largest[at], np.fmax.reduceat(values, first))
-
-
-def empty_over_time(scenario: Scenario) -> LoopsOverTime:
-    """Return the quantities of a run of which nothing is known yet."""
-    loops = len(phases_ns(scenario))
-    errors, states = np.full((2, loops, INTERVALS), np.nan)
-    edges_s = np.linspace(0, scenario.horizon_s, INTERVALS + 1)
-    return LoopsOverTime(edges_s, errors, states, np.zeros((loops, INTERVALS)))
-
-
-def add_link_bytes(link_bytes: Reals, packets: Rows, horizon_ns: int) -> None:
-    """Add the bytes of the packets that left the network to their loops, (L, intervals)."""
-    left = (packets["release_ns"] >= 0) & (packets["release_ns"] <= horizon_ns)
-    left &= packets["flow"] < len(link_bytes)  # the others are of the other direction
-    packets = packets[left]
-    columns = places(packets["release_ns"], horizon_ns)
-    np.add.at(link_bytes, (packets["flow"], columns), packets["size_bytes"])
-
-
-def places(t_ns: NDArray[np.int64], horizon_ns: int) -> NDArray[np.int64]:
-    """Return the interval of each time of the run."""
-    return np.asarray(np.minimum(t_ns * INTERVALS // horizon_ns, INTERVALS - 1))
-
-
-def quantiles(values: Reals) -> Reals:
-    """Return the ``QUANTILES`` over the loops of values (L, k), (6, k); NaN where all are."""
-    known = np.isfinite(values)
-    shares, counts = np.full((len(QUANTILES), values.shape[1]), np.nan), known.sum(axis=0)
-    observed = np.flatnonzero(counts)
-    ordered = np.sort(np.where(known, values, np.inf), axis=0)
-    shares[:, observed] = quantiles_in(ordered, counts[observed], np.array(QUANTILES)[:, None], observed)
-    return shares
 
 
 class WorstLoop(NamedTuple):

@@ -14,17 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cosim.analysis.summary.loop_statistics import (
-    disturbances,
     drops_by_cause,
     from_controller,
     latency,
     lateness,
     missing_rows,
     reported_violations,
-    signal_statistics,
     unintended_losses,
     watchdog_actions,
 )
+from cosim.analysis.summary.signal_statistics import disturbances, signal_statistics
 from cosim.analysis.summary.summary_model import (
     AssumptionPart,
     ChangePart,
@@ -124,7 +123,7 @@ def summarise(
         missing_samples=sum(missing.values()),
         missing_by_table={table: n for table, n in missing.items() if n},
         unintended_losses=sum(lost.values()),
-        unintended_losses_by_leg={leg: n for leg, n in lost.items() if n},
+        unintended_losses_by_leg={hop: n for hop, n in lost.items() if n},
         rejected_datagrams={
             role: rejected
             for role, report in record.reports.items()

@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from cosim.cli import command as cli
 from cosim.cli import options as opt
-from cosim.cli.execute_run import reopened
+from cosim.cli.execute_run import reopen_run
 from cosim.lazy_modules import lazy_modules
 from cosim.output.export import FORMATS, export_run, export_scenario, export_suffix, needs_run
 from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
@@ -49,7 +49,7 @@ def summary(
         noack summary --tables tables   its tables for a paper, as LaTeX and CSV
         noack summary runs/latest --json   all numbers, as JSON
     """
-    outcome = run_summary.outcome_of_loop(reopened(run.path), run.loop)
+    outcome = run_summary.outcome_of_loop(reopen_run(run.path), run.loop)
     cli.show(json, outcome.summary.to_json, terminal_output.print_outcome, outcome, verbose=verbose)
     cli.write_tables(run_tables.summary_tables(outcome.summary), tables, json=json)
     return _record_status(run.path)
@@ -146,7 +146,7 @@ def replay(run: opt.LoopOptions, *, json: opt.JsonOption = False) -> int:
     with cli.status("replaying"):
         result = run_replay.replay_run(run_record.load_run(path), run.loop)
     changed = run_directory.changed_since(path)
-    document = result.document() | {"changed_since": changed}
+    document = result.to_json() | {"changed_since": changed}
     cli.show(json, lambda: document, replay_result.print_replay, result, changed)
     return ExitStatus.OK if result.bit_exact else ExitStatus.FAILED
 
@@ -173,7 +173,7 @@ def fidelity(
         result = fidelity_analysis.compute_fidelity(run_record.load_record(run.path, run.loop))
         if out is not None:
             figure_files.save_figure(run_figures.fidelity_figure(result), out, width)
-    cli.show(json, result.as_json, terminal_output.print_fidelity, result)
+    cli.show(json, result.to_json, terminal_output.print_fidelity, result)
     return ExitStatus.OK if result.explained else ExitStatus.FAILED
 
 
@@ -220,7 +220,7 @@ def export(
     if needs_run(file_format):
         if settings:
             raise CallerError(f"--set: a run has its settings; {file_format} is a format of runs")
-        reopened(chosen := run.path)
+        reopen_run(chosen := run.path)
         name = run.loop or chosen.resolve().name
         path = out or Path(f"{name}{export_suffix(file_format)}")
         with cli.status("exporting"):
@@ -314,7 +314,7 @@ def collect(
         noack collect runs/latest copy   from a folder that was copied here
     """
     run_dir = chosen_run(run_dir, cli.DEFAULT_RUNS)
-    outcome = reopened(run_dir)  # refuses a run that is under way
+    outcome = reopen_run(run_dir)  # refuses a run that is under way
     for source in sources:
         merged, roles = collection.collect(run_dir, source, finalize.reopen)
         outcome = replace(merged, run_dir=run_dir)

@@ -267,7 +267,7 @@ def set_(
         noack set loss.p 0.9   lose nine in ten packets from now on
         noack set mansd 2 trigger.beta 0.3 --json   change M − 1 and β at once
     """
-    changes = parsed(settings or ())
+    changes = parse_settings(settings or ())
     answer = active_runs.request_change(active_runs.find_run(session, run), changes)
     if json:
         cli.print_json(answer.fields())
@@ -280,7 +280,7 @@ def set_(
         _print_parameters(cli.console(), answer)
 
 
-def parsed(words: list[str] | tuple[str, ...]) -> dict[str, object]:
+def parse_settings(words: list[str] | tuple[str, ...]) -> dict[str, object]:
     """Return the settings that words give as KEY VALUE or KEY=VALUE.
 
     Raise CallerError if a value is missing, or a key is given twice.

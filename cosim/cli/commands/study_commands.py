@@ -1,9 +1,8 @@
-"""``noack campaign``, ``paper``, ``design``, ``capacity``: studies, which make many runs."""
+"""``noack campaign``, ``paper``, ``capacity``: studies, which make many runs."""
 
 import math
 import re
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,26 +15,15 @@ from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
 from cosim.lazy_modules import lazy_modules
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError, ExitStatus
-from noack.core.file_access import write_whole
 from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
-    from cosim.live.monitoring import progress
     from cosim.output import result_tables
     from cosim.studies.campaign import campaign_file, campaign_grid, campaign_report
     from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result
-    from cosim.studies.design import (
-        design_page,
-        design_search,
-        design_space,
-        event_design,
-        hold_strategies,
-        network_search,
-    )
     from cosim.studies.paper import paper_page, published_result
     from cosim.studies.paper import results as paper_results
-    from noack.core import linear_systems
-    from noack.scenario import run_sections, scenario, scenario_file
+    from noack.scenario import run_sections, scenario_file
 
 
 @cli.command(cli.CAMPAIGNS, 10, takes="seconds to minutes, by the number of draws")
@@ -76,7 +64,7 @@ def campaign(
     summary, _, _, new_runs, files = execute_campaign(
         plan, path, start, folder=folder, draws=draws, figure_files=figure_files
     )
-    document = summary.document() | {"made": new_runs}
+    document = summary.to_json() | {"made": new_runs}
     cli.show_with_files(json, document, files, campaign_report.print_summary, summary)
     cli.write_tables(campaign_report.campaign_tables(summary), tables, json=json)
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK
@@ -121,7 +109,7 @@ def paper(
             raise CallerError("--out, --draws: are for `noack paper` without a name; this has --tables FILE")
         with cli.status("computing"):
             result = paper_results.reproduce(name)
-        cli.show(json, result.document, published_result.print_rows, result)
+        cli.show(json, result.to_json, published_result.print_rows, result)
         cli.write_tables([result.table], tables, json=json)
         return ExitStatus.OK if result.as_expected else ExitStatus.FAILED
     out = out or cli.DEFAULT_RUNS / "paper"
@@ -143,253 +131,6 @@ def paper(
     cli.print_lines(json, document, *files)
     cli.write_tables([table], tables, json=json)
     return ExitStatus.OK
-
-
-@opt.option_group
-class LimitOptions:
-    """What a design must meet.
-
-    Options:
-        settling: Largest settling time allowed; required for --for settling.
-        quantile: Share of the draws that must settle in time.
-        settle: A run has settled when ‖x‖ stays below this share of ‖x(0)‖.
-        bound: Largest certified sup‖x‖ (state) or sup‖e_c‖ (error) allowed over the box.
-        under: Conditions of the certificates: the `paper`'s, or the scenario's `schedule`.
-    """
-
-    settling: Annotated[float | None, Option(metavar="SECONDS")] = None
-    quantile: float = 0.95
-    settle: float = 0.02
-    bound: Annotated[list[str] | None, Option(metavar="state=X|error=X")] = None
-    under: str = "paper"
-
-    def limits(self) -> "design_search.DesignLimits":
-        """Return the limits; raise CallerError if one is wrong."""
-        if self.settling is None:
-            raise CallerError("--settling: give the largest settling time, e.g. --settling 14")
-        for option, upper in (("settling", math.inf), ("quantile", 1), ("settle", 1)):
-            if not 0 < (value := getattr(self, option)) < upper:
-                allowed = "positive" if upper == math.inf else "between 0 and 1"
-                raise CallerError(f"--{option}: must be {allowed}, not {value:g}")
-        if self.under not in ("paper", "schedule"):
-            raise CallerError(f'--under: paper or schedule, not "{self.under}"')
-        return design_search.DesignLimits(
-            self.settling, self.quantile, self.settle, self.bounds(), self.under == "schedule"
-        )
-
-    def bounds(self) -> "dict[design_search.Bounded, float]":
-        """Return the limits of certified bounds; raise CallerError if one is wrong."""
-        by_quantity: dict[design_search.Bounded, float] = {}
-        for text in self.bound or ():
-            name, _, value = text.partition("=")
-            try:
-                limit = float(value)
-            except ValueError:
-                limit = math.nan
-            bounded: dict[str, design_search.Bounded] = {"state": "state", "error": "error"}
-            if name not in bounded or not 0 < limit < math.inf:
-                raise CallerError(f"--bound {text}: write it as state=X or error=X, X positive")
-            if bounded[name] in by_quantity:
-                raise CallerError(f"--bound {text}: {name} is given twice")
-            by_quantity[bounded[name]] = limit
-        return by_quantity
-
-
-class DesignAim(StrEnum):
-    """What ``noack design`` may choose, and for what."""
-
-    SETTLING = "settling"
-    NETWORK = "network"
-    TRANSMISSIONS = "transmissions"
-
-
-@opt.option_group
-class NetworkOptions:
-    """What a design for a network must meet.
-
-    Options:
-        aim: `settling`: the trigger with the fewest transmissions that settles in time. `network`:
-            the gain and hold strategy that are proven stable for the largest M. `transmissions`:
-            those with the longest period for the scenario's guarantee.
-        period: Time between two updates of a time-triggered sensor; by default that of a periodic
-            scenario. Without it, the paper's trigger is kept, with other α and β.
-        window: Maximise L in "at most L losses in WINDOW updates" instead of M.
-        most: Largest M to examine; 16 with a period, else 1,000.
-        cost: Largest cost ∫ xᵀQx + uᵀRu dt, as a multiple of the given loop's. With a period, that
-            without losses; else the mean over draws.
-        share: Most transmissions of events, as a multiple of the given loop's.
-        holds: What to try between two updates: `zero`, `zoh` to hold the last input, `model`, or
-            `predictions:N`: the model for N periods, then zero (`predictions:N:hold`: the last
-            input); `predictions`: N = 2, 4 and 8.
-            By default all of these, and what the given loop does.
-        effort: Number of loops that the search may try; 1,500 by default.
-    """
-
-    aim: Annotated[DesignAim, Option("--for")] = DesignAim.SETTLING
-    period: Annotated[float | None, Option(metavar="SECONDS")] = None
-    window: Annotated[int | None, Option(metavar="UPDATES")] = None
-    most: Annotated[int | None, Option(min=1, max=10_000)] = None
-    cost: float = 1.2
-    share: float = 1.0
-    holds: str | None = None
-    effort: Annotated[int | None, Option(min=0)] = None
-
-    def refuse(self) -> None:
-        """Raise CallerError for an option that has no effect for --for settling."""
-        for option in ("period", "window", "most", "holds", "effort"):
-            if getattr(self, option) is not None:
-                raise CallerError(f"--{option}: is for --for network and --for transmissions only")
-
-    def request(
-        self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]", bounds: "design_search.Bounds"
-    ) -> "network_search.DesignRequest":
-        """Return what is asked for; raise CallerError if an option is wrong."""
-        if self.period is not None and not 1e-6 <= self.period <= 1e7:
-            raise CallerError(f"--period: from 1e-6 to 1e7 seconds, not {self.period:g}")
-        if not 0 < self.share < math.inf:
-            raise CallerError(f"--share: must be positive, not {self.share:g}")
-        return network_search.DesignRequest(
-            goal="transmissions" if self.aim is DesignAim.TRANSMISSIONS else "network",
-            window=self.window,
-            most=self.most,
-            transmissions=self.share,
-            period_s=self.period,
-            cost=self.cost,
-            bounds=bounds,
-            weights=weights,
-            holds=None if self.holds is None else hold_strategies.read_holds(self.holds),
-            **({} if self.effort is None else {"effort": self.effort}),
-        )
-
-
-@opt.option_group
-class GainOptions(opt.CostOptions):
-    """The gain of a design, and the costs of its regulator.
-
-    Options:
-        gain: Gain K: `given` in the scenario, or `lqr` of the nominal model.
-    """
-
-    gain: str = "given"
-
-    def regulator(
-        self, loaded: "scenario.Scenario"
-    ) -> "tuple[linear_systems.Matrix, linear_systems.Matrix] | None":
-        """Return the LQR costs, None for the scenario's gain; raise CallerError if one is wrong."""
-        if self.gain not in ("given", "lqr"):
-            raise CallerError(f'--gain: given or lqr, not "{self.gain}"')
-        if self.gain == "lqr":
-            return self.matrices(loaded)
-        if self.Q or self.R:
-            raise CallerError("--Q, --R: are for --gain lqr only")
-        return None
-
-
-@opt.option_group
-class DesignFiles:
-    """The files of a design.
-
-    Options:
-        out: Write the chosen scenario to this file (TOML).
-        page: File of the page (HTML); runs/design/NAME.html by default.
-    """
-
-    out: opt.OutOption = None
-    page: Path | None = None
-
-    def page_of(self, name: str) -> Path:
-        """Return the file of the page.
-
-        Raise CallerError if the scenario has no folder, or would replace a file that is none.
-        """
-        if self.out is not None and not self.out.parent.is_dir():
-            raise CallerError(f"--out {self.out}: there is no folder {self.out.parent}")
-        if self.out is not None and self.out.exists():
-            try:
-                scenario_file.load(self.out)
-            except CallerError:
-                message = f"--out {self.out}: exists, and is no scenario; give another name"
-                raise CallerError(message) from None
-        return self.page or cli.DEFAULT_RUNS / "design" / f"{name}.html"
-
-    def write(self, scenario_toml: str) -> list[Path]:
-        """Write the chosen scenario, if it is wanted; return the written files."""
-        return [] if self.out is None else [write_whole(self.out, scenario_toml)]
-
-
-@cli.command(cli.CAMPAIGNS, 20, takes="up to two minutes")
-def design(
-    source: opt.OneLoopOptions,
-    *,
-    network: NetworkOptions,
-    requirements: LimitOptions,
-    weights: str = "identity,chosen",
-    feedback: GainOptions,
-    draws: Annotated[int, Option(min=20)] = 2000,
-    seed: opt.SeedOption = 0,
-    files: DesignFiles,
-    figures: opt.FigureOptions,
-    json: opt.JsonOption = False,
-) -> int:
-    """Choose a trigger that transmits least, or a gain that tolerates the most losses.
-
-    Without --for: α, β and the norm with the fewest transmissions that meet your limits. With --for
-    network or --for transmissions: K, by LQR and a search without gradients, with α and β, or with
-    the hold strategy of a time-triggered loop; the result is certified, as by noack certify or
-    noack margin.
-
-    Exit status 1: no choice meets the limits or is proven stable, or fresh draws do not confirm it.
-
-    Options:
-        weights: Norms to try: `identity`, `given` in the scenario, `chosen` by noack.
-        draws: Draws that choose the trigger; the same number of new draws confirm it.
-
-    Examples:
-        noack design lane_following --settling 14   the fewest transmissions
-        noack design lane_following --settling 14 --bound error=3 --out mine.toml
-        noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json
-        noack design lane_periodic --for network   a gain for the largest M
-        noack design unstable_pendulum --for network --period 0.25 --out mine.toml
-        noack design lane_periodic --for transmissions --cost 1   the longest period
-    """
-    figure_files, loaded = figures.files, source.load()
-    if network.aim is not DesignAim.SETTLING:
-        if requirements.settling is not None or feedback.gain != "given":
-            raise CallerError(f"--settling, --gain: are not for --for {network.aim.value}")
-        page = files.page_of(f"{loaded.name}-network")
-        request = network.request(feedback.matrices(loaded), requirements.bounds())
-        with progress.work_bar("trying gains", lines=True) as bar:
-            outcome = event_design.design_for_network(loaded, request, seed, bar)
-        written = design_page.write_outcome(outcome, page, figure_files)
-        written += files.write(outcome.written()) if outcome.is_certified else []
-        cli.show_with_files(json, outcome.to_json(), written, design_page.print_loop_design, outcome)
-        return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
-    network.refuse()
-    page = files.page_of(loaded.name)
-    result = _trigger_of(loaded, requirements.limits(), weights, feedback, draws, seed)
-    written = design_page.write_page(result, page, figure_files)
-    written += files.write(scenario_file.dumps(result.scenario)) if result.feasible else []
-    cli.show_with_files(json, result.document(), written, design_page.print_trigger_design, result)
-    if not result.confirmed:
-        print_to_stderr(f"noack: {result.verdict()}")
-    return ExitStatus.OK if result.confirmed else ExitStatus.FAILED
-
-
-def _trigger_of(
-    loaded: "scenario.Scenario",
-    limits: "design_search.DesignLimits",
-    weights: str,
-    feedback: GainOptions,
-    draws: int,
-    seed: int,
-) -> "design_search.DesignResult":
-    """Choose the trigger with the fewest transmissions that meets the limits."""
-    loaded.decaying  # noqa: B018 - raises for another policy
-    norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
-    with progress.work_bar("choosing norms", lines=True) as bar:
-        families = design_space.families_of(loaded, norms, feedback.regulator(loaded), bar)
-    with progress.work_bar("trying candidates", lines=True) as bar:
-        return design_search.design(families, limits, draws=draws, seed=seed, progress=bar)
 
 
 @opt.option_group
@@ -540,7 +281,7 @@ def capacity(
     result = capacity_page.CapacityResult(plan, finished.summary, capacities, points)
     files = [*capacity_page.write(result, folder, figure_files), *finished.files]
     facts = {"thorough": study.thorough, "estimated_s": estimated_s, "made": finished.made}
-    document = result.document() | facts
+    document = result.to_json() | facts
     cli.show_with_files(json, document, files, capacity_page.print_result, result)
     agree = all(point.status == ExitStatus.OK and not point.outside for point in points)
     return ExitStatus.OK if agree else ExitStatus.FAILED

@@ -60,7 +60,7 @@ def certify(
             result = certificates.certificates_of(loaded, weight, late, bar, of_model=True)
     else:
         result = certificates.certificates_of(loaded, weight, late, of_model=True)
-    if weight == "given" and result.schedule.constants is None:
+    if weight == "given" and not result.schedule.exists:
         with progress.work_bar("no certificate in the given norm; choosing another") as bar:
             chosen = certificates.in_chosen_norm(loaded, result, bar)
 

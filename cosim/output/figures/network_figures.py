@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.summary.network_summary import LoopOverTime, LoopsOverTime, loops_over_time, quantiles
+from cosim.analysis.summary.loops_over_time import LoopOverTime, LoopsOverTime, loops_over_time, quantiles
 from cosim.analysis.summary.summary_model import InFlightPart, RunSummary
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (

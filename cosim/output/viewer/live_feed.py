@@ -13,14 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.summary.network_summary import (
-    INTERVALS,
-    add_link_bytes,
-    counts_inside,
-    empty_over_time,
-    places,
-    times_inside,
-)
+from cosim.analysis.summary.loops_over_time import INTERVALS, add_link_bytes, empty_over_time, intervals_of
+from cosim.analysis.summary.network_summary import counts_inside, times_inside
 from cosim.output.viewer.loop_feed import LAG_S, SHOWN, LoopFeed, log_level
 from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
 from cosim.record.record_source import rows_by_loop
@@ -259,7 +253,7 @@ class _AllLoops:
         return rest + moved
 
     def _largest(self, values: Reals, loops: Numbers, t_ns: Numbers, norms: Reals) -> None:
-        np.fmax.at(values, (loops, places(t_ns, self._horizon_ns)), norms)
+        np.fmax.at(values, (loops, intervals_of(t_ns, self._horizon_ns)), norms)
 
     def _take(self, waiting: list[Rows], until_ns: int) -> tuple[Rows, Numbers]:
         """Return the waiting rows up to a time of the run, and their times of the run."""

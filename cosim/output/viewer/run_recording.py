@@ -33,15 +33,14 @@ from matplotlib import colormaps
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from cosim.analysis.summary.network_summary import (
+from cosim.analysis.summary.loops_over_time import (
     QUANTILES,
     LoopOverTime,
     LoopsOverTime,
-    WorstLoop,
     loops_over_time,
     quantiles,
-    worst_loop,
 )
+from cosim.analysis.summary.network_summary import WorstLoop, worst_loop
 from cosim.analysis.summary.summary_model import RunSummary
 from cosim.output.figures.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp

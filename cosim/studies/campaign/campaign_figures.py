@@ -185,7 +185,7 @@ def _pareto(
             xs, ys = series.setdefault(result.point.labels[spec.series], ([], []))
             xs.append(result.estimates[spec.x])
             ys.append(result.estimates[spec.y])
-    series_name = summary.campaign.by_name[spec.series].called
+    series_name = summary.campaign.by_name[spec.series].name_in_figures
     return pareto_figure(series, spec.x, spec.y), (
         f"{_title(spec.y)} against {METRICS[spec.x].title}, means with 95 % confidence "
         f"intervals; for each {series_name} the points that none of its own dominates are joined"
@@ -206,7 +206,7 @@ def _curve(
     series = {name: [curve.get(x) for x in labels] for name, curve in curves.items() if any(curve.values())}
     numbers = None if axis.numbers is None else np.array(axis.numbers)[places]
     return curve_figure(numbers, labels, series, axis.heading, spec.metric), (
-        f"{_title(spec.metric)} over {axis.called}: means and 95 % confidence intervals"
+        f"{_title(spec.metric)} over {axis.name_in_figures}: means and 95 % confidence intervals"
         + _left_out(estimate for curve in series.values() for estimate in curve if estimate)
     )
 
@@ -224,7 +224,7 @@ def _heat_map(
                 row, column = (axis.labels.index(result.point.labels[axis.name]) for axis in (y, x))
                 maps[label][row, column] = result.estimates[spec.metric].mean
     figure = heat_map_figure(maps, (x.heading, x.labels), (y.heading, y.labels), spec.metric)
-    return figure, f"{_title(spec.metric)} over {x.called} and {y.called}: means"
+    return figure, f"{_title(spec.metric)} over {x.name_in_figures} and {y.name_in_figures}: means"
 
 
 def _distribution(
@@ -254,7 +254,7 @@ def _series(
         label = ", ".join(
             result.point.labels[axis.name]
             if axis.numbers is None
-            else f"{axis.called} = {result.point.labels[axis.name]}"
+            else f"{axis.name_in_figures} = {result.point.labels[axis.name]}"
             for axis in other_axes
         )
         groups.setdefault(label, []).append(result)

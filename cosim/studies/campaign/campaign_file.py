@@ -58,7 +58,7 @@ def _repeated(names: Sequence[str]) -> int | None:
     return next((i for i, name in enumerate(names) if name in names[:i]), None)
 
 
-def replaced(earlier_keys: Iterable[str], later_keys: Iterable[str]) -> tuple[str, str] | None:
+def find_replaced_key(earlier_keys: Iterable[str], later_keys: Iterable[str]) -> tuple[str, str] | None:
     """Return a key and a later key that replaces its value or its table; None if there is none."""
     pairs = itertools.product(earlier_keys, later_keys)
     return next(((old, new) for old, new in pairs if f"{old}.".startswith(f"{new}.")), None)
@@ -71,7 +71,7 @@ def scales_loops(key: str, value: object) -> bool:
 
 def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
     for old, new in itertools.combinations(settings, 2):
-        if replaced([old], [new]):
+        if find_replaced_key([old], [new]):
             raise ValueError(f"{place}: {new} replaces {old}, which is given before it")
 
 
@@ -109,7 +109,7 @@ class CampaignAxis(ScenarioSection):
         return self
 
     @property
-    def called(self) -> str:
+    def name_in_figures(self) -> str:
         """The axis's title, or its name if it has no title."""
         return self.title or self.name.replace("_", " ")
 
@@ -118,7 +118,7 @@ class CampaignAxis(ScenarioSection):
         """What it is called, with the unit of its key in brackets: the end of the key's name."""
         ends = (unit for end, unit in _UNITS.items() if (self.key or "").endswith(end))
         unit = next(ends, "") if "[" not in self.title else ""
-        return f"{self.called} [{unit}]" if unit else self.called
+        return f"{self.name_in_figures} [{unit}]" if unit else self.name_in_figures
 
     @property
     def labels(self) -> list[str]:
@@ -338,7 +338,7 @@ class Campaign(ScenarioSection):
     at each grid point, or group of them, that it is about. It is partly confirmed if it holds in
     at least half of the draws at the first of them."""
     claims_at: dict[str, tuple[Value, ...]] = Field({})
-    """Values of axes at which claims are judged that do not name them; by default all."""
+    """Values of axes at which claims are evaluated that do not name them; by default all."""
 
     @cached_property
     def by_name(self) -> Mapping[str, CampaignAxis]:
@@ -358,7 +358,7 @@ class Campaign(ScenarioSection):
             raise ValueError(f"axes.{twice}.name: another axis has this name")
         for i, axis in enumerate(self.axes):
             for earlier_axis in self.axes[:i]:
-                if (lost := replaced(earlier_axis.replaced_keys, axis.replaced_keys)) is not None:
+                if (lost := find_replaced_key(earlier_axis.replaced_keys, axis.replaced_keys)) is not None:
                     raise ValueError(
                         f"axes.{i}.name: {lost[1]} would replace {lost[0]} of axis {earlier_axis.name}; "
                         "an axis that sets a whole table comes first, "

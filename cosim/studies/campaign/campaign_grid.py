@@ -191,9 +191,11 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     if scenario.loops:
         if campaign.time != "sampled":
             raise CallerError('loops: a network that loops share needs time = "sampled"')
-        judges = "loops_claims_held" in campaign.measured_metrics
+        checks_claims = "loops_claims_held" in campaign.measured_metrics
         loops, from_s = in_virtual_time(scenario), metrics.count_from_s
-        work = SharedNetworkWork(loops, campaign.seed, **measured, judges=judges, count_from_s=from_s)
+        work = SharedNetworkWork(
+            loops, campaign.seed, **measured, checks_claims=checks_claims, count_from_s=from_s
+        )
         return work, None
     resolved = resolve(scenario)
     if campaign.time == "sampled":

@@ -46,7 +46,7 @@ def write_report(
     Raises:
         MachineError: they cannot be written.
     """
-    document = to_json(summary.document(), indent=1, inf_nan_mode="null")
+    document = to_json(summary.to_json(), indent=1, inf_nan_mode="null")
     return [
         write_whole(store.folder / PAGE, page(summary, store, base)),
         write_whole(store.folder / SUMMARY, document + b"\n"),
@@ -61,9 +61,12 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
     With ``shares``, the differences have the share of draws in which a metric is smaller, too.
     """
     campaign, metric_names = summary.campaign, summary.campaign.metrics.shown
-    headings = [*(axis.called for axis in campaign.axes), *(METRICS[name].heading for name in metric_names)]
+    headings = [
+        *(axis.name_in_figures for axis in campaign.axes),
+        *(METRICS[name].heading for name in metric_names),
+    ]
     means = [
-        (*result.point.labels.values(), *(written(result.estimates.get(name)) for name in metric_names))
+        (*result.point.labels.values(), *(estimate_text(result.estimates.get(name)) for name in metric_names))
         for result in summary.results
     ]
     title = f"{campaign.name}: {summary.draws:,} draws; mean ± half-width of its 95 % interval"
@@ -73,7 +76,7 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
         for compared in summary.compared:
             cells = []
             for paired in map(compared.differences.get, metric_names):
-                cells.append(written(paired.estimate if paired and paired.estimate.finite else None))
+                cells.append(estimate_text(paired.estimate if paired and paired.estimate.finite else None))
                 if paired and shares:
                     cells[-1] += f", smaller in {100 * paired.smaller:.3g} %"
             differences.append((*compared.point.labels.values(), *cells))
@@ -222,10 +225,10 @@ def _reference(summary: CampaignSummary) -> str | None:
     campaign = summary.campaign
     if campaign.compare is None:
         return None
-    return f"{campaign.by_name[campaign.compare.axis].called} = {campaign.compare.reference}"
+    return f"{campaign.by_name[campaign.compare.axis].name_in_figures} = {campaign.compare.reference}"
 
 
-def written(estimate: Estimate | None) -> str:
+def estimate_text(estimate: Estimate | None) -> str:
     """Return mean ± half-width, with the share of finite runs if it is below 100 %."""
     if estimate is None:
         return _NONE

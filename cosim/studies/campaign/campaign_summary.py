@@ -22,9 +22,9 @@ from cosim.studies.campaign.metrics import (
     Metric,
     PairedDifference,
     burst_frequency,
+    compute_metrics,
     difference,
     estimate,
-    measured,
 )
 from noack.core.linear_systems import Vector
 from noack.core.number_format import number
@@ -36,7 +36,7 @@ Values = Callable[[Point], Mapping[Metric, Vector]]
 """Returns the metrics of all draws at a grid point, (draws,) each."""
 
 
-class JudgedClaim(NamedTuple):
+class EvaluatedClaim(NamedTuple):
     """A claim with the shares of the draws in which it holds."""
 
     says: str
@@ -72,7 +72,7 @@ def share_text(share: float) -> str:
     return f"{100 * share:.1f} %" if rounded else f"{text} %"
 
 
-def judge_claims(campaign: Campaign, points: Sequence[Point], values: Values) -> Iterator[JudgedClaim]:
+def evaluate_claims(campaign: Campaign, points: Sequence[Point], values: Values) -> Iterator[EvaluatedClaim]:
     """Yield the claims of a campaign with their verdicts."""
     by_number = {point.number: point for point in points}
     cached = lru_cache(_POINTS_AT_ONCE)(lambda number: values(by_number[number]))
@@ -89,10 +89,10 @@ def judge_claims(campaign: Campaign, points: Sequence[Point], values: Values) ->
                     if axis != claim.axis and axis not in fixed
                 )
                 groups.setdefault(", ".join(other_labels), []).append(point)
-        yield _judged(claim, groups, lambda point: cached(point.number))
+        yield _evaluate_claim(claim, groups, lambda point: cached(point.number))
 
 
-def _judged(claim: CampaignClaim, groups: dict[str, list[Point]], values: Values) -> JudgedClaim:
+def _evaluate_claim(claim: CampaignClaim, groups: dict[str, list[Point]], values: Values) -> EvaluatedClaim:
     shares, medians = dict[str, float](), ""
     for name, group in groups.items():
         holds, texts = [], []
@@ -111,7 +111,7 @@ def _judged(claim: CampaignClaim, groups: dict[str, list[Point]], values: Values
         medians = medians or ", ".join(dict.fromkeys(texts))
     least_at = min(shares, key=shares.__getitem__)
     first = next(iter(shares.values()))
-    return JudgedClaim(claim.says, claim.source, first, shares[least_at], least_at, medians)
+    return EvaluatedClaim(claim.says, claim.source, first, shares[least_at], least_at, medians)
 
 
 def _side(term: Term, claim: CampaignClaim, group: Sequence[Point], values: Values) -> Vector:
@@ -160,14 +160,14 @@ class CampaignSummary(NamedTuple):
     draws: int
     results: Sequence[GridPointResult]
     compared: Sequence[ComparedResult]
-    claims: Sequence[JudgedClaim] = ()
+    claims: Sequence[EvaluatedClaim] = ()
 
     @property
     def breaches(self) -> int:
         """Number of runs in which a certified bound is exceeded."""
         return sum(result.breaches for result in self.results)
 
-    def document(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, object]:
         """The content of ``summary.json``."""
         return {
             "name": self.campaign.name,
@@ -202,20 +202,20 @@ class CampaignSummary(NamedTuple):
 
 
 def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
-    """Estimate all metrics and judge the claims; the runs of a few grid points are in memory."""
+    """Estimate all metrics and evaluate the claims; the runs of a few grid points are in memory."""
     results = [_point_result(point, store) for point in store.points]
 
     def values(point: Point) -> Mapping[Metric, Vector]:
         return runs_at(point, store)[0]
 
-    claims = list(judge_claims(campaign, store.points, values))
+    claims = list(evaluate_claims(campaign, store.points, values))
     return CampaignSummary(campaign, store.draws, results, list(_comparisons(campaign, store)), claims)
 
 
 def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], NDArray[np.generic]]:
     """Return all metrics of the runs at a grid point, and the status of each run."""
     columns = store.columns(point.number, store.row_type.names or ())
-    return measured(columns, point.certified_error), columns["status"]
+    return compute_metrics(columns, point.certified_error), columns["status"]
 
 
 def _point_result(point: Point, store: Store) -> GridPointResult:

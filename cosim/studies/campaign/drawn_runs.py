@@ -194,8 +194,8 @@ class SharedNetworkWork(SampledWork):
     entries: tuple[str, ...] = ()
     """Names of the entries of [[loops]] at all grid points, if there are several."""
 
-    judges: bool = False
-    """Whether the claims of each loop are judged, which takes as long as the run."""
+    checks_claims: bool = False
+    """Whether the claims of each loop are evaluated, which takes as long as the run."""
 
     count_from_s: float = 0.0
     """Updates that were sent earlier do not count in the last three columns of the row."""
@@ -220,9 +220,9 @@ class SharedNetworkWork(SampledWork):
         with np.errstate(all="ignore"):  # loops may diverge
             for loop_row, record in zip(loops, records, strict=True):
                 self._measure(record, loop_row)
-            if self.judges:
+            if self.checks_claims:
                 have_held = [
-                    all(claim.verdict == ClaimVerdict.HELD for claim in RunClaims(record).judge())
+                    all(claim.verdict == ClaimVerdict.HELD for claim in RunClaims(record).evaluate())
                     for record in records
                 ]
         for name, of_all in _OF_ALL.items():
@@ -238,7 +238,7 @@ class SharedNetworkWork(SampledWork):
             for section, costs in zip(sections, np.split(loops["cost"], ends), strict=True):
                 row[cost_of(section.name)] = np.mean(costs)
         row["loops_failed"] = np.mean(loops["status"] != OK)
-        row["loops_claims_held"] = np.mean(have_held) if self.judges else np.nan
+        row["loops_claims_held"] = np.mean(have_held) if self.checks_claims else np.nan
         self._measure_network(records, row)
 
     def _measure_network(self, records: Sequence[RunRecord], row: np.void) -> None:

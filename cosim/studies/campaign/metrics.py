@@ -89,7 +89,9 @@ METRICS: Mapping[Metric, Description] = {
 }
 
 
-def measured(columns: Mapping[str, NDArray[np.generic]], certified: float | None) -> dict[Metric, Vector]:
+def compute_metrics(
+    columns: Mapping[str, NDArray[np.generic]], certified: float | None
+) -> dict[Metric, Vector]:
     """Return all metrics of k runs.
 
     A time is infinite if its event does not happen. All metrics of a failed run are infinite.
@@ -100,7 +102,7 @@ def measured(columns: Mapping[str, NDArray[np.generic]], certified: float | None
     for name in METRICS:
         if name in columns:
             values = np.asarray(columns[name], dtype=np.float64)
-            if name == "loops_claims_held" and np.isnan(values).all():  # they were not judged
+            if name == "loops_claims_held" and np.isnan(values).all():  # no claims were evaluated
                 continue
             values_of[name] = np.where(np.isnan(values) | failed, np.inf, values)
     arrived = columns["deliveries"] / np.maximum(columns["transmissions"], 1)
@@ -187,7 +189,7 @@ def quartiles(values: Vector) -> Quartiles:
     return Quartiles(*_quantiles(values, (0.25, 0.5, 0.75)))
 
 
-def paired(values: Vector, reference: Vector) -> Vector:
+def paired_differences(values: Vector, reference: Vector) -> Vector:
     """Return ``values`` − ``reference`` draw by draw; 0 if both are infinite."""
     with np.errstate(invalid="ignore"):
         return np.where(values == reference, 0.0, values - reference)
@@ -208,7 +210,7 @@ def difference(values: Vector, reference: Vector) -> PairedDifference:
 
     If both are infinite, the quantiles use a difference of 0, and the mean omits the draw.
     """
-    differences = paired(values, reference)
+    differences = paired_differences(values, reference)
     are_finite = np.isfinite(values) & np.isfinite(reference)
     return PairedDifference(
         estimate(differences, differences[are_finite]),

@@ -60,7 +60,7 @@ class CapacityResult(NamedTuple):
     capacities: Sequence[PolicyCapacity]
     live: Sequence[LivePoint]
 
-    def document(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, object]:
         """Return the results for JSON."""
         plan = self.plan
         return {
@@ -76,10 +76,10 @@ class CapacityResult(NamedTuple):
             "draws": plan.draws,
             "disturbance": plan.amplitude,
             "seed": plan.seed,
-            "capacities": [capacity.document(plan) for capacity in self.capacities],
+            "capacities": [capacity.to_json(plan) for capacity in self.capacities],
             "comparisons": list(comparisons(self)),
-            "points": self.summary.document()["points"],
-            "live": [point.document() for point in self.live],
+            "points": self.summary.to_json()["points"],
+            "live": [point.to_json() for point in self.live],
         }
 
 
@@ -89,7 +89,7 @@ def write(result: CapacityResult, folder: Path, figure_files: FigureFiles | None
     Raises:
         MachineError: they cannot be written.
     """
-    document = to_json(result.document(), indent=1, inf_nan_mode="null")
+    document = to_json(result.to_json(), indent=1, inf_nan_mode="null")
     written = [write_whole(folder / PAGE, page(result)), write_whole(folder / RESULTS, document + b"\n")]
     files = figure_files or FigureFiles(FigureFormat.SVG, SCREEN_IN)
     for figure in figures(result):

@@ -303,7 +303,7 @@ class CapacityPlan:
             return CampaignAxis(name=LOOPS, title=title, key="loops", values=self.counts)
         variants = {str(count): self._network(count, 1) for count in self.counts}
         if not self.is_one_kind:
-            variants |= {unshared(count): self._network(count, count) for count in self.counts}
+            variants |= {unshared_label(count): self._network(count, count) for count in self.counts}
         return CampaignAxis(name=LOOPS, title=title, variants=variants)
 
     def _network(self, loops: int, factor: int) -> Entry:
@@ -320,7 +320,7 @@ class CapacityPlan:
         return settings
 
 
-def unshared(count: int) -> str:
+def unshared_label(count: int) -> str:
     """Return the label of the runs of loops that each have the rate of the link for themselves."""
     return f"{count} unshared"
 

@@ -18,7 +18,7 @@ with the simulation if its values lie within the 95 % prediction intervals of a 
 draw, mean ± t s √(1 + 1/k).
 
 How long a study takes is estimated before it starts. The time of a run is proportional to its loops
-and its steps. The time per loop and simulated second is measured with a short run on this machine,
+and its steps. The time per loop and simulated second is compute_metrics with a short run on this machine,
 as processor time, so that other programs that run meanwhile do not count. Loops that overload the
 link take up to twice as long.
 """
@@ -40,9 +40,9 @@ from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.drawn_runs import SharedNetworkWork
-from cosim.studies.campaign.metrics import Estimate, Metric, measured, quantile_interval, quartiles
+from cosim.studies.campaign.metrics import Estimate, Metric, compute_metrics, quantile_interval, quartiles
 from cosim.studies.campaign.random_draws import seeds_of
-from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan, unshared
+from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan, unshared_label
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
@@ -86,7 +86,7 @@ class PolicyCapacity(NamedTuple):
         names = [name for name, capacity in self.limits.items() if capacity.median == first]
         return ", ".join(names) if np.isfinite(first) else ""
 
-    def document(self, plan: CapacityPlan) -> dict[str, object]:
+    def to_json(self, plan: CapacityPlan) -> dict[str, object]:
         """Return the capacity for JSON, also as a multiple of the given mixture if it is finite."""
         median = self.any_limit.median
         is_finite = math.isfinite(median)
@@ -137,17 +137,17 @@ def capacity_of(
         reached["cost"] = np.logical_or.reduce(
             [
                 values(column)
-                >= COST_FACTOR * np.stack([runs[unshared(count)][column] for count in plan.counts])
+                >= COST_FACTOR * np.stack([runs[unshared_label(count)][column] for count in plan.counts])
                 for column in plan.cost_columns
             ]
         )
-    draws = {limit: carried(plan.counts, flags) for limit, flags in reached.items()}
+    draws = {limit: capacity_per_draw(plan.counts, flags) for limit, flags in reached.items()}
     limits = {limit: Capacity.estimate(counts) for limit, counts in draws.items()}
     worst = np.min(np.stack([*draws.values()]), axis=0)
     return PolicyCapacity(policy, disturbance, limits, Capacity.estimate(worst))
 
 
-def carried(counts: Sequence[int], reached: NDArray[np.bool_]) -> Vector:
+def capacity_per_draw(counts: Sequence[int], reached: NDArray[np.bool_]) -> Vector:
     """Return the capacity of each draw.
 
     Args:
@@ -177,7 +177,7 @@ class LivePoint(NamedTuple):
         ends = self.simulated.items()
         return [name for name, (low, high) in ends if not low <= self.values[name] <= high]
 
-    def document(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, object]:
         """Return the point for JSON."""
         return {**self._asdict(), "run_dir": str(self.run_dir), "outside": self.outside}
 
@@ -212,8 +212,8 @@ def live_point(chosen: tuple[str, int], results: Sequence[GridPointResult], fold
     rows = np.zeros(1, work.row_type)
     work.measure_loops(load_run(outcome.run_dir).loops, rows[0])
     columns = {column: rows[column] for column in work.row_type.names or ()}
-    values = {key: float(value[0]) for key, value in measured(columns, None).items()}
-    judged: list[Metric] = ["transmissions", *LIMITS.values()]
+    values = {key: float(value[0]) for key, value in compute_metrics(columns, None).items()}
+    compared: list[Metric] = ["transmissions", *LIMITS.values()]
     return LivePoint(
         policy,
         count,
@@ -221,8 +221,8 @@ def live_point(chosen: tuple[str, int], results: Sequence[GridPointResult], fold
         int(outcome.status),
         outcome.reason,
         sum(loop.unintended_losses for loop in outcome.summary.loops),
-        {metric: values[metric] for metric in [*judged, "delay_max_s"]},
-        {metric: prediction_interval(simulated.estimates[metric]) for metric in judged},
+        {metric: values[metric] for metric in [*compared, "delay_max_s"]},
+        {metric: prediction_interval(simulated.estimates[metric]) for metric in compared},
     )
 
 
@@ -235,9 +235,9 @@ def prediction_interval(metric: Estimate) -> tuple[float, float]:
 
 
 _MEASURED_LOOPS, _MEASURED_STEPS = 20, 4000
-"""Number of loops of the measured run, if there is such a point, and steps of all its loops."""
+"""Number of loops of the compute_metrics run, if there is such a point, and steps of all its loops."""
 _OVERLOADED = 1.2
-"""Mean time of the runs of a study, relative to the measured one."""
+"""Mean time of the runs of a study, relative to the compute_metrics one."""
 _START_S = 3.0
 """Time until the worker processes run."""
 

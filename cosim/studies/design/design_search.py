@@ -345,7 +345,7 @@ class DesignResult:
                 shortfalls.append(f"{certified(name, self.best.bounds[name])} ({limit:g} allowed)")
         return f"no design meets the limits; the closest has {' and '.join(shortfalls)}, at {settings_text}"
 
-    def document(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, object]:
         """Return the result as JSON."""
         limits = asdict(self.limits)
         limits["under"] = "schedule" if limits.pop("schedule") else "paper"

@@ -16,8 +16,10 @@ from scipy.linalg import solve_continuous_are
 from cosim.analysis.mean_cost import require_weight
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.core.number_format import to_digits
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
+from noack.settings.section import Rows
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.certificates.trigger_weight import choose_weight
@@ -158,7 +160,7 @@ def families_of(
     """
     if not norms:
         raise CallerError(f"--weights: name one at least of {', '.join(NORMS)}")
-    gains = {"given": scenario} if lqr is None else dict(_regulated(scenario, *lqr))
+    gains = {"given": scenario} if lqr is None else dict(_with_regulators(scenario, *lqr))
     scenarios = {}
     for i, (gain, regulated) in enumerate(gains.items()):
 
@@ -166,11 +168,12 @@ def families_of(
             progress((finished + share) / len(gains))
 
         for norm in norms:
-            scenarios[gain, norm] = _normed(regulated, norm, report)
+            scenarios[gain, norm] = _with_norm(regulated, norm, report)
     return scenarios
 
 
-def _regulated(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str, Scenario]]:
+def _with_regulators(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str, Scenario]]:
+    """Return the scenario with each regulator, by name."""
     loop = loop_of(resolve(scenario))
     for name, matrix, size in (("--Q", Q, loop.n), ("--R", R, loop.m)):
         if matrix.shape != (size, size):
@@ -181,6 +184,11 @@ def _regulated(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str, Scen
         model = scenario.model.model_copy(update={"gain": tuple(map(tuple, K.tolist()))})
         scenarios.append((f"lqr R × {cost:g}", scenario.model_copy(update={"model": model})))
     return scenarios
+
+
+def round_gain(K: Matrix) -> Rows:
+    """Return a gain with six digits: what is certified is what is printed."""
+    return tuple(tuple(to_digits(entry, 6) for entry in row) for row in K.tolist())
 
 
 def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
@@ -209,7 +217,9 @@ def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
     )
 
 
-def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) -> Scenario:
+def _with_norm(scenario: Scenario, norm: str, progress: Callable[[float], None]) -> Scenario:
+    """Return the scenario with a norm of its trigger, one of :data:`NORMS`."""
+
     def with_norm(rows: tuple[tuple[float, ...], ...] | None) -> Scenario:
         trigger = scenario.decaying.model_copy(update={"weight": rows})
         return scenario.model_copy(update={"trigger": trigger})

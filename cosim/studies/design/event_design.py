@@ -20,10 +20,9 @@ from cosim.output.figures.figure_description import Axis, FigureDescription, Lin
 from cosim.output.figures.palette import LOST, NETWORK
 from cosim.simulation.exact_simulation import Population, run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.design_page import DesignOutcome, LoopResult, figure_of, gain_text
+from cosim.studies.design.design_page import DesignOutcome, LoopResult, figure_of, gain_text, periodic_outcome
 from cosim.studies.design.design_search import WORDS, bounds_of
-from cosim.studies.design.design_space import lqr_gain
-from cosim.studies.design.network_outcome import periodic_outcome
+from cosim.studies.design.design_space import lqr_gain, round_gain
 from cosim.studies.design.network_search import (
     COSTS_OF_INPUT,
     DesignRequest,
@@ -31,10 +30,10 @@ from cosim.studies.design.network_search import (
     Progress,
     examined_m,
 )
-from cosim.studies.design.simplex_search import nelder_mead, scaled_steps
+from cosim.studies.design.simplex_search import nelder_mead, step_sizes
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector, spectral_abscissa
-from noack.core.number_format import NONE, at_most
+from noack.core.number_format import NONE, at_most, to_digits
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows, rows_of
@@ -59,7 +58,7 @@ class EventLoop(NamedTuple):
     beta: float
 
 
-class Measured(NamedTuple):
+class MeanCosts(NamedTuple):
     """Means over draws; infinite if a run diverges."""
 
     cost: float
@@ -72,7 +71,7 @@ class Certified(NamedTuple):
     loop: EventLoop
     m: int
     """0: there is none."""
-    measured: Measured
+    measured: MeanCosts
     """On fresh draws."""
 
 
@@ -95,21 +94,21 @@ class EventSearch:
         self.weights = request.weights or (np.eye(n), np.eye(m))
         lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
         self.original = EventLoop(rows_of(self.plant.K), trigger.alpha_per_s, trigger.beta)
-        self.tried = self.judged = self._likely = 0
+        self.tried = self.examined = self._likely = 0
         self.most = examined_m(scenario, request.most or _MOST_M)
         box = box_of(scenario)
         self._draws = box.population(seed, range(draws))
         self._fresh = box.population(seed, range(draws, 2 * draws))
         self.of_box = False
         certificate = self.certificate(self.original, 1, of_box=True)
-        is_certified = certificate is not None and certificate.constants is not None
+        is_certified = certificate is not None and certificate.exists
         self.of_box = is_certified and outside_box(resolved) is None
-        base = self.measured(self.original, self._draws)
+        base = self.measure(self.original, self._draws)
         if base.cost == 0:
             raise CallerError(
                 "the given loop costs 0, so that --cost limits nothing; give another plant.initial_state"
             )
-        self.limits = Measured(request.cost * base.cost, request.transmissions * base.transmissions)
+        self.limits = MeanCosts(request.cost * base.cost, request.transmissions * base.transmissions)
 
     def scenario_of(self, loop: EventLoop, m: int | None = None) -> Scenario:
         """Return the scenario of a loop; with M, or with its own."""
@@ -127,7 +126,7 @@ class EventSearch:
         self, loop: EventLoop, m: int, *, of_box: bool | None = None
     ) -> ScenarioCertificate | None:
         """Return the certificate for M under the scenario's schedule."""
-        self.judged += 1
+        self.examined += 1
         resolved = resolve(self.scenario_of(loop, m))
         conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
         if self.of_box if of_box is None else of_box:
@@ -143,16 +142,16 @@ class EventSearch:
         within = all(bounds[name] <= limit for name, limit in self.request.bounds.items())
         return bounds["state"] if within else math.inf
 
-    def measured(self, loop: EventLoop, population: Population) -> Measured:
+    def measure(self, loop: EventLoop, population: Population) -> MeanCosts:
         """Run a loop over draws; one whose model does not decay may have too many events to run."""
         if not self._decay_per_s(loop) > 0:
-            return Measured(math.inf, math.inf)
+            return MeanCosts(math.inf, math.inf)
         Q, R = self.weights
         setting = replace(setting_of(resolve(self.scenario_of(loop))), Q=Q, R=R)
         rows = run_batch(setting, population)
         if np.isnan(rows["cost"]).any():
-            return Measured(math.inf, math.inf)
-        return Measured(float(rows["cost"].mean()), float(rows["transmissions"].mean()))
+            return MeanCosts(math.inf, math.inf)
+        return MeanCosts(float(rows["cost"].mean()), float(rows["transmissions"].mean()))
 
     def _decay_per_s(self, loop: EventLoop) -> float:
         """Return the decay rate of the model's closed loop."""
@@ -182,7 +181,7 @@ class EventSearch:
         if not 0 < loop.alpha_per_s < decay_per_s:
             return _FORBIDDEN + min(abs(decay_per_s), _FORBIDDEN)
         self.tried += 1
-        measured, least = self.measured(loop, self._draws), self.scenario.network.mansd + 1
+        measured, least = self.measure(loop, self._draws), self.scenario.network.mansd + 1
         over = _log_over(measured.cost, self.limits.cost)
         if self.request.goal == "transmissions":
             bound = 0.0 if math.isfinite(self.state_bound(loop, least)) else 1.0
@@ -225,14 +224,14 @@ class EventSearch:
         if value >= min(values[0], 0.0):  # no better than the given loop, or beyond a limit
             best = self.original
         original, chosen = (
-            Certified(loop, self.largest_m(loop), self.measured(loop, self._fresh))
+            Certified(loop, self.largest_m(loop), self.measure(loop, self._fresh))
             for loop in (self.original, best)
         )
         return original, chosen
 
     def _improve(self, start: EventLoop, most: int, progress: Progress) -> tuple[EventLoop, float]:
         centre = np.array([*np.ravel(start.K), start.alpha_per_s, start.beta])
-        scale = np.append(scaled_steps(np.array(start.K)), centre[-2:])
+        scale = np.append(step_sizes(np.array(start.K)), centre[-2:])
         best, value, tries = start, math.inf, 0
 
         def objective(steps: Vector) -> float:
@@ -258,11 +257,9 @@ def _log_over(value: float, limit: float) -> float:
 
 
 def _rounded(entries: Vector, template: EventLoop, alpha_per_s: float, beta: float) -> EventLoop:
-    """Return a loop with six digits: what is judged is what is printed."""
-    width = len(template.K[0])
-    *numbers, alpha_per_s, beta = (float(f"{entry:.6g}") for entry in (*entries, alpha_per_s, beta))
-    K = tuple(tuple(numbers[i : i + width]) for i in range(0, len(numbers), width))
-    return EventLoop(K, alpha_per_s, beta)
+    """Return a loop with six digits: what is certified is what is printed."""
+    K = round_gain(entries.reshape(-1, len(template.K[0])))
+    return EventLoop(K, to_digits(alpha_per_s, 6), to_digits(beta, 6))
 
 
 def event_outcome(search: EventSearch, original: Certified, best: Certified) -> DesignOutcome:
@@ -282,7 +279,7 @@ def event_outcome(search: EventSearch, original: Certified, best: Certified) -> 
             "of_box": search.of_box,
             "limits": search.limits._asdict(),
             "tried": search.tried,
-            "judged": search.judged,
+            "examined": search.examined,
         },
         _figure(search, original, best),
     )

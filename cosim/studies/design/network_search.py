@@ -6,11 +6,10 @@ list. A loop meets a requirement if every loss pattern of its guarantee is prove
 
 1. The given loop is examined; regulators (LQR) over a grid of weights are the further starts.
 2. A quick lower bound of the growth (``quick_estimate.py``) excludes loops that cannot meet a
-   requirement. The others are judged: the margin's certified upper bound must be below 1.
+   requirement. Of the others the margin is computed: its certified upper bound must be below 1.
 3. From the best starts, the lower bound at the next level is minimised over K without gradients
-   (Nelder and Mead). As soon as it is below 1, the loop is judged, and the search aims higher.
-
-``network_outcome.py`` has what is shown of a search.
+   (Nelder and Mead). As soon as it is below 1, the margin of the loop is computed, and the search
+   aims higher.
 """
 
 import itertools
@@ -22,10 +21,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cosim.studies.design.design_search import Bounds
-from cosim.studies.design.design_space import lqr_gain
+from cosim.studies.design.design_space import lqr_gain, round_gain
 from cosim.studies.design.hold_strategies import HOLDS, Hold, given_hold
 from cosim.studies.design.quick_estimate import PatternGraph, QuickLoop
-from cosim.studies.design.simplex_search import nelder_mead, scaled_steps
+from cosim.studies.design.simplex_search import nelder_mead, step_sizes
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
@@ -48,7 +47,7 @@ _LONGER = 1.02
 _MOST_PERIODS = 400
 _MOST_M = 16
 _SLACK = 0.002
-"""The search wants log growth below −_SLACK: a loop at the limit takes long to judge."""
+"""The search wants log growth below −_SLACK: the margin of a loop at the limit takes long."""
 _STARTS = 4
 _UNSTABLE = 1e3
 
@@ -207,7 +206,7 @@ class NetworkSearch:
         base = self.quick_loop(self.original, margin.longest_ns).cost(self.plant.x0)
         self.limit = request.cost * base
         """Largest cost; infinite if the given loop is unstable without losses."""
-        self.tried = self.judged = 0
+        self.tried = self.examined = 0
         self.highest: dict[Hold, int] = {}
         """By hold strategy: the highest level at which a loop was tried and not excluded."""
         self._graphs: dict[tuple[LossGuarantee, int, Hold, int], PatternGraph] = {}
@@ -284,9 +283,9 @@ class NetworkSearch:
             }
         )
 
-    def judge(self, candidate: GainCandidate, level: int) -> Stability:
+    def stability(self, candidate: GainCandidate, level: int) -> Stability:
         """Return the certified bounds of a loop at a level."""
-        self.judged += 1
+        self.examined += 1
         margin = LossMargin(resolve(self.scenario_of(candidate, level)))
         stability = margin.first_bounds()
         return margin.coarse_bounds() if stability.verdict == "undecided" else stability
@@ -296,7 +295,7 @@ class NetworkSearch:
     ) -> tuple[int, Stability | None]:
         """Return the highest certified level from ``most`` down to above ``least``."""
         for level in range(most, least, -1):
-            if (stability := self.judge(candidate, level)).verdict == "stable":
+            if (stability := self.stability(candidate, level)).verdict == "stable":
                 return level, stability
         return least, None
 
@@ -320,11 +319,11 @@ class NetworkSearch:
         """
         level = most
         stability = None
-        while level >= 0 and (stability := self.judge(candidate, level)).verdict != "stable":
+        while level >= 0 and (stability := self.stability(candidate, level)).verdict != "stable":
             level, stability = level - 1, None
         following, limit = None, math.inf if candidate == self.original else self.limit
         while level + 1 < len(self.requirements) and self.cost(candidate, level + 1) <= limit:
-            following = self.judge(candidate, level + 1)
+            following = self.stability(candidate, level + 1)
             if following.verdict != "stable":
                 break
             level, stability, following = level + 1, following, None
@@ -334,7 +333,7 @@ class NetworkSearch:
         """Return LQR gains of the model with all hold strategies."""
         plant, (Q, R) = self.plant, self.weights
         gains = [lqr_gain(plant.A_model, plant.B_model, Q, c * R) for c in COSTS_OF_INPUT]
-        return [_rounded(hold, K) for hold in self.holds for K in gains]
+        return [GainCandidate(hold, round_gain(K)) for hold in self.holds for K in gains]
 
     @property
     def keeps_given_hold(self) -> bool:
@@ -347,32 +346,38 @@ class NetworkSearch:
 
     def run(self, progress: Progress = lambda share: None) -> tuple[CertifiedLoop, CertifiedLoop]:
         """Return what the given loop is proven to meet, and the best loop found."""
+        # The given loop, which the others must exceed.
         original = self.first()
         self.tried, best, level = 0, original.candidate, -1
         if self.keeps_given_hold:
             level = original.level
         progress(0.1)
+        # Rank the starts by the level that is not excluded, then by the excess at the next level.
         starts = [GainCandidate(hold, original.candidate.K) for hold in self.holds]
         starts += self.regulators()
         ranked = sorted(
             ((*self.highest_possible(start, max(level, 0)), start) for start in starts),
             key=lambda entry: (-entry[0], entry[1]),
         )
+        # Certify the best starts.
         for top, _, candidate in ranked[:_STARTS]:
             if top > level:
                 new_level, stability = self.highest_certified(candidate, top, level)
                 if stability is not None:
                     best, level = candidate, new_level
         progress(0.3)
+        # The best start of each hold strategy, which is part of the answer even if it is not the best.
         first_of_each = {candidate.hold: candidate for _, _, candidate in reversed(ranked)}
         for hold, candidate in first_of_each.items():
-            if hold not in self.highest:  # it was tried from the given loop's level on
+            if hold not in self.highest:  # it was tried from the given loop's level on only
                 self.highest_possible(candidate, 0)
+        # The candidates that are improved, each with an equal share of the effort.
         pool = [best] if level >= 0 else []
         pool += [candidate for _, _, candidate in ranked[:_STARTS]]
         pool = list(dict.fromkeys([*pool, *first_of_each.values()]))
         share = max(self.request.effort // len(pool), 1)
         for number, start in enumerate(pool):
+            # Improve until the next level is not excluded and certified, then aim at the one after it.
             candidate = start
             tries_left = share
             while tries_left > 0 and level + 1 < len(self.requirements):
@@ -399,18 +404,13 @@ class NetworkSearch:
     def _improve(self, start: GainCandidate, level: int, most: int) -> GainCandidate | None:
         """Return a loop near ``start`` whose lower bound at a level is below 1; None: none found."""
         K = np.array(start.K)
-        scale = scaled_steps(K)
+        scale = step_sizes(K)
 
         def moved(steps: Vector) -> GainCandidate:
-            return _rounded(start.hold, (K.ravel() + scale * steps).reshape(K.shape))
+            return GainCandidate(start.hold, round_gain((K.ravel() + scale * steps).reshape(K.shape)))
 
         def objective(steps: Vector) -> float:
             return self.excess(moved(steps), level)
 
         steps = nelder_mead(objective, K.size, 0.3, most, tolerance=1e-5, enough=-_SLACK)
         return None if steps is None else moved(steps)
-
-
-def _rounded(hold: Hold, K: Matrix) -> GainCandidate:
-    """Return a candidate with six digits: what is judged is what is printed."""
-    return GainCandidate(hold, tuple(tuple(float(f"{entry:.6g}") for entry in row) for row in K))

@@ -30,7 +30,7 @@ def nelder_mead(
 
     good_points: list[Vector] = []
 
-    def watched(point: Vector) -> float:
+    def evaluate(point: Vector) -> float:
         value = objective(point)
         if value < enough:
             good_points.append(point.copy())
@@ -40,7 +40,7 @@ def nelder_mead(
     simplex = np.vstack([np.zeros(size), first_step * np.eye(size)])
     try:
         minimize(
-            watched,
+            evaluate,
             np.zeros(size),
             method="Nelder-Mead",
             options={"maxfev": most, "adaptive": True, "initial_simplex": simplex, "fatol": tolerance},
@@ -50,6 +50,6 @@ def nelder_mead(
     return None
 
 
-def scaled_steps(K: Matrix) -> Vector:
+def step_sizes(K: Matrix) -> Vector:
     """Return the unit of a search's steps of each entry of a gain."""
     return np.ravel(np.maximum(np.abs(K), 0.1 * np.abs(K).max(axis=1, keepdims=True)))

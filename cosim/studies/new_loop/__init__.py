@@ -11,8 +11,3 @@ SETTLED = 0.01
 """The horizon is the time in which e^(−αt) falls to this."""
 MANSD = 4
 LOSS_PROBABILITY = 0.5
-
-
-def rounded(value: float, digits: int = 3) -> float:
-    """Return a number with three digits, or others."""
-    return float(f"{value:.{digits}g}")

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cosim.studies.new_loop import rounded
 from cosim.studies.new_loop.plant_reference import PlantReference, plant_reference
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
-from noack.core.number_format import Rows, as_text
+from noack.core.number_format import Rows, as_text, to_digits
 from noack.plants.fmu import unpacked_once
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
@@ -282,7 +281,7 @@ def gain(
     else:
         pole_values = np.array(poles, dtype=np.complex128)
         K, method = _placed(model, pole_values), f"poles {eigenvalue_text(pole_values)} /s"
-    K = np.array([[rounded(value, _DIGITS) for value in row] for row in K])
+    K = np.array([[to_digits(value, _DIGITS) for value in row] for row in K])
     if (reason := instability(model.A, model.B, K)) is not None:
         raise CallerError(f"{label}: {reason}")
     return LoopGain(model, K, method)

@@ -19,7 +19,7 @@ import numpy as np
 
 from cosim.analysis.certificates import with_linear_plant, with_weight
 from cosim.simulation.virtual_time import simulate_loops
-from cosim.studies.new_loop import ALPHA_SHARE, BETA_SHARE, LOSS_PROBABILITY, MANSD, SETTLED, rounded
+from cosim.studies.new_loop import ALPHA_SHARE, BETA_SHARE, LOSS_PROBABILITY, MANSD, SETTLED
 from cosim.studies.new_loop.linear_model import (
     LinearModel,
     LoopGain,
@@ -31,7 +31,7 @@ from cosim.studies.new_loop.linear_model import (
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix, Vector, norm
-from noack.core.number_format import at_most
+from noack.core.number_format import at_most, to_digits
 from noack.plants.fmu import FmuSettings
 from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.linear import LinearSettings
@@ -141,7 +141,7 @@ def new(
     certificate, _ = build.certified(best)
     notes = tuple(_notes(best, certificate, returns, build.is_linear))
     text = _commented(build.content(best), notes, best)
-    found_certificate = certificate if certificate.constants is not None else None
+    found_certificate = certificate if certificate.exists else None
     return NewScenario(best.gain, build.scenario(best), text, found_certificate, notes)
 
 
@@ -182,7 +182,7 @@ def _trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
         for rate in (base,) if is_fixed else (base, 2 * base):
             for mansd in range(MANSD, 0, -1):
                 for share in (ALPHA_SHARE, ALPHA_SHARE / 2):
-                    alpha = rounded(min(share * loop_gain.decay_per_s, _FASTEST_ALPHA_PER_S))
+                    alpha = to_digits(min(share * loop_gain.decay_per_s, _FASTEST_ALPHA_PER_S))
                     yield _Trial(loop_gain, rate, mansd, alpha, x0)
 
 
@@ -197,11 +197,11 @@ class _Builder:
         """Return the content of the scenario file."""
         model, reference = self._model, self._model.plant
         start = trial.x0 if trial.weight is None else trial.weight @ trial.x0
-        beta, alpha = rounded(BETA_SHARE * norm(start) or BETA_SHARE), trial.alpha_per_s
-        horizon_s = min(rounded(math.log(1 / SETTLED) / alpha), _LONGEST_S)
+        beta, alpha = to_digits(BETA_SHARE * norm(start) or BETA_SHARE), trial.alpha_per_s
+        horizon_s = min(to_digits(math.log(1 / SETTLED) / alpha), _LONGEST_S)
         weight = None
         if trial.weight is not None:
-            weight = [[rounded(entry, 6) for entry in row] for row in trial.weight]
+            weight = [[to_digits(entry, 6) for entry in row] for row in trial.weight]
         content: Table = {
             "name": "".join(c if c.isascii() and c.isalnum() else "_" for c in self._path.stem),
             "description": f"{reference.label} over a network that loses half of the updates.",
@@ -225,7 +225,7 @@ class _Builder:
                 "policy": "decaying",
                 "beta": beta,
                 "alpha_per_s": alpha,
-                "floor": rounded(_FLOOR_SHARE * beta),
+                "floor": to_digits(_FLOOR_SHARE * beta),
                 **({"weight": weight} if weight else {}),
             },
             "network": {
@@ -296,7 +296,7 @@ class _Builder:
         except CallerError:
             return None
         weighted = replace(trial, weight=weight)
-        return weighted if self.certified(weighted)[0].constants is not None else None
+        return weighted if self.certified(weighted)[0].exists else None
 
     def returns(self, trial: _Trial) -> bool:
         """Whether ‖x‖ ends below a tenth of its maximum, in virtual time."""

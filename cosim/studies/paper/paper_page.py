@@ -101,7 +101,7 @@ def numbers(campaign: FinishedCampaign) -> Document:
     document = {
         "representative": draw,
         "evidence": evidence(_base(campaign), draws, draw),
-        "summary": campaign.summary.document(),
+        "summary": campaign.summary.to_json(),
     }
     rounded: Document = _rounded(document)
     return rounded

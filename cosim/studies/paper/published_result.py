@@ -89,7 +89,7 @@ class Reproduction(NamedTuple):
         deviations = (f"{row.quantity}: {row.deviation}" for row in self.rows if row.deviation)
         return [*hows, *deviations, *self.result.notes]
 
-    def document(self) -> Mapping[str, object]:
+    def to_json(self) -> Mapping[str, object]:
         """Return the document of ``--json``."""
         rows = [row._asdict() | {"verdict": row.verdict} for row in self.rows]
         source = {"about": self.result.about, "reference": self.result.reference}

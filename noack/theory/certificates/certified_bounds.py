@@ -90,6 +90,11 @@ class ScenarioCertificate:
     """Of a nonlinear plant: where the certificate holds, and what x and u do not leave."""
 
     @property
+    def exists(self) -> bool:
+        """Whether there is a certificate."""
+        return self.constants is not None
+
+    @property
     def source(self) -> str:
         """Name of the certificate as the source of a claim."""
         kinds = {OWN_PLANT: "certificate", BOX: "box certificate"}

@@ -270,7 +270,13 @@ class LoopMoments:
         if number > _MOST_PERIODS:
             raise NotPredictableError("there are too many periods until the horizon")
         current, costs = start, np.zeros_like(self._slots[0][0].constants)
-        for k in range(number):
+        cycles, single_periods = divmod(number, len(self._slots))
+        count = len(triangles(start.moments)) + len(start.shares) + len(costs)
+        if number > count * (len(self._slots) + count // 100):  # a power is computed in less time
+            current, costs = self._after_cycles(start, cycles, count)
+        else:
+            single_periods = number
+        for k in range(single_periods):
             current, added = self._advance(current, self._slots[k % len(self._slots)])
             costs = costs + added
         if rest_ns:
@@ -282,6 +288,25 @@ class LoopMoments:
             current, added = self._advance(current, last)
             costs = costs + added
         return current, costs
+
+    def _after_cycles(self, start: SecondMoments, cycles: int, count: int) -> tuple[SecondMoments, Vector]:
+        """Return the moments after so many cycles, and the costs, by a power of the cycle's map.
+
+        It maps ``count`` numbers: moments, shares, and the costs so far.
+        """
+        size = len(self.states)
+        cuts = np.cumsum([len(triangles(start.moments)), len(start.shares)])
+
+        def after(entries: Vector) -> Vector:
+            moments, shares, costs = np.split(entries, cuts)
+            end, added = self._cycle(SecondMoments(from_triangles(moments, size), shares))
+            return np.concatenate([triangles(end.moments), end.shares, costs + added])
+
+        cycle = np.transpose([after(entries) for entries in np.eye(count)])
+        entries = np.zeros(count)
+        entries[: cuts[-1]] = np.concatenate([triangles(start.moments), start.shares])
+        moments, shares, costs = np.split(np.linalg.matrix_power(cycle, cycles) @ entries, cuts)
+        return SecondMoments(from_triangles(moments, size), shares), costs
 
     def _cycle(self, current: SecondMoments) -> tuple[SecondMoments, Vector]:
         return self.until(current, len(self._slots) * self._periods.times.period_ns)

@@ -43,8 +43,8 @@ def results(record: RunRecord) -> dict[str, Any]:
     claims = RunClaims(record)
     return {
         "summary": summarise(record, 0, "horizon").model_dump(mode="json"),
-        "replay": replay(record).document(),
-        "claims": [claim.model_dump(mode="json") for claim in claims.judge()],
+        "replay": replay(record).to_json(),
+        "claims": [claim.model_dump(mode="json") for claim in claims.evaluate()],
         "violations": claims.violations(),
         "conditions": claims.conditions,
         "envelopes": [(one.label, one.t_s.tobytes(), one.values.tobytes()) for one in claims.envelopes()],

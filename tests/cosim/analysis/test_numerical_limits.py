@@ -53,7 +53,7 @@ def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict
     assert found["exit"]["status"] == status, found["exit"]
     assert replay(record).bit_exact is True
     with np.errstate(all="ignore"):
-        claims = ClaimEvaluation(record).judge()
+        claims = ClaimEvaluation(record).evaluate()
     assert claims
     assert [c for c in claims if c.verdict is ClaimVerdict.VIOLATED] == []
     return found

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import tomli_w
 
-from cosim.cli.commands.run_commands import parsed
+from cosim.cli.commands.run_commands import parse_settings
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
 from noack.core.errors import CallerError
@@ -61,7 +61,7 @@ def test_both_names_of_a_parameter_work_in_noack_set_in_the_option_and_in_change
     assert VALUES.keys() == SHORT.keys()
     path.write_text(tomli_w.dumps(content))
     for name in (short, SHORT[short]):
-        settings = parsed([name, text])
+        settings = parse_settings([name, text])
         values.append(changed(load(path), settings))
         values.append(load(path, [f"{name}={text}"]))
         change = {"at_s": 0.5, "set": {name: settings[SHORT[short]]}}
@@ -74,7 +74,7 @@ def test_both_names_of_a_parameter_work_in_noack_set_in_the_option_and_in_change
 def test_a_mistake_in_the_words_gives_the_approved_line(descriptor: RunDescriptor) -> None:
     compare_lines(
         Path(__file__).with_name("set_mistakes.txt"),
-        lambda line: lines_of_error(lambda: changed(descriptor.scenario, parsed(line.split()))),
+        lambda line: lines_of_error(lambda: changed(descriptor.scenario, parse_settings(line.split()))),
     )
 
 
@@ -100,7 +100,7 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
         with pytest.raises(CallerError, match="no run is active in session 'none'; active: "):
             active_runs.find_run(session="none")
         with pytest.raises(CallerError, match="probability = nan: expected a finite number"):
-            active_runs.request_change(active_runs.find_run(session="lab"), parsed(["loss.p", "nan"]))
+            active_runs.request_change(active_runs.find_run(session="lab"), parse_settings(["loss.p", "nan"]))
     assert list(path.parent.iterdir()) == []
 
 

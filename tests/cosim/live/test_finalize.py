@@ -21,6 +21,7 @@ from cosim.analysis.summary.summary_model import RunSummary
 from cosim.live.finalize import ReplayInHelper, finalize, reopen
 from cosim.live.processes import finalize_helpers
 from cosim.live.processes.finalize_helpers import FinalizeHelpers, RunEndingWithHelpers
+from cosim.record.record_writing import write_run
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORDING_FILE,
@@ -31,7 +32,7 @@ from cosim.record.run_directory import (
     RunEnding,
     write_environment,
 )
-from cosim.record.run_record import load_record, write_run
+from cosim.record.run_record import load_record
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate, simulate_run
 from noack.core.errors import CallerError, ExitStatus, MachineError

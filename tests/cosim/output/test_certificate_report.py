@@ -161,7 +161,7 @@ def test_a_plant_outside_its_box_is_named() -> None:
     )  # fmt: skip
     message = outside_box(outside)
     assert message == ("the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3")
-    claims = [c for c in ClaimEvaluation(simulate(outside)).judge() if c.source == "box certificate"]
+    claims = [c for c in ClaimEvaluation(simulate(outside)).evaluate() if c.source == "box certificate"]
     assert claims
     assert {(c.verdict, c.since_s) for c in claims} == {("void", 0.0)}
 

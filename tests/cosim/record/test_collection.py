@@ -14,7 +14,8 @@ from cosim.analysis.summary.loop_statistics import missing_rows
 from cosim.record import run_directory
 from cosim.record.collection import collect
 from cosim.record.record_source import with_loop
-from cosim.record.run_record import Rows, RunRecord, load_record, write_run
+from cosim.record.record_writing import write_run
+from cosim.record.run_record import Rows, RunRecord, load_record
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError

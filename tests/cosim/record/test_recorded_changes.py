@@ -118,7 +118,7 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     (violation,) = summarise(record, 0, "horizon").to_json()["assumption_violations"]
     assert "change received too late" in violation["what"]
     assert violation["process"] == "controller"
-    claims = [one for one in RunClaims(record).judge() if one.source == "(I1)"]
+    claims = [one for one in RunClaims(record).evaluate() if one.source == "(I1)"]
     assert [one.verdict for one in claims] == [ClaimVerdict.HELD] * 4
     assert claims[0].until_s == 0.9
     assert claims[-1].from_s > made.everywhere_ns * 1e-9

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cosim.record.run_directory import REPORTS_FILE, write_environment, write_scenario
 from cosim.record.run_record import RecordedRun, Rows, load_run
-from cosim.record.spool_conversion import Segment, finish_record, merged, write_early
+from cosim.record.spool_conversion import Segment, finish_record, merge_segments, write_early
 from cosim.record.table_files import StoredTables, TableFile, write_table
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.errors import MachineError
@@ -241,6 +241,6 @@ def test_merged_rows_are_unique_and_ordered(ranges: list[tuple[int, int]], at_on
         if count:
             segments.append(Segment(first, first + count - 1, lambda rows=rows: rows))
     with patch("cosim.record.spool_conversion.BATCH_ROWS", at_once):
-        rows = np.concatenate([np.zeros(0, dtype), *merged(segments, dtype)])
+        rows = np.concatenate([np.zeros(0, dtype), *merge_segments(segments, dtype)])
     present = sorted({k for first, n in ranges for k in range(first, first + n)})
     assert rows["input"].tolist() == rows["value"].tolist() == present

@@ -78,7 +78,7 @@ def test_the_summary_counts_acknowledgements() -> None:
 
 def test_the_baseline_has_no_claims() -> None:
     record = run_of()
-    (claim,) = ClaimEvaluation(record).judge()
+    (claim,) = ClaimEvaluation(record).evaluate()
     assert claim.verdict is ClaimVerdict.VOID
     assert 'network.protocol = "ack"' in claim.why
     assert ClaimEvaluation(record).envelopes() == []

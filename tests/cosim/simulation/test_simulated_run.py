@@ -10,7 +10,7 @@ import pytest
 import rerun.chunk
 from typer.testing import Result
 
-from cosim.analysis.summary import network_summary
+from cosim.analysis.summary import loops_over_time
 from cosim.analysis.summary.summary_model import ReplayPart, read_summary
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint
@@ -169,7 +169,7 @@ def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: s
 @pytest.mark.usefixtures("no_recording")
 def test_the_report_reads_no_loop_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """How each loop went is known at the end of a run; to find it out takes most of the time."""
-    monkeypatch.setattr(network_summary, "loop_over_time", None)
+    monkeypatch.setattr(loops_over_time, "loop_over_time", None)
     loops = 'loops=[{ name = "a", count = 6 }]'  # of so many, the map is a bitmap
     ending = simulate_run(load(PATH, ["horizon_s=0.5", loops]), tmp_path)
     finalize(ending)

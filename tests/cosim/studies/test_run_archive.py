@@ -187,6 +187,11 @@ def with_horizon(files: Files, path: Path) -> Path:
     return write(path, checked(files | {"scenario.toml": text}))
 
 
+def with_beta(files: Files, path: Path) -> Path:
+    text = files["scenario.toml"].replace(b"beta = 0.5", b"beta = -0.5")
+    return write(path, checked(files | {"scenario.toml": text}))
+
+
 def fifo(files: Files, path: Path) -> Path:
     os.mkfifo(path)
     return path
@@ -223,6 +228,7 @@ HOSTILE: dict[str, tuple[Callable[[Files, Path], Path], str]] = {
     "rows without end": (with_rows, "plant_step.parquet: has 5,000,000 rows; a run of this"),
     "a device": (lambda files, path: Path("/dev/zero"), "not a regular file"),
     "a FIFO": (fifo, "not a regular file"),
+    "a wrong scenario": (with_beta, "b.zip: scenario.toml: trigger.beta"),
     "a long run": (with_horizon, "would take about 138.9 hours"),
     "no file": (lambda files, path: path, "No such file or directory"),
 }  # fmt: skip
@@ -236,6 +242,7 @@ def test_a_hostile_archive_gives_one_line(case: str, archive: Path, tmp_path: Pa
     assert done.exit_code == 2, done.output
     assert done.stderr.startswith(f"noack: {path}: ")
     assert message in done.stderr
+    assert str(tmp_path / "into") not in done.stderr
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.rglob("evil"))
 

@@ -22,6 +22,7 @@ from cosim.live.finalize import reopen
 from cosim.live.recording.recorder import Recorder
 from cosim.output.terminal_output import print_outcome
 from cosim.record.record_source import with_loop
+from cosim.record.record_writing import write_run
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
     RECORD,
@@ -31,7 +32,7 @@ from cosim.record.run_directory import (
     changed_since,
     environment,
 )
-from cosim.record.run_record import Rows, RunRecord, load_record, write_run
+from cosim.record.run_record import Rows, RunRecord, load_record
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import OWNER
@@ -199,7 +200,7 @@ def _read(run_dir: Path) -> None:
     json.loads(summarise(record, 0, "finished").model_dump_json())
     found = replay(record)
     found.verdict().model_dump_json()
-    json.dumps(found.document())
+    json.dumps(found.to_json())
     if cut_short:
         again = load_record(run_dir)  # a finalised record can be read
         assert all(record[table].tobytes() == again[table].tobytes() for table in record.tables)

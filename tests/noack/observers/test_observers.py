@@ -93,7 +93,7 @@ def test_a_restarted_sensor_restarts_its_estimate_and_is_replayed(
     found = replay(again_record)
     assert found.bit_exact, found.first_difference
     assert found.inputs == sum(map(record.count, record.tables))
-    verdicts = {str(claim.verdict) for claim in ClaimEvaluation(again_record).judge()}
+    verdicts = {str(claim.verdict) for claim in ClaimEvaluation(again_record).evaluate()}
     assert verdicts <= {"held", "void"}
 
 
@@ -118,7 +118,7 @@ def test_i1_and_the_certificate_are_claimed_of_the_estimate(
     observed["horizon_s"] = 4.0
     record = run(observed)
     claims = ClaimEvaluation(record)
-    found = claims.judge()
+    found = claims.evaluate()
     assert {claim.source for claim in found} == {"(I1)", "certificate"}
     assert any("‖x̂ − x‖" in claim.bound for claim in found)
     assert all(claim.verdict == "held" for claim in found)
@@ -145,7 +145,7 @@ def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> 
     noisy = run(observed)
     sizes = estimation_error(noisy).std(axis=0)
     assert 0.01 < sizes[0] < 0.03 < sizes[1] < 0.08
-    assert {claim.verdict for claim in ClaimEvaluation(noisy).judge()} == {"held"}
+    assert {claim.verdict for claim in ClaimEvaluation(noisy).evaluate()} == {"held"}
     assert summarise(noisy, 0, "horizon").to_json()["estimation"]["observer"] is None
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from cosim.analysis.claims.claim_definition import (
     Bound,
+    ClaimBound,
     Envelope,
-    Findings,
     claim,
     controller_error_bound,
     least_inter_event_time,
@@ -27,7 +27,7 @@ _CAPPED = "at most M − 1 consecutive losses"
 
 
 @claim("the controller's error is at most the sensor's error plus the missed jumps", "(I1)", _COMPLETE)
-def i1_controller_error(run: RunEvidence, samples: Samples) -> Findings:
+def i1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
     """The triangle inequality for (I1)."""
     error, values = (
         "e_c" if run.record.scenario.coverage.knows_state else "x_c − x̂",
@@ -35,14 +35,14 @@ def i1_controller_error(run: RunEvidence, samples: Samples) -> Findings:
     )
     jump = norm_text(run, "e^(H(t−t_k)) e_s(t_k)")
     formula = f"{norm_text(run, error)} ≤ {norm_text(run, 'e_s')} + Σ {jump}"
-    return Findings(
+    return ClaimBound(
         controller_error_bound(run, samples, formula, values),
         Envelope("bound from (I1)", "e_c", samples.t_s, values, "identity"),
     )
 
 
 @claim("x_c − x_s is the sum of the missed jumps", "(I1)", _COMPLETE)
-def i1_model_difference(run: RunEvidence, samples: Samples) -> Findings:
+def i1_model_difference(run: RunEvidence, samples: Samples) -> ClaimBound:
     """(I1) itself, up to rounding."""
     here, margin = samples.in_common, _margin(run)
     residual = samples.residual[here]
@@ -50,7 +50,7 @@ def i1_model_difference(run: RunEvidence, samples: Samples) -> Findings:
     scale = max(run.facts.largest_state + run.part.offset, float(np.finfo(float).tiny))
     formula = "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), relative residual ≤ {}"
     shares = residual / (margin * scale)
-    return Findings(Bound(formula, samples.t_s[here], shares, run.first_gap, margin))
+    return ClaimBound(Bound(formula, samples.t_s[here], shares, run.first_gap, margin))
 
 
 def _margin(run: RunEvidence) -> float:
@@ -69,15 +69,15 @@ def _margin(run: RunEvidence) -> float:
 
 
 @claim("the paper's bound of the controller's error", "eq:LossEv3", _CONTINUOUS, needs_ideal_loop=True)
-def paper_error_bound(run: RunEvidence, samples: Samples) -> Findings:
+def paper_error_bound(run: RunEvidence, samples: Samples) -> ClaimBound:
     """(I1) with the threshold in place of e_s at the events."""
     coverage = run.record.scenario.coverage
     # Estimates and noise jump at every measurement, so no trigger keeps e_s below a threshold.
     if not coverage.is_decaying or not coverage.knows_state:
-        return Findings()
+        return ClaimBound()
     growth = "‖e^(H(t−t_k))‖" if run.record.loop.weight is None else "‖W e^(H(t−t_k)) W⁻¹‖"
     formula = f"{norm_text(run, 'e_c')} ≤ βe^(−αt) + Σ βe^(−αt_k) {growth}"
-    return Findings(controller_error_bound(run, samples, formula, samples.error_bounds[1]))
+    return ClaimBound(controller_error_bound(run, samples, formula, samples.error_bounds[1]))
 
 
 @claim(
@@ -86,26 +86,26 @@ def paper_error_bound(run: RunEvidence, samples: Samples) -> Findings:
     f"{_CONTINUOUS}, {_CAPPED}",
     needs_ideal_loop=True,
 )
-def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> Findings:
+def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
     """Theorem 1 with the Δ of the trajectory."""
     scenario = run.record.scenario
     coverage = scenario.coverage
     is_covered = coverage.is_certifiable and coverage.is_undisturbed and coverage.is_decaying
     if not is_covered or scenario.decaying.floor > 0 or (delta := run.trajectory_delta) is None:
-        return Findings()
+        return ClaimBound()
     level = scenario.decaying.beta * np.exp(-scenario.decaying.alpha_per_s * samples.t_s)
     formula, void = f"{norm_text(run, 'e_c')} ≤ {{}} βe^(−αt)", run.paper_violation
-    return Findings(controller_error_bound(run, samples, formula, delta * level, delta, void))
+    return ClaimBound(controller_error_bound(run, samples, formula, delta * level, delta, void))
 
 
 _IDEAL = f"a continuous trigger, a network and input without delay, {_CAPPED}"
 
 
 @claim("minimum inter-event time", "Theorem 2, eq:tau", _IDEAL, needs_ideal_loop=True)
-def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> Findings:
+def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> ClaimBound:
     """Theorem 2's τ."""
     if run.theorem_2 is None:
-        return Findings()
+        return ClaimBound()
     least = least_inter_event_time(
         run,
         samples,
@@ -115,19 +115,19 @@ def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> Findings:
         "printed",
     )
     knows_state = run.record.scenario.coverage.knows_state
-    return least if knows_state else Findings(None, least.envelope)
+    return least if knows_state else ClaimBound(None, least.envelope)
 
 
 @claim("the state decays", "Theorem 2, eq:normXt", _IDEAL, needs_ideal_loop=True)
-def theorem_2_state(run: RunEvidence, samples: Samples) -> Findings:
+def theorem_2_state(run: RunEvidence, samples: Samples) -> ClaimBound:
     """Theorem 2's bound of ‖x‖."""
     if run.theorem_2 is None:
-        return Findings()
+        return ClaimBound()
     values = run.theorem_2.state(samples.t_s, run.record.scenario.decaying.alpha_per_s)
     envelope = Envelope("Theorem 2 (eq:normXt)", "x", samples.t_s, values, "printed")
     if not run.record.scenario.coverage.knows_state:
-        return Findings(None, envelope)
+        return ClaimBound(None, envelope)
     slack = ROUNDING * run.part.offset
     shares = upper_shares(samples.aligned.x_norm, values + slack)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
-    return Findings(Bound(formula, samples.t_s, shares, run.paper_violation), envelope)
+    return ClaimBound(Bound(formula, samples.t_s, shares, run.paper_violation), envelope)

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from cosim.analysis.adversary import Worst
+from cosim.analysis.adversary import WorstRun
 from cosim.analysis.adversary.loop_flows import Objective, evaluate, measure_of
 from cosim.analysis.adversary.pattern_search import PatternSearch, search_tree
 from cosim.analysis.adversary.scenario_search import find_worst as find_any
@@ -32,7 +32,7 @@ MANY = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate]
 find_worst = partial(find_any, continuous=True)
 
 
-def signed(worst: Worst) -> float:
+def signed(worst: WorstRun) -> float:
     if worst.value is None:
         return -math.inf
     return -worst.value if worst.objective is Objective.INTER_EVENT else worst.value
@@ -75,7 +75,7 @@ def test_the_pattern_is_admissible_and_has_the_reported_value(
     assert run.event_s.tolist() == list(worst.event_s)
     measure = flow_of(resolved, objective, rate_of(resolved)).measure
     assert evaluate(run, measure).value == signed(worst)
-    for milder in (worst.lossless, worst.own):
+    for milder in (worst.lossless, worst.with_own_network):
         best = signed(replace(worst, value=milder))
         assert best <= signed(worst) or best == pytest.approx(signed(worst), rel=1e-9)
 

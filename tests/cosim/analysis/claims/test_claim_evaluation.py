@@ -44,7 +44,7 @@ CERTIFIED = (
 
 
 def certified(record: RunRecord) -> dict[str, Claim]:
-    return {c.what: c for c in ClaimEvaluation(record).judge() if c.source == "certificate"}
+    return {c.what: c for c in ClaimEvaluation(record).evaluate() if c.source == "certificate"}
 
 
 DOCS = Path(__file__).parents[4] / "docs" / "record.md"
@@ -53,8 +53,8 @@ DOCS = Path(__file__).parents[4] / "docs" / "record.md"
 def test_the_docs_list_every_claim_of_the_catalogue() -> None:
     texts = [path.read_text() for path in Path(catalogue.__path__[0]).glob("*.py")]
     defined = sum(len(re.findall(r"^@(?:claim|certified)\(", text, re.MULTILINE)) for text in texts)
-    rows = {(one.statement, one.source, one.assumes) for one in definitions(ClaimDefinition)}
-    rows |= {(one.statement, "certificate", one.assumes) for one in definitions(CertifiedClaim)}
+    rows = {(claim.statement, claim.source, claim.assumes) for claim in definitions(ClaimDefinition)}
+    rows |= {(claim.statement, "certificate", claim.assumes) for claim in definitions(CertifiedClaim)}
     assert len(rows) == defined
     text = DOCS.read_text(encoding="utf-8")
     section = text[text.index("\n## Claims") : text.index("\n## The summary")]
@@ -67,7 +67,7 @@ def test_the_docs_list_every_claim_of_the_catalogue() -> None:
 
 def test_certified_claims_hold_in_a_run_that_meets_its_schedule(run: RunRecord) -> None:
     assert {c.what: c.verdict for c in certified(run).values()} == dict.fromkeys(CERTIFIED, HELD)
-    for claim in ClaimEvaluation(run).judge():
+    for claim in ClaimEvaluation(run).evaluate():
         assert claim.since_s is None
         assert claim.ratio is not None
         assert 0 <= claim.ratio <= 1
@@ -96,7 +96,7 @@ def test_a_run_of_another_plant_violates_the_certificate(make: Make) -> None:
     run = simulate(make())
     plant = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "initial_state": [0.1, 0.0]}
     other = changed(run, scenario=make(plant=plant))
-    judged = ClaimEvaluation(other).judge()
+    judged = ClaimEvaluation(other).evaluate()
     claims = {claim.what: claim for claim in judged if claim.source == "certificate"}
     state = claims["the state is bounded"]
     assert (state.verdict, state.since_s) == (VIOLATED, 0.0)
@@ -121,7 +121,7 @@ def test_a_wrong_value_violates_its_claim_from_its_time_on(
     rows = run[table].copy()
     row = np.flatnonzero(rows["event"] < 0)[150] if table == SENSOR_MEASUREMENT else 200
     rows[column][row] += by
-    claims = {claim.what: claim for claim in ClaimEvaluation(changed(run, {table: rows})).judge()}
+    claims = {claim.what: claim for claim in ClaimEvaluation(changed(run, {table: rows})).evaluate()}
     assert claims[violated].verdict is VIOLATED
     assert claims[violated].since_s == pytest.approx(rows["t_ns"][row] * 1e-9, abs=0.011)
     assert claims["the state is bounded"].verdict is HELD
@@ -147,7 +147,7 @@ def test_a_void_claim_is_judged_only_up_to_the_violation(run: RunRecord) -> None
 @pytest.mark.parametrize("process", ["plant", "controller"])
 def test_certified_claims_need_the_rows_of_every_process(run: RunRecord, process: str) -> None:
     """Claims on recorded signals are judged; too little is known about the conditions."""
-    assert ClaimEvaluation(without(run, "sensor")).judge() == []
+    assert ClaimEvaluation(without(run, "sensor")).evaluate() == []
     for claim in certified(without(run, process)).values():
         assert (claim.verdict, claim.since_s) == (VOID, 0.0)
 
@@ -161,7 +161,7 @@ def test_no_random_run_violates_a_claim(policy: str) -> None:
     judged: Counter[ClaimVerdict] = Counter()
     for number in range(POLICIES.index(policy), 4 * len(POLICIES), len(POLICIES)):
         record = simulate(resolve(validate(random_scenario(number), "random")))
-        judged.update(claim.verdict for claim in RunClaims(record).judge())
+        judged.update(claim.verdict for claim in RunClaims(record).evaluate())
     assert judged[VIOLATED] == 0
     assert judged[HELD] > 3
 
@@ -184,7 +184,7 @@ def test_no_claim_is_violated_at_a_set_point(name: str, settings: list[str]) -> 
     x_r = 3.0 if name == "double_integrator" else 0.1
     settings = [f"controller.setpoint=[{x_r}, 0.0]", *settings]
     record = simulate(resolved(name, *settings))
-    claims = RunClaims(record).judge()
+    claims = RunClaims(record).evaluate()
     verdicts = {claim.verdict for claim in claims}
     assert VIOLATED not in verdicts
     assert HELD in verdicts
@@ -197,7 +197,7 @@ def test_no_claim_is_violated_at_a_set_point(name: str, settings: list[str]) -> 
 def test_no_claim_is_violated_in_runs_that_an_attack_found(number: int) -> None:
     """u_r ≠ 0 before the first input; an event at the time of a change."""
     record = simulate(resolve(validate(random_scenario(number), "random")))
-    assert VIOLATED not in {claim.verdict for claim in RunClaims(record).judge()}
+    assert VIOLATED not in {claim.verdict for claim in RunClaims(record).evaluate()}
 
 
 # --- claims that cannot be judged -----------------------------------------------------------------
@@ -206,7 +206,7 @@ def test_no_claim_is_violated_in_runs_that_an_attack_found(number: int) -> None:
 def test_too_many_dropouts_void_the_papers_theorems(make: Make) -> None:
     """The theorems assume M − 1; consequences of (I1) alone do not and are judged to the end."""
     record = simulate(make(network={"loss": {"model": "worst_case"}, "enforce_mansd": False, "mansd": 2}))
-    claims = ClaimEvaluation(record).judge()
+    claims = ClaimEvaluation(record).evaluate()
     since = {claim.since_s for claim in claims if claim.verdict is VOID}
     theorems = [claim for claim in claims if claim.source.startswith("Theorem")]
     assert theorems
@@ -224,7 +224,7 @@ def test_a_claim_is_not_held_where_the_record_has_no_rows(run: RunRecord) -> Non
         CONTROLLER_DELIVERY: taken[taken["now_ns"] < 2_000_000_000],
     }
     cut = changed(run, early)
-    unknown = [c for c in ClaimEvaluation(cut).judge() if "e_c" in c.bound or c.source == "(I1)"]
+    unknown = [c for c in ClaimEvaluation(cut).evaluate() if "e_c" in c.bound or c.source == "(I1)"]
     assert unknown
     for claim in unknown:
         assert claim.verdict is not HELD
@@ -252,25 +252,25 @@ def run_with(*changes: tuple[float, dict[str, Any]], **more: Any) -> RunRecord:
 
 def test_a_change_of_the_loss_alone_affects_no_claim() -> None:
     record = run_with((2.0, {"network.loss.probability": 0.9}))
-    claims = RunClaims(record).judge()
-    assert claims == ClaimEvaluation(record).judge()
+    claims = RunClaims(record).evaluate()
+    assert claims == ClaimEvaluation(record).evaluate()
     assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}
 
 
 def test_the_part_after_a_change_is_judged_as_a_separate_run() -> None:
     record = run_with((2.005, {"trigger.beta": 0.04, "network.mansd": 2}))
     parts = RunClaims(record)
-    claims = parts.judge()
+    claims = parts.evaluate()
     deliveries = record[CONTROLLER_DELIVERY]["t_ns"]
     first_s = int(deliveries[deliveries >= 2_005_000_000][0]) / 1e9
     assert {(claim.from_s, claim.until_s) for claim in claims} == {(0.0, 2.005), (first_s, None)}
     assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}
     before, after = (
-        [one for one in claims if (one.from_s > 0) is later and one.source == "certificate"]
+        [claim for claim in claims if (claim.from_s > 0) is later and claim.source == "certificate"]
         for later in (False, True)
     )
-    assert [one.what for one in before] == [one.what for one in after]
-    delta = {one.what: one.certified for one in after}["the controller's error is bounded"]
+    assert [claim.what for claim in before] == [claim.what for claim in after]
+    delta = {claim.what: claim.certified for claim in after}["the controller's error is bounded"]
     # βe^{−αt} in the run's own time: the part's certificate starts from the threshold at that time.
     first, own = (part for part in parts.parts if isinstance(part, ClaimEvaluation))
     beta = 0.04 * np.exp(-0.2 * first_s)
@@ -287,20 +287,20 @@ def test_the_part_after_a_change_is_judged_as_a_separate_run() -> None:
 def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance() -> None:
     plant = CONTENT["plant"] | {"uncertainty_A": [[0.0, 0.0], [0.3, 0.0]]}
     record = run_with((2.005, {"controller.setpoint": [3.0, 0.0]}), plant=plant)
-    after = [one for one in RunClaims(record).judge() if one.from_s > 0]
-    own = [one for one in after if one.source == "certificate"]
+    after = [claim for claim in RunClaims(record).evaluate() if claim.from_s > 0]
+    own = [claim for claim in after if claim.source == "certificate"]
     assert own
-    assert {one.verdict for one in own} == {ClaimVerdict.HELD}
-    void = [one for one in after if one.verdict is ClaimVerdict.VOID]
-    assert {one.source for one in void} == {"box certificate"}
-    identity = next(one for one in after if one.source == "(I1)")
+    assert {claim.verdict for claim in own} == {ClaimVerdict.HELD}
+    void = [claim for claim in after if claim.verdict is ClaimVerdict.VOID]
+    assert {claim.source for claim in void} == {"box certificate"}
+    identity = next(claim for claim in after if claim.source == "(I1)")
     assert identity.verdict is ClaimVerdict.HELD
 
 
 @pytest.mark.parametrize(("name", "norms"), [("lane_weighted", {"W"}), ("double_integrator", {""})])
 def test_formulas_have_the_weight_of_the_triggers_norm(name: str, norms: set[str]) -> None:
-    claims = RunClaims(simulate(resolved(name, "horizon_s=2"))).judge()
-    bounded = [re.match(r"‖(W?) ?e_[cs]‖ ≤", one.bound) for one in claims]
+    claims = RunClaims(simulate(resolved(name, "horizon_s=2"))).evaluate()
+    bounded = [re.match(r"‖(W?) ?e_[cs]‖ ≤", claim.bound) for claim in claims]
     found = [match[1] for match in bounded if match]
     assert len(found) > 5
     assert set(found) == norms
@@ -316,13 +316,13 @@ def test_a_part_is_void_with_the_reason() -> None:
         (deaf, 2.005, "not every process received the change"),
         (far, None, "from Kx"),
     ):
-        after = [one for one in RunClaims(record).judge() if one.from_s > 0]
-        void = [one for one in after if since_s or one.source == "certificate"]
+        after = [claim for claim in RunClaims(record).evaluate() if claim.from_s > 0]
+        void = [claim for claim in after if since_s or claim.source == "certificate"]
         assert void
-        for one in void:
-            assert one.verdict is ClaimVerdict.VOID
-            assert one.since_s == since_s or since_s is None
-            assert why in one.why
+        for claim in void:
+            assert claim.verdict is ClaimVerdict.VOID
+            assert claim.since_s == since_s or since_s is None
+            assert why in claim.why
 
 
 # --- stopped runs --------------------------------------------------------------------------------
@@ -344,9 +344,9 @@ def stopped(record: RunRecord, reached_ns: dict[str, int]) -> RunRecord:
 def test_processes_that_stop_at_different_times_void_no_claim(run: RunRecord, order: tuple[str, ...]) -> None:
     cut = stopped(run, {role: STOP_NS + i * APART_NS for i, role in enumerate(order)})
     if order[0] == "controller":  # the plant continues with its last input
-        assert ClaimVerdict.VOID in {claim.verdict for claim in ClaimEvaluation(cut).judge()}
+        assert ClaimVerdict.VOID in {claim.verdict for claim in ClaimEvaluation(cut).evaluate()}
     claims = RunClaims(cut)
-    verdicts = [(claim.source, claim.verdict) for claim in claims.judge()]
+    verdicts = [(claim.source, claim.verdict) for claim in claims.evaluate()]
     assert len(verdicts) > 5
     assert {verdict for _, verdict in verdicts} == {ClaimVerdict.HELD}, verdicts
     assert claims.judged_until_s is not None

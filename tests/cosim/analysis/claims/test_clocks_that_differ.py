@@ -14,7 +14,7 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
 from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
-from cosim.analysis.claims.observed_conditions import ObservedConditions, combined
+from cosim.analysis.claims.observed_conditions import ObservedConditions, combine
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.record_source import rows_by_loop
@@ -79,7 +79,7 @@ def test_every_claim_holds_whatever_the_clocks(make: Make, delay_s: float) -> No
         }
         record = simulated(scenario, clocks)
         claims = ClaimEvaluation(record)
-        verdicts = {one.verdict for one in claims.judge() if one.source == "certificate"}
+        verdicts = {one.verdict for one in claims.evaluate() if one.source == "certificate"}
         assert verdicts == {ClaimVerdict.HELD}, clocks
         seen.add(claims.certified_for is not None)
         assert replay(record).bit_exact
@@ -119,7 +119,7 @@ def with_errors(record: RunRecord, errors: Errors, **t_ns: int) -> RunRecord:
 
 
 def judged(record: RunRecord) -> list[Claim]:
-    return ClaimEvaluation(record).judge()
+    return ClaimEvaluation(record).evaluate()
 
 
 def test_small_bounds_change_no_verdict(make: Make, clocked: RunRecord) -> None:
@@ -177,7 +177,7 @@ def test_batches_show_what_the_whole_record_shows(clocked: RunRecord, seed: int)
         for table, rows in zip(CLOCK_TABLES, piece, strict=True):
             reader.take(table, rows)
         parts.append(reader.observed())
-    for cause, series in combined(parts).clocks.items():
+    for cause, series in combine(parts).clocks.items():
         np.testing.assert_array_equal(series, whole.clocks[cause])
 
 

@@ -17,7 +17,7 @@ from cosim.analysis.claims.observed_conditions import (
     CLOCK_CAUSES,
     AssumptionViolation,
     ObservedConditions,
-    combined,
+    combine,
 )
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.summary.summary_model import ClaimVerdict
@@ -140,7 +140,7 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
                 reader.take(*batch)
         whole = read_conditions(record)
         parts.append(reader.end())
-        in_parts = combined(parts)
+        in_parts = combine(parts)
         for name in SERIES:
             np.testing.assert_array_equal(getattr(in_parts, name), getattr(whole, name))
         assert parts[-1].start_s == whole.start_s
@@ -227,7 +227,7 @@ def test_claims_are_void_from_the_time_and_for_the_reason_that_the_monitor_repor
     """``at`` is a time, or the number of an event."""
     record = violate(make)
     when_s = event_s(record, at) if isinstance(at, int) else at
-    judged = [claim for claim in ClaimEvaluation(record).judge() if claim.source == "certificate"]
+    judged = [claim for claim in ClaimEvaluation(record).evaluate() if claim.source == "certificate"]
     assert {claim.verdict for claim in judged} == {ClaimVerdict.VOID}
     # Nothing is recorded of ‖e_c‖ while there is no controller.
     claims = [claim for claim in judged if "e_c" not in claim.bound]
@@ -256,7 +256,7 @@ def test_a_late_run_has_the_certificate_of_its_lateness(
     claims = ClaimEvaluation(record)
     assert (covered := claims.certified_for) is not None
     assert least_s <= getattr(covered, time) == claims.conditions[time]
-    assert {one.verdict for one in claims.judge() if one.source in ("certificate", "(I1)")} == {
+    assert {one.verdict for one in claims.evaluate() if one.source in ("certificate", "(I1)")} == {
         ClaimVerdict.HELD
     }
 
@@ -275,10 +275,10 @@ def test_a_run_is_certified_until_it_is_later_than_any_certificate_covers(
     claims = ClaimEvaluation(record)
     covered, series = claims.certified_for, getattr(claims.observed, time)
     assert covered is not None
-    (since_s,) = {one.since_s for one in claims.judge() if one.source == "certificate"}
+    (since_s,) = {one.since_s for one in claims.evaluate() if one.source == "certificate"}
     assert since_s > min(reported(record)).t_s  # when it was later than allowed
     assert series.before(since_s).value.max(initial=0.01) == getattr(covered, f"{time}_s")
-    (found,) = {one.why for one in claims.judge() if one.source == "certificate"}
+    (found,) = {one.why for one in claims.evaluate() if one.source == "certificate"}
     assert found.startswith(why)
     assert found.endswith(BEYOND_CERTIFICATE)
     # The next lateness has none.

@@ -66,18 +66,18 @@ def columns() -> Iterator[tuple[str, str]]:
 
 @pytest.mark.sanitized
 def test_a_run_is_replayed_bit_for_bit() -> None:
-    found = replay(RECORD)
-    assert found.bit_exact
-    assert found.gaps == []
-    assert found.first_difference is None
-    assert found.inputs == sum(len(RECORD[table]) for table in RECORD.tables)
-    assert {leg.leg: leg.compared for leg in found.messages} == {
+    result = replay(RECORD)
+    assert result.bit_exact
+    assert result.gaps == []
+    assert result.first_difference is None
+    assert result.inputs == sum(len(RECORD[table]) for table in RECORD.tables)
+    assert {hop.hop: hop.compared for hop in result.messages} == {
         "plant → sensor": len(RECORD[SENSOR_MEASUREMENT]),
         "sensor → netem": len(RECORD[NETEM_PACKET]),
         "netem → controller": len(RECORD[CONTROLLER_DELIVERY]),
         "controller → plant": len(RECORD[PLANT_ACTUATION]),
     }
-    assert min(leg.compared for leg in found.messages) > 0
+    assert min(hop.compared for hop in result.messages) > 0
 
 
 @pytest.mark.parametrize(("table", "column"), list(columns()))
@@ -87,9 +87,9 @@ def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.Data
     rows = RECORD[table]
     row = data.draw(st.integers(0, len(rows) - 1))
     byte = data.draw(st.integers(0, rows.dtype[column].itemsize - 1))
-    found = replay(flipped(RECORD, table, row, column, 8 * byte + data.draw(st.integers(0, 7))))
-    first = found.first_difference
-    assert found.bit_exact is False
+    result = replay(flipped(RECORD, table, row, column, 8 * byte + data.draw(st.integers(0, 7))))
+    first = result.first_difference
+    assert result.bit_exact is False
     assert first is not None
     assert first.table == table
     name = f"{column}_{byte // 8 + 1}" if rows.dtype[column].shape else column
@@ -122,8 +122,8 @@ def test_a_flipped_bit_of_a_loop_of_another_kind_is_found(
     for flow in set(flows.tolist()):
         rows = np.flatnonzero(flows == flow)
         for column in columns:
-            found = replay(flipped(record, table, int(rows[len(rows) // 2]), column, 0))
-            assert found.first_difference is not None, column
+            result = replay(flipped(record, table, int(rows[len(rows) // 2]), column, 0))
+            assert result.first_difference is not None, column
 
 
 @pytest.mark.parametrize("table", FILLED)
@@ -132,33 +132,33 @@ def test_a_flipped_bit_of_a_loop_of_another_kind_is_found(
 def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
     row = data.draw(st.integers(0, len(RECORD[table]) - 1))
     bit = data.draw(st.integers(0, 63))
-    found = replay(flipped(RECORD, table, row, "input", bit))
-    first = found.first_difference
+    result = replay(flipped(RECORD, table, row, "input", bit))
+    first = result.first_difference
     assert first is not None
     # Either of two rows with the same number may be the wrong one.
     assert OWNER[first.table] == OWNER[table]
     assert first.column == "input"
-    assert [gap.partition(":")[0] for gap in found.gaps] == [OWNER[table]]
+    assert [gap.partition(":")[0] for gap in result.gaps] == [OWNER[table]]
 
 
 @pytest.mark.parametrize("table", FILLED)
 def test_a_time_that_decreases_is_found(table: str) -> None:
-    found = replay(flipped(RECORD, table, len(RECORD[table]) - 1, "now_ns", 63))
-    assert found.first_difference is not None
-    assert found.first_difference.column in ("now_ns", "t_ns")  # netem's t_ns is its now_ns
+    result = replay(flipped(RECORD, table, len(RECORD[table]) - 1, "now_ns", 63))
+    assert result.first_difference is not None
+    assert result.first_difference.column in ("now_ns", "t_ns")  # netem's t_ns is its now_ns
 
 
 @pytest.mark.parametrize("table", FILLED)
 def test_missing_rows_are_reported(table: str) -> None:
     rows = RECORD[table]
     cut = len(rows) // 2
-    found = replay(changed(RECORD, {table: np.delete(rows, [cut])}))
+    result = replay(changed(RECORD, {table: np.delete(rows, [cut])}))
     number = int(rows["input"][cut])
     process = OWNER[table]
-    assert found.bit_exact  # up to the gap
-    assert found.gaps == [f"{process}: rows are missing from input {number} on"]
-    assert found.verdict().complete is False
-    accounts = {account.process: account for account in found.processes}
+    assert result.bit_exact  # up to the gap
+    assert result.gaps == [f"{process}: rows are missing from input {number} on"]
+    assert result.verdict().complete is False
+    accounts = {account.process: account for account in result.processes}
     assert accounts[process].missing_from == accounts[process].compared == number
     assert all(account.whole for name, account in accounts.items() if name != process)
 
@@ -176,9 +176,9 @@ def test_rows_missing_at_the_end_are_reported(role: str) -> None:
             f"{role}: left no report; whether its last rows are missing is not known",
         ),
     ):
-        found = replay(record)
-        assert found.bit_exact
-        assert found.gaps == [gap]
+        result = replay(record)
+        assert result.bit_exact
+        assert result.gaps == [gap]
 
 
 def test_a_message_that_no_process_sent_is_found() -> None:
@@ -204,8 +204,8 @@ def test_a_delivery_of_a_dropped_update_is_found() -> None:
     for column in ("t_ns", "x"):
         deliveries[column][row] = events[column][lost]
     deliveries["sequence"][row] = lost
-    found = replay(changed(RECORD, {CONTROLLER_DELIVERY: deliveries}))
-    differences = {leg.leg: leg.difference for leg in found.messages}
+    result = replay(changed(RECORD, {CONTROLLER_DELIVERY: deliveries}))
+    differences = {hop.hop: hop.difference for hop in result.messages}
     delivery = differences["netem → controller"]
     assert delivery is not None
     assert delivery.what == "netem did not forward it"
@@ -219,14 +219,14 @@ def test_ticks_after_the_runs_end_are_not_made(table: str) -> None:
     """Of a period of 10¹⁸ ns, the times of ten more steps would not fit 64 bits."""
     rows = RECORD[table]
     more = np.repeat(rows[-1:], 10)
-    owned = (RECORD[one]["input"] for one in RECORD.tables if OWNER[one] == OWNER[table])
+    owned = (RECORD[name]["input"] for name in RECORD.tables if OWNER[name] == OWNER[table])
     last = max(inputs.max(initial=0) for inputs in owned)
     more["input"], more["now_ns"] = np.arange(1, 11) + last, 2**62
-    found = replay(changed(RECORD, {table: np.concatenate([rows, more])}))
-    account = next(one for one in found.processes if one.process == OWNER[table])
+    result = replay(changed(RECORD, {table: np.concatenate([rows, more])}))
+    account = next(process for process in result.processes if process.process == OWNER[table])
     assert account.difference is not None
     assert account.difference.row == len(rows)
-    assert f"{OWNER[table]}: replayed up to input {last + 1}" in found.gaps
+    assert f"{OWNER[table]}: replayed up to input {last + 1}" in result.gaps
 
 
 @pytest.mark.sanitized
@@ -234,8 +234,8 @@ def test_a_recorded_measurement_after_the_runs_end_is_not_taken() -> None:
     """The observer would make 10⁹ steps up to it."""
     rows = OBSERVED[SENSOR_MEASUREMENT].copy()
     rows["t_ns"][20] = 10**18
-    found = replay(changed(OBSERVED, {SENSOR_MEASUREMENT: rows}))
-    sensor = next(account for account in found.processes if account.process == "sensor")
+    result = replay(changed(OBSERVED, {SENSOR_MEASUREMENT: rows}))
+    sensor = next(account for account in result.processes if account.process == "sensor")
     assert sensor.difference is not None
     assert "cannot take this input" in sensor.difference.what
     assert sensor.compared == 20
@@ -261,9 +261,9 @@ def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
         rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~again]
         rows[CONTROLLER_DELIVERY] = taken[taken["input"] <= GENERATION]
     notice = {"process": "controller", "level": RESTART, "t_ns": 0, "text": "restarted"}
-    found = replay(changed(record, rows, notices=[notice], reports={}, kind="live"))
-    assert found.bit_exact, found.verdict()
-    assert found.verdict().inputs == sum(map(len, rows.values()))
+    result = replay(changed(record, rows, notices=[notice], reports={}, kind="live"))
+    assert result.bit_exact, result.verdict()
+    assert result.verdict().inputs == sum(map(len, rows.values()))
 
 
 @pytest.mark.sanitized
@@ -283,7 +283,7 @@ def test_a_record_with_any_numbers_is_replayed(number: int, data: st.DataObject)
             place = place[0], data.draw(st.integers(4, words.shape[1] - 1))
         before, words[place] = words[place], data.draw(st.sampled_from(WORDS))
         equal &= bool(before == words[place])
-    found = replay(changed(record, rows))
-    assert json.dumps(found.document(), allow_nan=False)
+    result = replay(changed(record, rows))
+    assert json.dumps(result.to_json(), allow_nan=False)
     if equal:
-        assert found.bit_exact
+        assert result.bit_exact

@@ -14,7 +14,6 @@ from pydantic import BaseModel
 from rich.console import Console
 
 import noack
-from cosim.analysis.summary.network_summary import in_flight
 from cosim.analysis.summary.run_summary import Outcome, summarise
 from cosim.analysis.summary.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.output.report_page import Report, page
@@ -23,7 +22,7 @@ from cosim.output.terminal_output import print_outcome
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
-from noack.protocol.record_tables import NETEM_PACKET, SENSOR_MEASUREMENT, network_tables
+from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.roles import GENERATION, RESTART
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
@@ -168,17 +167,3 @@ def test_restarts_and_their_missing_first_rows_are_listed(content: dict[str, Any
     assert {one["generation"]: (one["first_s"], one["what"]) for one in found["restarts"]} == {
         1: (first_s[0], None), 2: (None, "after 2"), 3: (first_s[1], "after 3"),
     }  # fmt: skip
-
-
-def test_the_number_in_flight_is_that_of_overlapping_delays() -> None:
-    """Two datagrams overlap from 10 to 20 s; a third did not wait, a fourth was lost."""
-    packets = np.zeros(4, network_tables()[NETEM_PACKET])
-    packets["copy_ns"] = -1
-    packets["now_ns"] = np.array([0, 10, 50, 60]) * 10**9
-    packets["release_ns"] = np.array([20 * 10**9, 30 * 10**9, 50 * 10**9, -1])
-    found = in_flight(packets, 100 * 10**9, 100 * 10**9)
-    assert (found.mean, found.max, found.width_s) == (pytest.approx(0.4), 2, 0.5)
-    assert found.max_by_interval[:60] == [1] * 20 + [2] * 20 + [1] * 20
-    assert not any(found.max_by_interval[61:])
-    assert found.mean_by_interval[20:40] == [2.0] * 20
-    assert in_flight(packets, 100 * 10**9, 40 * 10**9).mean == pytest.approx(1.0)  # stopped

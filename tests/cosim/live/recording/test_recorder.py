@@ -13,8 +13,7 @@ import pytest
 import zenoh
 from rich.console import Console
 
-from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.summary.loop_statistics import list_violations
+from cosim.analysis.claims.claim_evaluation import RunClaims, list_violations
 from cosim.analysis.summary.run_summary import summarise
 from cosim.live.monitoring.progress import progress_line
 from cosim.live.recording import recorder

@@ -6,7 +6,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from cosim.analysis.summary import network_summary as network
+from cosim.analysis.summary.loops_over_time import INTERVALS, loops_over_time, quantiles
+from cosim.analysis.summary.network_summary import counts_inside, times_inside
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_feed import LiveFeed
 from cosim.output.viewer.loop_feed import LoopFeed
@@ -49,23 +50,23 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks
 @pytest.mark.parametrize("phase", ["0.0", "0.3"])
 def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phase: str) -> None:
     run, found, said = shown(tmp_path, count, f"controller.phase={phase}")
-    expected = network.loops_over_time(run)
+    expected = loops_over_time(run)
     for entity, values in ((ERROR, expected.errors), (SIZE, expected.states)):
         t_ns, drawn = series(found, entity)
         assert (np.diff(t_ns) > 0).all()
-        assert len(t_ns) == network.INTERVALS
-        curves = (values if count == 3 else network.quantiles(values)).T
+        assert len(t_ns) == INTERVALS
+        curves = (values if count == 3 else quantiles(values)).T
         known = np.isfinite(curves)
         difference = np.abs(10**drawn - curves)[known]
         least = 1e-5 * np.nanmax(curves)  # curves are cut off below
         close = difference <= 1e-3 * curves[known] + least
         assert close.mean() > 0.99  # at the start, the newest tick may be before x(0)
     horizon_ns = run.network.scenario.timing.horizon_ns
-    edges_ns = np.linspace(0, horizon_ns, network.INTERVALS + 1)
-    means, largest = network.counts_inside(*network.times_inside(run.network[NETEM_PACKET]), edges_ns)
+    edges_ns = np.linspace(0, horizon_ns, INTERVALS + 1)
+    means, largest = counts_inside(*times_inside(run.network[NETEM_PACKET]), edges_ns)
     np.testing.assert_allclose(series(found, QUEUE)[1], np.column_stack([largest, means]), atol=1e-6)
     shares = 100 * expected.shares()[1]
-    curves = (shares if count == 3 else network.quantiles(shares)).T
+    curves = (shares if count == 3 else quantiles(shares)).T
     np.testing.assert_allclose(series(found, SHARE)[1], curves, rtol=1e-6)
     assert (MAP in found) == (count == 30)
     assert not said
@@ -81,7 +82,7 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     monkeypatch.setattr("cosim.output.viewer.live_feed._SHARE", 1e-4)
     _, found, said = shown(tmp_path, 3)
     assert "in detail end here" in said[-1]
-    assert len(series(found, ERROR)[0]) == network.INTERVALS
+    assert len(series(found, ERROR)[0]) == INTERVALS
     with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
         series(found, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
 

@@ -9,7 +9,7 @@ import pytest
 
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import Point
-from cosim.studies.campaign.campaign_summary import JudgedClaim, judge_claims, summarise
+from cosim.studies.campaign.campaign_summary import EvaluatedClaim, evaluate_claims, summarise
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.metrics import Metric, estimate
 from noack.core.linear_systems import Vector
@@ -37,7 +37,7 @@ MORE = {"says": "ZOH sends more.", "axis": "policy",
         "holds": ["transmissions @ ZOH > transmissions @ MB"]}  # fmt: skip
 
 
-def judged(write: Write, plan: dict[str, Any], claim: dict[str, Any], zoh: Vector) -> JudgedClaim:
+def evaluated(write: Write, plan: dict[str, Any], claim: dict[str, Any], zoh: Vector) -> EvaluatedClaim:
     """Judge a claim about runs with 10 transmissions of MB, and those of ZOH at β = 0.1."""
     plan["claims"] = [claim]
     campaign, points = few_of(write(plan))
@@ -47,7 +47,7 @@ def judged(write: Write, plan: dict[str, Any], claim: dict[str, Any], zoh: Vecto
         mb = np.full(len(zoh), 10.0)
         return {"transmissions": zoh if first else mb + 5 * (point.labels["policy"] == "ZOH")}
 
-    (found,) = judge_claims(campaign, points, values)
+    (found,) = evaluate_claims(campaign, points, values)
     return found
 
 
@@ -59,7 +59,7 @@ def test_a_verdict_follows_from_the_share_of_the_draws(
     write: Write, plan: dict[str, Any], share: float, verdict: str
 ) -> None:
     zoh = np.where(np.arange(100) < 100 * share, 11.0, 9.0)
-    found = judged(write, plan, MORE, zoh)
+    found = evaluated(write, plan, MORE, zoh)
     assert (found.share, found.verdict) == (share, verdict)
     assert found.least_at == "beta 0.1"
     assert "transmissions at ZOH 11" in found.medians or share <= 0.5
@@ -69,11 +69,11 @@ def test_the_least_favourable_grid_point_counts_unless_it_is_left_out(
     write: Write, plan: dict[str, Any]
 ) -> None:
     fewer = MORE | {"holds": ["transmissions @ ZOH < transmissions @ MB"]}
-    found = judged(write, plan, fewer, np.full(4, 9.0))
+    found = evaluated(write, plan, fewer, np.full(4, 9.0))
     assert (found.share, found.least, found.least_at) == (1.0, 0.0, "beta 0.3")
     assert found.verdict == "partly"
     plan["claims_at"] = {"beta": [0.1]}
-    assert judged(write, plan, fewer, np.full(4, 9.0)).verdict == "confirmed"
+    assert evaluated(write, plan, fewer, np.full(4, 9.0)).verdict == "confirmed"
 
 
 def test_a_mistake_in_a_claim_gives_the_approved_line(write: Write, plan: dict[str, Any]) -> None:

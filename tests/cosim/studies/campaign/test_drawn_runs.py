@@ -135,7 +135,7 @@ def shared_work(*overrides: str, **settings: Any) -> SharedNetworkWork:
 
 
 def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
-    one = shared_work("network.impairments=[]", "loops.0.count=2", judges=True)
+    one = shared_work("network.impairments=[]", "loops.0.count=2", checks_claims=True)
     rows = one.run(range(2))
     assert rows.dtype == LOOPS_ROW
     seeds = seeds_of(one.seed, 1)

@@ -13,10 +13,10 @@ from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.studies.campaign.metrics import (
     burst_frequency,
     certified_error,
+    compute_metrics,
     difference,
     estimate,
     interval_ranks,
-    measured,
 )
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -62,12 +62,12 @@ def test_metrics_without_a_value_and_of_failed_runs_are_infinite(failure: int) -
         "sup_e_c_scaled": np.array([0.5, 0.25, 0.1]),
         "status": np.array([OK, OK, failure]),
     }
-    found = measured(columns, 2.0)
+    found = compute_metrics(columns, 2.0)
     assert found["transmissions"].tolist() == [10.0, 1.0, math.inf]
     assert found["lost_share"].tolist() == [0.6, 0.0, math.inf]
     assert found["settling_s"].tolist() == [1.5, math.inf, math.inf]
     assert found["certificate_used"].tolist() == [0.25, 0.125, math.inf]
-    assert "certificate_used" not in measured(columns, None)
+    assert "certificate_used" not in compute_metrics(columns, None)
 
 
 def test_the_interval_of_a_mean_is_the_textbooks() -> None:

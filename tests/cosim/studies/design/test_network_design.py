@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.design.design_page import DesignOutcome
+from cosim.studies.design.design_page import DesignOutcome, periodic_outcome
 from cosim.studies.design.event_design import Certified, EventSearch, design_for_network, event_outcome
 from cosim.studies.design.hold_strategies import read_holds
-from cosim.studies.design.network_outcome import periodic_outcome
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
 from cosim.studies.design.quick_estimate import PatternGraph
 from noack.impairments.loss_guarantee import LossesInWindow
@@ -114,27 +113,29 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
 def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
     name: str, settings: tuple[str, ...], design_request: DesignRequest
 ) -> None:
-    found = searched(shipped(name, *settings), design_request)
-    given, best = found.given, found.best
+    outcome = searched(shipped(name, *settings), design_request)
+    given, best = outcome.given, outcome.best
     assert best.level >= given.level
-    assert best.cost <= found.search.limit or best == given
+    assert best.cost <= outcome.search.limit or best == given
     if best.level >= 0:
         assert best.stability is not None
-        assert LossMargin(resolve(found.shown.scenario)).coarse_bounds().upper < 1
+        assert LossMargin(resolve(outcome.shown.scenario)).coarse_bounds().upper < 1
     if name != "double_integrator":
         assert best.level > given.level
     if design_request.window:
-        assert isinstance(found.shown.scenario.network.guarantee.rules[-1], LossesInWindow)
+        assert isinstance(outcome.shown.scenario.network.guarantee.rules[-1], LossesInWindow)
 
 
 def test_each_hold_strategy_has_the_most_that_its_best_loop_reached() -> None:
-    found = searched(shipped("lane_periodic"), DesignRequest(effort=0, most=8, holds=read_holds("zoh,model")))
-    (hold, of_hold), (model, of_model) = found.shown.by_hold
+    outcome = searched(
+        shipped("lane_periodic"), DesignRequest(effort=0, most=8, holds=read_holds("zoh,model"))
+    )
+    (hold, of_hold), (model, of_model) = outcome.shown.by_hold
     assert (hold, model, of_model) == ("hold", "the model's input", "M = 8")
     alone = searched(shipped("lane_periodic"), DesignRequest(effort=0, most=8, holds=read_holds("zoh")))
     assert of_hold == f"M = {alone.best.level + 1}"
-    assert alone.best.level < found.best.level
-    assert found.shown.to_json()["highest_by_hold"] == {hold: of_hold, model: of_model}
+    assert alone.best.level < outcome.best.level
+    assert outcome.shown.to_json()["highest_by_hold"] == {hold: of_hold, model: of_model}
 
 
 def test_the_search_is_deterministic() -> None:
@@ -172,18 +173,18 @@ def test_the_written_scenario_is_checked_and_decided_as_claimed(tmp_path: Path) 
         "--period", PERIOD_S, "--effort", 0, "--out", out, "--page", page, "--json",
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr
-    found = json.loads(result.stdout)
-    assert found["files"] == [str(page), str(out)]
+    outcome = json.loads(result.stdout)
+    assert outcome["files"] == [str(page), str(out)]
     assert "<svg" in page.read_text()
     assert invoke("check", out).exit_code == 0
     decided = json.loads(
         invoke("margin", out, "--no-period", "--most", 4, "--accuracy", 0.02, "--json").stdout
     )
-    assert decided["stable_m"] == found["best"]["certified"] == 3
+    assert decided["stable_m"] == outcome["best"]["certified"] == 3
     assert decided["mansd"] == 2
     pasted = tmp_path / "pasted.toml"
-    pasted.write_text(found["lines"])
-    assert f"gain = [\n  {list(found['best']['K'][0])},\n]".replace("[[", "[") in found["lines"]
+    pasted.write_text(outcome["lines"])
+    assert f"gain = [\n  {list(outcome['best']['K'][0])},\n]".replace("[[", "[") in outcome["lines"]
 
 
 @pytest.mark.parametrize(
@@ -199,8 +200,8 @@ def test_each_hold_strategy_is_written_decided_and_run_as_claimed(
 ) -> None:
     """Repeated patterns of the M that is proven vanish in a run, one of the next M grows."""
     scenario = shipped("unstable_pendulum", "mode=zoh", "controller.safe_input=[0.1]")
-    found = searched(scenario, DesignRequest(period_s=PERIOD_S, effort=0, holds=read_holds(word), cost=50))
-    best, written = found.best, validate(tomllib.loads(found.shown.written()), "written")
+    outcome = searched(scenario, DesignRequest(period_s=PERIOD_S, effort=0, holds=read_holds(word), cost=50))
+    best, written = outcome.best, validate(tomllib.loads(outcome.shown.scenario_toml()), "written")
     assert best.candidate.hold in read_holds(word)
     assert (written.mode, written.controller.update_timeout_s) == (mode, timeout_s)
     assert (written.controller.timeout_input, written.controller.safe_input) == (timeout_input, None)
@@ -214,19 +215,19 @@ def test_each_hold_strategy_is_written_decided_and_run_as_claimed(
 def test_the_holds_that_are_named_decide_also_about_the_given_timeout() -> None:
     given = ("controller.update_timeout_s=0.752", "mode=model")
     request = DesignRequest(period_s=PERIOD_S, effort=0, holds=read_holds("zero"), cost=50)
-    found = searched(shipped("unstable_pendulum", *given), request)
-    assert found.best.candidate.hold in read_holds("zero")
-    assert found.best.level < found.given.level
-    assert any("--holds excludes its strategy" in note for note in found.shown.notes)
-    assert found.shown.given.cells["between updates"].endswith(" (not in --holds)")
+    outcome = searched(shipped("unstable_pendulum", *given), request)
+    assert outcome.best.candidate.hold in read_holds("zero")
+    assert outcome.best.level < outcome.given.level
+    assert any("--holds excludes its strategy" in note for note in outcome.shown.notes)
+    assert outcome.shown.given.cells["between updates"].endswith(" (not in --holds)")
     same = searched(shipped("unstable_pendulum", *ZERO), request)
     assert same.search.keeps_given_hold
     assert same.best.level >= same.given.level
 
 
 def test_a_period_between_two_measurements_is_said_to_be_longer() -> None:
-    found = searched(shipped("unstable_pendulum"), DesignRequest(period_s=0.2503, effort=0))
-    assert "--period 0.2503: updates are sent at measurements, every 0.252 s" in found.shown.notes
+    outcome = searched(shipped("unstable_pendulum"), DesignRequest(period_s=0.2503, effort=0))
+    assert "--period 0.2503: updates are sent at measurements, every 0.252 s" in outcome.shown.notes
 
 
 def test_a_file_that_is_no_scenario_is_kept(tmp_path: Path) -> None:
@@ -257,7 +258,7 @@ def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
     assert certificate.constants is not None
     assert certificate.constants.state <= 1.6
     assert search.state_bound(best.loop, best.m + 1) > 1.6
-    measured = search.measured(best.loop, search._draws)
+    measured = search.measure(best.loop, search._draws)
     assert measured.cost <= search.limits.cost
     assert measured.transmissions <= search.limits.transmissions
     # Means of fresh draws differ by their own spread.
@@ -266,11 +267,11 @@ def test_a_loop_with_events_is_certified_for_more_losses_within_its_limits(
 
 def test_fewer_transmissions_of_events_for_the_same_network() -> None:
     given = shipped("double_integrator")
-    found = searched_events(given, DesignRequest("transmissions", effort=50), seed=1)
-    assert found.shown.scenario.network == given.network
-    assert found.best.measured.transmissions < 0.9 * found.given.measured.transmissions
-    assert found.search.certificate(found.best.loop, given.network.mansd + 1) is not None
-    assert found.best.m >= given.network.mansd + 1
+    outcome = searched_events(given, DesignRequest("transmissions", effort=50), seed=1)
+    assert outcome.shown.scenario.network == given.network
+    assert outcome.best.measured.transmissions < 0.9 * outcome.given.measured.transmissions
+    assert outcome.search.certificate(outcome.best.loop, given.network.mansd + 1) is not None
+    assert outcome.best.m >= given.network.mansd + 1
 
 
 @pytest.mark.parametrize("losses", [0, 2])

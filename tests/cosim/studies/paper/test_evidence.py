@@ -44,21 +44,21 @@ def computed() -> Numbers:
 
 
 def test_the_committed_evidence_is_what_the_code_computes(computed: Numbers) -> None:
-    found, expected = _rounded(computed), copy.deepcopy(COMMITTED["evidence"])
+    part, expected = _rounded(computed), copy.deepcopy(COMMITTED["evidence"])
     counts = expected["certificates"], expected["certificates"]["theorem_2"]
     assert [one["draws"] for one in counts] == [25, 26]
     for one, count in zip(counts, (len(EXTREME), len(EXTREME) + 1), strict=True):
         one["draws"] = count
     counts[1]["negative"] = len(EXTREME) + 1  # it is so in all draws
-    assert_close(found, expected)
+    assert_close(part, expected)
 
 
 def test_no_draw_exceeds_its_certified_bounds(computed: Numbers) -> None:
-    found = computed["certificates"]
-    assert max(found["error"], found["state"]) < 1 < found["inter_event"]
-    assert 1 < found["representative"]["error"] <= found["representative"]["delta"]
+    part = computed["certificates"]
+    assert max(part["error"], part["state"]) < 1 < part["inter_event"]
+    assert 1 < part["representative"]["error"] <= part["representative"]["delta"]
     # eq:tau is smallest at t_i = 0 or as t_i → ∞.
-    assert found["theorem_2"]["inter_event_s"][0] <= found["theorem_2"]["first_s"][0]
+    assert part["theorem_2"]["inter_event_s"][0] <= part["theorem_2"]["first_s"][0]
 
 
 def assert_close(first: Any, second: Any) -> None:
@@ -75,21 +75,21 @@ def assert_close(first: Any, second: Any) -> None:
 
 
 def test_the_eigenvalues_are_roots_of_the_characteristic_polynomial(computed: Numbers) -> None:
-    found = computed["eigenvalues"]
+    part = computed["eigenvalues"]
     for name, speed in (("printed", -12.0), ("flipped", 12.0)):
         model = lane_following(speed=speed)
         H = model.A + model.B @ model.K
-        for real, imaginary in found[name]:
+        for real, imaginary in part[name]:
             shifted = H - (real + 1j * imaginary) * np.eye(4)
             assert np.linalg.svd(shifted, compute_uv=False)[-1] < 1e-9
-    assert max(real for real, _ in found["printed"]) < 0 < max(r for r, _ in found["flipped"])
-    assert (found["rank"], found["rank_squared"]) == (3, 2)
+    assert max(real for real, _ in part["printed"]) < 0 < max(r for r, _ in part["flipped"])
+    assert (part["rank"], part["rank_squared"]) == (3, 2)
 
 
 def test_the_expected_loss_rate_with_a_cap_is_the_simulated_one(computed: Numbers) -> None:
     rng = np.random.default_rng(0)
-    found = computed["loss"]
-    for p, share in ((0.8, found["at_0.8"]), (found["half"], 0.5)):
+    part = computed["loss"]
+    for p, share in ((0.8, part["at_0.8"]), (part["half"], 0.5)):
         lost = burst = 0
         for draw in rng.random(40_000):
             dropped = draw < p and burst < 4
@@ -97,23 +97,23 @@ def test_the_expected_loss_rate_with_a_cap_is_the_simulated_one(computed: Number
             lost += dropped
         # The standard deviation of the share is below 0.005 / 2.
         assert lost / 40_000 == pytest.approx(share, abs=0.015)
-    assert found["most"] == 0.8
+    assert part["most"] == 0.8
 
 
 def test_with_an_exact_model_x_is_the_undisturbed_closed_loop(computed: Numbers) -> None:
-    found = computed["exact_model"]
+    part = computed["exact_model"]
     model = lane_following()
     H, x0 = model.A + model.B @ model.K, np.array([0.5, 0.0, 0.1, 3.0])
-    assert found["events"] == 1
-    expected = [np.linalg.norm(expm(H * t_s) @ x0) for t_s in found["times_s"]]
-    np.testing.assert_allclose(found["norms"], expected, rtol=1e-9)
+    assert part["events"] == 1
+    expected = [np.linalg.norm(expm(H * t_s) @ x0) for t_s in part["times_s"]]
+    np.testing.assert_allclose(part["norms"], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
 def test_trapped_states_do_not_excite_the_unstable_mode(computed: Numbers, mode: str) -> None:
-    found = computed["trapped"]
-    assert found[mode] == found["n"] - found["unstable"] == 3
-    loop = loop_of(resolved_draw(SCENARIO, found["draw"], "model"))
+    part = computed["trapped"]
+    assert part[mode] == part["n"] - part["unstable"] == 3
+    loop = loop_of(resolved_draw(SCENARIO, part["draw"], "model"))
     n, BK = loop.n, loop.B @ loop.K
     H = loop.H if mode == "model" else np.zeros((n, n))
     rate = np.linalg.eigvals(loop.A).real.max()
@@ -127,42 +127,42 @@ def test_trapped_states_do_not_excite_the_unstable_mode(computed: Numbers, mode:
 
 
 def test_the_slow_models_error_is_the_closed_form(computed: Numbers) -> None:
-    found = computed["slow_model"]
-    assert found["model_per_s"] == pytest.approx(0.1)
-    assert found["model_per_s"] < found["alpha_per_s"] < found["closed_per_s"]
+    part = computed["slow_model"]
+    assert part["model_per_s"] == pytest.approx(0.1)
+    assert part["model_per_s"] < part["alpha_per_s"] < part["closed_per_s"]
     since_s = 0.0
-    for end_s, thresholds in zip(found["deliveries_s"], found["thresholds"], strict=True):
+    for end_s, thresholds in zip(part["deliveries_s"], part["thresholds"], strict=True):
         x, x_c = 5 * np.exp(-end_s), 5 * np.exp(-since_s - 0.1 * (end_s - since_s))
         assert thresholds == pytest.approx((x_c - x) * np.exp(0.5 * end_s), rel=1e-9)
         since_s = end_s
-    assert found["thresholds"] == sorted(found["thresholds"])
-    assert found["thresholds"][-1] > 1e30
+    assert part["thresholds"] == sorted(part["thresholds"])
+    assert part["thresholds"][-1] > 1e30
 
 
 def test_the_vehicles_rest_state_is_the_limit_of_its_free_motion(computed: Numbers) -> None:
-    found = computed["standstill"]
+    part = computed["standstill"]
     model = lane_following()
-    x0 = np.array(found["x0"])
+    x0 = np.array(part["x0"])
     assert np.abs(model.K @ x0).max() < 1e-12
     # Without input: (V, r) e^(λt), ψ(∞) = 0, Y(∞) = Y(0) + ∫(V + Uψ) dt with ψ = r/λ.
-    rate = found["stable_per_s"]
+    rate = part["stable_per_s"]
     rest = x0[3] + (x0[0] - 12.0 * x0[1] / rate) / -rate
-    assert found["norms"][-1] == pytest.approx(abs(rest), rel=1e-6)
+    assert part["norms"][-1] == pytest.approx(abs(rest), rel=1e-6)
     # From the second event on ‖e_s‖ tends to the remaining motion at the measurement: d e^(λt).
-    first, second = found["events_s"][1:]
+    first, second = part["events_s"][1:]
     left = np.linalg.norm(expm(model.A * first) @ x0 - [0.0, 0.0, 0.0, rest])
     assert 0.5 * np.exp(-0.25 * second) == pytest.approx(left, rel=1e-3)
 
 
 def test_theorem_3s_equation_is_solved_with_and_without_the_factor(computed: Numbers) -> None:
-    found = computed["theorem_3"]
-    gamma = found["gamma_per_s"]
-    for row in found["rows"]:
+    part = computed["theorem_3"]
+    gamma = part["gamma_per_s"]
+    for row in part["rows"]:
         for name, level in (("printed", 0.5), ("derived", 0.5 * np.exp(-0.25 * row["t_s"]))):
             delta_s = row[name]
             left = row["norm"] * (np.exp(gamma * delta_s) - 1)
             assert left == pytest.approx(level * np.exp(-0.25 * delta_s), rel=1e-6)
-    assert found["rows"][-1]["printed"] > 5 * found["rows"][-1]["derived"]
+    assert part["rows"][-1]["printed"] > 5 * part["rows"][-1]["derived"]
 
 
 def test_the_page_is_the_template_with_the_committed_numbers() -> None:

@@ -152,7 +152,7 @@ def test_without_the_library_one_line_says_how_to_get_it(
 def test_a_run_is_held_against_its_region() -> None:
     for name, verdict in (("sine_pendulum", ClaimVerdict.HELD), ("cart_pole", ClaimVerdict.VOID)):
         record = simulate(resolve(load(SCENARIOS / f"{name}.toml", ["horizon_s=1.0"])))
-        claims = [one for one in RunClaims(record).judge() if one.source == "region certificate"]
+        claims = [one for one in RunClaims(record).evaluate() if one.source == "region certificate"]
         assert {one.verdict for one in claims} == {verdict}
         assert ("x stays in the region" in {one.what for one in claims}) == (name != "cart_pole")
 
@@ -175,7 +175,7 @@ def test_what_persists_is_bounded_on_a_region(setting: str) -> None:
     assert undisturbed.region is not None
     assert np.less(certificate.region.x, np.multiply(1.1, undisturbed.region.x)).all()
     claims = [
-        claim for claim in RunClaims(simulate(resolved)).judge() if claim.source == "region certificate"
+        claim for claim in RunClaims(simulate(resolved)).evaluate() if claim.source == "region certificate"
     ]
     assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}
 

@@ -9,6 +9,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from noack.core.linear_systems import Matrix
 from noack.impairments.constraints import join_guarantee
+from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.scenario.resolution import loop_of
 from noack.theory.margins.exact_matrices import exactly
@@ -21,6 +22,7 @@ from noack.theory.random_losses.exact_moments import (
     flow,
     jump,
     periods_of,
+    start_of,
 )
 from tests.noack.theory.random_losses.example_losses import BURSTS, NOISE, scenario
 
@@ -130,3 +132,22 @@ def test_moments_do_not_depend_on_the_units_of_the_states() -> None:
         assert stationary is not None
         found.append(stationary[1][0])
     assert found[1] == pytest.approx(found[0], rel=1e-9)
+
+
+@pytest.mark.parametrize("guarantee", [join_guarantee(2, ()), LossGuarantee()])
+def test_many_periods_are_the_sum_of_few(guarantee: LossGuarantee) -> None:
+    """Many are computed by a power of the cycle's map."""
+    given = scenario(**NOISE, network={"mansd": 2, "loss": BURSTS}, **{"controller.rate_hz": 10.0})
+    outcomes = loss_process(given.network.link).outcomes(guarantee)
+    periods = periods_of(given, np.eye(3)[None])
+    moments, start = LoopMoments(periods, outcomes), start_of(given, outcomes)
+    few_ns, rest_ns = 8 * periods.times.slots * periods.times.period_ns, 70_000_000
+    many, costs = moments.until(start, 150 * few_ns + rest_ns)
+    expected, expected_costs = start, np.zeros(1)
+    for _ in range(150):
+        expected, added = moments.until(expected, few_ns)
+        expected_costs = expected_costs + added
+    expected, added = moments.until(expected, rest_ns)
+    np.testing.assert_allclose(many.shares, expected.shares, rtol=1e-10)
+    np.testing.assert_allclose(many.moments, expected.moments, rtol=1e-9, atol=1e-9 * many.moments.max())
+    np.testing.assert_allclose(costs, expected_costs + added, rtol=1e-9)

@@ -1,0 +1,221 @@
+"""The sizes of a loop's signals, from its record.
+
+* :class:`SignalStatistics`: states and errors, in one pass over the aligned run; with them the
+  :class:`SampleFacts` that claims need before they are checked.
+* :func:`disturbances` of u and of ẋ.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.summary.summary_model import DisturbancePart, EstimationPart
+from cosim.record.align import (
+    AlignedPart,
+    AlignedRun,
+    Reals,
+    SizeStatistics,
+    bounded_parts,
+    expected_rms,
+    shares_update,
+)
+from cosim.record.run_events import changes_of
+from cosim.record.run_record import RunRecord
+from noack.core.linear_systems import Matrix, row_norms
+from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
+from noack.scenario.resolution import loop_of, setpoint_of
+from noack.scenario.scenario import Scenario
+
+
+def _setpoints(record: RunRecord) -> tuple[list[int], Matrix]:
+    """Return when the set point changed, (k,), and the set points x_r, (k + 1, n); 0 is a row."""
+    changes = changes_of(record)
+    given = (setpoint_of(change) for change in (record.scenario, *(change.scenario for change in changes)))
+    nothing = np.zeros(loop_of(record.scenario).n)
+    points = [nothing if setpoint is None else setpoint[0] for setpoint in given]
+    return [change.first_ns for change in changes], np.array(points)
+
+
+def _larger(before: float | None, values: Reals) -> float | None:
+    """Return the largest of the values and of those before; NaN if one is NaN."""
+    if not len(values):
+        return before
+    largest = values.max()
+    return float(largest if before is None else np.maximum(before, largest))
+
+
+class SampleFacts(NamedTuple):
+    """What claims need to know about all samples of a run before they are checked."""
+
+    any_in_common: bool = False
+    gap_s: float | None = None
+    """First time at which the controller's error is not known, although it was before."""
+    largest_state: float = 0.0
+    """Largest entry of x_s, and of x_c where it is known, before the end of the claims."""
+    longest_update_ns: int = 0
+    """Longest time between two updates of the controller, or to the end of the run."""
+
+
+class SampleFactsReader:
+    """Reads these facts, part by part of an aligned run; the claims end at ``until_s``."""
+
+    def __init__(self, scenario: Scenario, until_s: float = math.inf) -> None:
+        self._scenario, self._until_s = scenario, until_s
+        self._found = SampleFacts()
+        self._fresh_ns: int | None = None
+        self._newest, self._last_ns = -1, 0
+
+    def take(self, aligned: AlignedRun, common: NDArray[np.bool_] | None = None) -> None:
+        """Add the next measurements; it may be known where sensor and controller share an update."""
+        if not len(aligned.t_ns):
+            return
+        common = shares_update(self._scenario, aligned) if common is None else common
+        facts, t_s = self._found, aligned.t_ns * 1e-9
+        started = np.logical_or.accumulate(common) | facts.any_in_common
+        gaps = np.flatnonzero(started & ~common)
+        gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
+        until = t_s < self._until_s
+        both = np.concatenate(
+            [aligned.x_s.compress(until, axis=0), aligned.x_c.compress(common & until, axis=0)]
+        )
+        largest = float(np.abs(both[np.isfinite(both)]).max(initial=facts.largest_state))
+        changes = aligned.t_ns[np.flatnonzero(np.diff(aligned.received, prepend=self._newest))]
+        ends_ns = changes if self._fresh_ns is None else np.append(self._fresh_ns, changes)
+        longest_ns = int(np.diff(ends_ns).max(initial=facts.longest_update_ns))
+        self._fresh_ns = int(ends_ns[-1]) if len(ends_ns) else None
+        self._newest, self._last_ns = int(aligned.received[-1]), int(aligned.t_ns[-1])
+        self._found = SampleFacts(bool(started[-1]), gap_s, largest, longest_ns)
+
+    @property
+    def facts(self) -> SampleFacts:
+        """What is known after the last part."""
+        if self._fresh_ns is None:
+            return self._found
+        since_ns = self._last_ns - self._fresh_ns
+        longest_ns = max(self._found.longest_update_ns, since_ns)
+        return self._found._replace(longest_update_ns=longest_ns)
+
+
+class SignalFields(TypedDict):
+    """The fields of a loop's summary about its signals."""
+
+    setpoint: list[float] | None
+    initial_state_norm: float | None
+    final_state_norm: float | None
+    sup_state_norm: float | None
+    sup_e_s_norm: float | None
+    sup_e_c_norm: float | None
+    sup_e_c_at_s: float | None
+    identity_residual_max: float | None
+    identity_residual_relative: float | None
+
+
+class SignalStatistics:
+    """Reads the signals of a run once, aligned."""
+
+    def __init__(self, record: RunRecord) -> None:
+        self._record = record
+        self._sup_e_s: float | None = None
+        self._sup_e_c: float | None = None
+        self._sup_e_c_at_s: float | None = None
+        self._residual: float | None = None
+        self._sup_true_e_c: float | None = None
+        self._errors, self._late_errors = SizeStatistics(), SizeStatistics()
+        self._scale, self._read = 0.0, 0
+        self._half = record.count(SENSOR_MEASUREMENT) // 2
+        facts = SampleFactsReader(record.scenario)
+        for bounded in bounded_parts(record):
+            part, left = bounded.part, bounded.residual
+            self._add(part)
+            facts.take(part.aligned, bounded.shared)
+            self._residual = _larger(self._residual, left[~np.isnan(left)])
+            self._estimation_error(part)
+            self._read += len(part.rows)
+        self.facts = facts.facts
+        """What claims need to know before they are checked."""
+
+    def _add(self, part: AlignedPart) -> None:
+        aligned = part.aligned
+        common = aligned.since_delivery(self._record.scenario)
+        t_s, e_c = aligned.t_ns[common] * 1e-9, aligned.e_c_norm[common]
+        self._sup_e_s = _larger(self._sup_e_s, aligned.e_s_norm)
+        if len(e_c) and (self._sup_e_c is None or e_c.max() > self._sup_e_c):
+            self._sup_e_c, self._sup_e_c_at_s = float(e_c.max()), float(t_s[np.argmax(e_c)])
+        self._scale = float(np.maximum(self._scale, np.abs(aligned.x_s).max(initial=0.0)))
+
+    def _estimation_error(self, part: AlignedPart) -> None:
+        if part.true_x is None:
+            return
+        # ‖x_c − x‖_W with the plant's own x, from the controller's first update on
+        aligned, weight = part.aligned, self._record.loop.weight
+        e_c = aligned.x_c - part.true_x
+        norms = row_norms(e_c if weight is None else e_c @ weight.T)
+        counted = np.isfinite(norms) & aligned.since_delivery(self._record.scenario)
+        self._sup_true_e_c = _larger(self._sup_true_e_c, norms[counted])
+        errors = row_norms(part.rows["x"] - part.true_x)
+        self._errors.add(errors)
+        self._late_errors.add(errors[max(self._half - self._read, 0) :])
+
+    def for_summary(self) -> SignalFields:
+        """Return norms of the state, of the errors, and of the residual of (I1)."""
+        first, last, largest = None, None, None
+        since_ns, points = _setpoints(self._record)
+        for steps in self._record.source.batches(PLANT_STEP, ("t_ns", "x")):
+            x = steps["x"]
+            if points.any():
+                x = x - points[np.searchsorted(since_ns, steps["t_ns"], "right")]
+            norms = row_norms(x)
+            first = float(norms[0]) if first is None else first
+            last, largest = float(norms[-1]), _larger(largest, norms)
+        scale = max(self._scale, float(np.finfo(float).tiny))
+        return {
+            "setpoint": points[-1].tolist() if points.any() else None,
+            "initial_state_norm": first,
+            "final_state_norm": last,
+            "sup_state_norm": largest,
+            "sup_e_s_norm": self._sup_e_s,
+            "sup_e_c_norm": self._sup_e_c,
+            "sup_e_c_at_s": self._sup_e_c_at_s,
+            "identity_residual_max": self._residual,
+            "identity_residual_relative": None if self._residual is None else self._residual / scale,
+        }
+
+    def estimation(self) -> EstimationPart | None:
+        """Return the estimation error; None if the sensor measures x itself."""
+        scenario = self._record.scenario
+        if scenario.coverage.knows_state:
+            return None
+        return EstimationPart(
+            observer=None if scenario.observer is None else scenario.observer.kind,
+            outputs=scenario.message_sizes.outputs,
+            noise_std=np.sqrt(scenario.plant.measurement.variance(self._record.loop.n)).tolist(),
+            rms=self._errors.rms,
+            rms_second_half=self._late_errors.rms,
+            expected_rms=expected_rms(scenario),
+            max=self._errors.max,
+            sup_e_c_norm=self._sup_true_e_c,
+        )
+
+
+@lru_cache(maxsize=1)
+@np.errstate(all="ignore")  # a run may diverge
+def signal_statistics(record: RunRecord) -> "SignalStatistics":
+    """Read the signals of a run; the summary and the claims use the same ones."""
+    return SignalStatistics(record)
+
+
+def disturbances(record: RunRecord) -> list[DisturbancePart]:
+    """The disturbances of u and of ẋ."""
+    parts = []
+    for entry, column in (("input", "d"), ("state", "w")):
+        if column not in (record.tables[PLANT_STEP].names or ()):
+            continue
+        sizes = SizeStatistics()
+        for steps in record.source.batches(PLANT_STEP, (column,)):
+            sizes.add(row_norms(steps[column]))
+        kinds = [cause.kind for cause in record.scenario.plant.disturbances if cause.at == entry]
+        parts.append(DisturbancePart(at=entry, kinds=kinds, rms=sizes.rms, max=sizes.max))
+    return parts

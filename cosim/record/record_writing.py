@@ -1,0 +1,81 @@
+"""Writes the record of a run: tables as Parquet, the run's log, and the processes' reports."""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+from cosim.lazy_modules import lazy_modules
+from cosim.record.processes import joint_reports
+from cosim.record.record_source import Rows, with_loop
+from cosim.record.run_directory import RECORD, REPORTS_FILE
+from cosim.record.run_record import NOTICES_FILE, Notice, RecordedRun
+from noack.core.file_access import PARTIAL, new_file, write_whole
+from noack.core.process_limits import cores
+from noack.protocol.record_tables import CLOCK_TABLES, LOOP, is_of_network
+from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
+
+with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
+    from cosim.record import table_files
+
+
+def write_run(run: RecordedRun, run_dir: Path) -> None:
+    """Write the tables, the notices and the reports of a run into its directory.
+
+    Raises:
+        OSError, NoackError: they cannot be written.
+    """
+    types = run_tables(run.scenario)
+
+    def rows(table: str) -> Iterator[Rows]:
+        if is_of_network(table):
+            yield from run.network.source.batches(table)
+            return
+        # A process's clock is in the record of every loop; only simulated runs have several, and
+        # those compare no clocks.
+        for number, record in enumerate(run.loops[:1] if table in CLOCK_TABLES else run.loops):
+            if table in record.tables:
+                for batch in record.source.batches(table):
+                    yield with_loop(batch, number, types[table])
+
+    common = list(run.network.notices)
+    of_loops = [
+        notice | {LOOP: number}
+        for number, record in enumerate(run.loops)
+        for notice in record.notices
+        if notice not in common
+    ]
+    notices = sorted([*common, *of_loops], key=lambda notice: int(notice["t_ns"]))
+    reports = joint_reports(run.network.reports, [record.reports for record in run.loops])
+    write_whole(run_dir / REPORTS_FILE, json.dumps(reports, indent=2), make_folder=False)
+    folder, names = run_dir / RECORD, vector_names(run.scenario)
+    with record_folder(folder, notices), ThreadPoolExecutor(cores()) as threads:
+        written = [
+            threads.submit(table_files.write_table, folder / f"{table}.parquet", rows(table), dtype, names)
+            for table, dtype in types.items()
+        ]
+        for writing in written:
+            writing.result()
+
+
+def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
+    """Return the names of states and inputs, if they are the same in all loops."""
+    models = [resolve(loop_scenario(scenario, section)).model for section in loop_sections(scenario)]
+    names = {(model.state_names or (), model.input_names or ()) for model in models}
+    if len(names) > 1:
+        return {}
+    ((states, inputs),) = names
+    return {"state_names": states, "input_names": inputs}
+
+
+@contextmanager
+def record_folder(folder: Path, notices: Iterable[Notice]) -> Iterator[None]:
+    """Have a folder for the tables that are written within the context, and for the run's log."""
+    folder.mkdir(exist_ok=True)
+    for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
+        scratch.unlink(missing_ok=True)
+    yield
+    with new_file(folder / NOTICES_FILE, make_folder=False) as file:
+        file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)

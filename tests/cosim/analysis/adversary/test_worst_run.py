@@ -1,0 +1,67 @@
+"""The worst run as values: its share of a certificate's bound, and that bound at the same time."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from cosim.analysis.adversary.loop_flows import Objective, ObjectiveValue, measure_of
+from cosim.analysis.adversary.worst_run import WorstRun, certified_value, reported_value
+from cosim.simulation.continuous import continuous_loop_of
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify
+from tests.helpers.shipped import resolved
+
+WORST = WorstRun(
+    Objective.STATE, 10.0, value=3.0, at_s=1.0, pattern=(True, False), event_s=(0.5, 1.0), exact=True,
+    nodes=4, runs=2, lossless=1.0, with_own_network=2.0, certified=4.0, elapsed_s=0.1,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("objective", "value", "certified", "share", "breaches"),
+    [
+        (Objective.STATE, 3.0, 4.0, 0.75, False),
+        (Objective.STATE, 4.1, 4.0, 1.025, True),
+        (Objective.STATE, 4.0 * (1 + 1e-12), 4.0, 1.0, False),  # a rounding error
+        (Objective.INTER_EVENT, 0.2, 0.1, 0.5, False),  # the bound is a lower one
+        (Objective.INTER_EVENT, 0.05, 0.1, 2.0, True),
+        (Objective.STATE, 3.0, None, None, False),
+        (Objective.INTER_EVENT, None, 0.1, None, False),
+    ],
+)
+def test_a_run_beyond_the_bound_refutes_the_certificate(
+    objective: Objective, value: float | None, certified: float | None, share: float | None, *, breaches: bool
+) -> None:
+    worst = replace(WORST, objective=objective, value=value, certified=certified)
+    assert worst.tightness == (None if share is None else pytest.approx(share))
+    assert worst.breaches is breaches
+
+
+def test_an_infinite_value_is_null_in_json() -> None:
+    diverged = replace(WORST, value=math.inf)
+    assert diverged.diverges
+    content = diverged.to_json()
+    assert (content["value"], content["diverges"]) == (None, True)
+    assert (content["pattern"], content["delivered"]) == ("DL", [0])
+
+
+@pytest.mark.parametrize(("value", "expected"), [(-0.2, 0.2), (-math.inf, None)])
+def test_an_inter_event_time_is_reported_with_its_own_sign(value: float, expected: float | None) -> None:
+    assert reported_value(value, Objective.INTER_EVENT) == expected
+    assert reported_value(value, Objective.STATE) == value
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.01])
+def test_the_certified_cost_is_the_integral_of_the_squared_bound(floor: float) -> None:
+    scenario, horizon_s = resolved("double_integrator", f"trigger.floor={floor}"), 30.0
+    certificate = certify(scenario, ideal_conditions(scenario))
+    measure = measure_of(continuous_loop_of(scenario), Objective.COST)
+    found = certified_value(certificate, measure, horizon_s, ObjectiveValue(1.0, None))
+    kink_s = [certificate.floor_from_s] if floor else None
+    expected, error = quad(
+        lambda t: certificate.state(np.array([t]))[0] ** 2, 0, horizon_s, points=kink_s, limit=200
+    )
+    assert found == pytest.approx(expected, abs=10 * error)
