@@ -27,7 +27,8 @@ from netem.control.emulator_statistics import (
     unintended,
 )
 from netem.control.statistics_view import Screen, picture_of
-from netem.emulator_options import command_line_parser, explain, parsed, specs_of
+from netem.emulator_options import command_line_parser, parsed, specs_of
+from netem.explanation import explain
 from netem.fates import FateRecorder, read_fates
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, raise_file_limit, report_line
