@@ -30,9 +30,9 @@ from netem.control.statistics_view import Screen, picture_of
 from netem.emulator_options import command_line_parser, parsed, specs_of
 from netem.explanation import explain
 from netem.fates import FateRecorder, read_fates
+from netem.relay.device_link import DeviceLink
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, raise_file_limit, report_line
-from netem.shell.devices import DeviceLink
 from noack.core.errors import CallerError, ExitStatus, NoackError, why
 from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings

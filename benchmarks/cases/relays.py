@@ -41,7 +41,7 @@ from benchmarks.report import (
     say,
 )
 from netem.relay.relay_links import LinkSpec
-from netem.shell.devices import open_devices
+from netem.shell.devices import inside, open_devices
 from noack.impairments.link_settings import LinkSettings
 
 ROUNDS = 2
@@ -281,7 +281,7 @@ def _bare(forwarder: Path, command: str) -> str:
         words = [str(forwarder), *map(str, link.devices)]
         process = stack.enter_context(subprocess.Popen(words, pass_fds=link.devices))
         stack.callback(process.kill)
-        with link.inside():
+        with inside(link):
             variables = os.environ | {"TO": link.spec.to[0]}
             words = ["sh", "-c", command]
             inner = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=variables)

@@ -23,15 +23,9 @@ from typing import NamedTuple, Self, TypedDict, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from netem.control.time_histogram import coarse_histogram, quantile_ns
 from netem.relay.relay import Relay
-from netem.relay.relay_links import (
-    DIRECTIONS,
-    Direction,
-    DirectionReport,
-    LinkReport,
-    coarse_histogram,
-    quantile_ns,
-)
+from netem.relay.relay_links import DIRECTIONS, Direction, DirectionReport, LinkReport
 from netem.tc_words import words_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError

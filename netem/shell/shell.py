@@ -13,9 +13,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from netem.emulator_options import parsed, shell_parser, shell_spec
+from netem.relay.device_link import DeviceLink
 from netem.relay.relay_links import report_line
 from netem.shell import process
-from netem.shell.devices import DeviceLink, open_devices
+from netem.shell.devices import inside, open_devices
 from netem.stand_alone import add_recording_options, check_options, relay, report_totals
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.process_limits import python_command
@@ -86,7 +87,7 @@ class _Program:
         earlier_children = process.children()
         process.adopt_orphans()
         processes = [_start(command) for command in self._outside]
-        with self.devices.inside():
+        with inside(self.devices):
             main = _start(self._command, addresses)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         ends = f"inside {spec.listen[0]}, outside {' and '.join(addresses.values())}"

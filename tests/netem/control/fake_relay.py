@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from netem.control.emulator_statistics import CommandQueue
-from netem.relay import relay_links
+from netem.control.time_histogram import BUCKETS
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport, LinkSpec
 from netem.stand_alone import _add_watching_options, check_watching_options
@@ -37,7 +37,7 @@ def spec_of(name: str) -> LinkSpec:
 
 def times(*t_ns: int) -> NDArray[np.int64]:
     buckets = [core.noack_bucket_of(one_ns) for one_ns in t_ns]
-    return np.bincount(np.array(buckets, np.int64), minlength=relay_links.BUCKETS)
+    return np.bincount(np.array(buckets, np.int64), minlength=BUCKETS)
 
 
 class FakeRelay(Relay):

@@ -6,6 +6,8 @@ import resource
 import socket
 import sys
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,17 @@ def numbers(datagrams: Received) -> list[int]:
 def send_numbers(client: socket.socket, to: Any, begin: int, end: int) -> None:
     for number in range(begin, end):
         client.sendto(number.to_bytes(4, "big"), to)
+
+
+@contextmanager
+def no_descriptors_left(clients: Sequence[socket.socket]) -> Iterator[None]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = max(client.fileno() for client in clients) + 2
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 @IP_VERSIONS
@@ -190,17 +203,23 @@ def test_more_clients_than_allowed_are_refused_and_counted(
         drain(server)
         clients[2].sendto(b"now", one.address())
         assert one.receive(server)[0][0] == b"now"
-        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        most = max(client.fileno() for client in clients) + 2
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-        try:
+        with no_descriptors_left(clients):
             clients[0].sendto(b"x", one.address())
             one.until(lambda: one.report().refused == 3)
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     error = capfd.readouterr().err
     assert error.count("no more than 2 clients at once") == 1
     assert error.count("no file descriptors are left") == 1
+
+
+def test_a_link_without_clients_tries_again_after_a_lack_of_descriptors() -> None:
+    """With a client it waits for the end of one; without, nothing would end the wait."""
+    with relayed() as (server, client, one):
+        with no_descriptors_left([client]):
+            client.sendto(b"x", one.address())
+            one.until(lambda: one.report().refused > 0)
+        one.until(lambda: not one.relay._directions[0].row.full)
+        client.sendto(b"now", one.address())
+        assert one.receive(server)[0][0] == b"now"
 
 
 @pytest.mark.parametrize("return_path", [True, False])
