@@ -173,7 +173,7 @@ def shell_spec(options: argparse.Namespace) -> LinkSpec:
     return LinkSpec(LINK_NAME, _NOWHERE, _NOWHERE, forward, reverse, seed, idle_s=_idle_s(options.idle))
 
 
-def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
+def parse_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line.
 
     Raises:

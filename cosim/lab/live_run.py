@@ -2,7 +2,7 @@
 
 :class:`LiveRun` is the page's side: the process, its progress, what it has reported. Run as a
 program, this module is the other side: it reads the scenario's text from standard input, until its
-end, and writes one JSON object per line on standard output: what happened, with its fields.
+end, and writes one JSON object per line on standard output: an event with its fields.
 """
 
 import asyncio
@@ -20,6 +20,7 @@ from cosim.interactive.scenario_draft import Draft
 from cosim.live.launcher import launch
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.output.viewer.rerun_program import is_installed
+from netem.shell import process
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command
 from noack.protocol.roles import LOOP_ROLES
@@ -33,7 +34,6 @@ MOST_LINES = 200
 """Of the log."""
 _STOP_S = 20.0
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
-_CMDLINE = Path("/proc")
 
 
 @dataclass
@@ -86,7 +86,7 @@ class LiveRun:
         self._process.stdin.close()  # after the text; a process that has ended needs none
 
     async def follow(self) -> None:
-        """Read what the run says until it has ended."""
+        """Read the reports of the run until it has ended."""
         assert self._process is not None
         assert self._process.stdout is not None
         async for line in self._process.stdout:
@@ -178,22 +178,13 @@ class LiveRun:
 
 def _descendants(pid: int) -> list[int]:
     """Return the processes below a process."""
-    parents: dict[int, int] = {}
-    for folder in _CMDLINE.iterdir():
-        if folder.name.isdigit():
-            with suppress(OSError, ValueError, IndexError):
-                stat = (folder / "stat").read_text().rpartition(")")[2].split()
-                parents[int(folder.name)] = int(stat[1])
-    descendants, new = set[int](), {pid}
-    while new:
-        new = {child for child, parent in parents.items() if parent in new} - descendants
-        descendants |= new
-    return sorted(descendants)
+    own_children = sorted(process.children(pid))
+    return own_children + [below for child in own_children for below in _descendants(child)]
 
 
 def _title(pid: int) -> str:
     with suppress(OSError):
-        return (_CMDLINE / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+        return Path("/proc", str(pid), "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
     return ""
 
 

@@ -13,7 +13,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
-from netem.channel import UPDATE_LINK, Channel, Leaving, require_stand_alone
+from netem.channel import UPDATE_LINK, Channel, Departure, require_stand_alone
 from netem.link_state import LinkState
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError, PeerError
@@ -183,7 +183,7 @@ class _Network:
                 route.longest_burst = max(route.longest_burst, int(row["consecutive_losses"]))
         self._leave(left, now_ns / NS_PER_S)
 
-    def _leave(self, left: Iterable[Leaving], now_s: float) -> None:
+    def _leave(self, left: Iterable[Departure], now_s: float) -> None:
         """Send what leaves the channel now."""
         helics = self._helics
         for flow, number, bit in left:

@@ -5,7 +5,6 @@ The client sends queries to a running emulator, and receives its statistics.
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,7 +24,7 @@ from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import read_files
-from noack.runtime.command_line import Parser, Signals, failed
+from noack.runtime.command_line import Parser, Signals, discard_output, failed
 from noack.runtime.control_plane import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
@@ -100,9 +99,7 @@ def main(arguments: Sequence[str]) -> ExitStatus:
         source, as_json = f"noack netem {command}", "--json" in options
         return failed(str(error), error.exit_status, source=source, as_json=as_json)
     except BrokenPipeError:  # the reader has closed the pipe
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, sys.stdout.fileno())
-        os.close(null)
+        discard_output(sys.stdout.fileno())
         return ExitStatus.OK
 
 

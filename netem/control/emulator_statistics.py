@@ -61,7 +61,7 @@ class Snapshot(NamedTuple):
     """The state of a relay at one time."""
 
     links: Sequence[LinkReport]
-    in_force: Mapping[tuple[str, Direction], AppliedSettings]
+    applied: Mapping[tuple[str, Direction], AppliedSettings]
     elapsed_ns: int  # Time since the relay started
     unix_ns: int
 
@@ -74,7 +74,7 @@ class CommandQueue:
         self._began_ns = time.monotonic_ns()
         self._waiting: SimpleQueue[tuple[Callable[[], None], Callable[[], bool]]] = SimpleQueue()
         """What runs a command, and what cancels it."""
-        self._in_force: dict[tuple[str, Direction], AppliedSettings] = {
+        self._applied: dict[tuple[str, Direction], AppliedSettings] = {
             (spec.name, direction): AppliedSettings(getattr(spec, direction), Counters())
             for spec in relay.specs
             for direction in DIRECTIONS
@@ -136,13 +136,13 @@ class CommandQueue:
         Raises:
             PeerError: the relay has ended, or does not answer.
         """
-        return self.submit(self.look)
+        return self.submit(self.snapshot_here)
 
-    def look(self) -> Snapshot:
+    def snapshot_here(self) -> Snapshot:
         """Return the state of the relay, in its thread or after its end."""
         return Snapshot(
             self._relay.report(),
-            dict(self._in_force),
+            dict(self._applied),
             time.monotonic_ns() - self._began_ns,
             time.time_ns(),
         )
@@ -161,7 +161,7 @@ class CommandQueue:
             (report,) = (link_report for link_report in self._relay.report() if link_report.name == link)
             for direction in directions:
                 counters = replace(getattr(report, direction).counters)
-                self._in_force[link, direction] = AppliedSettings(settings, counters)
+                self._applied[link, direction] = AppliedSettings(settings, counters)
 
         self.submit(command)
 
@@ -295,8 +295,8 @@ def statistics(latest: Snapshot, earlier: Snapshot | None = None) -> Statistics:
 
 def _link(new: LinkReport, old: LinkReport | None, seconds: float, snapshot: Snapshot) -> LinkStatistics:
     def direction(name: Direction) -> DirectionStatistics:
-        in_force = snapshot.in_force[new.name, name]
-        return _direction(getattr(new, name), in_force, getattr(old, name, None), seconds)
+        applied = snapshot.applied[new.name, name]
+        return _direction(getattr(new, name), applied, getattr(old, name, None), seconds)
 
     return {
         "name": new.name,
@@ -314,11 +314,11 @@ def _link(new: LinkReport, old: LinkReport | None, seconds: float, snapshot: Sna
 
 def _direction(
     report: DirectionReport,
-    in_force: AppliedSettings,
+    applied: AppliedSettings,
     earlier: DirectionReport | None,
     seconds: float,
 ) -> DirectionStatistics:
-    counters, since, words = report.counters, in_force.since, in_force.words
+    counters, since, words = report.counters, applied.since, applied.words
     new = counters - since
     return {
         "words": words if len(words) <= _MAX_WORDS else words[: _MAX_WORDS - 1] + "…",
@@ -338,7 +338,7 @@ def _direction(
             "realised": loss_share(new),
             "lost": _share(new, new.dropped + new.corrupted + new.overflowed + new.blacked_out),
             "drawn": _share(new, new.dropped + new.corrupted),
-            "predicted": in_force.predicted_loss,
+            "predicted": applied.predicted_loss,
         },
         "unintended": dict(report.unintended),
         "in_flight": report.in_flight,
@@ -453,7 +453,7 @@ class StatisticsThread:
                 with suppress(PeerError):
                     self._show_next(self._commands.snapshot())
         if self._at_end:
-            self._show_next(self._commands.look())
+            self._show_next(self._commands.snapshot_here())
 
     def _show_next(self, snapshot: Snapshot) -> None:
         earlier = self._snapshots[-1] if self._snapshots else None

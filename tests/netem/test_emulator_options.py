@@ -12,7 +12,7 @@ import pytest
 from netem import stand_alone
 from netem.__main__ import main
 from netem.emulator_options import command_line_parser as parser
-from netem.emulator_options import parsed, specs_of
+from netem.emulator_options import parse_options, specs_of
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import EXAMPLES, KEYWORDS, parse, settings_of
@@ -23,7 +23,7 @@ ADDRESSES = "--listen :9000 --to :9001"
 
 
 def specs(arguments: str) -> tuple[LinkSpec, ...]:
-    return specs_of(parsed(parser(), shlex.split(arguments)))
+    return specs_of(parse_options(parser(), shlex.split(arguments)))
 
 
 @pytest.mark.parametrize(

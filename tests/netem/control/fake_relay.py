@@ -20,7 +20,7 @@ from netem.control.emulator_statistics import CommandQueue
 from netem.control.time_histogram import BUCKETS
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport, LinkSpec
-from netem.stand_alone import _add_watching_options, check_watching_options
+from netem.stand_alone import add_watching_options, check_watching_options
 from netem.tc_words import settings_of
 from noack.core.core_library import core
 from noack.impairments.link_settings import Counters, LinkSettings
@@ -86,7 +86,7 @@ class FakeRelay(Relay):
 
 def options(*arguments: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    _add_watching_options(parser)
+    add_watching_options(parser)
     given = parser.parse_args(arguments)
     check_watching_options(given)
     return given

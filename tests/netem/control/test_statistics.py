@@ -37,11 +37,11 @@ UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
 
 
 def look(relay: FakeRelay, elapsed_s: float, since: Any = None) -> Snapshot:
-    in_force = {
+    applied = {
         key: AppliedSettings(settings, (since or {}).get(key, Counters()))
         for key, settings in relay.settings.items()
     }
-    return Snapshot(relay.report(), in_force, round(elapsed_s * NS_PER_S), UNIX_NS)
+    return Snapshot(relay.report(), applied, round(elapsed_s * NS_PER_S), UNIX_NS)
 
 
 def forward(document: Statistics, link: int = 0) -> DirectionStatistics:
