@@ -215,8 +215,8 @@ class LoadedRelay:
             continuation on; ``cpu_us``: CPU time for each.
         """
         if not self._burst:
-            held = self.ends.burst(self.pid, _PROBE, 0, addresses).last + 1
-            self._burst = min(BURST, held * 9 // 10)
+            capacity = self.ends.burst(self.pid, _PROBE, 0, addresses).last + 1
+            self._burst = min(BURST, capacity * 9 // 10)
             if not self._burst:
                 raise MeasurementError(f"{self.name} forwards nothing")
         sent, before_s = self._burst, self.cpu_s

@@ -159,7 +159,7 @@ def lab(options: argparse.Namespace) -> Iterator[Row]:
         late = summary["loops"][0]["lateness_us"]
         return {role: late[role]["p99"] for role in roles}
 
-    rounds.in_turn(ROUNDS, {side: partial(lateness_us, side) for side in sides})
+    rounds.measure_in_turn(ROUNDS, {side: partial(lateness_us, side) for side in sides})
     for side, role in itertools.product(sides[1:], roles):
         name = f"{role} lateness, p99, {side}"
         yield rounds.row(name, "µs", role, side, ALONE, Goal("<=", 1.2), paired=True)

@@ -66,7 +66,7 @@ def drained(options: argparse.Namespace) -> Iterator[Row]:
         ours = relay_load.our_relay(PLAIN, WORDS), relay_load.our_relay(SEGMENTS, WORDS, "--segment")
         kinds = relay_load.socat(), *(relay_load.c_relay(tools, *modes) for modes in C_MODES), *ours
         with relay_load.started(kinds, tools) as (rounds, relays):
-            rounds.in_turn(ROUNDS, {relay.name: relay.burst for relay in relays})
+            rounds.measure_in_turn(ROUNDS, {relay.name: relay.burst for relay in relays})
     for side, peer, goal in RATES:
         yield rounds.row(f"{side}: drained", "datagrams/s", "per_s", side, peer, goal, paired=True)
     for peer in ("socat", "C relay"):
@@ -99,7 +99,7 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
                 relay.burst(many)  # makes the states of the flows; not counted
             loads = (_single, single), (_many, many)
             sides = {name(relay.name): partial(relay.burst, to) for relay in relays for name, to in loads}
-            rounds.in_turn(FLOW_ROUNDS, sides)
+            rounds.measure_in_turn(FLOW_ROUNDS, sides)
             for name, reason in list(rounds.missing.items()):
                 rounds.add(_many(name), reason)
     cases = [
@@ -183,7 +183,7 @@ def _added(tools: relay_load.Built) -> Rounds:
         relay_load.started((relay_load.socat(), relay_load.c_relay(tools), ours), tools) as (rounds, relays),
     ):
         sides = {DIRECT: base} | {relay.name: partial(added, relay) for relay in relays}
-        rounds.in_turn(PING_ROUNDS, sides, "added delay, ")
+        rounds.measure_in_turn(PING_ROUNDS, sides, "added delay, ")
     return rounds
 
 
@@ -203,7 +203,7 @@ def _late(tools: relay_load.Built) -> Rounds:
     delayed = relay_load.our_relay(PLAIN, f"delay {DELAY_MS}ms", "--realtime", lossy=False)
     with on_core(LOAD_CORE), relay_load.started([delayed], tools) as (rounds, relays):
         sides = {KERNEL: kernel} | {relay.name: partial(late, relay) for relay in relays}
-        rounds.in_turn(LINE_ROUNDS, sides, "lateness, ")
+        rounds.measure_in_turn(LINE_ROUNDS, sides, "lateness, ")
     return rounds
 
 
@@ -242,13 +242,13 @@ def _soak_rows(relay: relay_load.LoadedRelay, seconds: int, maximum_per_s: float
     period_ns = round(group / (maximum_per_s / 2) * 1e9)
     groups_per_s = round(1e9 / period_ns)
     counts, resident_kib = relay_load.new_soak(), list[float]()
-    begun_s = time.monotonic()
+    began_s = time.monotonic()
     for number in range(seconds):
         if number % 60 == 0:
             say(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
         relay.ends.soak(counts, groups_per_s, group, period_ns)
         resident_kib.append(psutil.Process(relay.pid).memory_info().rss / 1024)
-    elapsed_s = time.monotonic() - begun_s
+    elapsed_s = time.monotonic() - began_s
     # Empty groups: receive the datagrams still in flight.
     relay.ends.soak(counts, round(_LAST_S / _GROUP_S), 0, period_ns)
     totals, none, quarter = relay.totals(), Goal("==", 0), max(seconds // 4, 1)
@@ -317,7 +317,7 @@ def shell(_options: argparse.Namespace) -> Iterator[Row]:
         stack.callback(process.kill)
         bare = partial(_bare, compiled("tun.c", Path(folder)))
         runs = {_BARE_FORWARDER: partial(_shell_figures, bare), _SHELL: partial(_shell_figures, _in_shell)}
-        rounds.in_turn(_SHELL_ROUNDS, runs)
+        rounds.measure_in_turn(_SHELL_ROUNDS, runs)
     row = partial(rounds.row, ours=_SHELL, peer=_BARE_FORWARDER, paired=True)
     yield row("TCP", "Mbit/s", "mbit", goal=Goal(">=", 0.9))
     yield row("ping, mean", "µs", "us")

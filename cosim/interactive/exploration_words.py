@@ -1,4 +1,4 @@
-"""What is said of an explored run: its verdict, and what distinguishes it from another run."""
+"""Words about an explored run: its verdict, and what distinguishes it from another run."""
 
 import math
 from typing import NamedTuple

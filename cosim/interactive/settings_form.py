@@ -1,6 +1,6 @@
 """A form with a field for every key of a scenario.
 
-It follows the JSON schema, in groups as its tables: it knows no key by name, so that a new key of
+It follows the JSON schema, in groups as its tables: it names no key, so that a new key of
 the schema has its field at once. A table with kinds (``trigger.policy``, ``network.loss.model``) has
 a choice, and the fields of its kind.
 """
@@ -21,7 +21,7 @@ from noack.scenario.scenario_file import value_of
 
 Schema = Mapping[str, Any]
 _VALUE = re.compile(r'^(?: = (?:"(?:[^"\\]|\\.)*"|[^:]*))?: ')
-"""What a mistake says before its reason; the field shows it."""
+"""What precedes the reason of a mistake; the field itself shows it."""
 
 
 class FieldKind(StrEnum):
@@ -97,7 +97,7 @@ def form_of(draft: Draft) -> Group:
     return _group("", _schema(), "", draft.content, {})
 
 
-def filled(draft: Draft, field: Field, text: str) -> Draft:
+def fill_in(draft: Draft, field: Field, text: str) -> Draft:
     """Return the draft with another text in a field; an empty one restores the default.
 
     Another kind of a table keeps what both kinds have.

@@ -37,7 +37,7 @@ Json = dict[str, Any]
 _PIXELS_PER_POINT = 4 / 3
 _MARGIN = 0.06
 _DRAWN_S = 10.0
-"""Parts without an answer of the browser for so long are sent again with the next ones."""
+"""Parts that the browser has not answered within this time are sent again with the next ones."""
 
 
 class PageParts:

@@ -368,7 +368,7 @@ def _check(setting: Setting, population: Population) -> None:
         raise ValueError(f"loss_seeds: expected uint64, found {population.loss_seeds.dtype}")
     if timeless(setting.link) != setting.link:
         raise CallerError(
-            "network.impairments: a batch knows losses and corruption only; leave out what takes time"
+            "network.impairments: a batch supports losses and corruption only; leave out what takes time"
         )
     rule = setting.trigger
     for form in (rule.form, *([rule.dynamic_variable.gain] if rule.dynamic_variable else [])):

@@ -96,15 +96,15 @@ def _endings_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def called(module: str, function: str, *arguments: object) -> object:
+def call_by_name(module: str, function: str, *arguments: object) -> object:
     """Import a module and call its function; the caller need not import it."""
     return getattr(import_module(module), function)(*arguments)
 
 
 def at_idle_priority(*call: object) -> object:
-    """Call a function by name, see :func:`called`, on a core that nothing else needs.
+    """Call a function by name, see :func:`call_by_name`, on a core that nothing else needs.
 
     A thread does so: without permission of the system, it could not leave that priority again.
     """
     with ThreadPoolExecutor(1, initializer=be_idle) as thread:
-        return thread.submit(called, *call).result()  # type: ignore[arg-type]
+        return thread.submit(call_by_name, *call).result()  # type: ignore[arg-type]

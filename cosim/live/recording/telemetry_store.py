@@ -20,7 +20,7 @@ from noack.scenario.scenario import Scenario
 
 
 class TelemetryStore:
-    """Writes batches of rows to the spool, and knows which rows are there.
+    """Writes batches of rows to the spool, and keeps a list of the rows that it has.
 
     Args:
         scenario: the resolved scenario.
