@@ -309,12 +309,14 @@ def explore_ensemble(scenario: Scenario, draws: int = DRAWS) -> Ensemble:
     setting = _ensemble_setting(scenario)
     population = box_of(scenario).population(0, range(draws))
     rows, events = run_with_events(setting, population)
+    # Draws with too many events, and undecided ones, are left out.
     used = np.flatnonzero((rows["status"] == OK) | (rows["status"] == DIVERGED))
     chosen = Population(
         population.A[used], population.B[used], population.x0[used], population.loss_seeds[used]
     )
     t_s = np.linspace(0.0, setting.horizon_s, _BAND_POINTS)
     states = trajectories(setting, chosen, [events[i] for i in used], t_s)
+    # Norms, weighted as the trigger weights them, as quantiles over the draws.
     x, e_c = states[:, :, 0], states[:, :, 2]
     weight = setting.trigger.weight
     with np.errstate(all="ignore"):

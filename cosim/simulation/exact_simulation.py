@@ -114,6 +114,7 @@ class ExactSimulation:
             "most_events": 2**62, "fading_per_s": trigger.fading_per_s, "fading_until_s": np.inf,
             **numbers,
         })  # fmt: skip
+        # The network: a link, or whether each update arrives.
         if link is not None:
             self.core.link = link.core
             self.core.first_delivered = link.settings.first_delivered
@@ -154,6 +155,7 @@ class ExactSimulation:
             np.empty((k, places, 3, self.n)) if states else None,
         )
         self.core.event_places = places
+        # The core writes the rows and logs of some runs per call, so that Ctrl-C can interrupt.
         for begin in range(0, k, _RUNS_AT_ONCE):
             part = slice(begin, min(begin + _RUNS_AT_ONCE, k))
             self.core.event_s = pointer_to(log.event_s[part], "double *")

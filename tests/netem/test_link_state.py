@@ -124,15 +124,17 @@ def test_the_limit_bounds_the_datagrams_and_copies_in_flight(words: str, overflo
 def test_every_datagram_is_counted_once(order: list[int], mansd: int | None) -> None:
     cap = "" if mansd is None else f"mansd {mansd}"
     link = new_link(f"{ALL_TIMELESS} rate 1mbit queue 3 blackout 10ms-30ms {cap}")
-    found = [fate_of(link, flow, k * MS) for k, flow in enumerate(order)]
+    all_fates = [fate_of(link, flow, k * MS) for k, flow in enumerate(order)]
     drain(link)
-    of = link.counters
+    counters = link.counters
     counted = (
-        of.delivered, of.dropped, of.forced, of.corrupted, of.overflowed, of.blacked_out,
+        counters.delivered, counters.dropped, counters.forced,
+        counters.corrupted, counters.overflowed, counters.blacked_out,
     )  # fmt: skip
-    assert list(counted) == [found.count(fate) for fate in Fate]
-    assert of.received == len(order)
-    assert of.forwarded == of.delivered + of.forced + of.corrupted + of.duplicated
+    assert list(counted) == [all_fates.count(fate) for fate in Fate]
+    assert counters.received == len(order)
+    effective = counters.delivered + counters.forced
+    assert counters.forwarded == effective + counters.corrupted + counters.duplicated
 
 
 @pytest.mark.parametrize(

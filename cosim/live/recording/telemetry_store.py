@@ -126,7 +126,7 @@ class TelemetryStore:
         for role, generation in newest.items():
             rows = {
                 table: received.ranges
-                for (of, table, number), received in self._received.items()
-                if (of, number) == (role, generation)
+                for (owner, table, number), received in self._received.items()
+                if (owner, number) == (role, generation)
             }
             yield role, {"generation": generation, "rows": rows}
