@@ -37,12 +37,12 @@ LOOPS = [
 """Those of the last entry have vectors of other lengths."""
 
 
-def require_equal(found: RunRecord, expected: RunRecord) -> None:
+def require_equal(record: RunRecord, expected: RunRecord) -> None:
     for table in expected.tables:
-        assert found[table].dtype == expected[table].dtype
-        assert found[table].tobytes() == expected[table].tobytes(), table
-    assert found.reports == expected.reports
-    assert found.notices == expected.notices
+        assert record[table].dtype == expected[table].dtype
+        assert record[table].tobytes() == expected[table].tobytes(), table
+    assert record.reports == expected.reports
+    assert record.notices == expected.notices
 
 
 @pytest.mark.parametrize("first", range(len(POLICIES)))
@@ -72,18 +72,18 @@ def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
     scenario = validate(given | {"network": network, "loops": LOOPS}, "")
     scheduler = EventScheduler(scenario, [resolve(one) for one in loops_of(scenario)], numbered=True)
     scheduler.run()
-    found = simulate_loops(scenario)
+    simulated = simulate_loops(scenario)
     for table in ("netem_packet", "netem_release"):
-        rows = np.array(scheduler.rows.get(table, []), found.network[table].dtype)
-        assert rows.tobytes() == found.network[table].tobytes()
-    for number, record in enumerate(found.loops):
+        rows = np.array(scheduler.rows.get(table, []), simulated.network[table].dtype)
+        assert rows.tobytes() == simulated.network[table].tobytes()
+    for number, record in enumerate(simulated.loops):
         for table, dtype in tables_of(record.scenario).items():
             if OWNER[table] != "netem":
                 own = [row[1:] for row in scheduler.rows.get(table, []) if row[0] == number]
                 assert np.array(own, dtype).tobytes() == record[table].tobytes(), table
         received = record.reports["controller"]["channel"]
         assert received == scheduler.decoders["controller"][number].report()
-    assert found.loops[4]["plant_step"]["x"].shape[1] == 3
+    assert simulated.loops[4]["plant_step"]["x"].shape[1] == 3
 
 
 @pytest.mark.sanitized

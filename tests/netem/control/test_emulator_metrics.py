@@ -54,15 +54,15 @@ def test_metrics_are_the_statistics(relay: FakeRelay) -> None:
     counters = relay.counters["up", "forward"]
     counters.received, counters.dropped, counters.delivered = 10, 3, 7
     commands = CommandQueue(relay)
-    found = statistics(commands.snapshot_here())
-    values = values_of(exposed(Fixed(lambda: metrics(found))))
+    document = statistics(commands.snapshot_here())
+    values = values_of(exposed(Fixed(lambda: metrics(document))))
     assert values["noack_netem_received_datagrams_total,forward,up"] == 10
     assert values["noack_netem_datagrams_total,dropped,forward,up"] == 3
     assert values["noack_netem_loss_ratio,forward,up"] == pytest.approx(0.3)
-    limit = found["links"][0]["forward"]["mansd"]
+    limit = document["links"][0]["forward"]["mansd"]
     assert values.get("noack_netem_loss_burst_limit,forward,up") == limit
-    assert values["noack_netem_elapsed_seconds"] == found["elapsed_s"]
-    unintended = found["links"][0]["forward"]["unintended"]
+    assert values["noack_netem_elapsed_seconds"] == document["elapsed_s"]
+    unintended = document["links"][0]["forward"]["unintended"]
     for cause, count in unintended.items():
         labels = ",".join(sorted([cause, "forward", "up"]))
         assert values[f"noack_netem_unintended_losses_total,{labels}"] == count

@@ -24,8 +24,8 @@ def open_and_close(specs: Sequence[LinkSpec]) -> None:
 
 
 def free_port(host: str) -> int:
-    with endpoints(host) as (one,):
-        return name_of(one)[1]
+    with endpoints(host) as (endpoint,):
+        return name_of(endpoint)[1]
 
 
 @pytest.mark.parametrize(
@@ -116,15 +116,15 @@ def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
     harsh = settings_of("loss 30% duplicate 30% delay 1ms 1ms mansd 3")
     with (
         endpoints(HOSTS[4]) as (server,),
-        running([link(name_of(server), harsh, idle_s=0.001)]) as one,
+        running([link(name_of(server), harsh, idle_s=0.001)]) as emulator,
     ):
-        relay: Any = one.relay
+        relay: Any = emulator.relay
         for number in range(rounds):
             with endpoints(*[HOSTS[4]] * most_clients) as clients:
                 for client in clients * (size // most_clients):
-                    client.sendto(bytes(600), one.address())
-                one.settle((number + 1) * size)
-                one.until(lambda: one.report().clients == 0)
+                    client.sendto(bytes(600), emulator.address())
+                emulator.settle((number + 1) * size)
+                emulator.until(lambda: emulator.report().clients == 0)
             drain(server)
             memory = relay._memory
             assert memory.core.free_slots == memory.core.slot_count <= 4 * size
