@@ -53,7 +53,7 @@ def program_path(name: str, package: str) -> str:
     return path
 
 
-def compiled(source: str, into: Path, *options: str) -> Path:
+def compile_program(source: str, into: Path, *options: str) -> Path:
     """Compile a C file of this folder into another folder; return the path."""
     target = into / Path(source).stem
     path = Path(__file__).with_name(source)
@@ -259,7 +259,7 @@ def on_core(core: int) -> Iterator[None]:
 
 
 @contextmanager
-def scheduled(priority: int = 1) -> Iterator[bool]:
+def raise_priority(priority: int = 1) -> Iterator[bool]:
     """Apply SCHED_FIFO to the calling thread and the processes that it starts, if permitted.
 
     With the lowest priority other programs of the machine do not affect a comparison of relays.

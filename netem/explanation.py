@@ -72,7 +72,7 @@ def _document(settings: LinkSettings) -> dict[str, object]:
         + [f"{words}: {meaning}" for words, meaning in settings_meaning(settings)],
         "predicted_loss": prediction.rate,
         "predicted_loss_note": prediction.note,
-        "predicted_loss_without_cap": expected_loss(_uncapped(settings)).rate,
+        "predicted_loss_without_cap": expected_loss(_without_guarantee(settings)).rate,
         "tc": tc.words,
         "tc_lacks": list(tc.lacks),
         "tc_notes": list(tc.notes),
@@ -140,13 +140,13 @@ def _rate_text(settings: LinkSettings) -> str:
     if prediction.rate is None:
         return f"not known: {prediction.note}"
     text = f"{100 * prediction.rate:.4g}%"
-    without = expected_loss(_uncapped(settings)).rate
+    without = expected_loss(_without_guarantee(settings)).rate
     if without is not None and settings.longest_burst is not None:
         text += f" (without the guarantee {100 * without:.4g}%)"
     return f"{text}, {prediction.note}" if prediction.note else text
 
 
-def _uncapped(settings: LinkSettings) -> LinkSettings:
+def _without_guarantee(settings: LinkSettings) -> LinkSettings:
     """Return settings without the guarantee, which lose with the same probabilities."""
     return with_target_loss(settings).model_copy(update={"mansd": None, "constraints": ()})
 

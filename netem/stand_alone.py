@@ -24,7 +24,7 @@ from netem.control.emulator_statistics import (
     Statistics,
     StatisticsThread,
     statistics,
-    unintended,
+    unintended_losses,
 )
 from netem.control.statistics_view import Screen, picture_of
 from netem.emulator_options import command_line_parser, parse_options, specs_of
@@ -112,7 +112,7 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
         except NoackError as error:  # reported in the format of the log
             return failed(str(error), error.exit_status, source="noack netem", as_json=options.json)
         report_totals(totals, options)
-    return ExitStatus.UNINTENDED_LOSSES if unintended(totals) else ExitStatus.OK
+    return ExitStatus.UNINTENDED_LOSSES if unintended_losses(totals) else ExitStatus.OK
 
 
 def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
@@ -126,7 +126,7 @@ def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
     if not (options.json or logged):
         console = Console(stderr=True, highlight=False)
         console.print(picture_of(totals, "totals", console.width))
-        if lost := unintended(totals):
+        if lost := unintended_losses(totals):
             status = ExitStatus.UNINTENDED_LOSSES
             text = f"{lost:,} datagrams; the guarantee does not hold (exit status {status})"
             console.print(f"unintended losses: {text}", style="bold red", soft_wrap=True)

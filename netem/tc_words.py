@@ -91,9 +91,9 @@ def parse(words: str | Sequence[str]) -> LinkWords:
             kind, clause = _CLAUSES[word]
             table = {"kind": kind.model_fields["kind"].default, **clause.read(reader)}
             if issubclass(kind, Constraint):
-                constraints.append(_validated(_CONSTRAINT, table, reader))
+                constraints.append(_validate(_CONSTRAINT, table, reader))
                 continue
-            impairment = _validated(_IMPAIRMENT, table, reader)
+            impairment = _validate(_IMPAIRMENT, table, reader)
             _check_place(reader, impairment, impairments, bare_gap=word == "gap")
             impairments.append(impairment)
             continue
@@ -101,9 +101,9 @@ def parse(words: str | Sequence[str]) -> LinkWords:
             reader.wrong("given twice")
         settings[word] = True if word == "first" else reader.value(COUNT)
         if word == "seed":
-            _validated(_SEED, settings[word], reader)
+            _validate(_SEED, settings[word], reader)
         else:
-            _validated(_LINK, {_SETTINGS[word]: settings[word]}, reader)
+            _validate(_LINK, {_SETTINGS[word]: settings[word]}, reader)
     seed = settings.pop("seed", None)
     content: Table = {_SETTINGS[word]: value for word, value in settings.items()}
     content |= {"impairments": tuple(impairments), "constraints": tuple(constraints)}
@@ -153,7 +153,7 @@ def require_no_dashes(arguments: Sequence[str]) -> None:
             raise CallerError(f"{argument}: write words without the dashes, e.g. {EXAMPLES[word]}")
 
 
-def _validated(kind: TypeAdapter[T], content: object, reader: WordReader) -> T:
+def _validate(kind: TypeAdapter[T], content: object, reader: WordReader) -> T:
     try:
         return kind.validate_json(json.dumps(content))  # strict mode: lists for tuples only in JSON
     except ValidationError as error:

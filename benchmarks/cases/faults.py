@@ -145,7 +145,7 @@ def stop(role: str) -> FaultedRun:
     return faulted_run(f"{role} stopped", _RESTARTS, act)
 
 
-def killed(role: str) -> Figures:
+def measure_kill(role: str) -> Figures:
     """Kill a process of the loop.
 
     Returns:
@@ -173,7 +173,10 @@ def killed(role: str) -> Figures:
 def killed_rows(role: str) -> Iterator[Row]:
     """Kill a process several times; yield the rows."""
     rounds, imported = Rounds(), partial(imported_s, MODULES[role])
-    sides = {role: lambda: killed(role), IMPORT: lambda: dict.fromkeys(("acted_s", "updated_s"), imported())}
+    sides = {
+        role: lambda: measure_kill(role),
+        IMPORT: lambda: dict.fromkeys(("acted_s", "updated_s"), imported()),
+    }
     rounds.measure_in_turn(ROUNDS, sides, f"{role} killed, ")
     row = partial(rounds.row, ours=role)
     yield row(f"{role} killed: until another acts in its place", "s", "acted_s", peer=IMPORT)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.programs import PRIORITY, compiled, execute, noack, program_path
+from benchmarks.programs import PRIORITY, compile_program, execute, noack, program_path
 from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, quantiles_us
 
 ROUNDS = 3
@@ -82,7 +82,7 @@ def latency(options: argparse.Namespace) -> Iterator[Row]:
     with every measurement, so that all code is in the processor's caches, or every half second.
     """
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
-        program = cache(lambda: compiled("ping.c", Path(folder)))
+        program = cache(lambda: compile_program("ping.c", Path(folder)))
         for name, case in CASES.items():
             rounds, refused = Rounds(), set[str]()
             pinged, run = partial(ping, program, case, refused), partial(updates, case, refused)

@@ -26,7 +26,7 @@ import psutil
 
 from benchmarks import relay_load
 from benchmarks.cases.latency import KERNEL, cyclictest
-from benchmarks.programs import LOAD_CORE, RELAY_CORE, compiled, on_core, program_path, scheduled
+from benchmarks.programs import LOAD_CORE, RELAY_CORE, compile_program, on_core, program_path, raise_priority
 from benchmarks.report import (
     Figures,
     Goal,
@@ -62,7 +62,7 @@ RATES = (
 @benchmark("relays", "Relays: drained datagrams")
 def drained(options: argparse.Namespace) -> Iterator[Row]:
     """Send bursts to each relay in turn; yield rates and costs."""
-    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+    with relay_load.built() as tools, on_core(LOAD_CORE), raise_priority():
         ours = relay_load.our_relay(PLAIN, WORDS), relay_load.our_relay(SEGMENTS, WORDS, "--segment")
         kinds = relay_load.socat(), *(relay_load.c_relay(tools, *modes) for modes in C_MODES), *ours
         with relay_load.started(kinds, tools) as (rounds, relays):
@@ -87,7 +87,7 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
     and returns them. (To wait for a socket by epoll costs when sending, too.)
     """
     single, many = relay_load.sources(1), relay_load.sources(FLOWS)
-    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+    with relay_load.built() as tools, on_core(LOAD_CORE), raise_priority():
         kinds = (
             relay_load.c_relay(tools),
             relay_load.c_relay(tools, "paths"),
@@ -177,7 +177,7 @@ def _added(tools: relay_load.Built) -> Rounds:
         return delays
 
     with (
-        scheduled(),
+        raise_priority(),
         on_core(RELAY_CORE),
         relay_load.direct_ends(tools) as direct,
         relay_load.started((relay_load.socat(), relay_load.c_relay(tools), ours), tools) as (rounds, relays),
@@ -194,7 +194,7 @@ def _late(tools: relay_load.Built) -> Rounds:
         return cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE)
 
     def late(relay: relay_load.LoadedRelay) -> Figures:
-        with scheduled(FIFO_PRIORITY) as permitted:
+        with raise_priority(FIFO_PRIORITY) as permitted:
             if not permitted:
                 rounds.add(KERNEL, "SCHED_FIFO is refused")
             delays_ns = relay.ends.pace(LINE_ROUND_S * 1_000_000_000 // PERIOD_NS, PERIOD_NS)
@@ -229,7 +229,7 @@ def steady_load(options: argparse.Namespace) -> Iterator[Row]:
     ``--soak-s 600`` is the full test.
     """
     kind = relay_load.our_relay(PLAIN, f"loss 5% mansd {MANSD} seed 7")
-    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+    with relay_load.built() as tools, on_core(LOAD_CORE), raise_priority():
         with relay_load.running(kind, tools) as relay:
             maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
         with relay_load.running(kind, tools) as relay:
@@ -315,7 +315,7 @@ def shell(_options: argparse.Namespace) -> Iterator[Row]:
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder, ExitStack() as stack:
         process = stack.enter_context(subprocess.Popen(server, stdout=subprocess.DEVNULL))
         stack.callback(process.kill)
-        bare = partial(_bare, compiled("tun.c", Path(folder)))
+        bare = partial(_bare, compile_program("tun.c", Path(folder)))
         runs = {_BARE_FORWARDER: partial(_shell_figures, bare), _SHELL: partial(_shell_figures, _in_shell)}
         rounds.measure_in_turn(_SHELL_ROUNDS, runs)
     row = partial(rounds.row, ours=_SHELL, peer=_BARE_FORWARDER, paired=True)

@@ -20,7 +20,7 @@ from benchmarks.programs import (
     PRIORITY,
     Observed,
     Sample,
-    compiled,
+    compile_program,
     execute,
     imported_s,
     noack,
@@ -123,7 +123,7 @@ def bare_step_us(load: LoopLoad) -> float:
     burst = min(max(steps, 1), _MOST_BURST)
     count = round(_BARE_S * steps_per_s / burst)
     with tempfile.TemporaryDirectory() as folder:
-        program = compiled("ping.c", Path(folder))
+        program = compile_program("ping.c", Path(folder))
         arguments = map(str, (count, round(1e9 * burst / steps_per_s), PRIORITY, burst))
         return 2e6 * cpu_s([str(program), *arguments]) / (count * burst)
 

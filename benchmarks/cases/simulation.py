@@ -59,7 +59,7 @@ from plant_server.plant import plants_of
 Method = Literal["RK45", "DOP853"]
 
 
-def integrated(
+def integrate(
     setting: Setting,
     draw: Population,
     delivered: NDArray[np.bool_],
@@ -182,7 +182,7 @@ _AGREEMENT_S = 1e-4
 """Accumulated effect of the integrator's errors of 1e-8 over hundreds of events."""
 
 
-def drawn(mode: str, trigger: Mapping[str, Any] | None = None) -> tuple[Setting, Population]:
+def draw_population(mode: str, trigger: Mapping[str, Any] | None = None) -> tuple[Setting, Population]:
     """Return draws of the lane example, by default with the paper's trigger."""
     content = load(find_scenario("lane_following"), ()).model_dump(mode="json", exclude_none=True)
     changes = {"mode": mode} | ({} if trigger is None else {"trigger": trigger})
@@ -192,7 +192,7 @@ def drawn(mode: str, trigger: Mapping[str, Any] | None = None) -> tuple[Setting,
 
 def batch_rows(mode: str) -> list[Row]:
     """Return the rows of a mode: the engine beside the integrator's default, and its fastest."""
-    setting, population = drawn(mode)
+    setting, population = draw_population(mode)
     rows, events = run_with_events(setting, population)
     draws = [Population._make(part[i : i + 1] for part in population) for i in range(DRAWS)]
     batch = Population._make(np.concatenate([part] * ENGINE[mode]) for part in population)
@@ -205,7 +205,7 @@ def batch_rows(mode: str) -> list[Row]:
         def integrate(method: Method = method) -> list[list[float]]:
             # The last event has no fate that matters.
             fates = [np.append(events[i].delivered, False) for i in few]
-            return [integrated(setting, draws[i], fates[i], method) for i in few]
+            return [integrate(setting, draws[i], fates[i], method) for i in few]
 
         error_s = max(map(apart_s, (events[i].event_s for i in few), integrate()))
         peer = f"solve_ivp, {method}, rtol 1e-8", per_cpu_s(len(few), integrate)
@@ -229,14 +229,14 @@ def batches(options: argparse.Namespace) -> Iterator[Row]:
     """
     yield from batch_rows("model")
     yield from batch_rows("zoh")
-    paper = drawn("model")
+    paper = draw_population("model")
     for name, settings in POLICIES.items():
         example = settings.example(4)
         if name in ("decaying", "lyapunov") or example is None:
             continue
         trigger = example.model_dump(mode="json", exclude_none=True)
         whole = f"{name} of {trigger['rule']['policy']}" if "rule" in trigger else name
-        other = drawn("model", trigger)
+        other = draw_population("model", trigger)
         side, peer = (per_cpu_s(DRAWS, partial(run_batch, *run)) for run in (other, paper))
         yield compare(f"model, {whole}", "runs/s", side, ("decaying", peer))
 

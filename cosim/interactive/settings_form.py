@@ -141,7 +141,7 @@ def _schema() -> Schema:
     return toml_file.json_schema(Scenario)
 
 
-def _resolved(schema: Schema) -> Schema:
+def _resolve(schema: Schema) -> Schema:
     """Return a schema without reference, and without the alternative null."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
@@ -150,7 +150,7 @@ def _resolved(schema: Schema) -> Schema:
         given = [alternative for alternative in schema["anyOf"] if alternative.get("type") != "null"]
         if len(given) == 1:
             rest = {key: value for key, value in schema.items() if key != "anyOf"}
-            return _resolved({**given[0], **rest})
+            return _resolve({**given[0], **rest})
     return schema
 
 
@@ -169,7 +169,7 @@ def _group(key: str, schema: Schema, help_: str, content: object, default: objec
         )
         schema = kinds.get(chosen, {}) if isinstance(chosen, str) else {}
     for part, described in schema.get("properties", {}).items():
-        inner, path = _resolved(described), f"{key}.{part}".removeprefix(".")
+        inner, path = _resolve(described), f"{key}.{part}".removeprefix(".")
         if part == name:
             continue
         value, usual = content.get(part), described.get("default", default.get(part))
@@ -186,7 +186,7 @@ def _kinds(schema: Schema) -> tuple[str, dict[str, Schema]]:
     kinds: dict[str, Schema] = {}
     name = ""
     for reference in schema.get("oneOf", ()):
-        kind = _resolved(reference)
+        kind = _resolve(reference)
         name, described = next((name, part) for name, part in kind["properties"].items() if "const" in part)
         kinds[described["const"]] = kind
     return name, kinds

@@ -100,7 +100,7 @@ class _Page:
                 .classes("lab-scenario")
             )
             ui.space()
-            FileMenu(self._services, self._calls, self._session, self._shown)
+            FileMenu(self._services, self._calls, self._session, self._explored_run)
             ui.button(icon="contrast", on_click=self._toggle).props(
                 'flat color=white dense aria-label="dark or light"'
             )
@@ -186,7 +186,7 @@ class _Page:
 
     async def _show(self) -> None:
         """Show the chosen source."""
-        shown, live = self._shown(), self._source == LIVE
+        shown, live = self._explored_run(), self._source == LIVE
         with suppress(DraftError):  # the mistakes are shown; the sliders stay
             self._controls = controls_of(self._session.draft)
         parts = self._drawing(shown) | {"note": self._note(shown), "verdict": self._verdict()}
@@ -229,7 +229,7 @@ class _Page:
         is_old = note and shown is None and self._parts.has_figure
         return f"{note}. The figure shows the settings before" if is_old else note
 
-    def _shown(self) -> ExploredRun | None:
+    def _explored_run(self) -> ExploredRun | None:
         """Return what the figure shows; None without a run."""
         view, reference = self._recorded.view, self._reference()
         shown = None
@@ -286,7 +286,7 @@ class _Page:
 
     async def _show_run(self) -> None:
         """Show the figure of a new run at once; its words follow when the settings rest."""
-        shown = self._shown()
+        shown = self._explored_run()
         if self._source != EXPLORE or shown is None:
             await self._show()
             return
@@ -340,7 +340,7 @@ class _Page:
         await self._session.change(draft)
 
     async def _keep_run(self) -> None:
-        shown = self._shown()
+        shown = self._explored_run()
         if self._kept is not None or shown is None:
             self._kept = None
         else:

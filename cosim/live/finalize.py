@@ -175,7 +175,7 @@ def _evaluate_run(
 
     with (
         work_bar(f"claims of {loops} loops") as show,
-        helpers.shared(_blocks(run), evaluate_in_helper, show) as evaluate,
+        helpers.share(_blocks(run), evaluate_in_helper, show) as evaluate,
     ):
         if run.kind == "live" and loops > 1:
             replayed = _replay(run.network)
@@ -390,7 +390,7 @@ def run_report(run_dir: Path, loop: str | None = None, *, again: bool = False) -
             loop.
         MachineError: the report cannot be written.
     """
-    summary, run = _opened(run_dir, loop)
+    summary, run = _open(run_dir, loop)
     path = run_dir / file_of_loop(REPORT_FILE, loop)
     if path.is_file() and not again:
         return path
@@ -404,11 +404,11 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
         CallerError, MachineError: as :func:`run_report`.
     """
     require_viewer()
-    summary, run = _opened(run_dir, loop, view=False)
+    summary, run = _open(run_dir, loop, view=False)
     _write_recording(run, summary, run_dir, loop)
 
 
-def _opened(run_dir: Path, loop: str | None, *, view: bool = True) -> tuple[RunSummary, RecordedRun]:
+def _open(run_dir: Path, loop: str | None, *, view: bool = True) -> tuple[RunSummary, RecordedRun]:
     """Return summary and record of an earlier run, which has this loop."""
     summary, run = reopen(run_dir, view=view).summary, load_run(run_dir)
     if run.names != [loop.name for loop in summary.loops]:

@@ -225,7 +225,7 @@ def vanishes_s(rule: TriggerRule) -> float:
     return math.log(rule.level / _SMALLEST_THRESHOLD) / rule.rate_per_s
 
 
-def vanished(from_s: float) -> CallerError:
+def vanished_error(from_s: float) -> CallerError:
     """Return the error of a threshold that decays too far."""
     return CallerError(
         f"trigger: from {from_s:g} s on the threshold is below {_SMALLEST_THRESHOLD:g}, where "
@@ -337,7 +337,7 @@ def run_with_events(setting: Setting, population: Population) -> tuple[NDArray[n
 def _run(setting: Setting, population: Population, places: int) -> tuple[NDArray[np.void], EventLog]:
     _check(setting, population)
     if (gone_s := vanishes_s(setting.trigger)) < setting.horizon_s:
-        raise vanished(gone_s)
+        raise vanished_error(gone_s)
     names = stream_names(setting.link, UPDATE_LINK)
     keys = np.zeros((len(population.A), len(names), 2), np.int64)
     for stage, name in enumerate(names):

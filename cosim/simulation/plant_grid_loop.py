@@ -114,7 +114,7 @@ class PlantGridLoop:
                 states[following] = self._states_under_held_inputs(x, newest, step, until)
             else:
                 states[following] = self._continuous(x, [newest, *within], step, until)
-            x_s_block = self._modelled(x_s, self._steps_s[1 : until - step + 1])
+            x_s_block = self._follow_model(x_s, self._steps_s[1 : until - step + 1])
             # Continue from the block's first event: what follows it is discarded.
             measured = np.flatnonzero(schedule.measured[following])
             if in_common:
@@ -146,11 +146,11 @@ class PlantGridLoop:
 
     def _states_after(self, x: Vector, newest: "_Update", now_ns: int, after_s: Vector) -> Matrix:
         """Return x at ascending times after now, (k, n), while no other update acts."""
-        x_c = self._modelled(newest.x, np.array([(now_ns - newest.event_ns) * 1e-9]))[0]
+        x_c = self._follow_model(newest.x, np.array([(now_ns - newest.event_ns) * 1e-9]))[0]
         start = np.array([x, np.zeros_like(x), x_c - x])  # e_s does not act on the plant
         return self._system.follow(np.zeros(1), start[None], after_s).x
 
-    def _modelled(self, x: Vector, age_s: Vector) -> Matrix:
+    def _follow_model(self, x: Vector, age_s: Vector) -> Matrix:
         """Return e^{H age} x for ascending ages, (k, n)."""
         start = np.array([x, np.zeros_like(x), np.zeros_like(x)])
         return self._system.follow(np.zeros(1), start[None], age_s).x_c
@@ -159,7 +159,7 @@ class PlantGridLoop:
         """Return x at the steps after ``step`` up to ``until``, under the inputs applied there."""
         model_ns = self._schedule.model_ns[step:until]
         age_ns = np.maximum(model_ns - newest.event_ns, 0)
-        inputs = self._modelled(newest.x, age_ns * 1e-9) @ self._system.loop.K.T
+        inputs = self._follow_model(newest.x, age_ns * 1e-9) @ self._system.loop.K.T
         inputs[model_ns == NO_ACTUATION] = 0.0
         Ad, Bd = self._one_step
         states = np.empty((until - step, len(x)))

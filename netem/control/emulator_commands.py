@@ -118,7 +118,7 @@ def _parser(
     return parser
 
 
-def _chosen(options: argparse.Namespace) -> str:
+def _find_emulator(options: argparse.Namespace) -> str:
     """Return the emulator that NAME or --control NAME selects."""
     if options.control is not None and options.name not in (None, options.control):
         raise CallerError(f"--control {options.control}: NAME is {options.name} already")
@@ -134,7 +134,7 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    name = _chosen(options)
+    name = _find_emulator(options)
     with Client(name) as client:
         statistics = client.ask("report")
     if options.json:
@@ -163,7 +163,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     options = parser.parse_intermixed_args(arguments)
     options.name, settings = _name_and_settings(options.words)
     settings = read_files(settings, Path())
-    with Client(_chosen(options)) as client:
+    with Client(_find_emulator(options)) as client:
         earlier = client.ask("settings")
         answer = client.ask(
             "change",
@@ -226,7 +226,7 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    name = _chosen(options)
+    name = _find_emulator(options)
     with (
         Signals().handled() as signals,
         Client(name) as client,

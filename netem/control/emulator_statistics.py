@@ -369,7 +369,7 @@ def _recent(latest: DirectionReport, earlier: DirectionReport, seconds: float) -
     }
 
 
-def unintended(totals: Statistics) -> int:
+def unintended_losses(totals: Statistics) -> int:
     """Return the number of unintended losses of all links."""
     directions = [link[name] for link in totals["links"] for name in DIRECTIONS]
     return sum(sum(direction["unintended"].values()) for direction in directions)
@@ -390,7 +390,7 @@ def _share(counters: Counters, lost: int) -> float | None:
 
 
 def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
-    """Return quantiles of a histogram of :mod:`netem.relay.relay_links`."""
+    """Return quantiles of a histogram of :mod:`netem.control.time_histogram`."""
     if not counts.any():
         return {"p50": None, "p99": None, "p999": None, "max": None}
     p50, p99, p999, largest = (round(quantile_ns(counts, q)) for q in (0.5, 0.99, 0.999, 1.0))

@@ -161,12 +161,12 @@ class FinalizeHelpers:
         show: Callable[[float], None],
     ) -> Iterable[Result]:
         """Call a function for each item, here and in the processes; return its results."""
-        with self.shared(work, partial(self.call, function), show) as take:
+        with self.share(work, partial(self.call, function), show) as take:
             results = take(function)
         return results.values()
 
     @contextmanager
-    def shared(
+    def share(
         self, work: Iterable[Item], elsewhere: Callable[[Item], Result], show: Callable[[float], None]
     ) -> Iterator[Callable[[Callable[[Item], Result]], Mapping[Item, Result]]]:
         """Let threads do work ``elsewhere``, item by item; this one does it with what is yielded.

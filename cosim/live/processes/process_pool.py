@@ -75,7 +75,7 @@ def process_starts() -> Iterator[None]:
     import the parent's main module, as multiprocessing lets them do: a user's program need not
     have an ``if __name__ == "__main__"``.
     """
-    with _STARTS, _endings_blocked():
+    with _STARTS, _block_endings():
         main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             yield
@@ -84,7 +84,7 @@ def process_starts() -> Iterator[None]:
 
 
 @contextmanager
-def _endings_blocked() -> Iterator[None]:
+def _block_endings() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
