@@ -59,7 +59,7 @@ from plant_server.plant import plants_of
 Method = Literal["RK45", "DOP853"]
 
 
-def integrate(
+def integrate_draw(
     setting: Setting,
     draw: Population,
     delivered: NDArray[np.bool_],
@@ -205,7 +205,7 @@ def batch_rows(mode: str) -> list[Row]:
         def integrate(method: Method = method) -> list[list[float]]:
             # The last event has no fate that matters.
             fates = [np.append(events[i].delivered, False) for i in few]
-            return [integrate(setting, draws[i], fates[i], method) for i in few]
+            return [integrate_draw(setting, draws[i], fates[i], method) for i in few]
 
         error_s = max(map(apart_s, (events[i].event_s for i in few), integrate()))
         peer = f"solve_ivp, {method}, rtol 1e-8", per_cpu_s(len(few), integrate)

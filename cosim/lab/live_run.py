@@ -132,7 +132,7 @@ class LiveRun:
     def _take(self, line: str) -> None:
         try:
             message = json.loads(line)
-            event = message.pop("what")
+            event = message.pop("event")
         except (ValueError, AttributeError, KeyError, TypeError):
             self._add(line)  # a message of a library, or of the compiler
             return
@@ -192,24 +192,24 @@ def main() -> int:
     """Run a scenario; the arguments are the folder of the files that it names, and of the runs."""
     folder, runs = map(Path, sys.argv[1:3])
     watcher = Watcher(
-        started=lambda run_dir: _say("started", run_dir=str(run_dir)),
-        failed=lambda why, t_s, by_hand: _say("failed", why=why, t_s=t_s),
-        restarted=lambda role, t_s: _say("restarted", role=role, t_s=t_s),
-        progress=lambda report: _say("progress", **report.fields()),
+        started=lambda run_dir: _report("started", run_dir=str(run_dir)),
+        failed=lambda why, t_s, by_hand: _report("failed", why=why, t_s=t_s),
+        restarted=lambda role, t_s: _report("restarted", role=role, t_s=t_s),
+        progress=lambda report: _report("progress", **report.fields()),
     )
     try:
         draft = Draft("scenario", folder, "", sys.stdin.buffer.read().decode())
         ending = launch(draft.scenario, runs, live=is_installed(), watcher=watcher)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a stop now must not cost the summary
-        _say("finalising", reason=ending.reason)
+        _report("finalising", reason=ending.reason)
         from cosim.live.finalize import finalize  # not earlier: it would take time from the loop
         from cosim.output.run_verdict import verdict
 
         outcome = finalize(ending, report=False)
     except NoackError as error:
-        _say("error", text=str(error))
+        _report("error", text=str(error))
         return error.exit_status
-    _say(
+    _report(
         "ended",
         run_dir=str(outcome.run_dir),
         reason=outcome.reason,
@@ -219,9 +219,9 @@ def main() -> int:
     return outcome.status
 
 
-def _say(event: str, **fields: object) -> None:
+def _report(event: str, **fields: object) -> None:
     with suppress(BrokenPipeError):  # the page has ended; the run is recorded all the same
-        print(json.dumps({"what": event, **fields}), flush=True)
+        print(json.dumps({"event": event, **fields}), flush=True)
 
 
 if __name__ == "__main__":

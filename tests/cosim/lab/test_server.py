@@ -305,8 +305,8 @@ def test_the_browser_is_started_with_the_address_for_command_lines(
     assert urlsplit(page).path != urlsplit(line).path
 
 
-def said(run: LiveRun, what: str, **fields: object) -> None:
-    run._take(json.dumps({"what": what, **fields}))
+def report_event(run: LiveRun, event: str, **fields: object) -> None:
+    run._take(json.dumps({"event": event, **fields}))
 
 
 REPORT = {
@@ -318,25 +318,25 @@ REPORT = {
 def test_what_a_live_run_reports_sets_its_state_and_its_lines() -> None:
     run = LiveRun(20.0)
     assert run.state == "starting"
-    said(run, "started", run_dir="/runs/one")
+    report_event(run, "started", run_dir="/runs/one")
     assert (run.state, run.run_dir) == ("running", Path("/runs/one"))
     live = "live view: http://127.0.0.1:1234/secret/"
     for changes in ([], ["M 3"]):  # each warning is shown once
-        said(run, "progress", **REPORT | {"warnings": ["void"], "changes": changes, "live": live})
+        report_event(run, "progress", **REPORT | {"warnings": ["void"], "changes": changes, "live": live})
     assert run.lines == ["all processes run", "void", "changed: M 3"]
     assert run.viewer == "http://127.0.0.1:1234/secret/"
-    said(run, "finalising", reason="horizon")
+    report_event(run, "finalising", reason="horizon")
     assert run.state == "finalising"
     assert not run.is_over
     lines = [["completed 20 s", "green"], ["3 transmissions, 2 delivered", ""]]
-    said(run, "ended", run_dir="/runs/one", reason="horizon", ok=True, verdict=lines)
+    report_event(run, "ended", run_dir="/runs/one", reason="horizon", ok=True, verdict=lines)
     assert run.is_over
     assert run.ok
     assert run.progress is not None
     assert run.progress.events == 3
     assert run.verdict == [("completed 20 s", "green"), ("3 transmissions, 2 delivered", "")]
     failed = LiveRun(20.0)
-    said(failed, "error", text="the port is taken")
+    report_event(failed, "error", text="the port is taken")
     assert failed.is_over
     assert failed.ok is False
     assert failed.lines == ["the port is taken"]
