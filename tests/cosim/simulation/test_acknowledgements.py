@@ -46,8 +46,8 @@ def run_of(*overrides: str) -> RunRecord:
 
 def fates(record: RunRecord, flow: int) -> list[int]:
     rows = record[NETEM_PACKET]
-    fates: list[int] = rows["fate"][rows["flow"] == flow].tolist()
-    return fates
+    values: list[int] = rows["fate"][rows["flow"] == flow].tolist()
+    return values
 
 
 def test_each_direction_has_its_own_random_stream() -> None:
