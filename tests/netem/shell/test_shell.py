@@ -78,13 +78,13 @@ class Totals:
     def lost(self, flow: str, direction: str) -> tuple[set[int], int]:
         """Return a flow's packets that the emulator dropped, and its count of the longest burst."""
         text = f":{self.flows[flow]['port']} "
-        (flow,) = (flow for flow in self.link[direction]["flows"] if text in flow["client"])
+        (counts,) = (row for row in self.link[direction]["flows"] if text in row["client"])
         rows = [
             row for row in self.rows
-            if row["direction"] == direction and row["flow"] == flow["flow"]
+            if row["direction"] == direction and row["flow"] == counts["flow"]
         ]  # fmt: skip
-        assert len(rows) == flow["packets"]
-        return {row["packet"] for row in rows if row["fate"] == Fate.DROPPED}, flow["longest_loss_burst"]
+        assert len(rows) == counts["packets"]
+        return {row["packet"] for row in rows if row["fate"] == Fate.DROPPED}, counts["longest_loss_burst"]
 
 
 def test_the_ends_miss_exactly_what_the_emulator_drops(tmp_path: Path) -> None:
