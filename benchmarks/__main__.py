@@ -1,8 +1,8 @@
 """Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE]``.
 
 The modules in ``cases/`` declare them (:func:`benchmarks.report.benchmark`). ``--list`` lists
-them. The name ``goals`` stands for those that have the figures which the project wants to reach
-(:data:`FIGURES`); they are printed once more at the end, and ``--docs docs/benchmarks.md`` writes
+them. The name ``goals`` stands for those with the goals of the project
+(:data:`GOAL_ROWS`); their rows are printed once more at the end, and ``--docs docs/benchmarks.md`` writes
 them into the page, between two marks.
 """
 
@@ -37,8 +37,8 @@ BEGIN, END = "<!-- goals: written by `python -m benchmarks goals --docs` -->", "
 _HEAD = "| figure | value | alternative in the same run | ratio | goal | holds |\n" + "|---" * 6 + "|"
 
 
-class Figure(NamedTuple):
-    """A figure of the goals: the rows of a benchmark whose whole names match."""
+class GoalRow(NamedTuple):
+    """Rows of the goals: those of a benchmark whose whole names match."""
 
     benchmark: str
     rows: str
@@ -47,29 +47,29 @@ class Figure(NamedTuple):
     """Replaces the row's name."""
 
 
-FIGURES = (
-    Figure("latency", r"event → update, .*, p(50|99)"),
-    Figure("startup", "noack run → first control step", "`noack run` to the first control step"),
-    Figure("startup", "the first run of 20 loops, .*"),
-    Figure("clone", "make demo.*"),
-    Figure("simulation", ".* of the machines in virtual time", "the demo's 20 s in virtual time"),
-    Figure("long_run", "the same, by CPU time .*", "end of a run of 10 minutes, by CPU time"),
-    Figure("long_run", "of it, the replay"),
-    Figure("simulation", "replay of .*", "replay of 10 minutes at 500 Hz, from memory"),
-    Figure("long_run", "peak memory, .*"),
-    Figure("fleet", ".*: end of the run"),
-    Figure("fleet", ".*lateness p99, worst loop"),
-    Figure("fleet", ".*: CPU time per loop and step"),
-    Figure("simulation", ".*loops × runs of .*"),
-    Figure("batch", "lane_following, .*"),
-    Figure("simulation", "sampled runs.*"),
-    Figure("relays", "ours.*: drained"),
-    Figure("relay_delay", ".*added one way, p50"),
-    Figure("relay_flows", ".*reverse direction.*: cost"),
-    Figure("fleet", ".*: private memory of .*"),
-    Figure("size", ".*"),
+GOAL_ROWS = (
+    GoalRow("latency", r"event → update, .*, p(50|99)"),
+    GoalRow("startup", "noack run → first control step", "`noack run` to the first control step"),
+    GoalRow("startup", "the first run of 20 loops, .*"),
+    GoalRow("clone", "make demo.*"),
+    GoalRow("simulation", ".* of the machines in virtual time", "the demo's 20 s in virtual time"),
+    GoalRow("long_run", "the same, by CPU time .*", "end of a run of 10 minutes, by CPU time"),
+    GoalRow("long_run", "of it, the replay"),
+    GoalRow("simulation", "replay of .*", "replay of 10 minutes at 500 Hz, from memory"),
+    GoalRow("long_run", "peak memory, .*"),
+    GoalRow("many_loops", ".*: end of the run"),
+    GoalRow("many_loops", ".*lateness p99, worst loop"),
+    GoalRow("many_loops", ".*: CPU time per loop and step"),
+    GoalRow("simulation", ".*loops × runs of .*"),
+    GoalRow("batch", "lane_following, .*"),
+    GoalRow("simulation", "sampled runs.*"),
+    GoalRow("relays", "ours.*: drained"),
+    GoalRow("relay_delay", ".*added one way, p50"),
+    GoalRow("relay_flows", ".*reverse direction.*: cost"),
+    GoalRow("many_loops", ".*: private memory of .*"),
+    GoalRow("size", ".*"),
 )
-OF_GOALS = tuple(dict.fromkeys(figure.benchmark for figure in FIGURES))
+OF_GOALS = tuple(dict.fromkeys(goal_row.benchmark for goal_row in GOAL_ROWS))
 
 
 def all_benchmarks() -> Mapping[str, Benchmark]:
@@ -94,63 +94,63 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
     if options.list:
         print("\n".join(f"{benchmark.name:<20}{benchmark.title}" for benchmark in benchmarks.values()))
         return 0
-    asked = options.names or [*benchmarks]
-    chosen = [name for entry in asked for name in (OF_GOALS if entry == GOALS else (entry,))]
+    requested = options.names or [*benchmarks]
+    chosen = [name for entry in requested for name in (OF_GOALS if entry == GOALS else (entry,))]
     if unknown := [name for name in chosen if name not in benchmarks]:
         parser.error(f"no benchmark {unknown[0]!r}; benchmarks: {', '.join(benchmarks)}")
     rows, failures = list[tuple[str, Row]](), 0
     for benchmark in (benchmark for name, benchmark in benchmarks.items() if name in chosen):
-        rows_of_one, failed = _measured(benchmark, options)
+        rows_of_one, failed = _measure(benchmark, options)
         rows += [(benchmark.name, row) for row in rows_of_one]
         failures += failed
     if options.json is not None:
-        write_json(options.json, (row.as_json() | {"benchmark": name} for name, row in rows))
-    figures = rows_of_figures(rows)
-    if GOALS in asked:
-        print_table("The goals", [row for _, row in figures])
+        write_json(options.json, (row.to_json() | {"benchmark": name} for name, row in rows))
+    goals = rows_of_goals(rows)
+    if GOALS in requested:
+        print_table("The goals", [row for _, row in goals])
     if options.docs is not None:
         try:
-            write_docs(options.docs, figures)
+            write_docs(options.docs, goals)
         except MeasurementError as error:
             print(error, file=sys.stderr)
             return 1
     return 1 if failures else 0
 
 
-def _measured(benchmark: Benchmark, options: argparse.Namespace) -> tuple[list[Row], bool]:
+def _measure(benchmark: Benchmark, options: argparse.Namespace) -> tuple[list[Row], bool]:
     """Run a benchmark and print its table; return its rows, and whether it failed."""
     print(f"{benchmark.name}:", file=sys.stderr)
-    load, begun_s, failed = MachineLoad(), time.monotonic(), False
+    load, began_s, failed = MachineLoad(), time.monotonic(), False
     try:
         rows = [*benchmark.measure(options)]
     except (MeasurementError, NoackError, AssertionError) as error:  # assertions of the tests' helpers
         failed = True
         rows = [Row(benchmark.name, None, "", unjudged=f"could not be measured: {error}")]
     rows += [*load.rows()]
-    print_table(f"{benchmark.title} ({time.monotonic() - begun_s:.0f} s)", rows)
+    print_table(f"{benchmark.title} ({time.monotonic() - began_s:.0f} s)", rows)
     return rows, failed
 
 
-def rows_of_figures(rows: Sequence[tuple[str, Row]]) -> list[tuple[str, Row]]:
-    """Return name and row of each figure that has a goal, from (benchmark, row), in order."""
+def rows_of_goals(rows: Sequence[tuple[str, Row]]) -> list[tuple[str, Row]]:
+    """Return name and row of each goal, from (benchmark, row), in order."""
     return [
-        (figure.name or row.name, row)
-        for figure in FIGURES
+        (goal_row.name or row.name, row)
+        for goal_row in GOAL_ROWS
         for benchmark, row in rows
-        if benchmark == figure.benchmark
-        and re.fullmatch(figure.rows, row.name)
+        if benchmark == goal_row.benchmark
+        and re.fullmatch(goal_row.rows, row.name)
         and (row.goal is not None or row.value is None)
     ]
 
 
-def write_docs(page: Path, figures: Iterable[tuple[str, Row]]) -> None:
+def write_docs(page: Path, goals: Iterable[tuple[str, Row]]) -> None:
     """Replace the table of a page."""
     before, begin, rest = page.read_text(encoding="utf-8").partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise MeasurementError(f"{page}: the marks of the table are missing")
     lines = [_HEAD]
-    for name, row in figures:
+    for name, row in goals:
         _, value, *peer, ratio, goal, holds = row.cells
         alternative = ", ".join(filter(None, peer))
         cells = (name, "not measured" if row.value is None else value, alternative, ratio, goal)

@@ -53,7 +53,7 @@ def program_path(name: str, package: str) -> str:
     return path
 
 
-def compiled(source: str, into: Path, *options: str) -> Path:
+def compile_program(source: str, into: Path, *options: str) -> Path:
     """Compile a C file of this folder into another folder; return the path."""
     target = into / Path(source).stem
     path = Path(__file__).with_name(source)
@@ -74,7 +74,7 @@ class OutputLine(NamedTuple):
 class Finished(NamedTuple):
     """A program that has ended with exit status 0."""
 
-    begun_s: float
+    began_s: float
     lines: list[OutputLine]
     stdout: str
 
@@ -82,7 +82,7 @@ class Finished(NamedTuple):
 def execute(command: Sequence[str]) -> Finished:
     """Run a program to its end, recording the time of each line of its standard error."""
     with tempfile.TemporaryFile("w+") as stdout:
-        begun_s = time.monotonic()
+        began_s = time.monotonic()
         with subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -98,14 +98,14 @@ def execute(command: Sequence[str]) -> Finished:
             messages = [line.text for line in lines if not PROGRESS.match(line.text)]
             last = messages[-1] if messages else "no message"
             raise MeasurementError(f"{command[0]} ended with {process.returncode}: {last}")
-        return Finished(begun_s, lines, stdout.read())
+        return Finished(began_s, lines, stdout.read())
 
 
 def imported_s(modules: str) -> float:
     """Return wall seconds from the start of a Python to the end of its imports."""
     code = f"import {modules}, sys; print('ready', file=sys.stderr)"
     finished = execute([sys.executable, "-c", code])
-    return finished.lines[-1].at_s - finished.begun_s
+    return finished.lines[-1].at_s - finished.began_s
 
 
 def in_new_process(call: Callable[..., _Result], *arguments: object) -> _Result:
@@ -126,11 +126,11 @@ def noack(*arguments: str) -> NoackRun:
     """Run ``noack ARGUMENTS`` to its end and return its own measurements."""
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
         finished = execute([*NOACK, *arguments, *FREE_PORTS, "--runs", runs, "--json"])
-    return NoackRun(json.loads(finished.stdout), first_step_s(finished.begun_s, finished.lines))
+    return NoackRun(json.loads(finished.stdout), first_step_s(finished.began_s, finished.lines))
 
 
-def first_step_s(begun_s: float, lines: Iterable[OutputLine]) -> float | None:
-    """Return an upper bound of the time from ``begun_s`` to the first control step at speed 1.
+def first_step_s(began_s: float, lines: Iterable[OutputLine]) -> float | None:
+    """Return an upper bound of the time from ``began_s`` to the first control step at speed 1.
 
     A progress line that shows simulated time t and is read at time s proves that the run's epoch
     was at s − t or before, up to the line's rounding: s − t is the epoch plus the line's delay,
@@ -139,7 +139,7 @@ def first_step_s(begun_s: float, lines: Iterable[OutputLine]) -> float | None:
     there was no progress line.
     """
     bounds_s = [
-        line.at_s - (float(match[1]) - _ROUNDING_S) - begun_s
+        line.at_s - (float(match[1]) - _ROUNDING_S) - began_s
         for line in lines
         if (match := PROGRESS.match(line.text)) is not None
     ]
@@ -182,7 +182,7 @@ class Observed(NamedTuple):
     run_dir: Path
     samples: Mapping[str, list[Sample]]
     """By process, from the first rows of the loops to the end of the command."""
-    begun_s: float
+    began_s: float
     """The loops' first rows are recorded."""
     horizon_s: float
     """The loops have reached their horizon, or have ended before."""
@@ -195,7 +195,7 @@ class Observed(NamedTuple):
 
     def in_loops(self, role: str) -> list[Sample]:
         """The samples of a process while the loops ran, without their first and last seconds."""
-        begin_s, end_s = self.begun_s + 1, self.horizon_s - 2
+        begin_s, end_s = self.began_s + 1, self.horizon_s - 2
         return [sample for sample in self.samples.get(role, ()) if begin_s <= sample.at_s <= end_s]
 
 
@@ -209,7 +209,7 @@ def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_
         pause_s: time between two samples.
     """
     samples, closed = defaultdict[str, list[Sample]](list), threading.Event()
-    begun_s = ended_s = math.inf
+    began_s = ended_s = math.inf
 
     def observe() -> None:
         nonlocal ended_s
@@ -227,7 +227,7 @@ def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_
     with begun(folder) as begin:
         run = begin(command=("run", *arguments), viewer=True)
         run.wait_recording()
-        begun_s = time.monotonic()
+        began_s = time.monotonic()
         launcher = psutil.Process(run.process.pid)
         processes = processes_of(launcher) | {LAUNCHER: launcher}
         observer = threading.Thread(target=observe)
@@ -239,8 +239,8 @@ def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_
             closed.set()
             observer.join()
         left = [process.name() for process in run.left_behind()]
-    horizon_s = min(ended_s, begun_s + length_s)
-    return Observed(finished.summary, finished.run_dir, samples, begun_s, horizon_s, ended_s, closed_s, left)
+    horizon_s = min(ended_s, began_s + length_s)
+    return Observed(finished.summary, finished.run_dir, samples, began_s, horizon_s, ended_s, closed_s, left)
 
 
 _CORES = sorted(os.sched_getaffinity(0))
@@ -259,7 +259,7 @@ def on_core(core: int) -> Iterator[None]:
 
 
 @contextmanager
-def scheduled(priority: int = 1) -> Iterator[bool]:
+def raise_priority(priority: int = 1) -> Iterator[bool]:
     """Apply SCHED_FIFO to the calling thread and the processes that it starts, if permitted.
 
     With the lowest priority other programs of the machine do not affect a comparison of relays.

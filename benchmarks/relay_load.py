@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from cffi import FFI
 
-from benchmarks.programs import RELAY_CORE, compiled, on_core, program_path
+from benchmarks.programs import RELAY_CORE, compile_program, on_core, program_path
 from benchmarks.report import Figures, MeasurementError, Rounds
 from noack.runtime.address import LOOPBACK
 
@@ -58,8 +58,8 @@ class Built(NamedTuple):
 def built() -> Iterator[Built]:
     """Compile the load and the C relay; they exist within the context."""
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
-        load = compiled("load.c", Path(folder), "-shared", "-fPIC")
-        yield Built(_FFI.dlopen(str(load)), compiled("relay.c", Path(folder)))
+        load = compile_program("load.c", Path(folder), "-shared", "-fPIC")
+        yield Built(_FFI.dlopen(str(load)), compile_program("relay.c", Path(folder)))
 
 
 def sources(count: int) -> Addresses:
@@ -215,8 +215,8 @@ class LoadedRelay:
             continuation on; ``cpu_us``: CPU time for each.
         """
         if not self._burst:
-            held = self.ends.burst(self.pid, _PROBE, 0, addresses).last + 1
-            self._burst = min(BURST, held * 9 // 10)
+            capacity = self.ends.burst(self.pid, _PROBE, 0, addresses).last + 1
+            self._burst = min(BURST, capacity * 9 // 10)
             if not self._burst:
                 raise MeasurementError(f"{self.name} forwards nothing")
         sent, before_s = self._burst, self.cpu_s

@@ -107,7 +107,7 @@ class Row:
             {True: "yes", False: "no", None: "?" if goal else ""}[self.holds],
         )
 
-    def as_json(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, object]:
         """Return the row as ``--json`` writes it."""
         row: dict[str, object] = {
             "name": self.name,
@@ -215,7 +215,9 @@ class Rounds:
         else:
             self._figures[side].append(figures)
 
-    def in_turn(self, count: int, sides: Mapping[str, Callable[[], Figures | str]], head: str = "") -> None:
+    def measure_in_turn(
+        self, count: int, sides: Mapping[str, Callable[[], Figures | str]], head: str = ""
+    ) -> None:
         """Measure the sides in turn, in some rounds; one that fails is missing from then on."""
         for number in range(count):
             say(f"{head}round {number + 1} of {count}")
@@ -259,7 +261,7 @@ Side = Callable[[], float]
 """Measures one figure of a side."""
 
 
-def compared(
+def compare(
     name: str,
     unit: str,
     ours: Side,
@@ -294,9 +296,9 @@ def per_cpu_s(count: float, call: Callable[[], object]) -> Side:
 
 
 def _cpu_s(call: Callable[[], object]) -> float:
-    begun_s = time.process_time()
+    began_s = time.process_time()
     call()
-    return max(time.process_time() - begun_s, 1e-9)
+    return max(time.process_time() - began_s, 1e-9)
 
 
 def say(text: str) -> None:

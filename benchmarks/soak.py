@@ -127,11 +127,11 @@ def constant(at_s: Sequence[float], counts: Sequence[int], length_s: float) -> t
     return (min(lasting), max(lasting)) if lasting else (0, 0)
 
 
-def process_rows(role: str, samples: Sequence[Sample], begun_s: float, length_s: float) -> Iterator[Row]:
+def process_rows(role: str, samples: Sequence[Sample], began_s: float, length_s: float) -> Iterator[Row]:
     """Yield the rows of a process, from its samples while the loops ran."""
     if not samples:
         raise MeasurementError(f"{role}: was never seen")
-    at_s = [sample.at_s - begun_s for sample in samples]
+    at_s = [sample.at_s - began_s for sample in samples]
     memory = trend(at_s, [sample.uss_kib for sample in samples], length_s)
     name, size = f"{role}: private memory gained", f"{samples[-1].uss_kib / 1024:.1f} MiB"
     if memory is None:
@@ -179,9 +179,9 @@ def end_rows(summary: Mapping[str, Any], delivered_out_of_order: int) -> Iterato
 
 def run_rows(run: Observed) -> Iterator[Row]:
     """Yield the rows of a finished run."""
-    length_s = run.horizon_s - run.begun_s - 2
+    length_s = run.horizon_s - run.began_s - 2
     for role in ROLES:
-        yield from process_rows(role, run.in_loops(role), run.begun_s, length_s)
+        yield from process_rows(role, run.in_loops(role), run.began_s, length_s)
     stale = int(load_record(run.run_dir)[NETEM_RELEASE]["stale"].sum())
     yield from end_rows(run.summary, stale)
     for role, late in run.summary["loops"][0]["lateness_us"].items():
@@ -201,7 +201,7 @@ def memory_figure(run: Observed) -> FigureDescription:
     rows = []
     for i, role in enumerate(ROLES):
         samples = run.in_loops(role)
-        at_s, kib = np.array([(sample.at_s - run.begun_s, sample.uss_kib) for sample in samples]).T
+        at_s, kib = np.array([(sample.at_s - run.began_s, sample.uss_kib) for sample in samples]).T
         line = Line(x=at_s, y=kib - kib[0], colour=palette.PROCESSES.get(role, palette.SERIES[i]))
         x = time_axis(at_s, numbers=i == len(ROLES) - 1, label="wall time [s]")
         title = "" if i else "private memory since the start"
@@ -227,7 +227,7 @@ def soak(path: Path, settings: Sequence[str], runs: Path) -> list[Row]:
     run = observed_run([str(path), "--report", *changes], folder, length_s, pause_s)
     rows = [*run_rows(run)]
     content = {
-        "rows": [row.as_json() for row in rows],
+        "rows": [row.to_json() for row in rows],
         "samples": {role: [sample._asdict() for sample in run.in_loops(role)] for role in ROLES},
     }
     (run.run_dir / "soak.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -32,10 +32,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_options(joining)
     try:
         if words[:1] == ["shell"]:
-            from netem.shell.shell import shell  # a run's emulator starts without it
+            from netem.shell.shell import run_in_shell  # a run's emulator starts without it
 
             as_json = "--json" in words[: (*words, "--").index("--")]
-            return shell(words[1:])
+            return run_in_shell(words[1:])
         _, further_words = joining.parse_known_args(words)
         if not further_words:
             with join_run("netem", words) as run:

@@ -58,7 +58,7 @@ class Datagram(NamedTuple):
     data: bytes
 
 
-class Leaving(NamedTuple):
+class Departure(NamedTuple):
     """A packet that leaves a channel; its payload is kept by the caller."""
 
     flow: int
@@ -124,12 +124,12 @@ class Channel:
         elif question == core.NOACK_ASK_PLACES:
             self._add_places(self.core.places)
         elif question == core.NOACK_ASK_OUTCOME:
-            self.decide(encoded(self.core.asked.message))
+            self.decide(encode_message(self.core.asked.message))
         else:
             assert question == core.NOACK_ROWS_FULL
             self._taken = self.take_rows()
 
-    def send(self, flow: int, number: int, size_bytes: int, now_ns: int) -> tuple[list[Leaving], int]:
+    def send(self, flow: int, number: int, size_bytes: int, now_ns: int) -> tuple[list[Departure], int]:
         """Take a packet of a flow; return what leaves at once, and the number of its copies.
 
         What is due must have left (:meth:`release`). Of a lost packet there are 0 copies.
@@ -146,18 +146,18 @@ class Channel:
         """When the next packet leaves; :data:`NEVER_NS`: there is none."""
         return int(core.noack_channel_due_ns(self.core))
 
-    def release(self, now_ns: int) -> list[Leaving]:
+    def release(self, now_ns: int) -> list[Departure]:
         """Let what is due leave; return it in its order."""
-        leaving: list[Leaving] = []
+        leaving: list[Departure] = []
         while (due_ns := self.due_ns) <= now_ns:
             leaving += self._departures(partial(core.noack_channel_release, self.core, due_ns))
         return leaving
 
-    def _departures(self, step: Callable[[], int]) -> list[Leaving]:
+    def _departures(self, step: Callable[[], int]) -> list[Departure]:
         while (question := step()) != core.NOACK_DONE:
             self.answer(question)
         departures = (self.core.leaving[index] for index in range(self.core.leaving_count))
-        return [Leaving(packet.flow, packet.message.sequence, packet.bit) for packet in departures]
+        return [Departure(packet.flow, packet.message.sequence, packet.bit) for packet in departures]
 
     def take_rows(self) -> list[tuple[str, Rows]]:
         """Return all rows since the last call, in batches of a table in their order."""
@@ -176,12 +176,7 @@ class Channel:
         largest cap that applied during it.
         """
         assert self._schedule is not None
-        outputs = self._schedule.announce(
-            NETEM_SETTING, change, self.core.inputs, now_ns, self.core.reached_ns
-        )
-        self.core.inputs += 1
-        self.core.change_ns = self._schedule.next_ns
-        return outputs
+        return announce_change(self.core, self._schedule, change, now_ns, self.core.reached_ns)
 
     def _change(self) -> None:
         """Apply the changes that are due at the datagram whose arrival asked for them."""
@@ -228,7 +223,7 @@ def channel_of(
     """Return the network of a resolved scenario; ``network`` replaces the link of the updates."""
     links: list[LinkState] = []
     for flow in resolved.network.flows:
-        settings, names = at_start(resolved.network.link_of(flow), link_name(flow), start)
+        settings, names = settings_at_start(resolved.network.link_of(flow), link_name(flow), start)
         if network is not None and not links:
             settings = LinkSettings(mansd=None, first_delivered=False)
         links.append(
@@ -264,7 +259,7 @@ def require_stand_alone(network: Scenario) -> Scenario:
     return network
 
 
-def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSettings, list[str]]:
+def settings_at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSettings, list[str]]:
     """Return the settings of a link of a run, and the names of its random streams.
 
     A restarted emulator does not know the losses before. Therefore its first datagrams pass
@@ -275,6 +270,20 @@ def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSetti
         return settings, [name]
     settings = settings.model_copy(update={"first_delivered": True})
     return settings, [name, f"again-{start.generation}"]
+
+
+def announce_change(
+    network: CData,
+    schedule: ChangeSchedule[LinkSettings],
+    change: ParameterChange,
+    now_ns: int,
+    reached_ns: int,
+) -> Sequence[Record | Notice]:
+    """Accept a change for a ``noack_channel`` or ``noack_relay``; it is an input with a number."""
+    outputs = schedule.announce(NETEM_SETTING, change, network.inputs, now_ns, reached_ns)
+    network.inputs += 1
+    network.change_ns = schedule.next_ns
+    return outputs
 
 
 def due_settings(
@@ -290,7 +299,7 @@ def due_settings(
             yield settings
 
 
-def encoded(message: CData) -> bytes:
+def encode_message(message: CData) -> bytes:
     """Return the datagram of a simulated run with a ``noack_message``."""
     vector = np.array(ffi.unpack(message.vector, message.entries))
     return Encoder(RUN_ID, bytes(KEY_BYTES)).encode(

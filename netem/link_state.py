@@ -148,6 +148,7 @@ class LinkState:
 
     def _new_link(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
         """Return a new ``noack_link`` of these settings, which shares the array of flows."""
+        # The stages, and the tables of numbers to which they refer.
         settings = with_target_loss(settings)
         tables = StageTables(
             scored=any(getattr(impairment, "loss_correlation", 0) != 0 for impairment in settings.impairments)
@@ -157,6 +158,7 @@ class LinkState:
         for row, (stage, key, _) in zip(stages, keyed, strict=False):
             _write_stage(row, stage, key, places)
             places += stage.queue_places
+        # The link, with its guarantee.
         rule_fields, windows = _rule_fields(settings)
         link = ffi.new(
             "noack_link *",
@@ -173,6 +175,7 @@ class LinkState:
             },
         )
         link.recent_width = 1 << link.mansd.bit_length() if link.tracks and link.mansd >= 0 else 1
+        # Its arrays: those that are read only, and its memory.
         tables_of = {
             "integers": np.array(tables.integers, np.int64),
             "reals": np.array(tables.reals, np.float64),

@@ -172,7 +172,7 @@ class LossyUdp:
         try:
             self._opened.set_result((commands, relay.addresses()[self._spec.name]))
             relay.run(self._stop.is_set, commands.run_pending)
-            self._ended = commands.look()
+            self._ended = commands.snapshot_here()
         finally:
             commands.close()
             relay.close()

@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from netem.channel import PACKET_ROW, Datagram, at_start, due_settings, link_name
+from netem.channel import PACKET_ROW, Datagram, announce_change, due_settings, link_name, settings_at_start
 from netem.relay.relay_links import set_receive_timeout, stamp_arrivals
 from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.clock import RunClock
 from noack.core.core_library import Rows, core
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE
 from noack.protocol.roles import Notice, Record, Start
 from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName, packed_name
@@ -31,7 +31,7 @@ _AT_ONCE_NS = -(2**63)
 
 
 class RunNetwork:
-    """A machine that also drives itself between two turns of housekeeping.
+    """The network of a run: :meth:`drive` runs the core until the next housekeeping.
 
     Args:
         resolved: the resolved scenario.
@@ -55,7 +55,7 @@ class RunNetwork:
         if len(links) == 1:  # the relay has two directions; nothing arrives in the second
             links.append((LinkSettings(), "none"))
         for number, (settings, name) in enumerate(links):
-            first, names = at_start(settings, name, start)
+            first, names = settings_at_start(settings, name, start)
             direction = RelayDirection(
                 first,
                 resolved.seeds.loss,
@@ -120,10 +120,7 @@ class RunNetwork:
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Accept a change; see :meth:`netem.channel.Channel.announce`."""
-        outputs = self._schedule.announce(NETEM_SETTING, change, self._relay.inputs, now_ns, self._reached_ns)
-        self._relay.inputs += 1
-        self._relay.change_ns = self._schedule.next_ns
-        return outputs
+        return announce_change(self._relay, self._schedule, change, now_ns, self._reached_ns)
 
     def drive(self, until_ns: int, sink: RowSink) -> None:
         """Relay datagrams until a simulated time, and pass on the rows of the record."""

@@ -1,7 +1,7 @@
 """A stand-alone emulator: runs a relay, with what watches, changes and records it; prints totals.
 
-:func:`run_stand_alone` reads the command line, :func:`relay` relays until Ctrl-C, :func:`attached` adds live
-control, statistics lines, metrics and the live screen.
+:func:`run_stand_alone` reads the command line, :func:`relay` relays until Ctrl-C, :func:`watch_relay`
+adds live control, statistics lines, metrics and the live screen.
 """
 
 import argparse
@@ -24,19 +24,20 @@ from netem.control.emulator_statistics import (
     Statistics,
     StatisticsThread,
     statistics,
-    unintended,
+    unintended_losses,
 )
 from netem.control.statistics_view import Screen, picture_of
-from netem.emulator_options import command_line_parser, explain, parsed, specs_of
+from netem.emulator_options import command_line_parser, parse_options, specs_of
+from netem.explanation import explain
 from netem.fates import FateRecorder, read_fates
+from netem.relay.device_link import DeviceLink
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, raise_file_limit, report_line
-from netem.shell.devices import DeviceLink
 from noack.core.errors import CallerError, ExitStatus, NoackError, why
 from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import address_text
-from noack.runtime.command_line import LogFormat, Signals, failed, log_event, log_format
+from noack.runtime.command_line import LogFormat, Signals, discard_output, failed, log_event, log_format
 from noack.runtime.connections.metrics_server import OPTION, metrics_server, require_package
 from noack.runtime.drivers.realtime_settings import realtime
 
@@ -85,7 +86,7 @@ def add_recording_options(parser: argparse.ArgumentParser, *, shell: bool = Fals
         help="replay recorded packet fates, matched by flow and packet number; the recorded cap "
         "applies unless mansd sets another",
     )
-    _add_watching_options(parser)
+    add_watching_options(parser)
 
 
 def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
@@ -99,7 +100,7 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
     """
     parser = command_line_parser()
     add_recording_options(parser)
-    options = parsed(parser, arguments)
+    options = parse_options(parser, arguments)
     specs = specs_of(options)
     if options.explain:
         written = specs_of(options, read=False)
@@ -111,7 +112,7 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
         except NoackError as error:  # reported in the format of the log
             return failed(str(error), error.exit_status, source="noack netem", as_json=options.json)
         report_totals(totals, options)
-    return ExitStatus.UNINTENDED_LOSSES if unintended(totals) else ExitStatus.OK
+    return ExitStatus.UNINTENDED_LOSSES if unintended_losses(totals) else ExitStatus.OK
 
 
 def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
@@ -125,7 +126,7 @@ def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
     if not (options.json or logged):
         console = Console(stderr=True, highlight=False)
         console.print(picture_of(totals, "totals", console.width))
-        if lost := unintended(totals):
+        if lost := unintended_losses(totals):
             status = ExitStatus.UNINTENDED_LOSSES
             text = f"{lost:,} datagrams; the guarantee does not hold (exit status {status})"
             console.print(f"unintended losses: {text}", style="bold red", soft_wrap=True)
@@ -158,7 +159,7 @@ def relay(
             stack.callback(opened.close)
             # Signals stay handled until all files are complete.
             signals = last.enter_context(Signals().handled())
-            side = stack.enter_context(attached(opened, options))
+            side = stack.enter_context(watch_relay(opened, options))
             running = nullcontext(lambda: False) if program is None else program.running(signals)
             has_ended = stack.enter_context(running)
         for setting, answer in stack.enter_context(realtime(options.realtime, _FIFO_PRIORITY)).items():
@@ -172,7 +173,7 @@ def relay(
             lambda: side.quit_requested or signals.received is not None or has_ended(),
             side.commands.run_pending,
         )
-        return statistics(side.commands.look())
+        return statistics(side.commands.snapshot_here())
 
 
 def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
@@ -256,7 +257,8 @@ _SWITCH_S = 0.0002
 """Maximum time for which another thread holds the interpreter lock before the relay's thread."""
 
 
-def _add_watching_options(parser: argparse.ArgumentParser) -> None:
+def add_watching_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options for what watches and changes a relay while it runs."""
     group = parser.add_argument_group("statistics and changes during operation")
     group.add_argument("--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`")
     group.add_argument(
@@ -282,7 +284,7 @@ def _add_watching_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_watching_options(options: argparse.Namespace) -> None:
-    """Check the options of :func:`_add_watching_options`; a file alone gets a line each second.
+    """Check the options of :func:`add_watching_options`; a file alone gets a line each second.
 
     Raises:
         CallerError: two options contradict each other.
@@ -295,7 +297,7 @@ def check_watching_options(options: argparse.Namespace) -> None:
         raise CallerError("--view and --stats both use standard output; add --stats-file FILE")
 
 
-class AttachedRelay(NamedTuple):
+class RelayWatch(NamedTuple):
     """The relay thread's access to the threads that watch the relay."""
 
     commands: CommandQueue  # To be run in the relay's thread, at least every 50 ms
@@ -308,7 +310,7 @@ class AttachedRelay(NamedTuple):
 
 
 @contextmanager
-def attached(relay: Relay, options: argparse.Namespace) -> Iterator[AttachedRelay]:
+def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[RelayWatch]:
     """Watch a relay within the context; the relay runs within it and is closed after it.
 
     Enter the context before the relay's thread applies real-time settings: new threads would
@@ -335,7 +337,7 @@ def attached(relay: Relay, options: argparse.Namespace) -> Iterator[AttachedRela
         stack.callback(commands.close)
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_SWITCH_S)
-        yield AttachedRelay(commands, screen)
+        yield RelayWatch(commands, screen)
 
 
 @contextmanager
@@ -367,9 +369,7 @@ def _statistics_lines(commands: CommandQueue, period_s: float, path: Path | None
             name = "standard output" if path is None else path
             report_line(f"statistics cannot be written to {name} ({error.strerror}); the relay continues")
             # Also, closing the file writes the buffer once more; this must not fail.
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, file.fileno())
-            os.close(null)
+            discard_output(file.fileno())
 
     try:
         with StatisticsThread(commands, period_s, write, at_end=True):

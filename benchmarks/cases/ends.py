@@ -58,9 +58,9 @@ def spooled_run(horizon_s: float, folder: Path) -> Path:
 
 def replay_s(run_dir: Path) -> float:
     """Replay a run as at its end; return the CPU time in s."""
-    begun_s = time.process_time()
+    began_s = time.process_time()
     stored_verdict(run_dir)
-    return time.process_time() - begun_s
+    return time.process_time() - began_s
 
 
 class End(NamedTuple):
@@ -76,10 +76,10 @@ class End(NamedTuple):
 def end_of(horizon_s: float, folder: Path) -> End:
     """Simulate, spool and complete a run; replay it once more."""
     say(f"a run of {horizon_s:g} s")
-    run_dir, begun_s = in_new_process(spooled_run, horizon_s, folder), time.monotonic()
+    run_dir, began_s = in_new_process(spooled_run, horizon_s, folder), time.monotonic()
     process = subprocess.Popen([*NOACK, "summary", str(run_dir)], stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
-    wall_s = time.monotonic() - begun_s
+    wall_s = time.monotonic() - began_s
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         raise MeasurementError(f"the end of the run failed with {process.returncode}")

@@ -54,7 +54,7 @@ class FaultedRun(NamedTuple):
 
     record: RunRecord
     summary: LoopSummary
-    begun_s: float
+    began_s: float
     """The fault's begin."""
     ended_s: float
     """The fault's end."""
@@ -145,7 +145,7 @@ def stop(role: str) -> FaultedRun:
     return faulted_run(f"{role} stopped", _RESTARTS, act)
 
 
-def killed(role: str) -> Figures:
+def measure_kill(role: str) -> Figures:
     """Kill a process of the loop.
 
     Returns:
@@ -173,8 +173,11 @@ def killed(role: str) -> Figures:
 def killed_rows(role: str) -> Iterator[Row]:
     """Kill a process several times; yield the rows."""
     rounds, imported = Rounds(), partial(imported_s, MODULES[role])
-    sides = {role: lambda: killed(role), IMPORT: lambda: dict.fromkeys(("acted_s", "updated_s"), imported())}
-    rounds.in_turn(ROUNDS, sides, f"{role} killed, ")
+    sides = {
+        role: lambda: measure_kill(role),
+        IMPORT: lambda: dict.fromkeys(("acted_s", "updated_s"), imported()),
+    }
+    rounds.measure_in_turn(ROUNDS, sides, f"{role} killed, ")
     row = partial(rounds.row, ours=role)
     yield row(f"{role} killed: until another acts in its place", "s", "acted_s", peer=IMPORT)
     yield row(f"{role} killed: until the controller has an update again", "s", "updated_s", peer=IMPORT)
@@ -219,7 +222,7 @@ class FloodCase(NamedTuple):
     roles: Sequence[str]
     rate_hz: float
     """Total rate of datagrams; 0: as fast as possible."""
-    asked: bool = True
+    realtime: bool = True
     """Whether the run requests real-time settings."""
 
 
@@ -227,7 +230,7 @@ CASES = (
     FloodCase("5 x the loop's rate", LOOP_ROLES, 5 * LOOP_HZ * len(LOOP_ROLES)),
     *(FloodCase(f"limit, {role}", (role,), 0) for role in LOOP_ROLES),
     FloodCase("limit, all", LOOP_ROLES, 0),
-    FloodCase("limit, all, no real-time", LOOP_ROLES, 0, asked=False),
+    FloodCase("limit, all, no real-time", LOOP_ROLES, 0, realtime=False),
 )
 
 
@@ -241,13 +244,13 @@ def flood(ports: Sequence[int], rate_hz: float) -> int:
     data = encoder.encode(Message(Flow.UPDATE, 0, 0, np.zeros(4)))
     count = 1 if rate_hz else _SEGMENTS
     control = [(socket.IPPROTO_UDP, _UDP_SEGMENT, struct.pack("=H", len(data)))] if count > 1 else []
-    targets, sent, begun_s = itertools.cycle((LOOPBACK, port) for port in ports), 0, time.monotonic()
+    targets, sent, began_s = itertools.cycle((LOOPBACK, port) for port in ports), 0, time.monotonic()
     with ExitStack() as stack:
         senders = [stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(_SENDERS)]
         for sender, target in zip(itertools.cycle(senders), targets, strict=False):
             sender.sendmsg([data * count], control, 0, target)
             sent += count
-            while (passed_s := time.monotonic() - begun_s) < FLOOD_S and sent > rate_hz * passed_s > 0:
+            while (passed_s := time.monotonic() - began_s) < FLOOD_S and sent > rate_hz * passed_s > 0:
                 time.sleep(min(_LONGEST_SLEEP_S, 1 / rate_hz))
             if passed_s >= FLOOD_S:
                 break
@@ -266,17 +269,17 @@ def flood_rows(case: FloodCase) -> Iterator[Row]:
         nonlocal sent
         sent = flood([udp_port(processes[role]) for role in case.roles], case.rate_hz)
 
-    settings = ["horizon_s=8", f"realtime.enabled={str(case.asked).lower()}"]
+    settings = ["horizon_s=8", f"realtime.enabled={str(case.realtime).lower()}"]
     run = faulted_run(case.name, settings, act)
     before, during = [], []
     for role, table in STEPS.items():
         late_us, now_s = lateness_us(run.record, role), run.record[table]["now_ns"] * 1e-9
-        inside = (now_s > run.begun_s + MARGIN_S) & (now_s < run.ended_s - MARGIN_S)
-        before.append(float(np.quantile(late_us[now_s < run.begun_s - MARGIN_S], 0.99)))
+        inside = (now_s > run.began_s + MARGIN_S) & (now_s < run.ended_s - MARGIN_S)
+        before.append(float(np.quantile(late_us[now_s < run.began_s - MARGIN_S], 0.99)))
         during.append(float(np.quantile(late_us[inside], 0.99)) if inside.any() else np.inf)
     measured = run.record[PLANT_STEP]["sequence"] // run.record.scenario.plant.measure_every
     missed = np.setdiff1d(measured, run.record[SENSOR_MEASUREMENT]["sequence"]).size
-    yield Row(f"{case.name}: the flood", sent / (run.ended_s - run.begun_s), "datagrams/s")
+    yield Row(f"{case.name}: the flood", sent / (run.ended_s - run.began_s), "datagrams/s")
     yield Row(f"{case.name}: measurements missed", missed, "")
     yield Row(f"{case.name}: the loop's datagrams lost", run.summary.unintended_losses, "")
     yield Row(f"{case.name}: lateness before, p99", max(before), "µs")

@@ -66,25 +66,25 @@ def check_rows(before: str, guarantee: str, count: int) -> Iterator[Row]:
 
 def network_rows() -> Iterator[Row]:
     """Yield the losses at the receiver of three networks with the same random numbers."""
-    held = f"mansd {CAP}"
-    drops = Decider(f"{_LOSS} {held}", _SPACING_NS).decide()["release_ns"] < 0
+    cap = f"mansd {CAP}"
+    drops = Decider(f"{_LOSS} {cap}", _SPACING_NS).decide()["release_ns"] < 0
     capped = Decider(_DELAY, _SPACING_NS).decide().copy()
     capped["release_ns"][drops] = -1
     networks = {
         "no cap": Decider(f"{_LOSS} {_DELAY}", _SPACING_NS).decide().copy(),
         f"cap {CAP} on drops only": capped,
-        held: Decider(f"{_LOSS} {_DELAY} {held}", _SPACING_NS).decide(),
+        cap: Decider(f"{_LOSS} {_DELAY} {cap}", _SPACING_NS).decide(),
     }
     for name, decisions in networks.items():
         lost, dropped = outcomes_of(decisions), decisions["release_ns"] < 0
-        goal = Goal("<=", CAP) if name == held else None
+        goal = Goal("<=", CAP) if name == cap else None
         yield Row(f"{name}: dropped", 100 * float(dropped.mean()), "%")
         yield Row(f"{name}: dropped or out of order", 100 * float(lost.mean()), "%")
         yield Row(f"{name}: longest loss burst", longest_burst(lost), "", goal=goal)
-    back_ns = networks[held]["hold_back_ns"]
+    back_ns = networks[cap]["hold_back_ns"]
     back_ns = back_ns[back_ns > 0]
-    yield Row(f"{held}: held back", 100 * len(back_ns) / _BATCH, "%")
-    yield Row(f"{held}: held back by, median", float(np.median(back_ns)) / 1e6, "ms")
+    yield Row(f"{cap}: held back", 100 * len(back_ns) / _BATCH, "%")
+    yield Row(f"{cap}: held back by, median", float(np.median(back_ns)) / 1e6, "ms")
 
 
 @benchmark("guarantee", "Emulator: the guarantee over many decisions")

@@ -244,7 +244,7 @@ def across_hosts(options: argparse.Namespace) -> Iterator[Row]:
     rounds = Rounds()
     with two_hosts() as hosts:
         sides = {ON_LOOPBACK: partial(run_by_hand, None), ACROSS: partial(run_by_hand, hosts)}
-        rounds.in_turn(ROUNDS, sides)
+        rounds.measure_in_turn(ROUNDS, sides)
     note = f"{sum(rounds.of(ACROSS, 'updates')):.0f} updates"
     for quantile in ("p50", "p99"):
         yield rounds.row(f"event → update, {quantile}", "µs", quantile, ACROSS, ON_LOOPBACK,

@@ -42,7 +42,7 @@ _NOTE_STROKES = Path(__file__).parents[1] / "strokes.js"
 
 
 @contextmanager
-def _opened(folder: Path, *settings: str, card: tuple[str, ...] = EMULATED_CARD) -> Iterator[Page]:
+def _open_page(folder: Path, *settings: str, card: tuple[str, ...] = EMULATED_CARD) -> Iterator[Page]:
     """Show the lab page in a headless browser."""
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
@@ -98,7 +98,7 @@ def summary_of(side: str, folder: Path) -> dict[str, Any]:
     arguments = ("run", "lane_following", *settings)
     if side == ALONE:
         return noack(*arguments).summary
-    with _opened(folder, *settings) as page:
+    with _open_page(folder, *settings) as page:
         if side == OPEN:
             return noack(*arguments).summary
         if side == DRAGGED:
@@ -134,7 +134,7 @@ def stroke(options: argparse.Namespace) -> Iterator[Row]:
         say(name)
         with (
             tempfile.TemporaryDirectory(prefix="noack-bench-", ignore_cleanup_errors=True) as folder,
-            _opened(Path(folder), "--set", "horizon_s=20", card=()) as page,
+            _open_page(Path(folder), "--set", "horizon_s=20", card=()) as page,
             _busy(processes),
         ):
             median_ms = median(_strokes_ms(page))
@@ -159,7 +159,7 @@ def lab(options: argparse.Namespace) -> Iterator[Row]:
         late = summary["loops"][0]["lateness_us"]
         return {role: late[role]["p99"] for role in roles}
 
-    rounds.in_turn(ROUNDS, {side: partial(lateness_us, side) for side in sides})
+    rounds.measure_in_turn(ROUNDS, {side: partial(lateness_us, side) for side in sides})
     for side, role in itertools.product(sides[1:], roles):
         name = f"{role} lateness, p99, {side}"
         yield rounds.row(name, "µs", role, side, ALONE, Goal("<=", 1.2), paired=True)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.programs import PRIORITY, compiled, execute, noack, program_path
+from benchmarks.programs import PRIORITY, compile_program, execute, noack, program_path
 from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, quantiles_us
 
 ROUNDS = 3
@@ -29,7 +29,7 @@ class LatencyCase(NamedTuple):
     period_s: float
     round_s: float
     arguments: tuple[str, ...]
-    asked: bool
+    realtime: bool
     """Whether the real-time settings are requested."""
     goal: Goal
     """Of the median's ratio to that of the ping in C."""
@@ -49,7 +49,7 @@ def ping(program: Callable[[], Path], case: LatencyCase, refused: set[str]) -> F
 
     Real-time settings that were not permitted are added to ``refused``.
     """
-    count, priority = round(case.round_s / case.period_s), PRIORITY if case.asked else 0
+    count, priority = round(case.round_s / case.period_s), PRIORITY if case.realtime else 0
     command = [str(program()), str(count), str(round(case.period_s * 1e9)), str(priority)]
     try:
         done = subprocess.run(command, capture_output=True, timeout=case.round_s + 30, check=True)
@@ -82,11 +82,11 @@ def latency(options: argparse.Namespace) -> Iterator[Row]:
     with every measurement, so that all code is in the processor's caches, or every half second.
     """
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
-        program = cache(lambda: compiled("ping.c", Path(folder)))
+        program = cache(lambda: compile_program("ping.c", Path(folder)))
         for name, case in CASES.items():
             rounds, refused = Rounds(), set[str]()
             pinged, run = partial(ping, program, case, refused), partial(updates, case, refused)
-            rounds.in_turn(ROUNDS, {PING: pinged, OURS: run}, f"{name}, ")
+            rounds.measure_in_turn(ROUNDS, {PING: pinged, OURS: run}, f"{name}, ")
             counts = (sum(rounds.of(side, "count")) for side in (OURS, PING))
             note = "{:.0f} updates, {:.0f} pings".format(*counts)
             note += f"; not applied: {', '.join(sorted(refused))}" if refused else ""
@@ -120,7 +120,7 @@ def cyclictest(seconds: int = ROUND_S, priority: int = PRIORITY, core: int | Non
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0 or not output.is_file():
             messages = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[0]
-            raise MeasurementError(f"cyclictest failed, said {messages!r}")
+            raise MeasurementError(f"cyclictest failed: {messages!r}")
         thread = json.loads(output.read_text())["thread"]["0"]
     histogram = thread["histogram"]
     late_ns = np.repeat([1000 * int(low_us) + 500 for low_us in histogram], [*histogram.values()])
@@ -144,7 +144,7 @@ def lateness(options: argparse.Namespace) -> Iterator[Row]:
     SCHED_FIFO, locked memory and no deep idle states, the settings that our processes request.
     """
     rounds = Rounds()
-    rounds.in_turn(TICK_ROUNDS, {KERNEL: cyclictest, LOOP: wake_ups})
+    rounds.measure_in_turn(TICK_ROUNDS, {KERNEL: cyclictest, LOOP: wake_ups})
     row = partial(rounds.row, unit="µs", ours=LOOP, peer=KERNEL)
     yield row("tick lateness p50", quantity="p50")
     yield row("tick lateness p99", quantity="p99", goal=Goal("<=", 1.5))

@@ -114,9 +114,9 @@ def margins(options: argparse.Namespace) -> Iterator[Row]:
     verdicts, times_s = defaultdict[str, list[str]](list), defaultdict[str, list[float]](list)
     for seed in range(options.margin_first, options.margin_first + options.margin_loops):
         loop = random_loop(seed)
-        begun_s = time.process_time()
+        began_s = time.process_time()
         stability = loop.margin.stability(loop.guarantee)
-        took_s = time.process_time() - begun_s
+        took_s = time.process_time() - began_s
         for kind in (loop.kind, "all"):
             verdicts[kind].append(stability.verdict)
             times_s[kind].append(took_s)

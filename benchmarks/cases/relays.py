@@ -26,7 +26,7 @@ import psutil
 
 from benchmarks import relay_load
 from benchmarks.cases.latency import KERNEL, cyclictest
-from benchmarks.programs import LOAD_CORE, RELAY_CORE, compiled, on_core, program_path, scheduled
+from benchmarks.programs import LOAD_CORE, RELAY_CORE, compile_program, on_core, program_path, raise_priority
 from benchmarks.report import (
     Figures,
     Goal,
@@ -41,7 +41,7 @@ from benchmarks.report import (
     say,
 )
 from netem.relay.relay_links import LinkSpec
-from netem.shell.devices import open_devices
+from netem.shell.devices import inside, open_devices
 from noack.impairments.link_settings import LinkSettings
 
 ROUNDS = 2
@@ -62,11 +62,11 @@ RATES = (
 @benchmark("relays", "Relays: drained datagrams")
 def drained(options: argparse.Namespace) -> Iterator[Row]:
     """Send bursts to each relay in turn; yield rates and costs."""
-    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+    with relay_load.built() as tools, on_core(LOAD_CORE), raise_priority():
         ours = relay_load.our_relay(PLAIN, WORDS), relay_load.our_relay(SEGMENTS, WORDS, "--segment")
         kinds = relay_load.socat(), *(relay_load.c_relay(tools, *modes) for modes in C_MODES), *ours
         with relay_load.started(kinds, tools) as (rounds, relays):
-            rounds.in_turn(ROUNDS, {relay.name: relay.burst for relay in relays})
+            rounds.measure_in_turn(ROUNDS, {relay.name: relay.burst for relay in relays})
     for side, peer, goal in RATES:
         yield rounds.row(f"{side}: drained", "datagrams/s", "per_s", side, peer, goal, paired=True)
     for peer in ("socat", "C relay"):
@@ -87,7 +87,7 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
     and returns them. (To wait for a socket by epoll costs when sending, too.)
     """
     single, many = relay_load.sources(1), relay_load.sources(FLOWS)
-    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+    with relay_load.built() as tools, on_core(LOAD_CORE), raise_priority():
         kinds = (
             relay_load.c_relay(tools),
             relay_load.c_relay(tools, "paths"),
@@ -99,7 +99,7 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
                 relay.burst(many)  # makes the states of the flows; not counted
             loads = (_single, single), (_many, many)
             sides = {name(relay.name): partial(relay.burst, to) for relay in relays for name, to in loads}
-            rounds.in_turn(FLOW_ROUNDS, sides)
+            rounds.measure_in_turn(FLOW_ROUNDS, sides)
             for name, reason in list(rounds.missing.items()):
                 rounds.add(_many(name), reason)
     cases = [
@@ -177,13 +177,13 @@ def _added(tools: relay_load.Built) -> Rounds:
         return delays
 
     with (
-        scheduled(),
+        raise_priority(),
         on_core(RELAY_CORE),
         relay_load.direct_ends(tools) as direct,
         relay_load.started((relay_load.socat(), relay_load.c_relay(tools), ours), tools) as (rounds, relays),
     ):
         sides = {DIRECT: base} | {relay.name: partial(added, relay) for relay in relays}
-        rounds.in_turn(PING_ROUNDS, sides, "added delay, ")
+        rounds.measure_in_turn(PING_ROUNDS, sides, "added delay, ")
     return rounds
 
 
@@ -194,7 +194,7 @@ def _late(tools: relay_load.Built) -> Rounds:
         return cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE)
 
     def late(relay: relay_load.LoadedRelay) -> Figures:
-        with scheduled(FIFO_PRIORITY) as permitted:
+        with raise_priority(FIFO_PRIORITY) as permitted:
             if not permitted:
                 rounds.add(KERNEL, "SCHED_FIFO is refused")
             delays_ns = relay.ends.pace(LINE_ROUND_S * 1_000_000_000 // PERIOD_NS, PERIOD_NS)
@@ -203,7 +203,7 @@ def _late(tools: relay_load.Built) -> Rounds:
     delayed = relay_load.our_relay(PLAIN, f"delay {DELAY_MS}ms", "--realtime", lossy=False)
     with on_core(LOAD_CORE), relay_load.started([delayed], tools) as (rounds, relays):
         sides = {KERNEL: kernel} | {relay.name: partial(late, relay) for relay in relays}
-        rounds.in_turn(LINE_ROUNDS, sides, "lateness, ")
+        rounds.measure_in_turn(LINE_ROUNDS, sides, "lateness, ")
     return rounds
 
 
@@ -229,7 +229,7 @@ def steady_load(options: argparse.Namespace) -> Iterator[Row]:
     ``--soak-s 600`` is the full test.
     """
     kind = relay_load.our_relay(PLAIN, f"loss 5% mansd {MANSD} seed 7")
-    with relay_load.built() as tools, on_core(LOAD_CORE), scheduled():
+    with relay_load.built() as tools, on_core(LOAD_CORE), raise_priority():
         with relay_load.running(kind, tools) as relay:
             maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
         with relay_load.running(kind, tools) as relay:
@@ -242,13 +242,13 @@ def _soak_rows(relay: relay_load.LoadedRelay, seconds: int, maximum_per_s: float
     period_ns = round(group / (maximum_per_s / 2) * 1e9)
     groups_per_s = round(1e9 / period_ns)
     counts, resident_kib = relay_load.new_soak(), list[float]()
-    begun_s = time.monotonic()
+    began_s = time.monotonic()
     for number in range(seconds):
         if number % 60 == 0:
             say(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
         relay.ends.soak(counts, groups_per_s, group, period_ns)
         resident_kib.append(psutil.Process(relay.pid).memory_info().rss / 1024)
-    elapsed_s = time.monotonic() - begun_s
+    elapsed_s = time.monotonic() - began_s
     # Empty groups: receive the datagrams still in flight.
     relay.ends.soak(counts, round(_LAST_S / _GROUP_S), 0, period_ns)
     totals, none, quarter = relay.totals(), Goal("==", 0), max(seconds // 4, 1)
@@ -281,7 +281,7 @@ def _bare(forwarder: Path, command: str) -> str:
         words = [str(forwarder), *map(str, link.devices)]
         process = stack.enter_context(subprocess.Popen(words, pass_fds=link.devices))
         stack.callback(process.kill)
-        with link.inside():
+        with inside(link):
             variables = os.environ | {"TO": link.spec.to[0]}
             words = ["sh", "-c", command]
             inner = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=variables)
@@ -315,9 +315,9 @@ def shell(_options: argparse.Namespace) -> Iterator[Row]:
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder, ExitStack() as stack:
         process = stack.enter_context(subprocess.Popen(server, stdout=subprocess.DEVNULL))
         stack.callback(process.kill)
-        bare = partial(_bare, compiled("tun.c", Path(folder)))
+        bare = partial(_bare, compile_program("tun.c", Path(folder)))
         runs = {_BARE_FORWARDER: partial(_shell_figures, bare), _SHELL: partial(_shell_figures, _in_shell)}
-        rounds.in_turn(_SHELL_ROUNDS, runs)
+        rounds.measure_in_turn(_SHELL_ROUNDS, runs)
     row = partial(rounds.row, ours=_SHELL, peer=_BARE_FORWARDER, paired=True)
     yield row("TCP", "Mbit/s", "mbit", goal=Goal(">=", 0.9))
     yield row("ping, mean", "µs", "us")

@@ -20,7 +20,7 @@ from benchmarks.programs import (
     PRIORITY,
     Observed,
     Sample,
-    compiled,
+    compile_program,
     execute,
     imported_s,
     noack,
@@ -34,7 +34,7 @@ from benchmarks.report import (
     Rounds,
     Row,
     benchmark,
-    compared,
+    compare,
     median,
     option,
     own_cpu_s,
@@ -44,7 +44,7 @@ from noack.protocol.roles import LOOP_ROLES, WITH_DEADLINES
 
 ROOT = Path(__file__).parents[2]
 CAP = 2
-_SCENARIO = Path(__file__).parents[1] / "fleet.toml"
+_SCENARIO = Path(__file__).parents[1] / "many_loops.toml"
 _KIBI = 1024
 _POLL_S = 2.0
 _SINGLE_S = 60.0
@@ -54,8 +54,8 @@ _STEP_US = {50.0: Goal("<=", 5)}
 steps that share a wake-up would be later than :data:`_LATE_MS`."""
 _LATE_MS = {50.0: Goal("<=", 1.0), 500.0: Goal("<=", 0.3)}
 """By the rate of the loops, Hz."""
-_BARE_S, _GATHERED_S, _MOST_BURST = 5.0, 0.0008, 64
-"""Length of a bare exchange; how long a run gathers steps, at most; datagrams in one message."""
+_BARE_S, _MOST_COALESCING_S, _MOST_BURST = 5.0, 0.0008, 64
+"""Length of a bare exchange; how long a run coalesces steps, at most; datagrams in one message."""
 _LIBRARIES = "import numpy, zenoh; print(); input()"
 _NOTHING = Goal("==", 0)
 
@@ -119,11 +119,11 @@ def bare_step_us(load: LoopLoad) -> float:
     of 72 bytes at once as a run's processes gather.
     """
     steps_per_s = load.loops * load.rate_hz
-    gathered = round(steps_per_s * min(1 / load.rate_hz / 25, _GATHERED_S))
-    burst = min(max(gathered, 1), _MOST_BURST)
+    steps = round(steps_per_s * min(1 / load.rate_hz / 25, _MOST_COALESCING_S))
+    burst = min(max(steps, 1), _MOST_BURST)
     count = round(_BARE_S * steps_per_s / burst)
     with tempfile.TemporaryDirectory() as folder:
-        program = compiled("ping.c", Path(folder))
+        program = compile_program("ping.c", Path(folder))
         arguments = map(str, (count, round(1e9 * burst / steps_per_s), PRIORITY, burst))
         return 2e6 * cpu_s([str(program), *arguments]) / (count * burst)
 
@@ -182,14 +182,14 @@ def libraries_mib(count: int) -> float:
 
 
 @benchmark(
-    "fleet",
+    "many_loops",
     "Many loops on one network",
     {
-        "--fleet-s": option(60.0, "length of the runs, seconds"),
-        "--fleet-loops": option(1000, "loops at 50 Hz"),
+        "--many-loops-s": option(60.0, "length of the runs, seconds"),
+        "--many-loops": option(1000, "loops at 50 Hz"),
     },
 )
-def fleet(options: argparse.Namespace) -> Iterator[Row]:
+def many_loops(options: argparse.Namespace) -> Iterator[Row]:
     """Measure many loops through one bottleneck, live, and the memory of one loop.
 
     Each loop samples, computes and applies its input at the same rate. A step is one of the plant
@@ -203,11 +203,11 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
         with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
             return run(load, Path(folder))
 
-    for loops, rate_hz in ((options.fleet_loops, 50.0), (20, 500.0)):
-        load = LoopLoad(loops, rate_hz, options.fleet_s)
+    for loops, rate_hz in ((options.many_loops, 50.0), (20, 500.0)):
+        load = LoopLoad(loops, rate_hz, options.many_loops_s)
         before_us, observed, after_us = bare_step_us(load), measured(load), bare_step_us(load)
         yield from figures(load, observed, (before_us + after_us) / 2)
-    alone = LoopLoad(1, 500.0, min(options.fleet_s, _SINGLE_S))
+    alone = LoopLoad(1, 500.0, min(options.many_loops_s, _SINGLE_S))
     yield from memory(alone, measured(alone))
 
 
@@ -256,12 +256,12 @@ def startup(options: argparse.Namespace) -> Iterator[Row]:
     """
     rounds = Rounds()
     libraries = "numpy, scipy.linalg, pydantic, zenoh"
-    rounds.in_turn(ROUNDS, {OURS: started, IMPORTS: lambda: {"first_s": imported_s(libraries)}})
+    rounds.measure_in_turn(ROUNDS, {OURS: started, IMPORTS: lambda: {"first_s": imported_s(libraries)}})
     note = "upper bound: includes a progress line's way through the recorder"
     yield rounds.row("noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6), note=note)
     yield rounds.row("the same, against a bare import", "s", "first_s", OURS, IMPORTS)
-    yield rounds.row("of it, from launch to time 0, as the run says", "s", "launch_s", OURS)
-    yield compared(
+    yield rounds.row("of it, from launch to time 0, by its summary", "s", "launch_s", OURS)
+    yield compare(
         "noack certify lane_following, with all limits",
         "CPU s",
         lambda: cpu_s(_CERTIFY),
@@ -270,9 +270,9 @@ def startup(options: argparse.Namespace) -> Iterator[Row]:
     )
     say("20 loops")
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
-        begun_s = time.monotonic()
+        began_s = time.monotonic()
         run(_LOOPS, Path(folder))
-        loops_s = time.monotonic() - begun_s
+        loops_s = time.monotonic() - began_s
     yield Row("the first run of 20 loops, 5 s, without report", loops_s, "s", goal=Goal("<=", 15))
     say("noack demo, 20 s")
     yield from demo_rows(noack("demo").summary)
@@ -294,7 +294,7 @@ def installed_bytes(names: Iterable[str]) -> int:
 
 
 def lines(*patterns: str) -> int:
-    """Return the lines of the files that git knows."""
+    """Return the number of lines of the files in the repository."""
     command = ["git", "ls-files", "-z", "--", *patterns]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     files = [ROOT / name for name in listed.split("\0") if name]
@@ -327,8 +327,8 @@ def clone(options: argparse.Namespace) -> Iterator[Row]:
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         say("make demo from a clean clone")
         subprocess.run(["git", "clone", "-q", str(ROOT), folder], check=True)
-        begun_s = time.monotonic()
+        began_s = time.monotonic()
         execute(["env", "--unset=VIRTUAL_ENV", "make", "-C", folder, "demo"])
-        spent_s = time.monotonic() - begun_s
+        spent_s = time.monotonic() - began_s
     compiler = "gcc present" if shutil.which("cc") else "no C compiler"
     yield Row(f"make demo from a clean clone to its verdict, {compiler}", spent_s, "s", goal=Goal("<=", 60))

@@ -29,7 +29,7 @@ from benchmarks.report import (
     Peer,
     Row,
     benchmark,
-    compared,
+    compare,
     cpu_ms,
     median,
     option,
@@ -61,7 +61,7 @@ from plant_server.plant import plants_of
 Method = Literal["RK45", "DOP853"]
 
 
-def integrated(
+def integrate_draw(
     setting: Setting,
     draw: Population,
     delivered: NDArray[np.bool_],
@@ -140,14 +140,14 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
     earlier = Peer("the Python machines of b3991367 in virtual time", 1 / _PYTHON_MACHINES_S)
     machines = cpu_ms(lambda: simulate(lane))
     name = f"{horizon_s:g} s of the machines in virtual time"
-    yield compared(name, "ms", machines, live, Goal("<=", 1e-3))
-    yield compared(
+    yield compare(name, "ms", machines, live, Goal("<=", 1e-3))
+    yield compare(
         f"{_LOOPS} loops at {_LOOPS_HZ:g} Hz: loops × runs of {_LOOPS_S:g} s per second of CPU",
         "/s",
         per_cpu_s(_LOOPS, lambda: simulate_loops(many)),
         goal=Goal(">=", 3000),
     )
-    yield compared(
+    yield compare(
         f"sampled runs of {horizon_s:g} s on one core",
         "/s",
         per_cpu_s(_SAMPLED_RUNS, lambda: sampled_runs(loop)),
@@ -157,7 +157,7 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
     )
     record = simulate(lane.model_copy(update={"horizon_s": _REPLAYED_S}))
     replayed = replay(record)
-    yield compared(
+    yield compare(
         f"replay of {_REPLAYED_S:g} s, {replayed.inputs:,} inputs",
         "× real time",
         per_cpu_s(_REPLAYED_S, lambda: replay(record)),
@@ -170,7 +170,7 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
         with patch.object(solution, "sharpened_once", sharpened_constants):  # each round computes it
             certify(lane, conditions)
 
-    yield compared("certificate", "ms", cpu_ms(certificate))
+    yield compare("certificate", "ms", cpu_ms(certificate))
 
 
 DRAWS = 200
@@ -184,7 +184,7 @@ _AGREEMENT_S = 1e-4
 """Accumulated effect of the integrator's errors of 1e-8 over hundreds of events."""
 
 
-def drawn(mode: str, trigger: Mapping[str, Any] | None = None) -> tuple[Setting, Population]:
+def draw_population(mode: str, trigger: Mapping[str, Any] | None = None) -> tuple[Setting, Population]:
     """Return draws of the lane example, by default with the paper's trigger."""
     content = load(find_scenario("lane_following"), ()).model_dump(mode="json", exclude_none=True)
     changes = {"mode": mode} | ({} if trigger is None else {"trigger": trigger})
@@ -194,7 +194,7 @@ def drawn(mode: str, trigger: Mapping[str, Any] | None = None) -> tuple[Setting,
 
 def batch_rows(mode: str) -> list[Row]:
     """Return the rows of a mode: the engine beside the integrator's default, and its fastest."""
-    setting, population = drawn(mode)
+    setting, population = draw_population(mode)
     rows, events = run_with_events(setting, population)
     draws = [Population._make(part[i : i + 1] for part in population) for i in range(DRAWS)]
     batch = Population._make(np.concatenate([part] * ENGINE[mode]) for part in population)
@@ -207,13 +207,13 @@ def batch_rows(mode: str) -> list[Row]:
         def integrate(method: Method = method) -> list[list[float]]:
             # The last event has no fate that matters.
             fates = [np.append(events[i].delivered, False) for i in few]
-            return [integrated(setting, draws[i], fates[i], method) for i in few]
+            return [integrate_draw(setting, draws[i], fates[i], method) for i in few]
 
         error_s = max(map(apart_s, (events[i].event_s for i in few), integrate()))
         peer = f"solve_ivp, {method}, rtol 1e-8", per_cpu_s(len(few), integrate)
         note = f"event times differ by {error_s:.1g} s from those of {method}"
         doubt = None if error_s <= _AGREEMENT_S else "the two do not agree"
-        results.append(compared(name, "runs/s", engine, peer, goal, note=note, unjudged=doubt))
+        results.append(compare(name, "runs/s", engine, peer, goal, note=note, unjudged=doubt))
     value = median(row.value for row in results if row.value is not None)
     note = f"{rows['transmissions'].mean():.0f} events a run"
     return [Row(name, value, "runs/s", goal=Goal(">=", _FASTEST[mode]), note=note), *results]
@@ -231,16 +231,16 @@ def batches(options: argparse.Namespace) -> Iterator[Row]:
     """
     yield from batch_rows("model")
     yield from batch_rows("zoh")
-    paper = drawn("model")
+    paper = draw_population("model")
     for name, settings in POLICIES.items():
         example = settings.example(4)
         if name in ("decaying", "lyapunov") or example is None:
             continue
         trigger = example.model_dump(mode="json", exclude_none=True)
         whole = f"{name} of {trigger['rule']['policy']}" if "rule" in trigger else name
-        other = drawn("model", trigger)
+        other = draw_population("model", trigger)
         side, peer = (per_cpu_s(DRAWS, partial(run_batch, *run)) for run in (other, paper))
-        yield compared(f"model, {whole}", "runs/s", side, ("decaying", peer))
+        yield compare(f"model, {whole}", "runs/s", side, ("decaying", peer))
 
 
 STEPS = 7500
@@ -261,11 +261,11 @@ def steps_us(scenario: Scenario) -> Iterator[float]:
             "flow": Flow.ACTUATION, "sequence": step, "t_ns": t_ns,
             "entries": len(u), "vector": u.tolist(),
         }), t_ns)  # fmt: skip
-        begun_ns = time.thread_time_ns()
+        began_ns = time.thread_time_ns()
         while (question := core.noack_process_tick(plant.core, t_ns)) != core.NOACK_DONE:
             plant.answer(question)
         plant.take_rows()
-        yield (time.thread_time_ns() - begun_ns) / 1e3
+        yield (time.thread_time_ns() - began_ns) / 1e3
 
 
 def plant_rows(name: str, scenario: Scenario) -> Iterator[Row]:
@@ -310,7 +310,7 @@ _LOOK_EVERY_S = 0.5
 
 def campaign_figures(draws: int, *options: str) -> Figures:
     """Run the campaign as a user does; shared pages of memory count once."""
-    peak_mib, begun_s = 0.0, time.perf_counter()
+    peak_mib, began_s = 0.0, time.perf_counter()
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as output:
         command = [*NOACK, "campaign", CAMPAIGN, "--json", "--draws", str(draws), "--out", folder, *options]
         with subprocess.Popen(command, stdout=output) as process:
@@ -321,7 +321,7 @@ def campaign_figures(draws: int, *options: str) -> Figures:
                     used_bytes = sum(process.memory_full_info().pss for process in every)
                     peak_mib = max(peak_mib, used_bytes / 2**20)
                 time.sleep(_LOOK_EVERY_S)
-        took_s = time.perf_counter() - begun_s
+        took_s = time.perf_counter() - began_s
         if process.returncode != 0:
             raise MeasurementError(f"noack campaign {CAMPAIGN} ended with {process.returncode}")
         output.seek(0)
@@ -338,7 +338,7 @@ def campaign(options: argparse.Namespace) -> Iterator[Row]:
     These are the user's command, with summary and page. In a round, one and then two workers run
     the same draws.
     """
-    yield compared(
+    yield compare(
         f"{CAMPAIGN}, two workers",
         "runs/s",
         lambda: campaign_figures(SHARED_DRAWS, "--workers", "2")["per_s"],

@@ -19,7 +19,7 @@ from cosim.interactive.exploration_figure import (
     exploration_figure,
 )
 from cosim.interactive.scenario_draft import Draft
-from cosim.interactive.sliders import Choice, Slider, chosen, controls_of, dragged
+from cosim.interactive.sliders import Choice, Slider, choose, controls_of, drag
 from cosim.output.figures.figure_drawing import draw
 from cosim.output.figures.figure_layout import settings
 from noack.core.errors import NoackError
@@ -141,7 +141,7 @@ class ExplorerWidget:
             layout=_WIDE,
         )
         dropdown.observe(
-            lambda change: self._change(lambda draft: chosen(draft, choice.key, change["new"])),
+            lambda change: self._change(lambda draft: choose(draft, choice.key, change["new"])),
             "value",
         )
         return widgets.VBox([widgets.Label(choice.label), dropdown], layout=_WIDE)
@@ -165,7 +165,7 @@ class ExplorerWidget:
             current = self._sliders[key]
             value = current.value_at(current.place(change["new"]))
             if value != current.value:
-                self._change(lambda draft: dragged(draft, current, value))
+                self._change(lambda draft: drag(draft, current, value))
 
         widget.observe(moved, "value")
         return widget

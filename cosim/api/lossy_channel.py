@@ -17,7 +17,7 @@ from gymnasium.spaces.utils import flatdim
 
 from cosim.api.scenarios import Source, load
 from cosim.shipped_files import find_shipped
-from netem.channel import Channel, Leaving, link_name, require_stand_alone
+from netem.channel import Channel, Departure, link_name, require_stand_alone
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -175,7 +175,7 @@ class LossyChannel(
             for row in rows if table == NETEM_PACKET else ():
                 receiver.losses = int(row["consecutive_losses"])
 
-    def _take(self, leaving: Iterable[Leaving]) -> None:
+    def _take(self, leaving: Iterable[Departure]) -> None:
         """Let what leaves the channel arrive."""
         for packet in leaving:
             if packet.bit < 0:  # a receiver rejects a damaged datagram

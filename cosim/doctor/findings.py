@@ -148,15 +148,15 @@ def _timer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
 
 @_check("wake-ups without real-time settings")
 def _plain_wake_ups(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
-    yield _wake_ups(machine.plain, required, in_force=not required.realtime)
+    yield _wake_ups(machine.plain, required, applied=not required.realtime)
 
 
 @_check("wake-ups with the real-time settings applied")
 def _realtime_wake_ups(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
-    yield _wake_ups(machine.realtime, required, in_force=required.realtime)
+    yield _wake_ups(machine.realtime, required, applied=required.realtime)
 
 
-def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, in_force: bool) -> Outcome:
+def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, applied: bool) -> Outcome:
     """Compare the lateness of an idle loop with the lateness that the certificates allow."""
     if isinstance(lateness, str):
         return LIMITED, lateness, "the lateness of a run cannot be predicted"
@@ -177,7 +177,7 @@ def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, in_force: 
         f"{first_s:.2g} s of a run of {required.duration_s:g} s; from the first on, the run needs a "
         "certificate for its actual lateness"
     )
-    if not in_force:
+    if not applied:
         return GOOD, late, f"{means}. Runs use real-time settings"
     remedy = "raise certificate.late_periods, or lower speed or rates"
     return LIMITED, late, means, remedy

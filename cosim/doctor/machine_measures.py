@@ -266,11 +266,11 @@ def _round_trips_us(endpoint: socket.socket) -> list[float]:
     """Return the times of the datagrams that come back; raise MachineError if three do not."""
     times_us: list[float] = []
     for number in range(_ROUND_TRIPS):
-        begun_ns = time.perf_counter_ns()
+        began_ns = time.perf_counter_ns()
         with suppress(TimeoutError):
             endpoint.send(_DATAGRAM)
             endpoint.recv(len(_DATAGRAM) + 1)
-            times_us.append((time.perf_counter_ns() - begun_ns) * 1e-3)
+            times_us.append((time.perf_counter_ns() - began_ns) * 1e-3)
         if number - len(times_us) >= 2:
             raise MachineError("datagrams on the loopback are lost")
     return times_us
@@ -328,9 +328,9 @@ def _measure_query() -> float:
         centre.declare_queryable(key, lambda query: query.reply(key, "here")),
         open_session(RUNS, name, listen=False) as client,
     ):
-        begun_s = time.perf_counter()
+        began_s = time.perf_counter()
         answer = answer_to(client, key, "", _QUERY_TIMEOUT_S)
-        taken_s = time.perf_counter() - begun_s
+        taken_s = time.perf_counter() - began_s
     if answer is None:
         raise MachineError(f"no answer within {_QUERY_TIMEOUT_S:g} s")
     return taken_s
@@ -341,12 +341,12 @@ def _measure_disk(runs: Path, required_bytes: int) -> Disk:
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             block = bytes(1024 * 1024)
-            begun_s = time.perf_counter()
+            began_s = time.perf_counter()
             for _ in range(_WRITE_BYTES // len(block)):
                 file.write(block)
             file.flush()
             os.fsync(file.fileno())
-            taken_s = time.perf_counter() - begun_s
+            taken_s = time.perf_counter() - began_s
     except OSError as error:
         raise MachineError(f"{folder}: cannot be written: {why(error)}") from None
     return Disk(str(folder), shutil.disk_usage(folder).free, required_bytes, _WRITE_BYTES / taken_s)

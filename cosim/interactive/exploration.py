@@ -185,7 +185,7 @@ def _of_exact(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
     even = run.at(np.linspace(0.0, run.reached_s, POINTS))
     parts = [(even.t_s, even.x, even.e_s, even.e_c)]
     if 0 < len(run.before) <= _MOST_EVENT_POINTS:  # before, after, then the even times
-        parts = [_stacked(run.before), _stacked(run.after), *parts]
+        parts = [_stack(run.before), _stack(run.after), *parts]
     t_s, x, e_s, e_c = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(t_s, kind="stable")
     t_s, x, e_s, e_c = t_s[order], x[order], e_s[order], e_c[order]
@@ -196,7 +196,7 @@ def _of_exact(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
     )  # fmt: skip
 
 
-def _stacked(states: tuple[LoopState, ...]) -> tuple[Vector, Matrix, Matrix, Matrix]:
+def _stack(states: tuple[LoopState, ...]) -> tuple[Vector, Matrix, Matrix, Matrix]:
     t_s, x, e_s, e_c = zip(*states, strict=True)
     return np.array(t_s), np.array(x), np.array(e_s), np.array(e_c)
 
@@ -309,12 +309,14 @@ def explore_ensemble(scenario: Scenario, draws: int = DRAWS) -> Ensemble:
     setting = _ensemble_setting(scenario)
     population = box_of(scenario).population(0, range(draws))
     rows, events = run_with_events(setting, population)
+    # Draws with too many events, and undecided ones, are left out.
     used = np.flatnonzero((rows["status"] == OK) | (rows["status"] == DIVERGED))
     chosen = Population(
         population.A[used], population.B[used], population.x0[used], population.loss_seeds[used]
     )
     t_s = np.linspace(0.0, setting.horizon_s, _BAND_POINTS)
     states = trajectories(setting, chosen, [events[i] for i in used], t_s)
+    # Norms, weighted as the trigger weights them, as quantiles over the draws.
     x, e_c = states[:, :, 0], states[:, :, 2]
     weight = setting.trigger.weight
     with np.errstate(all="ignore"):

@@ -111,7 +111,7 @@ def _errors(shown: ExploredRun) -> _Part:
         items.insert(0, replace(threshold, dash=DASHED))
         about = np.concatenate([about, level])
     if guarantee is not None:
-        items.append(_certified(guarantee, guarantee.e_c))
+        items.append(_certified_line(guarantee, guarantee.e_c))
     if draws is not None:
         items.append(_edge(draws, _positive(draws.e_c_norm.high, floor)))
     if other is not None:
@@ -125,7 +125,7 @@ def _norm(shown: ExploredRun) -> _Part:
     norm = _positive(run.x_norm, _SMALLEST * _largest(run.x_norm))
     items = [Line(x=run.t_s, y=norm, label="‖x‖", colour=PLANT, width=2.25)]
     if guarantee is not None:
-        items.append(_certified(guarantee, guarantee.x))
+        items.append(_certified_line(guarantee, guarantee.x))
     if draws is not None:
         edges = (draws.x_norm.low, draws.x_norm.high)
         items += [_edge(draws, _positive(edge, 0.0)) for edge in edges]
@@ -147,7 +147,7 @@ def _events(shown: ExploredRun) -> _Part:
     return "transmissions: time since the last one [s]", items, Axis(ends=(0.0, None))
 
 
-def _certified(guarantee: Guarantee, values: Vector) -> Line:
+def _certified_line(guarantee: Guarantee, values: Vector) -> Line:
     return Line(x=guarantee.t_s, y=values, label="certified bound", colour=CERTIFIED)
 
 

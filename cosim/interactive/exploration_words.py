@@ -1,4 +1,4 @@
-"""What is said of an explored run: its verdict, and what distinguishes it from another run."""
+"""Words about an explored run: its verdict, and what distinguishes it from another run."""
 
 import math
 from typing import NamedTuple
@@ -53,7 +53,7 @@ def compare(reference: Reference, run: Exploration) -> Comparison:
     last_s = [float(shown.t_s[-1]) for shown in (reference.run, run)]
     until_s = min(last_s)
     until = f", until {number(until_s, 3)} s" if max(last_s) > until_s * _NEARLY else ""
-    before, after = (_measured(shown, until_s) for shown in (reference.run, run))
+    before, after = (_measure(shown, until_s) for shown in (reference.run, run))
     rows = (
         *(_counts(name, before[name], after[name]) for name in ("transmissions", "lost")),
         *(_sizes(name, before[name], after[name]) for name in (_END, "largest ‖e_c‖")),
@@ -61,7 +61,7 @@ def compare(reference: Reference, run: Exploration) -> Comparison:
     return Comparison(f"compared with {reference.name}{until}", _settings(reference.run, run), rows)
 
 
-def _measured(run: Exploration, until_s: float) -> dict[str, float]:
+def _measure(run: Exploration, until_s: float) -> dict[str, float]:
     """Return the numbers of a run up to a time."""
     sent, drawn = run.event_s <= until_s, run.t_s <= until_s
     errors = run.e_c_norm[drawn & run.controller_knows & np.isfinite(run.e_c_norm)]

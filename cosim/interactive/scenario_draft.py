@@ -105,15 +105,15 @@ class Draft:
 
     def with_value(self, key: str, value: object) -> "Draft":
         """Return the draft with another value of a key; comments are kept where possible."""
-        return self._changed(key, lambda content: put(content, key, value, key))
+        return self._change(key, lambda content: put(content, key, value, key))
 
     def without(self, key: str) -> "Draft":
         """Return the draft without a key, which then has its default."""
         if leaf(self.content, key) is _ABSENT:
             return self
-        return self._changed(key, lambda content: remove(content, key))
+        return self._change(key, lambda content: remove(content, key))
 
-    def _changed(self, key: str, change: Callable[[Table], object]) -> "Draft":
+    def _change(self, key: str, change: Callable[[Table], object]) -> "Draft":
         content = copy.deepcopy(self.content)
         change(content)
         if "text" in self.__dict__:

@@ -1,6 +1,6 @@
 """A form with a field for every key of a scenario.
 
-It follows the JSON schema, in groups as its tables: it knows no key by name, so that a new key of
+It follows the JSON schema, in groups as its tables: it names no key, so that a new key of
 the schema has its field at once. A table with kinds (``trigger.policy``, ``network.loss.model``) has
 a choice, and the fields of its kind.
 """
@@ -21,7 +21,7 @@ from noack.scenario.scenario_file import value_of
 
 Schema = Mapping[str, Any]
 _VALUE = re.compile(r'^(?: = (?:"(?:[^"\\]|\\.)*"|[^:]*))?: ')
-"""What a mistake says before its reason; the field shows it."""
+"""What precedes the reason of a mistake; the field itself shows it."""
 
 
 class FieldKind(StrEnum):
@@ -97,7 +97,7 @@ def form_of(draft: Draft) -> Group:
     return _group("", _schema(), "", draft.content, {})
 
 
-def filled(draft: Draft, field: Field, text: str) -> Draft:
+def fill_in(draft: Draft, field: Field, text: str) -> Draft:
     """Return the draft with another text in a field; an empty one restores the default.
 
     Another kind of a table keeps what both kinds have.
@@ -141,7 +141,7 @@ def _schema() -> Schema:
     return toml_file.json_schema(Scenario)
 
 
-def _resolved(schema: Schema) -> Schema:
+def _resolve(schema: Schema) -> Schema:
     """Return a schema without reference, and without the alternative null."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
@@ -150,7 +150,7 @@ def _resolved(schema: Schema) -> Schema:
         given = [alternative for alternative in schema["anyOf"] if alternative.get("type") != "null"]
         if len(given) == 1:
             rest = {key: value for key, value in schema.items() if key != "anyOf"}
-            return _resolved({**given[0], **rest})
+            return _resolve({**given[0], **rest})
     return schema
 
 
@@ -169,7 +169,7 @@ def _group(key: str, schema: Schema, help_: str, content: object, default: objec
         )
         schema = kinds.get(chosen, {}) if isinstance(chosen, str) else {}
     for part, described in schema.get("properties", {}).items():
-        inner, path = _resolved(described), f"{key}.{part}".removeprefix(".")
+        inner, path = _resolve(described), f"{key}.{part}".removeprefix(".")
         if part == name:
             continue
         value, usual = content.get(part), described.get("default", default.get(part))
@@ -186,7 +186,7 @@ def _kinds(schema: Schema) -> tuple[str, dict[str, Schema]]:
     kinds: dict[str, Schema] = {}
     name = ""
     for reference in schema.get("oneOf", ()):
-        kind = _resolved(reference)
+        kind = _resolve(reference)
         name, described = next((name, part) for name, part in kind["properties"].items() if "const" in part)
         kinds[described["const"]] = kind
     return name, kinds

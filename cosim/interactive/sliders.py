@@ -160,7 +160,7 @@ def _is_window(scenario: Scenario) -> bool:
     return [constraint.kind for constraint in scenario.network.constraints] == [_WINDOW["kind"]]
 
 
-def chosen(draft: Draft, key: str, value: str) -> Draft:
+def choose(draft: Draft, key: str, value: str) -> Draft:
     """Return the draft with another choice; tables take the example of their kind."""
     if (example := example_of(draft, key, value)) is not None:
         return draft.with_value(key, example)
@@ -169,7 +169,7 @@ def chosen(draft: Draft, key: str, value: str) -> Draft:
     return draft.with_value(key, value)
 
 
-def dragged(draft: Draft, slider: Slider, value: float) -> Draft:
+def drag(draft: Draft, slider: Slider, value: float) -> Draft:
     """Return the draft with another value of a slider."""
     if not slider.scaled:
         return draft.with_value(slider.key, value)

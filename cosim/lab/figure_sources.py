@@ -17,7 +17,7 @@ from cosim.interactive.scenario_draft import Draft, DraftError
 from cosim.interactive.sliders import controls_of
 from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.lab.live_run import MOST_LINES, LiveRun
-from cosim.lab.recorded_views import RunView, compared, recorded_view, replayed
+from cosim.lab.recorded_views import RunView, compare_with_ideal, recorded_view, replay_run
 from cosim.output.run_verdict import DOUBTFUL, NEUTRAL, VerdictLine, transmission_line
 from noack.core.errors import NoackError
 from noack.core.number_format import number
@@ -56,7 +56,7 @@ class LiveSource:
         self._again.set_visibility(False)
 
     def build_details(self) -> None:
-        """Build kill buttons, log and viewer, which are below what is said of the run."""
+        """Build kill buttons, log and viewer, which are below the words about the run."""
         with ui.row().classes("items-center gap-2"):
             self._restarts = ui.checkbox("restart killed processes", value=True).props("dense")
             self._kill = [
@@ -218,8 +218,8 @@ class RecordedSource:
         ui.button(icon="refresh", on_click=self.refresh).props('flat dense aria-label="look for new runs"')
 
     def build_details(self) -> None:
-        """Build what can be asked about a run, below what is said of it."""
-        for text, function in (("replay", replayed), ("compare with the ideal loop", compared)):
+        """Build the buttons for a run, below the words about it."""
+        for text, function in (("replay", replay_run), ("compare with the ideal loop", compare_with_ideal)):
             ui.button(text, on_click=partial(self._ask, function)).props("outline no-caps dense").classes(
                 "mr-2"
             )
@@ -255,10 +255,10 @@ class RecordedSource:
     async def _replay(self) -> None:
         if self._replays:
             self._replays = False
-            await self._ask(replayed)
+            await self._ask(replay_run)
 
     async def _ask(self, function: Callable[[Path], str]) -> None:
-        """Show what a function says about the chosen run."""
+        """Show the words that a function returns about the chosen run."""
         if not self.chosen:
             return
         self.note = "computing …"

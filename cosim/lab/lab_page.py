@@ -1,4 +1,4 @@
-"""The page as a visitor sees it: the figure, what is said of it, and a drawer with the settings.
+"""The page as a visitor sees it: the figure, the words about it, and a drawer with the settings.
 
 The figure shows one of three sources: the explored run, the live run, or a recorded one. What the
 browser is sent are the parts of :class:`cosim.lab.page_parts.PageParts`.
@@ -17,8 +17,8 @@ from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 from cosim.interactive.exploration_figure import CERTIFICATE, ExploredRun, exploration_figure
 from cosim.interactive.exploration_words import Reference, compare, verdict_of
 from cosim.interactive.scenario_draft import Draft, DraftError, draft_of_query, open_draft
-from cosim.interactive.settings_form import by_field, filled, form_of
-from cosim.interactive.sliders import Controls, chosen, controls_of, dragged
+from cosim.interactive.settings_form import by_field, fill_in, form_of
+from cosim.interactive.sliders import Controls, choose, controls_of, drag
 from cosim.lab.figure_sources import LiveSource, RecordedSource, report_address
 from cosim.lab.file_menu import FileMenu
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
@@ -60,7 +60,7 @@ class _Page:
     def __init__(self, services: LabServices, draft: Draft) -> None:
         self._services, self._client = services, ui.context.client
         self._calls = PageCalls(services)
-        self._session = Session(self._calls, draft, self._drawn, self._settle)
+        self._session = Session(self._calls, draft, self._show_run, self._settle)
         self._parts = PageParts(self._client)
         self._dark = ui.dark_mode(None)
         self._is_dark = False
@@ -100,7 +100,7 @@ class _Page:
                 .classes("lab-scenario")
             )
             ui.space()
-            FileMenu(self._services, self._calls, self._session, self._shown)
+            FileMenu(self._services, self._calls, self._session, self._explored_run)
             ui.button(icon="contrast", on_click=self._toggle).props(
                 'flat color=white dense aria-label="dark or light"'
             )
@@ -163,15 +163,15 @@ class _Page:
                 if slider := next((slider for slider in sliders if slider.key == message["key"]), None):
                     value = slider.value_at(float(message["place"]))
                     self._moved = [slider.key, value_text(value)]
-                    await self._apply(lambda draft: dragged(draft, slider, value), slider.key)
+                    await self._apply(lambda draft: drag(draft, slider, value), slider.key)
             case "fill":
                 fields = (field for field in self._form.all_fields() if field.key == message["key"])
                 field, text = next(fields), str(message["text"]).strip()
                 if text != field.text(self._session.draft):
-                    await self._apply(lambda draft: filled(draft, field, text), field.key)
+                    await self._apply(lambda draft: fill_in(draft, field, text), field.key)
             case "choose":
                 key, kind = message["key"], str(message["value"])
-                await self._apply(lambda draft: chosen(draft, key, kind), key)
+                await self._apply(lambda draft: choose(draft, key, kind), key)
             case "state":
                 self._state = int(message["number"])
                 await self._show()
@@ -186,7 +186,7 @@ class _Page:
 
     async def _show(self) -> None:
         """Show the chosen source."""
-        shown, live = self._shown(), self._source == LIVE
+        shown, live = self._explored_run(), self._source == LIVE
         with suppress(DraftError):  # the mistakes are shown; the sliders stay
             self._controls = controls_of(self._session.draft)
         parts = self._drawing(shown) | {"note": self._note(shown), "verdict": self._verdict()}
@@ -229,7 +229,7 @@ class _Page:
         is_old = note and shown is None and self._parts.has_figure
         return f"{note}. The figure shows the settings before" if is_old else note
 
-    def _shown(self) -> ExploredRun | None:
+    def _explored_run(self) -> ExploredRun | None:
         """Return what the figure shows; None without a run."""
         view, reference = self._recorded.view, self._reference()
         shown = None
@@ -284,9 +284,9 @@ class _Page:
         if self._live.follow() and self._source == LIVE:
             await self._show()
 
-    async def _drawn(self) -> None:
-        """Show the figure of a new run at once; what is said of it follows when the settings rest."""
-        shown = self._shown()
+    async def _show_run(self) -> None:
+        """Show the figure of a new run at once; its words follow when the settings rest."""
+        shown = self._explored_run()
         if self._source != EXPLORE or shown is None:
             await self._show()
             return
@@ -340,7 +340,7 @@ class _Page:
         await self._session.change(draft)
 
     async def _keep_run(self) -> None:
-        shown = self._shown()
+        shown = self._explored_run()
         if self._kept is not None or shown is None:
             self._kept = None
         else:

@@ -117,7 +117,7 @@ def refused_message(record: logging.LogRecord) -> bool:
 
 
 _END_S, _STDERR = 60.0, 2
-"""The end may take so long; a live run that is being judged is a process of its own and goes on."""
+"""Time limit for the end, and standard error. A live run is a process of its own and continues."""
 _CAN_CHECK = sys.platform == "linux"
 """Whether the user of a connection can be seen."""
 _RECONNECT_S = 60.0

@@ -30,11 +30,11 @@ T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
 ANSWER_S = 60.0
-"""So long a browser may take to answer: without a graphics card it may draw for seconds."""
+"""Time limit for a browser's answer: without a graphics card it may draw for seconds."""
 _GIVE_UP_S = 3.0
-"""So long the worker may go on with a call whose page does not want it any more."""
+"""Time limit for a call whose page no longer needs it; then the worker is replaced."""
 _MANAGER_ENDS_S = 5.0
-"""So long, at most, the end waits for the thread of the pool, whose worker is killed."""
+"""Time limit at the end for the thread of the pool, whose worker is killed."""
 _LOOK_S = 0.4
 _NICE = 10
 """The worker yields to a live run and to the page."""
@@ -71,7 +71,7 @@ class LabServices:
     async def compute(self, function: Callable[[*Ts], T], *arguments: *Ts) -> T:
         """Call a function in the worker process, after the calls that were made before.
 
-        A cancelled call is not begun, or given up after a moment.
+        A cancelled call does not start, or is given up after a moment.
 
         Raises: what the function raises.
         """
@@ -193,10 +193,10 @@ def _prepare() -> None:
 
 
 _QUIET_S = 0.15
-"""So long after the last change, what takes longer than a redraw is computed."""
+"""Time after the last change until what takes longer than a redraw is computed."""
 _MARGIN_S = 0.6
 _SLOW_S = 1.0
-"""Without a result for so long, the page says that it waits."""
+"""Time without a result after which the page shows that it waits."""
 
 
 @dataclass
@@ -299,15 +299,15 @@ class Session:
         await self.on_rest()
 
     async def _compute(self, quantity: str, function: Callable[[Scenario], T], scenario: Scenario) -> T:
-        """Compute a result, and say so; if it does not come soon, that it waits."""
+        """Compute a result; show what is computed, and after a while that it waits."""
 
-        async def say_waiting() -> None:
+        async def show_waiting() -> None:
             await asyncio.sleep(_SLOW_S)
             self.pending = f"{quantity}: waiting for the processor"
             await self.on_rest()
 
         self.pending = f"computing: {quantity}"
-        waiting = asyncio.create_task(say_waiting())
+        waiting = asyncio.create_task(show_waiting())
         try:
             result = await self.calls.compute(function, scenario)
         finally:

@@ -2,7 +2,7 @@
 
 :class:`LiveRun` is the page's side: the process, its progress, what it has reported. Run as a
 program, this module is the other side: it reads the scenario's text from standard input, until its
-end, and writes one JSON object per line on standard output: what happened, with its fields.
+end, and writes one JSON object per line on standard output: an event with its fields.
 """
 
 import asyncio
@@ -20,6 +20,7 @@ from cosim.interactive.scenario_draft import Draft
 from cosim.live.launcher import launch
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.output.viewer.rerun_program import is_installed
+from netem.shell import process
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command
 from noack.protocol.roles import LOOP_ROLES
@@ -33,7 +34,6 @@ MOST_LINES = 200
 """Of the log."""
 _STOP_S = 20.0
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
-_CMDLINE = Path("/proc")
 
 
 @dataclass
@@ -86,7 +86,7 @@ class LiveRun:
         self._process.stdin.close()  # after the text; a process that has ended needs none
 
     async def follow(self) -> None:
-        """Read what the run says until it has ended."""
+        """Read the reports of the run until it has ended."""
         assert self._process is not None
         assert self._process.stdout is not None
         async for line in self._process.stdout:
@@ -132,7 +132,7 @@ class LiveRun:
     def _take(self, line: str) -> None:
         try:
             message = json.loads(line)
-            event = message.pop("what")
+            event = message.pop("event")
         except (ValueError, AttributeError, KeyError, TypeError):
             self._add(line)  # a message of a library, or of the compiler
             return
@@ -178,22 +178,13 @@ class LiveRun:
 
 def _descendants(pid: int) -> list[int]:
     """Return the processes below a process."""
-    parents: dict[int, int] = {}
-    for folder in _CMDLINE.iterdir():
-        if folder.name.isdigit():
-            with suppress(OSError, ValueError, IndexError):
-                stat = (folder / "stat").read_text().rpartition(")")[2].split()
-                parents[int(folder.name)] = int(stat[1])
-    descendants, new = set[int](), {pid}
-    while new:
-        new = {child for child, parent in parents.items() if parent in new} - descendants
-        descendants |= new
-    return sorted(descendants)
+    own_children = sorted(process.children(pid))
+    return own_children + [below for child in own_children for below in _descendants(child)]
 
 
 def _title(pid: int) -> str:
     with suppress(OSError):
-        return (_CMDLINE / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+        return Path("/proc", str(pid), "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
     return ""
 
 
@@ -201,24 +192,24 @@ def main() -> int:
     """Run a scenario; the arguments are the folder of the files that it names, and of the runs."""
     folder, runs = map(Path, sys.argv[1:3])
     watcher = Watcher(
-        started=lambda run_dir: _say("started", run_dir=str(run_dir)),
-        failed=lambda why, t_s, by_hand: _say("failed", why=why, t_s=t_s),
-        restarted=lambda role, t_s: _say("restarted", role=role, t_s=t_s),
-        progress=lambda report: _say("progress", **report.fields()),
+        started=lambda run_dir: _report("started", run_dir=str(run_dir)),
+        failed=lambda why, t_s, by_hand: _report("failed", why=why, t_s=t_s),
+        restarted=lambda role, t_s: _report("restarted", role=role, t_s=t_s),
+        progress=lambda report: _report("progress", **report.fields()),
     )
     try:
         draft = Draft("scenario", folder, "", sys.stdin.buffer.read().decode())
         ending = launch(draft.scenario, runs, live=is_installed(), watcher=watcher)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a stop now must not cost the summary
-        _say("finalising", reason=ending.reason)
+        _report("finalising", reason=ending.reason)
         from cosim.live.finalize import finalize  # not earlier: it would take time from the loop
         from cosim.output.run_verdict import verdict
 
         outcome = finalize(ending, report=False)
     except NoackError as error:
-        _say("error", text=str(error))
+        _report("error", text=str(error))
         return error.exit_status
-    _say(
+    _report(
         "ended",
         run_dir=str(outcome.run_dir),
         reason=outcome.reason,
@@ -228,9 +219,9 @@ def main() -> int:
     return outcome.status
 
 
-def _say(event: str, **fields: object) -> None:
+def _report(event: str, **fields: object) -> None:
     with suppress(BrokenPipeError):  # the page has ended; the run is recorded all the same
-        print(json.dumps({"what": event, **fields}), flush=True)
+        print(json.dumps({"event": event, **fields}), flush=True)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ Json = dict[str, Any]
 _PIXELS_PER_POINT = 4 / 3
 _MARGIN = 0.06
 _DRAWN_S = 10.0
-"""Parts without an answer of the browser for so long are sent again with the next ones."""
+"""Parts that the browser has not answered within this time are sent again with the next ones."""
 
 
 class PageParts:
@@ -161,7 +161,7 @@ class TextPanel:
         with ui.expansion("all settings (TOML)").classes("w-full").props("dense") as expansion:
             self._mistakes = ui.column().classes("gap-0 w-full").props("role=status")
             self._editor = ui.codemirror(
-                draft.text, language="TOML", line_wrapping=True, on_change=self._edited
+                draft.text, language="TOML", line_wrapping=True, on_change=self._take_edit
             ).classes("w-full h-96")
         expansion.on("after-show", js_handler="labNameEditor")
 
@@ -180,7 +180,7 @@ class TextPanel:
         """Choose the colours of the editor."""
         self._editor.set_theme("vscodeDark" if dark else "vscodeLight")
 
-    def _edited(self, event: ValueChangeEventArguments[str]) -> Awaitable[None] | None:
+    def _take_edit(self, event: ValueChangeEventArguments[str]) -> Awaitable[None] | None:
         if self._quiet or event.value == self._draft.text:
             return None
         return self._apply(lambda draft: draft.with_text(event.value), "scenario")

@@ -92,8 +92,8 @@ def _bounds(record: RunRecord) -> Guarantee | None:
     return Guarantee(CERTIFIED, "", (), (), t_s, unknown, e_c, x)
 
 
-def replayed(directory: Path) -> str:
-    """Replay a run, and say whether it is bit-exact."""
+def replay_run(directory: Path) -> str:
+    """Replay a run; return in words whether it is bit-exact."""
     result = runs.open_run(directory).replay()
     return (
         "replay: bit-exact, the same numbers again"
@@ -102,7 +102,7 @@ def replayed(directory: Path) -> str:
     )
 
 
-def compared(directory: Path) -> str:
+def compare_with_ideal(directory: Path) -> str:
     """Compare a run with the ideal loop."""
     return f"ideal loop: {runs.open_run(directory).fidelity().verdict}"
 

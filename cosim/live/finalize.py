@@ -57,7 +57,7 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 _FEW_LOOPS = 4
 """The reports of up to so many loops are written at the end of the run."""
 _LOOPS_AT_ONCE, _LEAST_LOOPS, _ROWS_AT_ONCE = 64, 8, 2**18
-"""Loops that are judged together, and rows of one of their tables."""
+"""Loops that are evaluated together, and rows of one of their tables."""
 
 
 @np.errstate(all="ignore")
@@ -91,7 +91,7 @@ def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again
         with work_bar("the record of the run") as show:
             each = partial(helpers.each, show=show)
             run = finish_record(run_dir, each, helpers.early) if unfinished else load_run(run_dir)
-        summary, over_time = _judge_run(run, ending, helpers)
+        summary, over_time = _evaluate_run(run, ending, helpers)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
         if view and (again or not is_shown):
@@ -159,36 +159,36 @@ class _LoopResults(NamedTuple):
     """Only of several loops; None if it could not be computed."""
 
 
-def _judge_run(
+def _evaluate_run(
     run: RecordedRun, ending: RunEnding, helpers: FinalizeHelpers
 ) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
-    """Judge every loop and the network; return the summary of the run, and how each loop went."""
+    """Evaluate every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.loops), None
     replay_in_helper = ReplayInHelper(helpers, ending.run_dir) if helpers.count and loops == 1 else None
 
-    def judge_here(block: range) -> list[_LoopResults]:
-        return _judge_loops(run, ending, replay_in_helper, block, helpers.expectations(block))
+    def evaluate_here(block: range) -> list[_LoopResults]:
+        return _evaluate_loops(run, ending, replay_in_helper, block, helpers.expectations(block))
 
-    def judge_in_helper(block: range) -> list[_LoopResults]:
+    def evaluate_in_helper(block: range) -> list[_LoopResults]:
         own = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason)
-        return helpers.call(_judge_stored_loops, own, block, helpers.expectations(block))
+        return helpers.call(_evaluate_stored_loops, own, block, helpers.expectations(block))
 
     with (
         work_bar(f"claims of {loops} loops") as show,
-        helpers.shared(_blocks(run), judge_in_helper, show) as judge,
+        helpers.share(_blocks(run), evaluate_in_helper, show) as evaluate,
     ):
         if run.kind == "live" and loops > 1:
             replayed = _replay(run.network)
-        judged_blocks = judge(judge_here)
-    judged = [loop for block in sorted(judged_blocks, key=min) for loop in judged_blocks[block]]
-    summary = _summary(run, ending, [loop.summary for loop in judged])
+        blocks = evaluate(evaluate_here)
+    results = [loop for block in sorted(blocks, key=min) for loop in blocks[block]]
+    summary = _summary(run, ending, [loop.summary for loop in results])
     if replayed is not None:
         network = summary.network.model_copy(update={"replay": replayed})
         summary = summary.model_copy(update={"network": network})
         if replayed.error is not None:
             end = _exit_after_replay(summary.exit, replayed)
             summary = summary.model_copy(update={"exit": end})
-    over_time = [loop.over_time for loop in judged if loop.over_time is not None]
+    over_time = [loop.over_time for loop in results if loop.over_time is not None]
     return summary, over_time if len(over_time) == loops else None
 
 
@@ -204,7 +204,7 @@ def _steps(run: RecordedRun) -> int:
 
 
 def _blocks(run: RecordedRun) -> Iterator[range]:
-    """Yield the loops that are judged together: as many as fit into memory, at the end fewer."""
+    """Yield the loops that are evaluated together: as many as fit into memory, at the end fewer."""
     loops, first = len(run.loops), 0
     # A power of 2, as in the row groups of early tables.
     most = 2 ** (min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // _steps(run), 1)).bit_length() - 1)
@@ -219,28 +219,28 @@ _stored_run = cache(load_run)
 
 
 @np.errstate(all="ignore")
-def _judge_stored_loops(
+def _evaluate_stored_loops(
     ending: RunEnding, block: range, known: Sequence[Expectations] | None
 ) -> list[_LoopResults]:
-    return _judge_loops(_stored_run(ending.run_dir), ending, None, block, known)
+    return _evaluate_loops(_stored_run(ending.run_dir), ending, None, block, known)
 
 
 def _record_stored(run_dir: Path, summary: RunSummary, over_time: Sequence[LoopOverTime] | None) -> None:
     _write_recording(_stored_run(run_dir), summary, run_dir, None, over_time)
 
 
-def _judge_loops(
+def _evaluate_loops(
     run: RecordedRun,
     ending: RunEnding,
     replay_in_helper: "ReplayInHelper | None",
     block: range,
     known: Sequence[Expectations] | None,
 ) -> list[_LoopResults]:
-    """Judge some loops, of which expectations may be known; a helper may replay the only one."""
+    """Evaluate some loops, of which expectations may be known; a helper may replay the only one."""
     records = run.together(block)
     expected = known or _expectations([record.scenario for record in records])
     shared = SharedMachines(records if len(block) > 1 else ())
-    judged, claims = [], [*map(claims_of, records)]
+    results, claims = [], [*map(claims_of, records)]
     for claims_of_loop, own in zip(claims, expected, strict=True):
         claims_of_loop.certificates = own.certificates
     with suppress(Exception):  # the claims of the loop concerned report it
@@ -252,9 +252,9 @@ def _judge_loops(
         if len(run.loops) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
-        judged.append(_with_results(run, summary, claims[0], shared, replay_in_helper))
+        results.append(_with_results(run, summary, claims[0], shared, replay_in_helper))
         del claims[0]  # with its samples
-    return judged
+    return results
 
 
 def expectations_of(run_dir: Path, block: range) -> Sequence[Expectations]:
@@ -305,7 +305,7 @@ def _with_results(
     try:
         results |= _claim_results(claims, summary)
     except Exception as error:  # likewise
-        print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
+        print(f"noack: warning: the claims were not evaluated: {error!r}", file=sys.stderr)
     if record.kind == "live":
         replayed = (replay_in_helper and replay_in_helper.part()) or _replay(record, shared)
         results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
@@ -390,7 +390,7 @@ def run_report(run_dir: Path, loop: str | None = None, *, again: bool = False) -
             loop.
         MachineError: the report cannot be written.
     """
-    summary, run = _opened(run_dir, loop)
+    summary, run = _open(run_dir, loop)
     path = run_dir / file_of_loop(REPORT_FILE, loop)
     if path.is_file() and not again:
         return path
@@ -404,11 +404,11 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
         CallerError, MachineError: as :func:`run_report`.
     """
     require_viewer()
-    summary, run = _opened(run_dir, loop, view=False)
+    summary, run = _open(run_dir, loop, view=False)
     _write_recording(run, summary, run_dir, loop)
 
 
-def _opened(run_dir: Path, loop: str | None, *, view: bool = True) -> tuple[RunSummary, RecordedRun]:
+def _open(run_dir: Path, loop: str | None, *, view: bool = True) -> tuple[RunSummary, RecordedRun]:
     """Return summary and record of an earlier run, which has this loop."""
     summary, run = reopen(run_dir, view=view).summary, load_run(run_dir)
     if run.names != [loop.name for loop in summary.loops]:

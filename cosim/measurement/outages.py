@@ -49,7 +49,7 @@ class OutageRule:
 
 
 def outages_longer_than(durations_s: NDArray[np.float64], least_s: float) -> OutageRule:
-    """Classify the bursts that last for ``least_s`` or more, as the user says."""
+    """Classify the bursts that last for ``least_s`` or more, as the user requests."""
     return OutageRule(durations_s >= least_s, f"bursts of {least_s:g} s or more, as given")
 
 
@@ -72,7 +72,7 @@ def find_outages(bursts: LossBursts) -> OutageRule:
             )
     flags = np.zeros(count, bool)
     if 0 < count < FEWEST_BURSTS:
-        return OutageRule(flags, f"only {count} loss bursts: too few to tell an outage from them")
+        return OutageRule(flags, f"only {count} loss bursts: too few to distinguish an outage")
     return OutageRule(flags, "no burst is too long for the fitted chain")
 
 

@@ -1,4 +1,4 @@
-"""What a run's summary says in words: a verdict of three lines, and remarks on its validity.
+"""A run's summary in words: a verdict of three lines, and remarks on its validity.
 
 The terminal (:mod:`cosim.output.terminal_output`), the report and the lab page show them.
 """
@@ -21,7 +21,7 @@ _NAMED = 3
 _SETTLED = 0.1
 """A loop is stable if ‖x‖ falls to this share of its largest value."""
 _ROSE = 1.001
-"""Where this multiple of the first ‖x‖ is exceeded, it is said."""
+"""The verdict mentions that ‖x‖ has exceeded this multiple of its first value."""
 _MOST_VIOLATIONS = 5
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
 
@@ -285,7 +285,7 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         yield f"{role} rejected datagrams: {counts}"
     if guarantee_of(loop).why.startswith("no certificate: the loop gain"):
         yield (
-            "no bound of ‖x‖ is certified: noack certify says what would have to change; "
+            "no bound of ‖x‖ is certified: noack certify shows what would have to change; "
             "noack margin, whether a time-triggered loop is proven stable"
         )
     unchecked = any(claim.verdict == "void" and _is_late(loop, claim) for claim in loop.claims)

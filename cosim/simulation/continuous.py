@@ -32,7 +32,7 @@ from cosim.simulation.exact_simulation import (
     EventLog,
     ExactSimulation,
     timeless,
-    vanished,
+    vanished_error,
     vanishes_s,
 )
 from netem.channel import UPDATE_LINK
@@ -271,7 +271,7 @@ def simulate_continuous(
     x0 = np.array(system.loop.x0 if x0 is None else x0, np.float64)
     row, log = _with_room(system, until_s, x0, delivered, known_start, max_events)
     if row["status"] == OK and until_s < horizon_s:
-        raise vanished(until_s)
+        raise vanished_error(until_s)
     if row["status"] not in (OK, DIVERGED, TOO_MANY_EVENTS):
         raise CallerError(
             f"trigger: a million steps do not decide event {row['transmissions']}: an error stays "

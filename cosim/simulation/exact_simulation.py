@@ -114,6 +114,7 @@ class ExactSimulation:
             "most_events": 2**62, "fading_per_s": trigger.fading_per_s, "fading_until_s": np.inf,
             **numbers,
         })  # fmt: skip
+        # The network: a link, or whether each update arrives.
         if link is not None:
             self.core.link = link.core
             self.core.first_delivered = link.settings.first_delivered
@@ -154,6 +155,7 @@ class ExactSimulation:
             np.empty((k, places, 3, self.n)) if states else None,
         )
         self.core.event_places = places
+        # The core writes the rows and logs of some runs per call, so that Ctrl-C can interrupt.
         for begin in range(0, k, _RUNS_AT_ONCE):
             part = slice(begin, min(begin + _RUNS_AT_ONCE, k))
             self.core.event_s = pointer_to(log.event_s[part], "double *")
@@ -223,7 +225,7 @@ def vanishes_s(rule: TriggerRule) -> float:
     return math.log(rule.level / _SMALLEST_THRESHOLD) / rule.rate_per_s
 
 
-def vanished(from_s: float) -> CallerError:
+def vanished_error(from_s: float) -> CallerError:
     """Return the error of a threshold that decays too far."""
     return CallerError(
         f"trigger: from {from_s:g} s on the threshold is below {_SMALLEST_THRESHOLD:g}, where "
@@ -335,7 +337,7 @@ def run_with_events(setting: Setting, population: Population) -> tuple[NDArray[n
 def _run(setting: Setting, population: Population, places: int) -> tuple[NDArray[np.void], EventLog]:
     _check(setting, population)
     if (gone_s := vanishes_s(setting.trigger)) < setting.horizon_s:
-        raise vanished(gone_s)
+        raise vanished_error(gone_s)
     names = stream_names(setting.link, UPDATE_LINK)
     keys = np.zeros((len(population.A), len(names), 2), np.int64)
     for stage, name in enumerate(names):
@@ -368,7 +370,7 @@ def _check(setting: Setting, population: Population) -> None:
         raise ValueError(f"loss_seeds: expected uint64, found {population.loss_seeds.dtype}")
     if timeless(setting.link) != setting.link:
         raise CallerError(
-            "network.impairments: a batch knows losses and corruption only; leave out what takes time"
+            "network.impairments: a batch supports losses and corruption only; leave out what takes time"
         )
     rule = setting.trigger
     for form in (rule.form, *([rule.dynamic_variable.gain] if rule.dynamic_variable else [])):

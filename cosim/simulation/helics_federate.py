@@ -13,7 +13,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
-from netem.channel import UPDATE_LINK, Channel, Leaving, require_stand_alone
+from netem.channel import UPDATE_LINK, Channel, Departure, require_stand_alone
 from netem.link_state import LinkState
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError, PeerError
@@ -82,7 +82,7 @@ def run(scenario: Scenario, endpoints: Sequence[str], options: FederateOptions) 
     settings = require_stand_alone(scenario).network.link
     link = LinkState(settings, scenario.seeds.loss, UPDATE_LINK, rows=len(endpoints))
     channel = Channel([link], loops=len(endpoints))
-    with _joined(options) as (helics, federate):
+    with _join_federation(options) as (helics, federate):
         network = _Network(helics, federate, channel, options.name, endpoints)
         helics.helicsFederateEnterInitializingMode(federate)
         network.check()
@@ -92,7 +92,7 @@ def run(scenario: Scenario, endpoints: Sequence[str], options: FederateOptions) 
 
 
 @contextmanager
-def _joined(options: FederateOptions) -> "Iterator[tuple[ModuleType, HelicsMessageFederate]]":
+def _join_federation(options: FederateOptions) -> "Iterator[tuple[ModuleType, HelicsMessageFederate]]":
     """Yield helics and a federate; afterwards it leaves the federation."""
     try:
         helics = import_module("helics")
@@ -155,11 +155,11 @@ class _Network:
             granted_s = helics.helicsFederateRequestTime(self._federate, wanted_s)
             if granted_s >= end_s:
                 return
-            for time_ns, flow, message in sorted(self._received(), key=lambda received: received[:2]):
+            for time_ns, flow, message in sorted(self._receive(), key=lambda received: received[:2]):
                 self._take(time_ns, flow, message)
             self._leave(self._channel.release(round(granted_s * NS_PER_S)), granted_s)
 
-    def _received(self) -> Iterator[tuple[int, int, _QueuedMessage]]:
+    def _receive(self) -> Iterator[tuple[int, int, _QueuedMessage]]:
         """Yield the messages that have come: time in ns, number of the endpoint, content."""
         helics = self._helics
         for flow, endpoint in enumerate(self._endpoints):
@@ -183,7 +183,7 @@ class _Network:
                 route.longest_burst = max(route.longest_burst, int(row["consecutive_losses"]))
         self._leave(left, now_ns / NS_PER_S)
 
-    def _leave(self, left: Iterable[Leaving], now_s: float) -> None:
+    def _leave(self, left: Iterable[Departure], now_s: float) -> None:
         """Send what leaves the channel now."""
         helics = self._helics
         for flow, number, bit in left:

@@ -74,6 +74,7 @@ class PlantGridLoop:
     @np.errstate(all="ignore")
     def run(self, *, delay: bool, hold: bool) -> PlantGridRun:
         """Simulate; once the state is not finite, it stays non-finite."""
+        # Start: the first measurement is an event, unless the start is known and passes the trigger.
         schedule, period_ns, x0 = self._schedule, self._schedule.period_ns, self._system.loop.x0
         last = len(schedule.measured) - 1
         states = np.empty((last + 1, len(x0)))
@@ -89,6 +90,7 @@ class PlantGridLoop:
             event = trigger.test(0, x0[None], np.zeros_like(x0)[None]) is not None
         while True:
             x, now_ns = states[step], step * period_ns
+            # At an event the sensor's model restarts, and the update of a delivered one is on its way.
             if event:
                 x_s, in_common, number = x, True, len(events)
                 trigger.start(now_ns, x)
@@ -97,10 +99,12 @@ class PlantGridLoop:
                     wait_ns = self._wait_ns(number, hold=hold) if delay else 0
                     in_flight.append(_Update(number, now_ns, now_ns + wait_ns, x))
                     in_flight.sort(key=lambda update: update.acts_ns)
+            # Of the updates that act by now, the newest counts.
             while in_flight and in_flight[0].acts_ns <= now_ns:
                 newest = max(newest, in_flight.pop(0), key=lambda update: update.number)
             if step == last:
                 return PlantGridRun(states, np.array(events, dtype=np.int64))
+            # Simulate a block of steps, which ends at the next update's effect, as if no event came.
             until = min(step + _BLOCK, last)
             if in_flight:
                 until = min(until, max(in_flight[0].acts_ns // period_ns, step + 1))
@@ -110,7 +114,8 @@ class PlantGridLoop:
                 states[following] = self._states_under_held_inputs(x, newest, step, until)
             else:
                 states[following] = self._continuous(x, [newest, *within], step, until)
-            x_s_block = self._modelled(x_s, self._steps_s[1 : until - step + 1])
+            x_s_block = self._follow_model(x_s, self._steps_s[1 : until - step + 1])
+            # Continue from the block's first event: what follows it is discarded.
             measured = np.flatnonzero(schedule.measured[following])
             if in_common:
                 block = states[following][measured]
@@ -130,6 +135,7 @@ class PlantGridLoop:
     def _continuous(self, x: Vector, updates: list["_Update"], step: int, until: int) -> Matrix:
         """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t)."""
         now_ns, newest = step * self._schedule.period_ns, updates[0]
+        # With further updates, there is one step; x advances from one update's effect to the next.
         for update in updates[1:]:
             x = self._states_after(x, newest, now_ns, np.array([(update.acts_ns - now_ns) * 1e-9]))[0]
             newest, now_ns = max(newest, update, key=lambda candidate: candidate.number), update.acts_ns
@@ -140,11 +146,11 @@ class PlantGridLoop:
 
     def _states_after(self, x: Vector, newest: "_Update", now_ns: int, after_s: Vector) -> Matrix:
         """Return x at ascending times after now, (k, n), while no other update acts."""
-        x_c = self._modelled(newest.x, np.array([(now_ns - newest.event_ns) * 1e-9]))[0]
+        x_c = self._follow_model(newest.x, np.array([(now_ns - newest.event_ns) * 1e-9]))[0]
         start = np.array([x, np.zeros_like(x), x_c - x])  # e_s does not act on the plant
         return self._system.follow(np.zeros(1), start[None], after_s).x
 
-    def _modelled(self, x: Vector, age_s: Vector) -> Matrix:
+    def _follow_model(self, x: Vector, age_s: Vector) -> Matrix:
         """Return e^{H age} x for ascending ages, (k, n)."""
         start = np.array([x, np.zeros_like(x), np.zeros_like(x)])
         return self._system.follow(np.zeros(1), start[None], age_s).x_c
@@ -153,7 +159,7 @@ class PlantGridLoop:
         """Return x at the steps after ``step`` up to ``until``, under the inputs applied there."""
         model_ns = self._schedule.model_ns[step:until]
         age_ns = np.maximum(model_ns - newest.event_ns, 0)
-        inputs = self._modelled(newest.x, age_ns * 1e-9) @ self._system.loop.K.T
+        inputs = self._follow_model(newest.x, age_ns * 1e-9) @ self._system.loop.K.T
         inputs[model_ns == NO_ACTUATION] = 0.0
         Ad, Bd = self._one_step
         states = np.empty((until - step, len(x)))

@@ -270,7 +270,7 @@ def simulate(
     """
     if network is not None:
         resolved.coverage.require_unchanging()
-    return _simulated(resolved, (resolved,), network, progress).loops[0]
+    return _simulate(resolved, (resolved,), network, progress).loops[0]
 
 
 def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> RecordedRun:
@@ -283,7 +283,7 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Reco
     Returns:
         The record of the run; its reports have no entries about sockets or real-time settings.
     """
-    return _simulated(scenario, resolved_loops(scenario), None, progress)
+    return _simulate(scenario, resolved_loops(scenario), None, progress)
 
 
 def simulate_run(scenario: Scenario, runs: Path, progress: Progress | None = None) -> RunEnding:
@@ -319,7 +319,7 @@ def simulate_run(scenario: Scenario, runs: Path, progress: Progress | None = Non
     return RunEnding(run_dir, run_id, ExitStatus.OK, HORIZON)
 
 
-def _simulated(
+def _simulate(
     scenario: Scenario,
     loops: Sequence[Scenario],
     network: Network | None,

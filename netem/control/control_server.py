@@ -204,7 +204,8 @@ class ControlServer:
 
     def _settings(self, _: Mapping[str, object]) -> object:
         links = [
-            {"name": link.name} | {name: _settings(getattr(link, name).settings) for name in DIRECTIONS}
+            {"name": link.name}
+            | {name: _settings_document(getattr(link, name).settings) for name in DIRECTIONS}
             for link in self._commands.snapshot().links
         ]
         return {"links": links}
@@ -237,7 +238,7 @@ class ControlServer:
         return name
 
 
-def _settings(settings: LinkSettings) -> object:
+def _settings_document(settings: LinkSettings) -> object:
     return {"words": words_of(settings), "settings": settings.model_dump(mode="json")}
 
 

@@ -5,7 +5,6 @@ The client sends queries to a running emulator, and receives its statistics.
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,7 +24,7 @@ from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import read_files
-from noack.runtime.command_line import Parser, Signals, failed
+from noack.runtime.command_line import Parser, Signals, discard_output, failed
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
@@ -100,9 +99,7 @@ def main(arguments: Sequence[str]) -> ExitStatus:
         source, as_json = f"noack netem {command}", "--json" in options
         return failed(str(error), error.exit_status, source=source, as_json=as_json)
     except BrokenPipeError:  # the reader has closed the pipe
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, sys.stdout.fileno())
-        os.close(null)
+        discard_output(sys.stdout.fileno())
         return ExitStatus.OK
 
 
@@ -121,7 +118,7 @@ def _parser(
     return parser
 
 
-def _chosen(options: argparse.Namespace) -> str:
+def _find_emulator(options: argparse.Namespace) -> str:
     """Return the emulator that NAME or --control NAME selects."""
     if options.control is not None and options.name not in (None, options.control):
         raise CallerError(f"--control {options.control}: NAME is {options.name} already")
@@ -137,7 +134,7 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    name = _chosen(options)
+    name = _find_emulator(options)
     with Client(name) as client:
         statistics = client.ask("report")
     if options.json:
@@ -166,7 +163,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     options = parser.parse_intermixed_args(arguments)
     options.name, settings = _name_and_settings(options.words)
     settings = read_files(settings, Path())
-    with Client(_chosen(options)) as client:
+    with Client(_find_emulator(options)) as client:
         earlier = client.ask("settings")
         answer = client.ask(
             "change",
@@ -229,7 +226,7 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    name = _chosen(options)
+    name = _find_emulator(options)
     with (
         Signals().handled() as signals,
         Client(name) as client,

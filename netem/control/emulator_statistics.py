@@ -23,15 +23,9 @@ from typing import NamedTuple, Self, TypedDict, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from netem.control.time_histogram import coarse_histogram, quantile_ns
 from netem.relay.relay import Relay
-from netem.relay.relay_links import (
-    DIRECTIONS,
-    Direction,
-    DirectionReport,
-    LinkReport,
-    coarse_histogram,
-    quantile_ns,
-)
+from netem.relay.relay_links import DIRECTIONS, Direction, DirectionReport, LinkReport
 from netem.tc_words import words_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
@@ -67,7 +61,7 @@ class Snapshot(NamedTuple):
     """The state of a relay at one time."""
 
     links: Sequence[LinkReport]
-    in_force: Mapping[tuple[str, Direction], AppliedSettings]
+    applied: Mapping[tuple[str, Direction], AppliedSettings]
     elapsed_ns: int  # Time since the relay started
     unix_ns: int
 
@@ -80,7 +74,7 @@ class CommandQueue:
         self._began_ns = time.monotonic_ns()
         self._waiting: SimpleQueue[tuple[Callable[[], None], Callable[[], bool]]] = SimpleQueue()
         """What runs a command, and what cancels it."""
-        self._in_force: dict[tuple[str, Direction], AppliedSettings] = {
+        self._applied: dict[tuple[str, Direction], AppliedSettings] = {
             (spec.name, direction): AppliedSettings(getattr(spec, direction), Counters())
             for spec in relay.specs
             for direction in DIRECTIONS
@@ -142,13 +136,13 @@ class CommandQueue:
         Raises:
             PeerError: the relay has ended, or does not answer.
         """
-        return self.submit(self.look)
+        return self.submit(self.snapshot_here)
 
-    def look(self) -> Snapshot:
+    def snapshot_here(self) -> Snapshot:
         """Return the state of the relay, in its thread or after its end."""
         return Snapshot(
             self._relay.report(),
-            dict(self._in_force),
+            dict(self._applied),
             time.monotonic_ns() - self._began_ns,
             time.time_ns(),
         )
@@ -167,7 +161,7 @@ class CommandQueue:
             (report,) = (link_report for link_report in self._relay.report() if link_report.name == link)
             for direction in directions:
                 counters = replace(getattr(report, direction).counters)
-                self._in_force[link, direction] = AppliedSettings(settings, counters)
+                self._applied[link, direction] = AppliedSettings(settings, counters)
 
         self.submit(command)
 
@@ -301,8 +295,8 @@ def statistics(latest: Snapshot, earlier: Snapshot | None = None) -> Statistics:
 
 def _link(new: LinkReport, old: LinkReport | None, seconds: float, snapshot: Snapshot) -> LinkStatistics:
     def direction(name: Direction) -> DirectionStatistics:
-        in_force = snapshot.in_force[new.name, name]
-        return _direction(getattr(new, name), in_force, getattr(old, name, None), seconds)
+        applied = snapshot.applied[new.name, name]
+        return _direction(getattr(new, name), applied, getattr(old, name, None), seconds)
 
     return {
         "name": new.name,
@@ -320,11 +314,11 @@ def _link(new: LinkReport, old: LinkReport | None, seconds: float, snapshot: Sna
 
 def _direction(
     report: DirectionReport,
-    in_force: AppliedSettings,
+    applied: AppliedSettings,
     earlier: DirectionReport | None,
     seconds: float,
 ) -> DirectionStatistics:
-    counters, since, words = report.counters, in_force.since, in_force.words
+    counters, since, words = report.counters, applied.since, applied.words
     new = counters - since
     return {
         "words": words if len(words) <= _MAX_WORDS else words[: _MAX_WORDS - 1] + "…",
@@ -344,7 +338,7 @@ def _direction(
             "realised": loss_share(new),
             "lost": _share(new, new.dropped + new.corrupted + new.overflowed + new.blacked_out),
             "drawn": _share(new, new.dropped + new.corrupted),
-            "predicted": in_force.predicted_loss,
+            "predicted": applied.predicted_loss,
         },
         "unintended": dict(report.unintended),
         "in_flight": report.in_flight,
@@ -375,7 +369,7 @@ def _recent(latest: DirectionReport, earlier: DirectionReport, seconds: float) -
     }
 
 
-def unintended(totals: Statistics) -> int:
+def unintended_losses(totals: Statistics) -> int:
     """Return the number of unintended losses of all links."""
     directions = [link[name] for link in totals["links"] for name in DIRECTIONS]
     return sum(sum(direction["unintended"].values()) for direction in directions)
@@ -396,7 +390,7 @@ def _share(counters: Counters, lost: int) -> float | None:
 
 
 def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
-    """Return quantiles of a histogram of :mod:`netem.relay.relay_links`."""
+    """Return quantiles of a histogram of :mod:`netem.control.time_histogram`."""
     if not counts.any():
         return {"p50": None, "p99": None, "p999": None, "max": None}
     p50, p99, p999, largest = (round(quantile_ns(counts, q)) for q in (0.5, 0.99, 0.999, 1.0))
@@ -459,7 +453,7 @@ class StatisticsThread:
                 with suppress(PeerError):
                     self._show_next(self._commands.snapshot())
         if self._at_end:
-            self._show_next(self._commands.look())
+            self._show_next(self._commands.snapshot_here())
 
     def _show_next(self, snapshot: Snapshot) -> None:
         earlier = self._snapshots[-1] if self._snapshots else None

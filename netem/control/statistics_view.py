@@ -169,7 +169,7 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
             continue
         grid.add_row(label, forward_text, reverse_text)
         lines += 1 + max(cell.plain.count("\n") for cell in (forward_text, reverse_text))
-    unintended = _unintended(link)
+    unintended = _unintended_losses(link)
     ends = (link[end].removesuffix(":0") for end in ("listen", "to"))  # a shell's have no port
     title = Text.assemble((link["name"], "bold"), f"  {' → '.join(ends)}  ", (_clients_text(link), "dim"))
     panel = Panel(
@@ -194,7 +194,7 @@ def _clients_text(link: LinkStatistics) -> str:
     return text
 
 
-def _unintended(link: LinkStatistics) -> list[Text]:
+def _unintended_losses(link: LinkStatistics) -> list[Text]:
     """Return the line about unintended losses, if there are any."""
     causes = [
         f"{number:,} {cause.replace('_', ' ')} ({name})"
@@ -223,7 +223,7 @@ def _cells(
         delay, late = recent["delay_ns"], recent["lateness_ns"]
     return [
         ("", Text(_ARROWS[direction], "bold cyan")),
-        ("", _wrapped(side["words"] or "no impairment", width)),
+        ("", _wrap(side["words"] or "no impairment", width)),
         ("received", Text(_flow(side, "received"))),
         ("", Text(sparkline(arrivals, top), "green")),
         ("forwarded", Text(_flow(side, "forwarded"))),
@@ -231,8 +231,8 @@ def _cells(
         ("loss", Text(_loss(side))),
         ("", Text(sparkline(losses, _top([*losses, side["loss"]["predicted"]])), "yellow")),
         ("drawn", Text(_drawn_text(side))),
-        ("lost", _wrapped(_lost_text(side), width)),
-        ("", _wrapped(_further_counts(side), width)),
+        ("lost", _wrap(_lost_text(side), width)),
+        ("", _wrap(_further_counts(side), width)),
         ("burst", _burst(side, width)),
         ("delay", Text(_times(delay, width))),
         ("lateness", Text(_times(late, width))),
@@ -312,7 +312,7 @@ def _burst(side: DirectionStatistics, width: int) -> Text:
     return text.append_text(end)
 
 
-def _wrapped(text: str, width: int) -> Text:
+def _wrap(text: str, width: int) -> Text:
     return Text("\n".join(textwrap.wrap(text, width, max_lines=_WORDS_LINES, placeholder=" …")))
 
 
@@ -335,7 +335,7 @@ _OPTIONAL = ("predicted", "p99", "forwarded")
 
 def _table(history: History, latest: Statistics, width: int, lines: int) -> RenderableType:
     """Return a table with a row for each direction that has received datagrams."""
-    rows = _used(latest)
+    rows = _directions_in_use(latest)
     listed = rows[:lines]
     names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in listed]
     name_width = min(max(map(len, names), default=0), width // 3)
@@ -366,14 +366,14 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
     return Group(table, Text(f" … and {hidden} more", "dim")) if hidden else table
 
 
-def _used(statistics: Statistics) -> list[tuple[LinkStatistics, Direction]]:
+def _directions_in_use(statistics: Statistics) -> list[tuple[LinkStatistics, Direction]]:
     links = statistics["links"]
     return [(link, name) for link in links for name in DIRECTIONS if link[name]["received"]]
 
 
 def plain_lines(statistics: Statistics) -> list[str]:
     """Return a line of text for each direction that has received datagrams."""
-    return [_plain_line(statistics["elapsed_s"], *row) for row in _used(statistics)]
+    return [_plain_line(statistics["elapsed_s"], *row) for row in _directions_in_use(statistics)]
 
 
 def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:

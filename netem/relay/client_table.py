@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from netem.relay.device_link import DeviceLink
 from netem.relay.relay_links import (
     Direction,
     Endpoint,
@@ -23,7 +24,6 @@ from netem.relay.relay_links import (
     stamp_arrivals,
 )
 from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
-from netem.shell.devices import DeviceLink
 from noack.core.core_library import core
 from noack.runtime.address import address_text, packed_name
 from noack.runtime.udp_sockets import drops_of
@@ -41,29 +41,17 @@ class LinkWarnings:
 
     def __init__(self, spec: LinkSpec) -> None:
         self._spec = spec
-        self._full = False
         self._reported: set[str] = set()
 
-    def accepts_client(self, clients: int) -> bool:
-        """Whether a client is accepted in addition to ``clients`` present ones."""
-        if clients >= self._spec.most_clients:
-            self._full = True
-            self._report(f"no more than {self._spec.most_clients} clients at once are served")
-        return not self._full
+    def report_full(self) -> None:
+        """Report that the link has its maximum number of clients."""
+        self._report(f"no more than {self._spec.most_clients} clients at once are served")
 
-    def no_descriptor_left(self, error: int, clients: int) -> bool:
-        """Whether an errno means that no file descriptor is left; if so, refuse further clients."""
-        if error not in (errno.EMFILE, errno.ENFILE):
-            return False
-        self._full = clients > 0  # the end of one makes place
+    def report_no_descriptor(self, clients: int) -> None:
+        """Report that no file descriptor is left for a client in addition to those present."""
         self._report(
             f"no file descriptors are left for more than {clients} clients; raise the limit (ulimit -n)"
         )
-        return True
-
-    def client_removed(self) -> None:
-        """Accept clients again."""
-        self._full = False
 
     def port_unreachable(self, answers: int) -> None:
         """Set the total number of ICMP port-unreachable messages from the server's host."""
@@ -108,7 +96,7 @@ class UnintendedLosses:
             if datagrams > self._reported[cause]:
                 self._reported[cause] = datagrams
                 text = _CAUSES.get(cause, f"could not be sent ({cause})")
-                report_line(f"{self._where}: {datagrams} datagrams {text}, against the guarantee")
+                report_line(f"{self._where}: {datagrams} datagrams {text}; the guarantee is void")
 
     def _set(self, cause: str, datagrams: int) -> None:
         if datagrams > 0:
@@ -148,14 +136,19 @@ class ClientTable:
         self._expired_ns = 0
 
     def add(self, link: int, name: bytes) -> None:
-        """Add a client by its packed name; if that is impossible, mark the link as full."""
-        warnings, present, path, error = self._warnings[link], self.present[link], None, 0
-        if warnings.accepts_client(present) and self._links[link].has_paths:
+        """Add a client by its packed name; if that is impossible, refuse clients until one leaves."""
+        present, path, error = self.present[link], None, 0
+        if present >= self._links[link].spec.most_clients:
+            self._warnings[link].report_full()
+            self._set_full(link, True)
+            return
+        if self._links[link].has_paths:
             path, error = return_path(self._links[link].server)
-        if not warnings.no_descriptor_left(error, present) and warnings.accepts_client(present):
-            self._accept(link, name, path, error)
-        else:
-            self._directions[2 * link].row.full = 1
+            if error in (errno.EMFILE, errno.ENFILE):
+                self._warnings[link].report_no_descriptor(present)
+                self._set_full(link, True)
+                return
+        self._accept(link, name, path, error)
 
     def expire(self, now_ns: int) -> None:
         """Remove the clients that have been idle and have no datagram in flight."""
@@ -170,6 +163,9 @@ class ClientTable:
             path = self._paths.get(row)
             if path is None or not has_data(path):
                 self._forget(row)
+        for link, present in enumerate(self.present):
+            if present == 0:  # full for lack of a file descriptor; no client can make room
+                self._set_full(link, False)
 
     def reconnect(self) -> None:
         """Open the return paths again that could not be opened before."""
@@ -272,8 +268,10 @@ class ClientTable:
         self._free_rows.append(row)
         self._free_places[link].append(place)
         self.present[link] -= 1
-        self._directions[2 * link].row.full = 0
-        self._warnings[link].client_removed()
+        self._set_full(link, False)
+
+    def _set_full(self, link: int, full: bool) -> None:
+        self._directions[2 * link].row.full = full
 
     def _grow(self) -> None:
         count = len(self._memory.clients)

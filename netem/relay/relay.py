@@ -8,6 +8,7 @@ from contextlib import suppress
 import numpy as np
 
 from netem.relay.client_table import ClientTable, LinkWarnings, UnintendedLosses
+from netem.relay.device_link import DeviceLink
 from netem.relay.relay_links import (
     DIRECTIONS,
     Direction,
@@ -22,7 +23,6 @@ from netem.relay.relay_links import (
     stamp_arrivals,
 )
 from netem.relay.relay_memory import RelayDirection, RelayMemory
-from netem.shell.devices import DeviceLink
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings

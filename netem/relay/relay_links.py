@@ -1,8 +1,7 @@
 """A relay's links: what describes one, its sockets, and what the relay reports of it.
 
 In the order of reading: lines for the user; events, which taps receive; :class:`LinkSpec`, and the
-reports; histograms of times, which the core counts (native/relay/events.c); sockets over IPv4 and
-IPv6; and :func:`open_links`, which binds the listening sockets.
+reports; sockets over IPv4 and IPv6; and :func:`open_links`, which binds the listening sockets.
 """
 
 import ctypes
@@ -20,10 +19,10 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import core, dtype_of
+from noack.core.core_library import dtype_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import Counters, Decisions, LinkSettings
-from noack.runtime.address import Address, SocketName, address_text
+from noack.runtime.address import Address, SocketName, address_of, address_text, unpacked_address
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.udp_sockets import bind_to, drops_of, enlarge_buffer
 
@@ -95,7 +94,8 @@ class DirectionReport:
     flows: Sequence[FlowReport]
     """At most 16: the present clients that sent most."""
     delays: NDArray[np.int64]
-    """(k,) Histogram of the time from arrival to departure; see :mod:`netem.relay.relay_links`."""
+    """(k,) Histogram of the time from arrival to departure; see
+    :mod:`netem.control.time_histogram`."""
     lateness: NDArray[np.int64]
     """(k,) Histogram of the time from a delayed datagram's release time to its departure."""
 
@@ -132,39 +132,6 @@ class Tap(Protocol):
 
         Both arrays are overwritten after the call.
         """
-
-
-_STEP_BITS = 5
-_STEPS = 1 << _STEP_BITS
-_JOINED = 8
-BUCKETS: int = core.NOACK_BUCKETS
-"""Number of buckets. The last one also counts all longer times: 4.8 hours and more."""
-
-
-def bucket_start_ns(bucket: int) -> int:
-    """Return the shortest time of a bucket."""
-    if bucket < _STEPS:
-        return bucket
-    shift = (bucket >> _STEP_BITS) - 1
-    return (_STEPS + (bucket & (_STEPS - 1))) << shift
-
-
-def coarse_histogram(counts: NDArray[np.int64]) -> list[list[int]]:
-    """Return a coarser histogram for people and plots: four buckets for each doubling.
-
-    Each entry is the shortest time in ns and the count of a bucket that is not empty.
-    """
-    joined = counts.reshape(-1, _JOINED).sum(axis=1)
-    return [[bucket_start_ns(_JOINED * k), int(joined[k])] for k in np.flatnonzero(joined).tolist()]
-
-
-def quantile_ns(counts: Sequence[int] | NDArray[np.int64], share: float) -> float:
-    """Return the quantile of a level in ns, accurate to 3 %; nan if the histogram is empty."""
-    reached = np.cumsum(counts)
-    if reached[-1] == 0:
-        return float("nan")
-    bucket = int(np.searchsorted(reached, max(share * reached[-1], 1)))
-    return (bucket_start_ns(bucket) + bucket_start_ns(bucket + 1) - 1) / 2
 
 
 _BUFFER_BYTES = 4 * 1024 * 1024
@@ -303,22 +270,6 @@ def raise_file_limit() -> None:
 
         _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-
-
-def address_of(name: SocketName) -> Address:
-    """Return a name from ``getsockname`` as an address; a scope follows the host after ``%``."""
-    host, scope = str(name[0]).partition("%")[0], name[3] if len(name) > 3 else 0
-    return (f"{host}%{scope}" if scope else host), int(name[1])
-
-
-def unpacked_address(packed: bytes) -> Address:
-    """Return a struct sockaddr as host and port; a scope follows the host after ``%``."""
-    (family,) = struct.unpack_from("=H", packed)
-    (port,) = struct.unpack_from("!H", packed, 2)
-    if family == socket.AF_INET:
-        return socket.inet_ntop(socket.AF_INET, packed[4:8]), port
-    (scope,) = struct.unpack_from("=I", packed, 24)
-    return address_of((socket.inet_ntop(socket.AF_INET6, packed[8:24]), port, 0, scope))
 
 
 def _host(name: SocketName) -> IPv4Address | IPv6Address:

@@ -105,7 +105,7 @@ class RelayMemory:
         if relay.no_memory:
             return
         if relay.free_slots < 2:
-            self._set_slots(doubled(self._heap), doubled(self._slots), len(self._slots))
+            self._set_slots(double_length(self._heap), double_length(self._slots), len(self._slots))
         # Any two datagrams fit into one chunk.
         if relay.free_blocks < core.NOACK_CHUNK_BLOCKS // 2:
             self._add_chunk()
@@ -243,7 +243,7 @@ def zeros_in_lines(count: int, dtype: np.dtype[_Element]) -> NDArray[_Element]:
     return room[begin : begin + size_bytes].view(dtype)
 
 
-def doubled(array: Rows) -> Rows:
+def double_length(array: Rows) -> Rows:
     """Return an array of twice the length; the new elements are 0."""
     return np.concatenate((array, np.zeros_like(array)))
 

@@ -17,16 +17,16 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address
 from pathlib import Path
 from typing import NoReturn
 
+from netem.relay.device_link import DeviceLink
 from netem.relay.relay_links import LinkSpec
 from netem.shell import process
 from noack.core.errors import CallerError
 from noack.core.process_limits import python_command
-from noack.runtime.address import Address, SocketName
 
 MTU_BYTES = 1500
 _RANGE = IPv4Network("198.18.0.0/16")
@@ -39,90 +39,12 @@ _SET_INTERFACE, _GET_ADDRESS, _GET_MASK = 0x400454CA, 0x8915, 0x891B
 _TUN, _NO_HEADER, _EXCLUSIVE = 0x1, 0x1000, 0x8000
 _ENTERED = "NOACK_SHELL_OUTSIDE"
 """Environment variable of a process that has entered, or could not enter, its own outside."""
-_DROPPED = 11
-"""Column of /proc/net/dev with the packets that a full device did not take."""
 _RESTRICTIONS = {
     "kernel/apparmor_restrict_unprivileged_userns": ("1", 0),
     "kernel/unprivileged_userns_clone": ("0", 1),
     "user/max_user_namespaces": ("0", 10000),
 }
 """Settings in /proc/sys that forbid user namespaces, and values that permit them."""
-
-
-@dataclass(frozen=True)
-class DeviceLink:
-    """The link between the two devices, in the place of a :class:`netem.relay.relay_links.OpenLink`."""
-
-    spec: LinkSpec
-    devices: tuple[int, int]
-    """The device inside, and the one outside."""
-    statistics: tuple[int, int]
-    """/proc/net/dev of the two namespaces, whose place in the file system does not matter."""
-    names: tuple[str, str]
-    namespace: int
-    """The network namespace inside."""
-    outside6: str | None
-    """The address outside of IPv6, if the system has it."""
-
-    discarded = 0
-    has_paths = False
-
-    @property
-    def name(self) -> SocketName:
-        """The address inside, in the form that sockets use."""
-        return self.spec.listen
-
-    @property
-    def local(self) -> SocketName:
-        """The address outside."""
-        return self.spec.to
-
-    server = local
-    """The same: nothing is sent there by address."""
-
-    @property
-    def address(self) -> Address:
-        """The address inside."""
-        return self.spec.listen
-
-    def drops(self, reverse: bool) -> int:
-        """Return how many packets a direction lost because a device was full."""
-        text = os.pread(self.statistics[reverse], 65536, 0).decode()
-        line = next(line for line in text.splitlines() if f"{self.names[reverse]}:" in line)
-        return int(line.partition(":")[2].split()[_DROPPED])
-
-    def client_text(self, flow: bytes) -> str:
-        """Return a flow as text: protocol, end inside, end outside."""
-        version, protocol, is_fragment, _, inner_port, outer_port = struct.unpack_from("!4BHH", flow)
-        if version == 0:
-            return "not IP"
-        size, family = (4, socket.AF_INET) if version == 4 else (16, socket.AF_INET6)
-        hosts = (socket.inet_ntop(family, flow[begin : begin + size]) for begin in (8, 24))
-        names = {1: "icmp", 6: "tcp", 17: "udp", 58: "icmpv6"}
-        words = [names.get(protocol, f"protocol {protocol}")]
-        if is_fragment:
-            words[0] += " fragments"
-        words += [
-            f"{host if version == 4 else f'[{host}]'}{f':{port}' if port else ''}"
-            for host, port in zip(hosts, (inner_port, outer_port), strict=True)
-        ]
-        return " ".join(words)
-
-    @contextmanager
-    def inside(self) -> Iterator[None]:
-        """Let this thread be inside within the context: what it starts then stays there."""
-        own_namespace = _open_namespace()
-        process.call("setns", self.namespace, process.NEW_NETWORK)
-        try:
-            yield
-        finally:
-            process.call("setns", own_namespace, process.NEW_NETWORK)
-            os.close(own_namespace)
-
-    def close(self) -> None:
-        """Close the devices, which end with that."""
-        for descriptor in (*self.devices, *self.statistics, self.namespace):
-            os.close(descriptor)
 
 
 def open_devices(spec: LinkSpec) -> DeviceLink:
@@ -143,25 +65,37 @@ def open_devices(spec: LinkSpec) -> DeviceLink:
         _enter_outside()
     os.environ.pop(_ENTERED, None)
     network = list(addresses.subnets(_STEP_BITS))[number]
-    outside, inside = network[1], network[2]
+    outside_address, inside_address = network[1], network[2]
     inner = _open_tun(_INSIDE)
-    _configure(_INSIDE, inside, network.prefixlen)
-    has_six = _ip("route add ::/0 dev noack0", "route add 0.0.0.0/0 dev noack0")
+    _configure(_INSIDE, inside_address, network.prefixlen)
+    has_ipv6 = _ip("route add ::/0 dev noack0", "route add 0.0.0.0/0 dev noack0")
     for setting in ("ipv4/ip_forward", "ipv6/conf/all/forwarding"):
         with suppress(OSError):  # without it, shells in this one reach only this one
             Path("/proc/sys/net", setting).write_text("1")
     namespace, inner_counts = _open_namespace(), _open_counts()
     process.call("setns", own_namespace, process.NEW_NETWORK)
     os.close(own_namespace)
-    _configure(name := f"noack{number}", outside, network.prefixlen)
+    _configure(name := f"noack{number}", outside_address, network.prefixlen)
     return DeviceLink(
-        replace(spec, listen=(str(inside), 0), to=(str(outside), 0)),
+        replace(spec, listen=(str(inside_address), 0), to=(str(outside_address), 0)),
         (inner, outer),
         (inner_counts, _open_counts()),
         (_INSIDE, name),
         namespace,
-        str(_six(outside)) if has_six else None,
+        str(_ipv6_address(outside_address)) if has_ipv6 else None,
     )
+
+
+@contextmanager
+def inside(link: DeviceLink) -> Iterator[None]:
+    """Let this thread be inside within the context: what it starts then stays there."""
+    own_namespace = _open_namespace()
+    process.call("setns", link.namespace, process.NEW_NETWORK)
+    try:
+        yield
+    finally:
+        process.call("setns", own_namespace, process.NEW_NETWORK)
+        os.close(own_namespace)
 
 
 def _namespace_range() -> IPv4Network:
@@ -212,12 +146,12 @@ def _configure(name: str, address: IPv4Address, prefix_bits: int) -> None:
     _ip(
         "link set lo up",
         f"link set {name} mtu {MTU_BYTES} txqueuelen {_QUEUE_PACKETS} up",
-        f"address add {_six(address)}/{six_bits} dev {name} nodad",
+        f"address add {_ipv6_address(address)}/{six_bits} dev {name} nodad",
         f"address add {address}/{prefix_bits} dev {name}",
     )
 
 
-def _six(address: IPv4Address) -> IPv6Address:
+def _ipv6_address(address: IPv4Address) -> IPv6Address:
     """Return the address of IPv6 beside one of IPv4, by the latter's lower 16 bits."""
     return _RANGE6 + ((int(address) & 0xFFFF) << 64)
 

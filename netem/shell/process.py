@@ -67,25 +67,25 @@ def enter_namespaces() -> None:
             call("prctl", _AMBIENT, 2, capability, 0, 0)
 
 
-def children() -> set[int]:
-    """Return the process ids of this process's children."""
+def children(parent: int) -> set[int]:
+    """Return the process ids of a process's children."""
     ids = set()
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it has ended
             state = (process / "stat").read_bytes().rpartition(b")")[2]
-            if int(state.split()[1]) == os.getpid():
+            if int(state.split()[1]) == parent:
                 ids.add(int(process.name))
     return ids
 
 
 def end_children(kept: Collection[int] = ()) -> None:
     """End all children and adopted descendants but those kept: by SIGTERM, then by SIGKILL."""
-    late_s = time.monotonic() + _GRACE_S
+    deadline_s = time.monotonic() + _GRACE_S
     terminated: set[int] = set()
-    while remaining := children().difference(kept):
-        late = time.monotonic() > late_s
-        for child in remaining if late else remaining - terminated:
-            os.kill(child, signal.SIGKILL if late else signal.SIGTERM)
+    while remaining := children(os.getpid()).difference(kept):
+        is_overdue = time.monotonic() > deadline_s
+        for child in remaining if is_overdue else remaining - terminated:
+            os.kill(child, signal.SIGKILL if is_overdue else signal.SIGTERM)
             os.kill(child, signal.SIGCONT)  # a stopped process, too
         terminated |= remaining
         for child in remaining:

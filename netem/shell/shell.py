@@ -12,10 +12,11 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from netem.emulator_options import parsed, shell_parser, shell_spec
+from netem.emulator_options import parse_options, shell_parser, shell_spec
+from netem.relay.device_link import DeviceLink
 from netem.relay.relay_links import report_line
 from netem.shell import process
-from netem.shell.devices import DeviceLink, open_devices
+from netem.shell.devices import inside, open_devices
 from netem.stand_alone import add_recording_options, check_options, relay, report_totals
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.process_limits import python_command
@@ -25,7 +26,7 @@ _ENDS_S = 10.0
 """More than the time that a guard gives the processes of its command to end."""
 
 
-def shell(arguments: Sequence[str]) -> int:
+def run_in_shell(arguments: Sequence[str]) -> int:
     """Run a command in a shell; return the command's exit status.
 
     Raises:
@@ -37,7 +38,7 @@ def shell(arguments: Sequence[str]) -> int:
         words, command = words[:index], words[index + 1 :]
     parser = shell_parser()
     add_recording_options(parser, shell=True)
-    options = parsed(parser, words)
+    options = parse_options(parser, words)
     spec = shell_spec(options)
     if options.view or options.capture == "-":
         raise CallerError("--view and --capture - take the terminal, which the command has")
@@ -83,10 +84,10 @@ class _Program:
         addresses = {"NOACK_OUTSIDE": spec.to[0]}
         if self.devices.outside6 is not None:
             addresses["NOACK_OUTSIDE6"] = self.devices.outside6
-        earlier_children = process.children()
+        earlier_children = process.children(os.getpid())
         process.adopt_orphans()
         processes = [_start(command) for command in self._outside]
-        with self.devices.inside():
+        with inside(self.devices):
             main = _start(self._command, addresses)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         ends = f"inside {spec.listen[0]}, outside {' and '.join(addresses.values())}"

@@ -76,3 +76,19 @@ def packed_name(name: SocketName) -> tuple[bytes, int]:
         packed = struct.pack("=H", socket.AF_INET6) + struct.pack("!HI", port, flow)
         packed += socket.inet_pton(socket.AF_INET6, host) + struct.pack("=I", scope)
     return packed.ljust(NAME_BYTES, b"\0"), len(packed)
+
+
+def address_of(name: SocketName) -> Address:
+    """Return a name from ``getsockname`` as an address; a scope follows the host after ``%``."""
+    host, scope = str(name[0]).partition("%")[0], name[3] if len(name) > 3 else 0
+    return (f"{host}%{scope}" if scope else host), int(name[1])
+
+
+def unpacked_address(packed: bytes) -> Address:
+    """Return a struct sockaddr as host and port; a scope follows the host after ``%``."""
+    (family,) = struct.unpack_from("=H", packed)
+    (port,) = struct.unpack_from("!H", packed, 2)
+    if family == socket.AF_INET:
+        return socket.inet_ntop(socket.AF_INET, packed[4:8]), port
+    (scope,) = struct.unpack_from("=I", packed, 24)
+    return address_of((socket.inet_ntop(socket.AF_INET6, packed[8:24]), port, 0, scope))

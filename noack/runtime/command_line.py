@@ -155,6 +155,13 @@ def failed(message: str, status: ExitStatus, *, source: str, as_json: bool) -> E
     return status
 
 
+def discard_output(descriptor: int) -> None:
+    """Replace an output that fails by the null device; what is still buffered goes there, too."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, descriptor)
+    os.close(null)
+
+
 def print_to_stderr(line: str) -> None:
     """Print a line; ignore a closed pipe and a full disk."""
     if sys.stderr is not None:

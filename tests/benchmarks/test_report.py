@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.__main__ import BEGIN, END, OF_GOALS, all_benchmarks, rows_of_figures, run, write_docs
-from benchmarks.report import Benchmark, Goal, MeasurementError, Peer, Rounds, Row, compared, per_cpu_s
+from benchmarks.__main__ import BEGIN, END, OF_GOALS, all_benchmarks, rows_of_goals, run, write_docs
+from benchmarks.report import Benchmark, Goal, MeasurementError, Peer, Rounds, Row, compare, per_cpu_s
 
 HALF = Goal("<=", 0.5)
 
@@ -54,7 +54,7 @@ def test_rows_and_reasons_are_printed_and_written_as_json(
     rows = {found["name"]: found for found in json.loads(path.read_text())}
     assert rows["broken"]["value"] is None
     assert "no such program" in rows["broken"]["note"]
-    assert rows["a"] == row.as_json() | {"benchmark": "example"}
+    assert rows["a"] == row.to_json() | {"benchmark": "example"}
     said = capsys.readouterr().out
     assert "Example" in said
     assert "no such program" in said
@@ -76,9 +76,9 @@ def test_a_row_has_the_medians_of_the_rounds_or_the_median_of_their_ratios() -> 
     assert (row.value, row.peer) == (3.0, Peer("theirs", 8.0))
     assert row.ratio == 0.5  # not 3 / 8
     ours, theirs = iter([1.0, 30.0, 3.0]), iter([2.0, 60.0, 8.0])
-    again = compared("cost", "µs", lambda: next(ours), ("theirs", lambda: next(theirs)), HALF, rounds=3)
+    again = compare("cost", "µs", lambda: next(ours), ("theirs", lambda: next(theirs)), HALF, rounds=3)
     assert again == row
-    assert compared("a", "/s", per_cpu_s(1, lambda: None), Peer("known", 2.0)).ratio is not None
+    assert compare("a", "/s", per_cpu_s(1, lambda: None), Peer("known", 2.0)).ratio is not None
 
 
 @pytest.mark.parametrize("side", ["ours", "theirs"])
@@ -87,7 +87,7 @@ def test_a_side_without_measurements_is_named_and_not_judged(side: str) -> None:
     rounds.add(side, "lost a datagram")
     row = rounds.row("cost", "µs", "us", "ours", "theirs", HALF, paired=True)
     assert row.holds is None
-    assert f"{side}: lost a datagram" in row.as_json()["note"]
+    assert f"{side}: lost a datagram" in row.to_json()["note"]
 
 
 def test_the_goals_are_selected_in_their_order_and_written_into_the_page(tmp_path: Path) -> None:
@@ -96,9 +96,9 @@ def test_the_goals_are_selected_in_their_order_and_written_into_the_page(tmp_pat
         ("size", Row("C", 4000, "lines", goal=Goal("<=", 5000))),
         ("startup", Row("noack run → first control step", 0.7, "s", goal=Goal("<=", 0.6))),
         ("startup", Row("the same, against a bare import", 0.7, "s", Peer("Python", 0.2))),
-        ("fleet", end),
+        ("many_loops", end),
     ]
-    figures = rows_of_figures(rows)
+    figures = rows_of_goals(rows)
     assert [row.unit for _, row in figures] == ["s", "s", "lines"]
     page = tmp_path / "page.md"
     page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")

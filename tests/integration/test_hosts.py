@@ -265,5 +265,5 @@ def test_a_process_that_does_not_start_on_its_host_ends_the_run(
     run = start(0, "run", "lane_following", "--hosts", file, *live.BARE, environment=on_path(ssh))
     _, stderr = ended(run)
     assert run.returncode == 1
-    assert "say in the file of hosts how noack is called: command" in stderr.splitlines()[-1]
+    assert "set `command` in the hosts file to the path of noack" in stderr.splitlines()[-1]
     assert "Traceback" not in stderr

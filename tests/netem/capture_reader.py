@@ -119,15 +119,15 @@ def padded(data: bytes, at: int, size: int) -> tuple[bytes, int]:
 
 
 def options(data: bytes) -> Options:
-    found: Options = {}
+    values_by_code: Options = {}
     at, code = 0, -1
     while code != 0:
         code, size = struct.unpack_from("<HH", data, at)
         value, at = padded(data, at + 4, size)
-        found.setdefault(code, []).append(value)
-    assert found.pop(0) == [b""]
+        values_by_code.setdefault(code, []).append(value)
+    assert values_by_code.pop(0) == [b""]
     assert at == len(data)
-    return found
+    return values_by_code
 
 
 def read(data: bytes) -> File:

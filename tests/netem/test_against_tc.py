@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as example_settings
 
-from netem.tc_words import settings_of, tc_command
+from netem.explanation import tc_command
+from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings

@@ -33,8 +33,8 @@ arrivals = st.lists(
 
 
 def content_of(outputs: Sequence[Any]) -> tuple[list[tuple[int, bytes]], list[Any]]:
-    datagrams = [(one.flow, one.data) for one in outputs if not isinstance(one, Record)]
-    rows = [(one.table, *map(plain, one.row)) for one in outputs if isinstance(one, Record)]
+    datagrams = [(output.flow, output.data) for output in outputs if not isinstance(output, Record)]
+    rows = [(output.table, *map(plain, output.row)) for output in outputs if isinstance(output, Record)]
     return datagrams, rows
 
 
@@ -52,9 +52,9 @@ def test_the_channel_does_what_the_plain_network_does(
     number: int,
 ) -> None:
     named = (first, 5, "update"), (second, 5, "actuation")
-    forward, reverse = (Link(*one, first_number=number, loops=LOOPS) for one in named)
+    forward, reverse = (Link(*arguments, first_number=number, loops=LOOPS) for arguments in named)
     expected = Duplex(forward, reverse, first_number=number, loops=LOOPS)
-    links = [LinkState(*one, rows=LOOPS) for one in named]
+    links = [LinkState(*arguments, rows=LOOPS) for arguments in named]
     channel = SteppedChannel(Channel(links, loops=LOOPS, first_number=number))
     now_ns, rng = 0, np.random.default_rng(1)
     for k, (flow, size, step_ns, leaves) in enumerate(arriving):
@@ -75,7 +75,7 @@ def test_the_channel_does_what_the_plain_network_does(
         assert channel.next_deadline_ns() == due_ns
         assert content_of(channel.on_timer(due_ns)) == content_of(expected.on_timer(due_ns))
     assert channel.next_deadline_ns() is None
-    assert [one.counters for one in channel.channel.links] == [forward.counters, reverse.counters]
+    assert [link.counters for link in channel.channel.links] == [forward.counters, reverse.counters]
 
 
 def test_the_channel_makes_room_for_any_number_of_delayed_datagrams(content: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""A command line gives links; mistakes give error messages; ``--explain`` describes links."""
+"""A command line gives links; mistakes give error messages."""
 
 import json
 import re
@@ -12,10 +12,10 @@ import pytest
 from netem import stand_alone
 from netem.__main__ import main
 from netem.emulator_options import command_line_parser as parser
-from netem.emulator_options import parsed, specs_of
+from netem.emulator_options import parse_options, specs_of
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
-from netem.tc_words import EXAMPLES, KEYWORDS, load_links, parse, settings_of
+from netem.tc_words import EXAMPLES, KEYWORDS, parse, settings_of
 from noack.impairments.kinds.loss import LOSS_WORDS
 from tests.helpers.approved import compare_lines
 
@@ -23,7 +23,7 @@ ADDRESSES = "--listen :9000 --to :9001"
 
 
 def specs(arguments: str) -> tuple[LinkSpec, ...]:
-    return specs_of(parsed(parser(), shlex.split(arguments)))
+    return specs_of(parse_options(parser(), shlex.split(arguments)))
 
 
 @pytest.mark.parametrize(
@@ -90,79 +90,6 @@ def test_every_word_is_in_the_help_and_has_an_example() -> None:
         assert parse(example)
         assert synonyms.get(word, word) in example.split()
     assert set(KEYWORDS) - EXAMPLES.keys() == {"seed"}
-
-
-class Explain:
-    """Runs the program and returns its output."""
-
-    def __init__(self, capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> None:
-        self._capsys, self._patch = capsys, patch
-
-    def __call__(self, *arguments: str, columns: int = 80) -> str:
-        self._patch.setenv("COLUMNS", str(columns))
-        assert main(["--explain", *arguments]) == 0
-        out, err = self._capsys.readouterr()
-        assert err == ""
-        return out
-
-
-@pytest.fixture
-def explain(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Explain:
-    return Explain(capsys, monkeypatch)
-
-
-LINKS = """
-[[link]]
-name = "uplink"
-listen = "127.0.0.1:9000"
-to = "[::1]:9001"
-words = "loss 50% mansd 4"
-reverse = "delay 10ms"
-seed = 7
-
-[[link]]
-name = "video"
-listen = "127.0.0.1:9002"
-to = "127.0.0.1:9003"
-return_path = false
-words = "loss 20%"
-"""
-
-
-def test_links_are_explained_by_the_approved_text(
-    explain: Explain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Tables fit into a terminal of 80 columns, and the file of links has the same meaning."""
-    monkeypatch.chdir(tmp_path)
-    Path("links.toml").write_text(LINKS)
-
-    def explained(arguments: str) -> list[str]:
-        given = shlex.split(arguments)
-        text = explain(*given)
-        if "--json" in given:  # rates are compared without their rounding
-            text = json.dumps(json.loads(text, parse_float=lambda digits: round(float(digits), 9)), indent=2)
-        else:
-            tables, _, file = text.partition("(--links)\n")
-            assert max(map(len, tables.splitlines())) <= 80
-            Path("again.toml").write_text(file or LINKS)
-            assert load_links(Path("again.toml")) == specs_of(
-                parser().parse_intermixed_args(["--explain", *given])
-            )
-        return [line.rstrip() for line in text.splitlines() if line.strip()]
-
-    compare_lines(Path(__file__).with_name("explained.txt"), explained)
-
-
-def test_a_command_of_tc_is_complete_in_a_terminal_of_any_width(explain: Explain) -> None:
-    commands = set()
-    for columns in (200, 60, 30):
-        out = explain("delay 10ms 2ms distribution normal loss gemodel 1%", columns=columns)
-        command = out[out.index("tc qdisc") :].partition("\ndifference")[0]
-        commands.add(" ".join(command.replace("\\\n", "").split()))
-    assert commands == {
-        "tc qdisc add dev DEVICE root netem limit 16384 delay 10ms 2ms distribution normal "
-        "loss gemodel 1% 99% 100% 0%"
-    }
 
 
 def test_settings_that_are_not_permitted_are_reported(

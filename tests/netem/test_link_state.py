@@ -43,12 +43,12 @@ def new_link(words: str) -> Link:
 
 
 def rows_of(outputs: Outputs, table: str = NETEM_PACKET) -> Any:
-    found = [one.row for one in outputs if isinstance(one, Record) and one.table == table]
-    return np.array(found, tables(1, 1)[table])
+    rows = [output.row for output in outputs if isinstance(output, Record) and output.table == table]
+    return np.array(rows, tables(1, 1)[table])
 
 
 def sent(outputs: Outputs) -> list[Datagram]:
-    return [one for one in outputs if isinstance(one, Datagram)]
+    return [output for output in outputs if isinstance(output, Datagram)]
 
 
 def fate_of(link: Link, flow: int, now_ns: int = 0) -> Fate:
@@ -62,10 +62,10 @@ def fates(link: Link, flow: int, count: int) -> list[Fate]:
 
 def drain(link: Link) -> list[tuple[int, Outputs]]:
     """Release all datagrams in flight, each at its due time."""
-    found = []
+    released = []
     while (due := link.next_deadline_ns()) is not None:
-        found.append((due, link.on_timer(due)))
-    return found
+        released.append((due, link.on_timer(due)))
+    return released
 
 
 @given(
@@ -78,16 +78,16 @@ def test_a_flows_fates_depend_on_nothing_but_its_own_order(
     """Other flows and arrival times change no fate, bit, copy or delay, except with rates,
     blackouts and the limit. Delays are without the time that the guarantee adds."""
     words += "" if mansd is None else f" mansd {mansd}"
-    link, found = new_link(words), dict[int, list[tuple[int, ...]]]()
+    link, outcomes = new_link(words), dict[int, list[tuple[int, ...]]]()
 
     def decided(by: Link, flow: int, now_ns: int) -> tuple[int, ...]:
-        one = by.decide(flow, 100, now_ns)
-        delay_ns = one.release_ns - one.hold_back_ns - now_ns if one.bit < 0 else -1
-        return one.fate, one.consecutive_losses, one.bit, one.copy_bit, max(delay_ns, -1)
+        decision = by.decide(flow, 100, now_ns)
+        delay_ns = decision.release_ns - decision.hold_back_ns - now_ns if decision.bit < 0 else -1
+        return decision.fate, decision.consecutive_losses, decision.bit, decision.copy_bit, max(delay_ns, -1)
 
     for flow, now_ns in arrivals:
-        found.setdefault(flow, []).append(decided(link, flow, now_ns))
-    for flow, of_flow in found.items():
+        outcomes.setdefault(flow, []).append(decided(link, flow, now_ns))
+    for flow, of_flow in outcomes.items():
         alone = new_link(words)
         assert of_flow == [decided(alone, flow, k * 10**9) for k in range(len(of_flow))]
 
@@ -100,8 +100,8 @@ def test_every_seed_name_and_flow_has_a_stream_of_its_own(words: str) -> None:
         for seed, name, flow in itertools.product((5, 6), (("a",), ("b",), ("a", "b")), (0, 1))
     ]
     assert len(set(sequences)) == 12
-    for one in (words, f"delay 10ms 5ms {words}", f"{words} duplicate 50%"):
-        assert tuple(fates(new_link(one), 0, 100)) == sequences[0]
+    for more_words in (words, f"delay 10ms 5ms {words}", f"{words} duplicate 50%"):
+        assert tuple(fates(new_link(more_words), 0, 100)) == sequences[0]
 
 
 @pytest.mark.parametrize(
@@ -124,15 +124,17 @@ def test_the_limit_bounds_the_datagrams_and_copies_in_flight(words: str, overflo
 def test_every_datagram_is_counted_once(order: list[int], mansd: int | None) -> None:
     cap = "" if mansd is None else f"mansd {mansd}"
     link = new_link(f"{ALL_TIMELESS} rate 1mbit queue 3 blackout 10ms-30ms {cap}")
-    found = [fate_of(link, flow, k * MS) for k, flow in enumerate(order)]
+    all_fates = [fate_of(link, flow, k * MS) for k, flow in enumerate(order)]
     drain(link)
-    of = link.counters
+    counters = link.counters
     counted = (
-        of.delivered, of.dropped, of.forced, of.corrupted, of.overflowed, of.blacked_out,
+        counters.delivered, counters.dropped, counters.forced,
+        counters.corrupted, counters.overflowed, counters.blacked_out,
     )  # fmt: skip
-    assert list(counted) == [found.count(fate) for fate in Fate]
-    assert of.received == len(order)
-    assert of.forwarded == of.delivered + of.forced + of.corrupted + of.duplicated
+    assert list(counted) == [all_fates.count(fate) for fate in Fate]
+    assert counters.received == len(order)
+    effective = counters.delivered + counters.forced
+    assert counters.forwarded == effective + counters.corrupted + counters.duplicated
 
 
 @pytest.mark.parametrize(
@@ -150,8 +152,8 @@ def test_the_link_of_a_scenario_keeps_its_mansd(
 ) -> None:
     content["network"] |= {"loss": {"model": "worst_case"}, **network}
     link = update_link_of(resolve(validate(content, "here")))
-    found = "".join("dF"[fate is Fate.FORCED] for fate in fates(link, 0, 7))
-    assert found == expected
+    letters = "".join("dF"[fate is Fate.FORCED] for fate in fates(link, 0, 7))
+    assert letters == expected
 
 
 def test_a_refused_change_leaves_a_link_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:

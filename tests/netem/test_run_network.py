@@ -76,8 +76,8 @@ class Both:
 
     def received(self) -> tuple[list[bytes], list[bytes]]:
         """Return what the two receivers should have received; check that they did."""
-        found = {0: drain(self._controller), 1: drain(self._other)}
-        assert {flow: [data for data, _ in found[flow]] for flow in found} == self._expected
+        drained = {0: drain(self._controller), 1: drain(self._other)}
+        assert {flow: [data for data, _ in drained[flow]] for flow in drained} == self._expected
         return self._expected[0], self._expected[1]
 
     def _release(self, now_ns: int) -> list[Any]:
@@ -92,8 +92,8 @@ class Both:
                 self._expected[output.flow // self.loops].append(output.data)
         return [output for output in outputs if not isinstance(output, Datagram)]
 
-    def _compare(self, expected: Any, found: Any) -> None:
-        assert list(found) == list(expected)
+    def _compare(self, expected: Any, outputs: Any) -> None:
+        assert list(outputs) == list(expected)
         assert self.compiled.next_deadline_ns() == self.plain.next_deadline_ns()
         self.rows += expected
 
@@ -164,9 +164,9 @@ def test_arrival_is_when_the_datagram_reached_the_socket() -> None:
     resolved = network(LinkSettings(), LinkSettings(), Flow.UPDATE)
     with endpoints(*["127.0.0.1"] * 5) as (sender, sensor, controller, *receivers):
         peers = dict(zip((name_of(sensor), name_of(controller)), receivers, strict=True))
-        with closing(RunNetwork(cast(Scenario, resolved), BEGINNING)) as one:
+        with closing(RunNetwork(cast(Scenario, resolved), BEGINNING)) as run_network:
             sender.connect(name_of(controller))
-            one.open(clock, sender, peers, [name_of(controller)])
+            run_network.open(clock, sender, peers, [name_of(controller)])
             for _ in range(20):  # a process that is stalled meanwhile cannot compare its clocks
                 before_ns = clock.now_ns()
                 sensor.sendto(bytes(32), name_of(receivers[0]))
@@ -174,7 +174,7 @@ def test_arrival_is_when_the_datagram_reached_the_socket() -> None:
                 time.sleep(0.05)
                 rows, read_ns = _Rows(), clock.now_ns()
                 while not rows:  # a machine that stalls may end it before it reads
-                    one.drive(clock.now_ns() + 10**6, rows)
+                    run_network.drive(clock.now_ns() + 10**6, rows)
                 ((_, _, t_ns, now_ns, *_),) = rows
                 assert now_ns >= read_ns
                 if before_ns - 10**6 <= t_ns <= after_ns + 10**6:
@@ -225,7 +225,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
             shell.finish(clock.now_ns(), telemetry)
             telemetry.flush()
             report = shell.report()
-        senders = {address_text(name_of(one)) for one in (sensor, other)}
+        senders = {address_text(name_of(source)) for source in (sensor, other)}
     assert [data for data, _ in received] == sent
     assert {address_text(source) for _, source in received} == {report["local"]}
     assert (report["sent"], report["send_errors"]) == (len(sent), {})
@@ -282,19 +282,19 @@ def test_the_relay_gives_datagrams_the_fates_and_the_order_of_the_plain_machine(
 ) -> None:
     tap = KeepAll()
     parts = relayed(forward, reverse, clients=CLIENTS, taps=[tap], segment=segment)
-    with parts as (server, *clients, one):
+    with parts as (server, *clients, emulator):
         for k, size in enumerate(sizes):
-            clients[k % CLIENTS].sendto(payload_of(k, size), one.address())
-        one.settle(len(sizes))
+            clients[k % CLIENTS].sendto(payload_of(k, size), emulator.address())
+        emulator.settle(len(sizes))
         received = drain(server)
         for data, source in received:
             server.sendto(data, source)
-        one.settle(len(received), "reverse")
-        sides = one.report().forward, one.report().reverse
-        (spec,) = one.relay.specs
+        emulator.settle(len(received), "reverse")
+        sides = emulator.report().forward, emulator.report().reverse
+        (spec,) = emulator.relay.specs
         ports = [name_of(client)[1] for client in clients]
         at_clients = [[data for data, _ in drain(client)] for client in clients]
-        events, began_ns = tap.events, one.relay.began_unix_ns
+        events, began_ns = tap.events, emulator.relay.began_unix_ns
         assert began_ns is not None
     by_flow: dict[int, list[bytes]] = defaultdict(list)
     flow_of = {
@@ -311,13 +311,13 @@ def test_the_relay_gives_datagrams_the_fates_and_the_order_of_the_plain_machine(
         if not event["departure"] and not event["direction"]
     }
     expected = replayed(spec, 1, events, tap.payloads, began_ns)
-    for port, found in zip(ports, at_clients, strict=True):
-        assert found == expected.get(flow_at[port], [])
+    for port, at_client in zip(ports, at_clients, strict=True):
+        assert at_client == expected.get(flow_at[port], [])
     departures = events[events["departure"] == 1]
     assert len(departures) == len(received) + sum(map(len, at_clients))
     # A stale datagram counts once; a copy counts if the original is corrupted.
     intact = departures[departures["bit"] < 0]
-    counted = sum(one.counters.delivered_out_of_order for one in sides)
+    counted = sum(side.counters.delivered_out_of_order for side in sides)
     assert intact["stale"][intact["copy"] == 0].sum() <= counted <= intact["stale"].sum()
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, link_name
+from netem.channel import UPDATE_LINK, Datagram, due_settings, link_name, settings_at_start
 from netem.link_state import LinkState
 from noack.core.core_library import core
 from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
@@ -280,7 +280,7 @@ def link_of(
     schedule: ChangeSchedule | None = None,
 ) -> Link:  # fmt: skip
     """Return a link of a run."""
-    settings, names = at_start(settings, name, start)
+    settings, names = settings_at_start(settings, name, start)
     return Link(
         settings, seed, *names, first_number=start.first_number, schedule=schedule,
         restarted=start.is_restart,

@@ -29,7 +29,7 @@ with lazy_modules():
     from cosim.output import terminal_output
     from cosim.studies.campaign import campaign_file
     from cosim.studies.new_loop import linear_model, new_scenario
-    from netem import tc_words
+    from netem import links_file
     from noack.scenario import link_load, resolution, scenario, scenario_file, toml_file
     from noack.theory.certificates import assumptions
     from noack.trigger import periodic_trigger, trigger_rule
@@ -284,7 +284,7 @@ def schema(
     if campaign:
         cli.print_json(campaign_file.json_schema())
     elif netem:
-        cli.print_json(tc_words.json_schema())
+        cli.print_json(links_file.json_schema())
     else:
         cli.print_json(toml_file.json_schema(scenario.Scenario))
 

@@ -256,7 +256,7 @@ class ChildProcesses:
         if code == SSH_FAILED:
             return f"{where}: {newest or 'the connection by ssh broke'}"
         if code in (_NOT_EXECUTABLE, _NOT_FOUND):
-            return f"{where}: {newest}; say in the file of hosts how noack is called: command"
+            return f"{where}: {newest}; set `command` in the hosts file to the path of noack"
         return None
 
     def _log_lines(self, role: str) -> list[str]:

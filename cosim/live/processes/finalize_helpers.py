@@ -17,7 +17,7 @@ from pathlib import Path
 from threading import Thread, current_thread
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from cosim.live.processes.process_pool import at_idle_priority, called, process_starts, processes
+from cosim.live.processes.process_pool import at_idle_priority, call_by_name, process_starts, processes
 from cosim.record.run_directory import RunEnding
 from noack.core.process_limits import cores
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 Item = TypeVar("Item", bound=Hashable)
 _MANY_STEPS = 50_000
-"""Loops with fewer steps of the plant, all together, are judged in less time than processes
+"""Loops with fewer steps of the plant, all together, are evaluated in less time than processes
 start."""
 _GRACE_S = 2.0
 """Wall time for what is being prepared when the run ends."""
@@ -67,7 +67,7 @@ class FinalizeHelpers:
             return
         self.start()
         # This process keeps them, too.
-        self._due.append(partial(called, "cosim.record.run_record", "scenarios_of", run_dir))
+        self._due.append(partial(call_by_name, "cosim.record.run_record", "scenarios_of", run_dir))
         for first in self._loops[::_LOOPS_AT_ONCE]:
             block = self._loops[first:][:_LOOPS_AT_ONCE]
             self._due.append(partial(self._prepare_loops, run_dir, block))
@@ -92,7 +92,7 @@ class FinalizeHelpers:
 
     def _write_early(self, run_dir: Path) -> None:
         self._ended, self._writer = run_dir / SPOOL / EARLY / EARLY_ENDED, current_thread()
-        written = self.submit(called, "cosim.record.spool_conversion", "write_early", run_dir).result()
+        written = self.submit(call_by_name, "cosim.record.spool_conversion", "write_early", run_dir).result()
         self.early = cast("Mapping[str, int]", written)
 
     def _tell_writer(self) -> bool:
@@ -161,12 +161,12 @@ class FinalizeHelpers:
         show: Callable[[float], None],
     ) -> Iterable[Result]:
         """Call a function for each item, here and in the processes; return its results."""
-        with self.shared(work, partial(self.call, function), show) as take:
+        with self.share(work, partial(self.call, function), show) as take:
             results = take(function)
         return results.values()
 
     @contextmanager
-    def shared(
+    def share(
         self, work: Iterable[Item], elsewhere: Callable[[Item], Result], show: Callable[[float], None]
     ) -> Iterator[Callable[[Callable[[Item], Result]], Mapping[Item, Result]]]:
         """Let threads do work ``elsewhere``, item by item; this one does it with what is yielded.

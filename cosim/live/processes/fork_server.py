@@ -136,7 +136,7 @@ class ForkServer:
         self._socket.settimeout(_START_TIMEOUT_S)
         with its, ExitStack() as on_error:
             on_error.callback(self._socket.close)
-            forked = self._forked(its) if of_itself else None
+            forked = self._fork_program(its) if of_itself else None
             self._process = forked or subprocess.Popen(
                 python_command("-m", "cosim.live.processes.fork_server", its.fileno()),
                 pass_fds=[its.fileno()],
@@ -147,7 +147,7 @@ class ForkServer:
             on_error.pop_all()
         _adopt_orphans(True)
 
-    def _forked(self, its: socket.socket) -> ForkedProcess | None:
+    def _fork_program(self, its: socket.socket) -> ForkedProcess | None:
         """Fork the server; None if only a program of its own would work as every process must.
 
         That is one thread, open standard streams, and UTF-8 for files and streams.

@@ -75,7 +75,7 @@ def process_starts() -> Iterator[None]:
     import the parent's main module, as multiprocessing lets them do: a user's program need not
     have an ``if __name__ == "__main__"``.
     """
-    with _STARTS, _endings_blocked():
+    with _STARTS, _block_endings():
         main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             yield
@@ -84,7 +84,7 @@ def process_starts() -> Iterator[None]:
 
 
 @contextmanager
-def _endings_blocked() -> Iterator[None]:
+def _block_endings() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
@@ -96,15 +96,15 @@ def _endings_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def called(module: str, function: str, *arguments: object) -> object:
+def call_by_name(module: str, function: str, *arguments: object) -> object:
     """Import a module and call its function; the caller need not import it."""
     return getattr(import_module(module), function)(*arguments)
 
 
 def at_idle_priority(*call: object) -> object:
-    """Call a function by name, see :func:`called`, on a core that nothing else needs.
+    """Call a function by name, see :func:`call_by_name`, on a core that nothing else needs.
 
     A thread does so: without permission of the system, it could not leave that priority again.
     """
     with ThreadPoolExecutor(1, initializer=be_idle) as thread:
-        return thread.submit(called, *call).result()  # type: ignore[arg-type]
+        return thread.submit(call_by_name, *call).result()  # type: ignore[arg-type]

@@ -20,7 +20,7 @@ from noack.scenario.scenario import Scenario
 
 
 class TelemetryStore:
-    """Writes batches of rows to the spool, and knows which rows are there.
+    """Writes batches of rows to the spool, and keeps a list of the rows that it has.
 
     Args:
         scenario: the resolved scenario.
@@ -126,7 +126,7 @@ class TelemetryStore:
         for role, generation in newest.items():
             rows = {
                 table: received.ranges
-                for (of, table, number), received in self._received.items()
-                if (of, number) == (role, generation)
+                for (owner, table, number), received in self._received.items()
+                if (owner, number) == (role, generation)
             }
             yield role, {"generation": generation, "rows": rows}

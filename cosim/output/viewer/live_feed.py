@@ -35,7 +35,7 @@ from noack.scenario.scenario import Scenario, phases_ns
 _TURN_S, _SHARE = 0.03, 0.3
 """CPU time of a turn; share of a core."""
 _NAMED_S, _PATIENCE_S = 3.0, 10.0
-"""Wall time by which the loops in detail may lag before it is said, and before they are dropped."""
+"""Wall time by which the loops in detail may lag before a warning, and before they are dropped."""
 _MAP_EVERY_S = 2.0
 Reals = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -236,8 +236,8 @@ class _AllLoops:
         known &= at_ns >= self._first_ns[measured[LOOP]]
         measured, age_ns, x_c = measured[known], age_ns[known], models["x"][row[known]]
         for dt_ns in np.unique(age_ns).tolist():
-            of = age_ns == dt_ns
-            x_c[of] = self._flow(dt_ns, measured[LOOP][of], x_c[of])
+            aged = age_ns == dt_ns
+            x_c[aged] = self._flow(dt_ns, measured[LOOP][aged], x_c[aged])
         errors = row_norms(x_c - measured["x"])
         self._largest(self._over_time.errors, measured[LOOP], at_ns[known], errors)
 

@@ -308,7 +308,7 @@ def write_loop_view(record: RunRecord, path: Path) -> None:
 
 
 def _new_id() -> int:
-    """Return an identity, by which the viewer knows a recording."""
+    """Return an identity, by which the viewer distinguishes recordings."""
     return secrets.randbits(64)
 
 

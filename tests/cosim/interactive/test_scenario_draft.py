@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosim.interactive.scenario_draft import Draft, DraftError, draft_of_query, known_scenarios, open_draft
-from cosim.interactive.sliders import controls_of, dragged
+from cosim.interactive.sliders import controls_of, drag
 from cosim.shipped_files import shipped_names
 from noack.core.errors import CallerError
 from noack.scenario import toml_file
@@ -21,12 +21,12 @@ def test_the_model_error_multiplies_both_boxes() -> None:
     draft = open_draft("lane_following")
     (slider,) = [one for one in controls_of(draft).sliders if one.scaled]
     assert slider.value == 1.0
-    wide = dragged(dragged(draft, slider, 3.0), slider, 12.0)
+    wide = drag(drag(draft, slider, 3.0), slider, 12.0)
     assert "# M - 1: at most four consecutive losses" in wide.text
     assert wide.value("plant.uncertainty_A")[0] == [1.2, 1.2, 0.0, 0.0]
     assert wide.value("plant.uncertainty_B")[1] == [0.0, 0.6]
     assert [one.value for one in controls_of(wide).sliders if one.scaled] == [12.0]
-    assert dragged(wide, slider, 1.0).text.count("0.1, 0.1") == 2
+    assert drag(wide, slider, 1.0).text.count("0.1, 0.1") == 2
     nominal = draft.with_value("plant.draw", "nominal")
     assert not any(one.scaled for one in controls_of(nominal).sliders)
 
@@ -65,7 +65,7 @@ def test_every_scenario_has_controls_and_an_address(name: str) -> None:
         low, high = slider.ends
         assert low <= slider.position <= high
         for share in (0.0, 0.77, 1.0):
-            moved = dragged(draft, slider, slider.value_at(low + share * (high - low)))
+            moved = drag(draft, slider, slider.value_at(low + share * (high - low)))
             again = draft_of_query(moved.query(), name, {name: name})
             assert again.content == moved.content
             assert again.scenario == moved.scenario  # it is valid

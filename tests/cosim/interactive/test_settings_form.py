@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from cosim.interactive.scenario_draft import DraftError, draft_of_query, open_draft
-from cosim.interactive.settings_form import Field, by_field, filled, form_of
-from cosim.interactive.sliders import chosen, controls_of, dragged
+from cosim.interactive.settings_form import Field, by_field, fill_in, form_of
+from cosim.interactive.sliders import choose, controls_of, drag
 from cosim.shipped_files import shipped_names
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs/scenario.schema.json").read_text(encoding="utf-8"))
@@ -54,10 +54,10 @@ def test_every_value_of_a_shipped_scenario_is_in_its_form(name: str) -> None:
 
 
 def test_a_wrong_text_stays_as_it_is_typed_and_is_named_at_its_field() -> None:
-    draft = filled(open_draft("lane_following"), field("trigger.beta"), "about 1: or 2")
+    draft = fill_in(open_draft("lane_following"), field("trigger.beta"), "about 1: or 2")
     assert field("trigger.beta").text(draft) == "about 1: or 2"
-    draft = filled(draft, field("plant.initial_state"), '[1.0, "a", 0, 0]')
-    draft = filled(draft, field("network.mansd"), "-3")
+    draft = fill_in(draft, field("plant.initial_state"), '[1.0, "a", 0, 0]')
+    draft = fill_in(draft, field("network.mansd"), "-3")
     with pytest.raises(DraftError) as caught:
         _ = draft.scenario
     assert by_field(form_of(draft), caught.value.mistakes) == {
@@ -71,7 +71,7 @@ def test_every_choice_gives_a_valid_scenario() -> None:
     draft = open_draft("lane_following")
     for choice in controls_of(draft).choices:
         for value in choice.options:
-            other = chosen(draft, choice.key, value)
+            other = choose(draft, choice.key, value)
             assert {one.key: one.value for one in controls_of(other).choices}[choice.key] == value
             assert (
                 draft_of_query(other.query(), "lane_following", {"lane_following": "lane_following"}).scenario
@@ -80,17 +80,17 @@ def test_every_choice_gives_a_valid_scenario() -> None:
             for slider in controls_of(other).sliders:
                 for place in slider.ends:
                     if slider.key != "network.loss.mean_loss":  # limited by the mean burst
-                        assert dragged(other, slider, slider.value_at(place)).scenario
+                        assert drag(other, slider, slider.value_at(place)).scenario
 
 
 def test_another_kind_keeps_what_both_kinds_have() -> None:
     draft, choice = open_draft("lane_following"), field("controller.kind")
-    python = filled(draft, choice, "python")
+    python = fill_in(draft, choice, "python")
     assert python.value("controller") == {"rate_hz": 500.0, "kind": "python"}
     with pytest.raises(DraftError) as caught:
         _ = python.scenario
     assert by_field(form_of(python), caught.value.mistakes)["controller.name"]
-    assert filled(python, choice, "").value("controller") is None
+    assert fill_in(python, choice, "").value("controller") is None
     policy = field("trigger.policy")
     for kind in policy.options:
-        assert filled(draft, policy, kind).value("trigger.policy") in (kind, None)
+        assert fill_in(draft, policy, kind).value("trigger.policy") in (kind, None)

@@ -93,8 +93,8 @@ class Page:
             )  # fmt: skip
 
     def js(self, expression: str) -> Any:
-        found = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
-        return found["result"].get("value")
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        return answer["result"].get("value")
 
     def wait(self, condition: str) -> None:
         deadline_s = time.monotonic() + live.PATIENCE_S
@@ -103,16 +103,16 @@ class Page:
             time.sleep(0.05)
 
     def click(self, text: str, kind: str) -> None:
-        found = (
+        element = (
             f"[...document.querySelectorAll('{kind}')].filter(e => e.offsetParent && "
             f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
         )
-        self.wait(f"{found}.length > 0")
-        self.js(f"{found}.at(-1).click()")
+        self.wait(f"{element}.length > 0")
+        self.js(f"{element}.at(-1).click()")
 
     def press_button(self, text: str) -> None:
         """Click on a button with the mouse, once it can be clicked; again if it moved meanwhile."""
-        found = (
+        element = (
             f"[...document.querySelectorAll('button')].find(e => !e.disabled && e.offsetParent && "
             f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
         )
@@ -120,12 +120,12 @@ class Page:
         deadline_s = time.monotonic() + live.PATIENCE_S
         while not self.js("window.pressed"):
             assert time.monotonic() < deadline_s, text
-            self.wait(f"!!{found}")
+            self.wait(f"!!{element}")
             x, y = self.js(
                 "(e => { e.addEventListener('click', () => { window.pressed = true; }, "
                 "{ once: true }); e.scrollIntoView({ block: 'center' }); "
                 "const r = e.getBoundingClientRect(); "
-                f"return [r.x + r.width / 2, r.y + r.height / 2]; }})({found})"
+                f"return [r.x + r.width / 2, r.y + r.height / 2]; }})({element})"
             )
             for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
                 self.call(
@@ -135,23 +135,23 @@ class Page:
 
     def unfold(self, title: str) -> None:
         """Open a part of the settings."""
-        found = (
+        element = (
             "[...document.querySelectorAll('summary, .q-expansion-item .q-item')].filter(e => "
             f"e.innerText.replace('keyboard_arrow_down', '').trim() === {json.dumps(title)})"
         )
-        self.wait(f"{found}.length > 0")
-        self.js(f"{found}[0].click()")
+        self.wait(f"{element}.length > 0")
+        self.js(f"{element}[0].click()")
 
     def fill(self, key: str, text: str) -> None:
         """Type a text into a field of the form; again if another element took the focus meanwhile."""
-        found = f"document.getElementById({json.dumps(f'lab-field-{key}')})"
+        element = f"document.getElementById({json.dumps(f'lab-field-{key}')})"
         deadline_s, typed = time.monotonic() + live.PATIENCE_S, None
         while typed != text:
             assert time.monotonic() < deadline_s, (key, text, typed)
-            self.wait(f"!!{found}")
-            self.js(f"{found}.focus(), {found}.select()")
+            self.wait(f"!!{element}")
+            self.js(f"{element}.focus(), {element}.select()")
             self.call("Input.insertText", text=text)
-            typed = self.js(f"{found}?.value")
+            typed = self.js(f"{element}?.value")
 
     def resize(self, width: int, height: int) -> None:
         """Give the window another size."""
@@ -190,10 +190,10 @@ def address(folder: Path) -> Iterator[str]:
 
 @contextmanager
 def started(profile: Path, *card: str) -> Iterator[Browser]:
-    found = shutil.which("chromium") or shutil.which("google-chrome")
-    if found is None or sys.platform != "linux" or not hasattr(os, "fork"):
+    program = shutil.which("chromium") or shutil.which("google-chrome")
+    if program is None or sys.platform != "linux" or not hasattr(os, "fork"):
         pytest.skip("no chromium here")
-    browser = Browser(found, str(profile), card)
+    browser = Browser(program, str(profile), card)
     try:
         yield browser
     finally:

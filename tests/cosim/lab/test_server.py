@@ -96,23 +96,23 @@ def session_of(name: str, drawn: list[Session], calls: object = None, **settings
         draft = draft.with_value(key.replace("__", "."), value)
 
     async def on_rest() -> None:
-        drawn.append(found)
+        drawn.append(lab_session)
         # What is there is not waited for any more.
-        assert not known(found, CERTIFICATE) or "certificate" not in found.pending
+        assert not known(lab_session, CERTIFICATE) or "certificate" not in lab_session.pending
         await asyncio.sleep(0)  # as the browser's answer is awaited
 
-    found = Session(cast("PageCalls", calls or Inline()), draft, on_rest, on_rest)
-    return found
+    lab_session = Session(cast("PageCalls", calls or Inline()), draft, on_rest, on_rest)
+    return lab_session
 
 
 def known(session: Session, name: str) -> bool:
     return session.results is not None and name in session.results.known
 
 
-async def settled(found: Session) -> None:
-    await found.change(found.draft)
-    assert found._later is not None
-    await found._later
+async def settled(lab_session: Session) -> None:
+    await lab_session.change(lab_session.draft)
+    assert lab_session._later is not None
+    await lab_session._later
 
 
 class Watched(Inline):
@@ -135,27 +135,27 @@ def test_the_certificate_is_shown_before_the_bands_and_waiting_is_said(
 ) -> None:
     monkeypatch.setattr(lab_services, "_SLOW_S", 0.0)
     calls = Watched()
-    found = calls.session = session_of("lane_following", drawn, calls, horizon_s=2.0)
-    asyncio.run(settled(found))
+    lab_session = calls.session = session_of("lane_following", drawn, calls, horizon_s=2.0)
+    asyncio.run(settled(lab_session))
     assert calls.begun == [
         ("certificate: waiting for the processor", False),
         ("bands: waiting for the processor", True),
         ("margin: waiting for the processor", True),
     ]
-    assert found.pending == ""
+    assert lab_session.pending == ""
 
 
 def test_of_many_changes_the_newest_is_drawn(drawn: list[Session]) -> None:
-    found = session_of("lane_following", drawn, horizon_s=2.0)
+    lab_session = session_of("lane_following", drawn, horizon_s=2.0)
 
     async def drag() -> None:
         values = [0.1 * step for step in range(1, 9)]
-        drafts = [found.draft.with_value("trigger.beta", value) for value in values]
-        await asyncio.gather(*map(found.change, drafts))
+        drafts = [lab_session.draft.with_value("trigger.beta", value) for value in values]
+        await asyncio.gather(*map(lab_session.change, drafts))
 
     asyncio.run(drag())
-    assert found.results is not None
-    assert found.results.run.scenario.trigger.beta == pytest.approx(0.8)
+    assert lab_session.results is not None
+    assert lab_session.results.run.scenario.trigger.beta == pytest.approx(0.8)
     assert len(drawn) <= 4
 
 
@@ -167,10 +167,10 @@ def with_services(use: Callable[[LabServices], Awaitable[Any]], folder: Path) ->
         with LabServices("lane_following", folder, folder / "runs") as services:
             return await asyncio.wait_for(use(services), live.PATIENCE_S)
 
-    found = asyncio.run(run())
+    result = asyncio.run(run())
     gc.collect()  # the loop hears of exceptions that nobody asked for when they are removed
     assert unhandled == []
-    return found
+    return result
 
 
 def test_a_closed_page_gives_up_its_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,8 +187,8 @@ def test_a_closed_page_gives_up_its_work(tmp_path: Path, monkeypatch: pytest.Mon
         while not services._turn.locked():  # the first of them is begun
             await asyncio.sleep(0)
         closed.give_up()
-        found = await asyncio.gather(*given_up, return_exceptions=True)
-        assert [type(one) for one in found] == [asyncio.CancelledError] * 2
+        results = await asyncio.gather(*given_up, return_exceptions=True)
+        assert [type(result) for result in results] == [asyncio.CancelledError] * 2
         return await wanted
 
     assert with_services(use, tmp_path) == 7
@@ -206,10 +206,10 @@ def test_the_newest_run_that_has_ended_is_known(tmp_path: Path) -> None:
 
 
 def test_mistakes_leave_no_run(drawn: list[Session]) -> None:
-    found = session_of("lane_following", drawn)
-    asyncio.run(found.change(found.draft.with_text(found.draft.text + "\nbeta = 1\n")))
-    assert found.results is None
-    assert found.mistakes
+    lab_session = session_of("lane_following", drawn)
+    asyncio.run(lab_session.change(lab_session.draft.with_text(lab_session.draft.text + "\nbeta = 1\n")))
+    assert lab_session.results is None
+    assert lab_session.mistakes
 
 
 SECRET, OPENING = "s" * 43, "o" * 43
@@ -305,8 +305,8 @@ def test_the_browser_is_started_with_the_address_for_command_lines(
     assert urlsplit(page).path != urlsplit(line).path
 
 
-def said(run: LiveRun, what: str, **fields: object) -> None:
-    run._take(json.dumps({"what": what, **fields}))
+def report_event(run: LiveRun, event: str, **fields: object) -> None:
+    run._take(json.dumps({"event": event, **fields}))
 
 
 REPORT = {
@@ -318,25 +318,25 @@ REPORT = {
 def test_what_a_live_run_reports_sets_its_state_and_its_lines() -> None:
     run = LiveRun(20.0)
     assert run.state == "starting"
-    said(run, "started", run_dir="/runs/one")
+    report_event(run, "started", run_dir="/runs/one")
     assert (run.state, run.run_dir) == ("running", Path("/runs/one"))
     live = "live view: http://127.0.0.1:1234/secret/"
     for changes in ([], ["M 3"]):  # each warning is shown once
-        said(run, "progress", **REPORT | {"warnings": ["void"], "changes": changes, "live": live})
+        report_event(run, "progress", **REPORT | {"warnings": ["void"], "changes": changes, "live": live})
     assert run.lines == ["all processes run", "void", "changed: M 3"]
     assert run.viewer == "http://127.0.0.1:1234/secret/"
-    said(run, "finalising", reason="horizon")
+    report_event(run, "finalising", reason="horizon")
     assert run.state == "finalising"
     assert not run.is_over
     lines = [["completed 20 s", "green"], ["3 transmissions, 2 delivered", ""]]
-    said(run, "ended", run_dir="/runs/one", reason="horizon", ok=True, verdict=lines)
+    report_event(run, "ended", run_dir="/runs/one", reason="horizon", ok=True, verdict=lines)
     assert run.is_over
     assert run.ok
     assert run.progress is not None
     assert run.progress.events == 3
     assert run.verdict == [("completed 20 s", "green"), ("3 transmissions, 2 delivered", "")]
     failed = LiveRun(20.0)
-    said(failed, "error", text="the port is taken")
+    report_event(failed, "error", text="the port is taken")
     assert failed.is_over
     assert failed.ok is False
     assert failed.lines == ["the port is taken"]

@@ -21,7 +21,7 @@ from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed, identity_residual
-from tests.cosim.simulation.shuttle import Shuttle
+from tests.cosim.simulation.event_scheduler import EventScheduler
 from tests.helpers.machine_parts import controller_of, sensor_of
 
 MS = 1_000_000
@@ -104,13 +104,13 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     resolved = resolve(validate(CONTENT, "here"))
     change = ParameterChange(0, 900 * MS, {"controller.setpoint": [2.0, 0.0]})
     told_ns = {"sensor": 500 * MS, "netem": 500 * MS, "controller": 1_000 * MS}
-    shuttle = Shuttle(resolved, (resolved,))
-    for now_ns in shuttle.steps():
+    scheduler = EventScheduler(resolved, (resolved,))
+    for now_ns in scheduler.steps():
         for role in [role for role, at_ns in told_ns.items() if at_ns <= now_ns]:
-            machine: Any = shuttle.machines[role]
-            shuttle.emit(role, machine.announce(change, now_ns))
+            machine: Any = scheduler.machines[role]
+            scheduler.emit(role, machine.announce(change, now_ns))
             del told_ns[role]
-    record = shuttle.record()
+    record = scheduler.record()
     assert replay(record).bit_exact
     (made,) = changes_of(record)
     assert list(made.late) == ["controller"]

@@ -80,7 +80,7 @@ def random_population(rng: np.random.Generator, setting: Setting, k: int) -> Pop
     return Population(A, B, rng.uniform(-1, 1, (k, n)), seeds)
 
 
-def one(population: Population, i: int) -> Population:
+def single(population: Population, i: int) -> Population:
     return Population(*(part[i : i + 1] for part in population))
 
 
@@ -204,14 +204,14 @@ def dense(run: ContinuousRun, setting: Setting) -> tuple[Vector, Vector, Vector]
     return np.concatenate(times_s), np.concatenate(norms), np.concatenate(errors)
 
 
-def compare(setting: Setting, row: Any, found: Events, run: ContinuousRun) -> None:
+def compare(setting: Setting, row: Any, events: Events, run: ContinuousRun) -> None:
     """Compare a run of a batch with the exact simulator's, which uses another method."""
     assert row["status"] == OK
-    assert found.delivered.tolist() == run.delivered.tolist()
-    np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
+    assert events.delivered.tolist() == run.delivered.tolist()
+    np.testing.assert_allclose(events.event_s, run.event_s, rtol=0, atol=1e-9)
     assert row["transmissions"] == len(run.event_s)
     assert row["deliveries"] == run.delivered.sum()
-    bursts = "".join("D" if one else "L" for one in run.delivered).split("D")
+    bursts = "".join("D" if delivered else "L" for delivered in run.delivered).split("D")
     assert row["longest_loss_burst"] == max(map(len, bursts))
     gaps_s = np.diff(run.event_s)
     least_s, mean_s = (gaps_s.min(), gaps_s.mean()) if len(gaps_s) else (math.nan, math.nan)
@@ -235,5 +235,5 @@ def check_independence(setting: Setting, population: Population, order: Any) -> 
     rows = run_batch(setting, population)
     permuted = run_batch(setting, Population(*(part[order] for part in population)))
     assert permuted.tobytes() == rows[order].tobytes()
-    alone = [run_batch(setting, one(population, i)) for i in range(len(order))]
+    alone = [run_batch(setting, single(population, i)) for i in range(len(order))]
     assert np.concatenate(alone).tobytes() == rows.tobytes()

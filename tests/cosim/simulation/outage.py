@@ -14,7 +14,7 @@ from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from tests.cosim.simulation.shuttle import shuttled
+from tests.cosim.simulation.event_scheduler import record_of_run
 from tests.helpers.machine_parts import Machine
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -59,27 +59,27 @@ class Frozen:
         return [*late, *self._machine.on_timer(now_ns)]
 
 
-class Deaf:
+class LosingMachine:
     """A machine that does not receive some messages, as if they were lost in a socket.
 
     Args:
         machine: the wrapped machine.
-        hears: maps the number of a sent message to whether it arrives.
+        arrives: maps the number of a sent message to whether it arrives.
     """
 
-    def __init__(self, machine: Machine[Any], hears: Callable[[int], bool]) -> None:
+    def __init__(self, machine: Machine[Any], arrives: Callable[[int], bool]) -> None:
         self._machine = machine
-        self._hears = hears
+        self._arrives = arrives
         self._sent = 0
         self.next_deadline_ns, self.on_timer = machine.next_deadline_ns, machine.on_timer
 
     def handle(self, message: Any, now_ns: int) -> Sequence[Any]:
         self._sent += 1
-        return self._machine.handle(message, now_ns) if self._hears(self._sent - 1) else ()
+        return self._machine.handle(message, now_ns) if self._arrives(self._sent - 1) else ()
 
 
-class Reborn:
-    """A machine that is replaced by a restarted one.
+class RestartedMachine:
+    """A machine, and from a time on the restarted one that replaces it.
 
     Args:
         machine: the machine that ends.
@@ -92,8 +92,8 @@ class Reborn:
 
     def next_deadline_ns(self) -> int | None:
         due_ns = self._machine.next_deadline_ns()
-        alive = due_ns is not None and due_ns < self._at_ns
-        return due_ns if alive else self._successor.next_deadline_ns()
+        is_present = due_ns is not None and due_ns < self._at_ns
+        return due_ns if is_present else self._successor.next_deadline_ns()
 
     def handle(self, message: Any, now_ns: int) -> Sequence[Any]:
         return self._at(now_ns).handle(message, now_ns)
@@ -112,7 +112,7 @@ def simulate_with(
     network: Network | None = None,
 ) -> RunRecord:
     """Simulate a scenario with the machine of one role replaced."""
-    return shuttled(resolved, network, {role: wrap})
+    return record_of_run(resolved, network, {role: wrap})
 
 
 def with_outage(resolved: Scenario, from_s: float, until_s: float) -> RunRecord:

@@ -46,8 +46,8 @@ def run_of(*overrides: str) -> RunRecord:
 
 def fates(record: RunRecord, flow: int) -> list[int]:
     rows = record[NETEM_PACKET]
-    found: list[int] = rows["fate"][rows["flow"] == flow].tolist()
-    return found
+    values: list[int] = rows["fate"][rows["flow"] == flow].tolist()
+    return values
 
 
 def test_each_direction_has_its_own_random_stream() -> None:
@@ -66,11 +66,11 @@ def test_each_direction_has_its_own_random_stream() -> None:
 def test_the_summary_counts_acknowledgements() -> None:
     record = run_of()
     summary = summarise(record, 0, "horizon").to_json()
-    found = summary["acknowledgements"]
-    assert found["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
-    assert found["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
-    assert found["lost"] > 0
-    assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # in flight at the end
+    counts = summary["acknowledgements"]
+    assert counts["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
+    assert counts["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
+    assert counts["lost"] > 0
+    assert 0 <= counts["sent"] - counts["lost"] - counts["received"] <= 2  # in flight at the end
     assert summary["unintended_losses"] == summary["missing_samples"] == 0
     assert summary["identity_residual_max"] is None
     assert summarise(simulate(plain()), 0, "horizon").acknowledgements is None

@@ -20,10 +20,10 @@ from tests.cosim.simulation.exact_populations import (
     check_independence,
     compare,
     events_of,
-    one,
     random_population,
     random_setting,
     reference,
+    single,
 )
 from tests.helpers.example_rules import TABLES, decaying_rule, mixed_rule, quadratic_rule, random_rule
 from tests.helpers.shipped import resolved
@@ -56,7 +56,7 @@ def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -
         name, range(12 if name in ("lyapunov", "decaying", "dynamic") else 4)
     ):
         for i, row in enumerate(run_batch(setting, population)):
-            draw = one(population, i)
+            draw = single(population, i)
             try:
                 run = reference(setting, draw, MOST_EVENTS)
             except TooManyEventsError:
@@ -109,10 +109,10 @@ def test_very_short_crossings_are_found(depth: float, omega: float, alpha_omega:
 
     Each of the hundred polynomials up to there adds a relative error of about 1e-14.
     """
-    found = events_of(*turning(2 * (1 - depth), omega, alpha_omega * omega))
+    batch_events = events_of(*turning(2 * (1 - depth), omega, alpha_omega * omega))
     first_s = 2 / omega * math.asin(1 - depth)
     tolerance_s = 5e-13 / math.sqrt(depth) / omega + 1e-12 * first_s
-    assert found.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
+    assert batch_events.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
     beyond = turning(2 * (1 + depth), omega, alpha_omega * omega)
     assert events_of(*beyond).event_s.size == 0
 
@@ -124,11 +124,11 @@ def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(mode: str) -> Non
     scenario = resolved("lane_following", *settings)
     loop = loop_of(scenario)
     draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.array([seed], np.uint64))
-    found = events_of(setting_of(scenario), draw)
+    batch_events = events_of(setting_of(scenario), draw)
     run = run_continuous(scenario)
     assert len(run.event_s) >= (1 if mode == "model" else 5)
-    np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
-    assert found.delivered.tolist() == run.delivered.tolist()
+    np.testing.assert_allclose(batch_events.event_s, run.event_s, rtol=0, atol=1e-9)
+    assert batch_events.delivered.tolist() == run.delivered.tolist()
 
 
 def test_invalid_settings_are_refused() -> None:

@@ -37,16 +37,16 @@ helics.helicsFederateInfoSetCoreTypeFromString(info, "zmq")
 helics.helicsFederateInfoSetBroker(info, sys.argv[1])
 helics.helicsFederateInfoSetFlagOption(info, helics.HELICS_FLAG_UNINTERRUPTIBLE, True)
 own = helics.helicsCreateMessageFederate("both", info)
-sender, *ends = (helics.helicsFederateRegisterGlobalEndpoint(own, one, "") for one in "sab")
+sender, *ends = (helics.helicsFederateRegisterGlobalEndpoint(own, name, "") for name in "sab")
 helics.helicsFederateEnterExecutingMode(own)
 for k in range({MESSAGES} + 10):
     if k:
         helics.helicsFederateRequestTime(own, k * 0.01)
     for name, end in zip("ab", ends):
         while helics.helicsEndpointHasMessage(end):
-            one = helics.helicsEndpointGetMessage(end)
-            data = helics.helicsMessageGetBytes(one).hex()
-            print(name, round(one.time * 1e9), data, one.original_source)
+            message = helics.helicsEndpointGetMessage(end)
+            data = helics.helicsMessageGetBytes(message).hex()
+            print(name, round(message.time * 1e9), data, message.original_source)
         if k < {MESSAGES}:
             helics.helicsEndpointSendBytesTo(sender, b"%08d" % k, "noack/" + name)
 helics.helicsFederateDisconnect(own)
@@ -62,14 +62,14 @@ def start() -> Iterator[Start]:
 
     def begin(*arguments: str, stdout: IO[str] | int = subprocess.PIPE) -> "subprocess.Popen[str]":
         command = [sys.executable, *arguments]
-        one = subprocess.Popen(command, stdout=stdout, stderr=subprocess.PIPE, text=True, cwd=ROOT)
-        started.append(one)
-        return one
+        process = subprocess.Popen(command, stdout=stdout, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+        started.append(process)
+        return process
 
     yield begin
-    for one in started:
-        one.kill()
-        one.communicate()
+    for process in started:
+        process.kill()
+        process.communicate()
 
 
 def federation(start: Start, federates: int, *options: str) -> tuple[str, "subprocess.Popen[str]"]:
@@ -131,8 +131,8 @@ def test_copies_damage_and_overtaking_are_those_of_the_link(start: Start) -> Non
     expected = []
     for k in range(MESSAGES):
         for row, name in enumerate("ab"):
-            one = link.decide(row, 8, 10_000_000 * k)
-            for time_ns, bit in ((one.release_ns, one.bit), (one.copy_ns, one.copy_bit)):
+            decision = link.decide(row, 8, 10_000_000 * k)
+            for time_ns, bit in ((decision.release_ns, decision.bit), (decision.copy_ns, decision.copy_bit)):
                 data = int.from_bytes(b"%08d" % k, "little") ^ (1 << bit if bit >= 0 else 0)
                 if time_ns >= 0:
                     expected.append(f"{name} {time_ns} {data.to_bytes(8, 'little').hex()} s")

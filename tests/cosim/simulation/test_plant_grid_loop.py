@@ -91,12 +91,12 @@ def test_the_plant_grid_loop_is_what_one_exponential_after_another_gives(delay: 
         whole = recorded_loop(record).schedule
         late = replace(whole, measured=whole.measured & (np.arange(len(whole.measured)) > 3))
         for schedule in (whole, late):
-            found = on_the_grid(record, schedule, delay=delay, hold=False)
+            grid_run = on_the_grid(record, schedule, delay=delay, hold=False)
             expected, events = step_by_step(record, schedule, delay=delay)
-            assert found.event_steps.tolist() == events
+            assert grid_run.event_steps.tolist() == events
             # Products, each with an error of about 1e-16 of the state, which may grow.
             size = np.abs(expected).max()
-            np.testing.assert_allclose(found.x, expected, rtol=0, atol=1e-12 * size)
+            np.testing.assert_allclose(grid_run.x, expected, rtol=0, atol=1e-12 * size)
 
 
 @pytest.mark.parametrize("first", range(len(POLICIES)))
@@ -105,8 +105,8 @@ def test_the_plant_grid_loop_with_all_effects_is_what_the_machines_do(first: int
     for number in range(first, 4 * len(POLICIES), len(POLICIES)):
         record = simulated(number)
         live = recorded_loop(record)
-        found = on_the_grid(record, live.schedule, delay=True, hold=True)
-        expected = record[PLANT_STEP]["x"][: len(found.x)]
-        np.testing.assert_allclose(found.x, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+        grid_run = on_the_grid(record, live.schedule, delay=True, hold=True)
+        expected = record[PLANT_STEP]["x"][: len(grid_run.x)]
+        np.testing.assert_allclose(grid_run.x, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
         period_s = record.scenario.timing.plant_period_ns * 1e-9
-        np.testing.assert_allclose(found.event_steps * period_s, live.event_s, rtol=1e-12)
+        np.testing.assert_allclose(grid_run.event_steps * period_s, live.event_s, rtol=1e-12)

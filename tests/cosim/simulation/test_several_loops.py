@@ -85,8 +85,8 @@ def test_the_guarantee_holds_per_loop_when_the_shared_queue_overflows(crowded: C
     assert (fates == Fate.OVERFLOWED).sum() > 100
     assert (fates == Fate.FORCED).sum() > 10
     longest = []
-    for one in shared.loops:
-        lost = ~np.isin(one[NETEM_PACKET]["fate"], (Fate.DELIVERED, Fate.FORCED))
+    for loop_record in shared.loops:
+        lost = ~np.isin(loop_record[NETEM_PACKET]["fate"], (Fate.DELIVERED, Fate.FORCED))
         runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], lost, [0]]))))[::2]
         longest.append(int(runs.max(initial=0)))
     assert max(longest) == 3
@@ -103,14 +103,14 @@ def test_the_guarantee_holds_per_loop_when_the_shared_queue_overflows(crowded: C
 @pytest.mark.sanitized
 def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     shared = run(crowded, {"name": "a", "count": 3}, {"name": "b", "mode": "zoh"})
-    found = replay(shared.network)
-    assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 1)
+    result = replay(shared.network)
+    assert (result.bit_exact, result.gaps, len(result.processes)) == (True, [], 1)
     machines = SharedMachines(shared.loops)
     for record in shared.loops:
-        found = replay(record, machines)
-        assert found == replay(record)
-        assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 3)
-        assert all(hop.compared > 20 for hop in found.messages)
+        result = replay(record, machines)
+        assert result == replay(record)
+        assert (result.bit_exact, result.gaps, len(result.processes)) == (True, [], 3)
+        assert all(hop.compared > 20 for hop in result.messages)
     packets = shared.network[NETEM_PACKET].copy()
     packets["release_ns"][-1] += 1
     assert replay(changed(shared.network, {NETEM_PACKET: packets})).bit_exact is False
@@ -119,10 +119,10 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     head[6] = 1  # the number of another loop
     packets["head"][3] = bytes(head)
     other = changed(shared.loops[2], {NETEM_PACKET: packets})
-    found = replay(other)
-    assert found == replay(other, SharedMachines([*shared.loops[:2], other]))
-    assert found.first_difference is not None
-    assert found.first_difference.column == "head"
+    result = replay(other)
+    assert result == replay(other, SharedMachines([*shared.loops[:2], other]))
+    assert result.first_difference is not None
+    assert result.first_difference.column == "head"
 
 
 def shares_of(level: int) -> tuple[float, float]:

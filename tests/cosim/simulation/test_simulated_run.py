@@ -32,7 +32,7 @@ SETTINGS = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigg
 
 
 def simulated(folder: Path, *settings: str, options: Sequence[str] = ()) -> Result:
-    words = [word for one in settings for word in ("--set", one)]
+    words = [word for setting in settings for word in ("--set", setting)]
     return invoke("simulate", PATH, "--runs", folder, "--json", *options, *words)
 
 
@@ -67,15 +67,15 @@ def test_the_counts_of_the_loops_add_up_to_those_of_the_network(run_dir: Path) -
     assert read_summary(summary) is not None
     assert read_summary(summary | {"loops": summary["loops"][::-1]}) is None
     network, loops = summary["network"], summary["loops"]
-    assert [one["number"] for one in loops] == [*range(LOOPS)]
-    assert sum(one["link_share"] for one in loops) == pytest.approx(1)
-    for one in loops:
-        record = load_record(run_dir, one["name"])
-        assert one["events"] == len(record.events()) == one["deliveries"] + one["drops"]
-    assert sum(one["events"] for one in loops) == network["datagrams"]
-    assert sum(network["drops_by_cause"].values()) == sum(one["drops"] for one in loops)
+    assert [part["number"] for part in loops] == [*range(LOOPS)]
+    assert sum(part["link_share"] for part in loops) == pytest.approx(1)
+    for part in loops:
+        record = load_record(run_dir, part["name"])
+        assert part["events"] == len(record.events()) == part["deliveries"] + part["drops"]
+    assert sum(part["events"] for part in loops) == network["datagrams"]
+    assert sum(network["drops_by_cause"].values()) == sum(part["drops"] for part in loops)
     # Little's law: the mean number in the network is the rate times the mean time in it.
-    times_s = sum(one["deliveries"] * (one["delay_mean_s"] or 0.0) for one in loops)
+    times_s = sum(part["deliveries"] * (part["delay_mean_s"] or 0.0) for part in loops)
     assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.02)
 
 
@@ -150,7 +150,7 @@ def test_the_verdict_of_all_loops_says_why_claims_are_void(tmp_path: Path) -> No
     """Their reasons differ in numbers only, so that the verdict's second line has them."""
     settings = ("horizon_s=1", "certificate.late_periods=20", 'loops=[{ name = "p", count = 3 }]')
     late = simulated(tmp_path, *settings, options=["--no-report"])
-    claims = [claim for one in json.loads(late.stdout)["loops"] for claim in one["claims"]]
+    claims = [claim for loop in json.loads(late.stdout)["loops"] for claim in loop["claims"]]
     reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
     shown = invoke("summary", tmp_path / "latest").stdout
     assert any(f"no certificate: {why}" in shown for why in reasons)
@@ -189,8 +189,8 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     diverged_at_s = summary["loops"][2]["diverged_at_s"] + summary["loops"][2]["phase_s"]
     reason = f"1 of 3 loops failed (wild diverged at {diverged_at_s:.2f} s)"
     assert summary["exit"]["reason"] == reason
-    assert [(one["t_s"], one["what"]) for one in summary["changes"]] == [(1.5, "network.mansd = 1")]
-    assert [one["exit"]["status"] for one in summary["loops"]] == [0, 0, 1]
+    assert [(change["t_s"], change["what"]) for change in summary["changes"]] == [(1.5, "network.mansd = 1")]
+    assert [part["exit"]["status"] for part in summary["loops"]] == [0, 0, 1]
     assert summary["reached_s"] == 3
     # Finalised again, it is the same.
     path = tmp_path / "latest/summary.json"
@@ -200,7 +200,7 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     (row,) = [line for line in shown if line.startswith(" wild")]
     assert written(summary["loops"][2]["sup_e_c_norm"]) in row
     assert re.match(r"guarantee not checkable in \d of 3 loops: ", shown[1])
-    sent = sum(one["actuations"]["sent"] for one in summary["loops"])
+    sent = sum(part["actuations"]["sent"] for part in summary["loops"])
     assert any(f" {sent} (" in line for line in shown)
 
 

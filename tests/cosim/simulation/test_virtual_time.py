@@ -13,7 +13,7 @@ from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, OWNE
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import loops_of
 from noack.scenario.scenario_file import validate
-from tests.cosim.simulation.shuttle import Shuttle, shuttled
+from tests.cosim.simulation.event_scheduler import EventScheduler, record_of_run
 from tests.helpers.shipped import resolved, shipped
 from tests.oracles.random_scenarios import POLICIES, random_scenario
 
@@ -37,19 +37,19 @@ LOOPS = [
 """Those of the last entry have vectors of other lengths."""
 
 
-def require_equal(found: RunRecord, expected: RunRecord) -> None:
+def require_equal(record: RunRecord, expected: RunRecord) -> None:
     for table in expected.tables:
-        assert found[table].dtype == expected[table].dtype
-        assert found[table].tobytes() == expected[table].tobytes(), table
-    assert found.reports == expected.reports
-    assert found.notices == expected.notices
+        assert record[table].dtype == expected[table].dtype
+        assert record[table].tobytes() == expected[table].tobytes(), table
+    assert record.reports == expected.reports
+    assert record.notices == expected.notices
 
 
 @pytest.mark.parametrize("first", range(len(POLICIES)))
 def test_random_loops_run_as_by_the_plain_driver(first: int) -> None:
     for number in range(first, 2 * len(POLICIES), len(POLICIES)):
         scenario = resolve(validate(random_scenario(number), "random"))
-        require_equal(simulate(scenario), shuttled(scenario))
+        require_equal(simulate(scenario), record_of_run(scenario))
 
 
 @pytest.mark.sanitized
@@ -59,7 +59,7 @@ def test_a_scripted_network_decides_as_in_the_plain_driver() -> None:
     def decide(data: bytes, now_ns: int) -> int | None:
         return None if data[16] % 3 == 1 else now_ns % 70_000_000
 
-    require_equal(simulate(scenario, decide), shuttled(scenario, decide))
+    require_equal(simulate(scenario, decide), record_of_run(scenario, decide))
 
 
 @pytest.mark.sanitized
@@ -70,20 +70,20 @@ def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
         "impairments": [rate, IMPAIRMENTS[1]], "actuation": {"impairments": IMPAIRMENTS},
     }  # fmt: skip
     scenario = validate(given | {"network": network, "loops": LOOPS}, "")
-    shuttle = Shuttle(scenario, [resolve(one) for one in loops_of(scenario)], numbered=True)
-    shuttle.run()
-    found = simulate_loops(scenario)
+    scheduler = EventScheduler(scenario, [resolve(one) for one in loops_of(scenario)], numbered=True)
+    scheduler.run()
+    simulated = simulate_loops(scenario)
     for table in ("netem_packet", "netem_release"):
-        rows = np.array(shuttle.rows.get(table, []), found.network[table].dtype)
-        assert rows.tobytes() == found.network[table].tobytes()
-    for number, record in enumerate(found.loops):
+        rows = np.array(scheduler.rows.get(table, []), simulated.network[table].dtype)
+        assert rows.tobytes() == simulated.network[table].tobytes()
+    for number, record in enumerate(simulated.loops):
         for table, dtype in tables_of(record.scenario).items():
             if OWNER[table] != "netem":
-                own = [row[1:] for row in shuttle.rows.get(table, []) if row[0] == number]
+                own = [row[1:] for row in scheduler.rows.get(table, []) if row[0] == number]
                 assert np.array(own, dtype).tobytes() == record[table].tobytes(), table
         received = record.reports["controller"]["channel"]
-        assert received == shuttle.decoders["controller"][number].report()
-    assert found.loops[4]["plant_step"]["x"].shape[1] == 3
+        assert received == scheduler.decoders["controller"][number].report()
+    assert simulated.loops[4]["plant_step"]["x"].shape[1] == 3
 
 
 @pytest.mark.sanitized

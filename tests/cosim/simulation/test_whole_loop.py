@@ -58,18 +58,18 @@ def compared(number: int) -> Comparison:
 @pytest.mark.parametrize("policy", POLICIES)
 def test_random_scenarios_run_as_the_reference_loop(policy: str) -> None:
     first = POLICIES.index(policy)
-    found = [compared(number) for number in range(first, RANDOM, len(POLICIES))]
-    assert sum(one.tie_ns is not None for one in found) <= 1
-    assert sum((one.rows["sensor_measurement"]["event"] != NONE).sum() for one in found) > 33
+    outcomes = [compared(number) for number in range(first, RANDOM, len(POLICIES))]
+    assert sum(outcome.tie_ns is not None for outcome in outcomes) <= 1
+    assert sum((outcome.rows["sensor_measurement"]["event"] != NONE).sum() for outcome in outcomes) > 33
 
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_random_runs_are_replayed_and_keep_the_guarantee_of_each_direction(policy: str) -> None:
     for number in range(POLICIES.index(policy), RANDOM, 2 * len(POLICIES)):
         record = random_run(number)
-        found = replay(record)
-        assert (found.bit_exact, found.gaps) == (True, []), found.first_difference
-        assert found.inputs == sum(map(record.count, record.tables))
+        result = replay(record)
+        assert (result.bit_exact, result.gaps) == (True, []), result.first_difference
+        assert result.inputs == sum(map(record.count, record.tables))
         assert sum(unintended_losses(record).values()) == 0
         network = record.scenario.network
         links = (network, network.actuation or network.acknowledgements)
@@ -80,15 +80,15 @@ def test_random_runs_are_replayed_and_keep_the_guarantee_of_each_direction(polic
 
 def rejected_in(record: RunRecord) -> set[str]:
     """The reasons for which datagrams were rejected."""
-    return {one for report in record.reports.values() for one in report["channel"]["rejected"]}
+    return {reason for report in record.reports.values() for reason in report["channel"]["rejected"]}
 
 
 def test_the_random_scenarios_have_every_feature() -> None:
     counts: Counter[str] = Counter()
     for number in range(RANDOM):
-        scenario, one = random_run(number).scenario, compared(number)
-        steps, measured = one.found["plant_step"], one.found["sensor_measurement"]
-        delivered, packets = one.found["controller_delivery"], one.rows["netem_packet"]
+        scenario, outcome = random_run(number).scenario, compared(number)
+        steps, measured = outcome.found["plant_step"], outcome.found["sensor_measurement"]
+        delivered, packets = outcome.found["controller_delivery"], outcome.rows["netem_packet"]
         has = {
             scenario.mode: True,
             scenario.network.initial_sync: True,
@@ -98,11 +98,11 @@ def test_the_random_scenarios_have_every_feature() -> None:
             f"input after the timeout: {scenario.controller.timeout_input}": any(
                 row["t_ns"] - max((d["t_ns"] for d in delivered if d["model_t_ns"] <= row["t_ns"]), default=0)
                 >= scenario.timing.update_timeout_ns
-                for row in one.found["controller_step"]
+                for row in outcome.found["controller_step"]
             ),
             "set point": any(scenario.controller.setpoint or ()),
             "changes": bool(scenario.changes),
-            "acknowledgements": bool(one.found["sensor_acknowledgement"]),
+            "acknowledgements": bool(outcome.found["sensor_acknowledgement"]),
             "updates lost": any(row["dropouts"] > 0 for row in delivered),
             "updates late": any(row["model_t_ns"] > row["t_ns"] for row in delivered),
             "update of the time of a step": any(
@@ -114,7 +114,7 @@ def test_the_random_scenarios_have_every_feature() -> None:
             "stale": "stale" in rejected_in(random_run(number)),
             "damaged": "tag" in rejected_in(random_run(number)),
         }
-        counts.update(feature for feature, found in has.items() if found)
+        counts.update(feature for feature, is_present in has.items() if is_present)
     assert len(counts) == 24, counts
     assert min(counts.values()) >= 4, counts
 
@@ -171,7 +171,7 @@ def check_identity(record: RunRecord) -> int:
         np.concatenate([rows["now_ns"] for rows in (measured, deliveries, steps)])
     ).tolist():
         row, delivery, step = (rows[rows["now_ns"] <= now_ns][-1:] for rows in (measured, deliveries, steps))
-        last = max([*step, *delivery], key=lambda one: one["input"], default=None)
+        last = max([*step, *delivery], key=lambda row: row["input"], default=None)
         if last is None or not (len(row) and (settings.known_state or len(delivery))):
             continue  # no common start of the two models yet
         received = max(deliveries["sequence"][deliveries["now_ns"] <= now_ns], default=NONE)

@@ -10,9 +10,11 @@ from unittest.mock import patch
 import tomli_w
 
 from netem.control.control_server import ControlServer, SettingsChange
+from netem.explanation import tc_command
+from netem.links_file import json_schema, load_links
 from netem.relay.relay_links import DIRECTIONS
 from netem.tc_words import EXAMPLES as ANY_WORD
-from netem.tc_words import json_schema, load_links, parse, settings_of, tc_command, words_of
+from netem.tc_words import parse, settings_of, words_of
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import SHAPES
 from noack.impairments.link_settings import LinkSettings

@@ -17,10 +17,10 @@ import pytest
 from numpy.typing import NDArray
 
 from netem.control.emulator_statistics import CommandQueue
-from netem.relay import relay_links
+from netem.control.time_histogram import BUCKETS
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport, LinkSpec
-from netem.stand_alone import _add_watching_options, check_watching_options
+from netem.stand_alone import add_watching_options, check_watching_options
 from netem.tc_words import settings_of
 from noack.core.core_library import core
 from noack.impairments.link_settings import Counters, LinkSettings
@@ -37,7 +37,7 @@ def spec_of(name: str) -> LinkSpec:
 
 def times(*t_ns: int) -> NDArray[np.int64]:
     buckets = [core.noack_bucket_of(one_ns) for one_ns in t_ns]
-    return np.bincount(np.array(buckets, np.int64), minlength=relay_links.BUCKETS)
+    return np.bincount(np.array(buckets, np.int64), minlength=BUCKETS)
 
 
 class FakeRelay(Relay):
@@ -86,7 +86,7 @@ class FakeRelay(Relay):
 
 def options(*arguments: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    _add_watching_options(parser)
+    add_watching_options(parser)
     given = parser.parse_args(arguments)
     check_watching_options(given)
     return given

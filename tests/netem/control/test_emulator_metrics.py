@@ -18,7 +18,7 @@ from netem import stand_alone
 from netem.control.control_server import running
 from netem.control.emulator_metrics import EmulatorMetrics, metrics
 from netem.control.emulator_statistics import CommandQueue, statistics
-from netem.stand_alone import attached
+from netem.stand_alone import watch_relay
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.runtime.address import address_text
@@ -54,15 +54,15 @@ def test_metrics_are_the_statistics(relay: FakeRelay) -> None:
     counters = relay.counters["up", "forward"]
     counters.received, counters.dropped, counters.delivered = 10, 3, 7
     commands = CommandQueue(relay)
-    found = statistics(commands.look())
-    values = values_of(exposed(Fixed(lambda: metrics(found))))
+    document = statistics(commands.snapshot_here())
+    values = values_of(exposed(Fixed(lambda: metrics(document))))
     assert values["noack_netem_received_datagrams_total,forward,up"] == 10
     assert values["noack_netem_datagrams_total,dropped,forward,up"] == 3
     assert values["noack_netem_loss_ratio,forward,up"] == pytest.approx(0.3)
-    limit = found["links"][0]["forward"]["mansd"]
+    limit = document["links"][0]["forward"]["mansd"]
     assert values.get("noack_netem_loss_burst_limit,forward,up") == limit
-    assert values["noack_netem_elapsed_seconds"] == found["elapsed_s"]
-    unintended = found["links"][0]["forward"]["unintended"]
+    assert values["noack_netem_elapsed_seconds"] == document["elapsed_s"]
+    unintended = document["links"][0]["forward"]["unintended"]
     for cause, count in unintended.items():
         labels = ",".join(sorted([cause, "forward", "up"]))
         assert values[f"noack_netem_unintended_losses_total,{labels}"] == count
@@ -79,7 +79,7 @@ def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(
     monkeypatch.setattr(stand_alone, "address_text", lambda at: asked.append(at) or address_text(at))
     with (
         ExitStack() as stack,
-        attached(relay, options("--metrics", ":0")) as side,
+        watch_relay(relay, options("--metrics", ":0")) as side,
         ThreadPoolExecutor() as pool,
     ):
         stack.enter_context(slow_reader(asked[0]))
@@ -101,7 +101,7 @@ def test_invalid_options_are_refused_before_the_relay_runs(relay: FakeRelay) -> 
     nowhere = options("--stats-file", "/nowhere/x")
     with (
         pytest.raises(CallerError, match=r"--stats-file /nowhere/x: cannot be written \(No such"),
-        attached(relay, nowhere),
+        watch_relay(relay, nowhere),
     ):
         pass
 
@@ -111,13 +111,15 @@ def test_attachments_end_with_the_relay(relay: FakeRelay, tmp_path: Path) -> Non
     threads = threading.active_count()
     file = tmp_path / "lines"
     interval = sys.getswitchinterval()
-    with attached(relay, options("--control", "lab", "--stats", "0.01", "--stats-file", str(file))) as side:
+    with watch_relay(
+        relay, options("--control", "lab", "--stats", "0.01", "--stats-file", str(file))
+    ) as side:
         assert running() == ["lab"]
         assert sys.getswitchinterval() < interval
         for _ in range(3):
             side.commands.run_pending()
         relay.counters["up", "forward"].received = 5
-        assert side.commands.look().links[0].forward.counters.received == 5
+        assert side.commands.snapshot_here().links[0].forward.counters.received == 5
     assert running() == []
     assert threading.active_count() == threads
     assert sys.getswitchinterval() == interval
@@ -129,7 +131,7 @@ def test_a_full_disk_is_reported_and_the_relay_continues(relay: FakeRelay) -> No
     error = io.StringIO()
     with (
         redirect_stderr(error),
-        attached(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as side,
+        watch_relay(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as side,
     ):
         wait_for(lambda: side.commands.run_pending() or error.getvalue().endswith("\n"))
     assert "cannot be written to /dev/full (No space left" in error.getvalue()
@@ -142,7 +144,7 @@ def test_the_view_shows_the_relay_and_later_messages_until_q(
     with terminal(monkeypatch) as user:
         with ThreadPoolExecutor() as threads:
             drawn = threads.submit(press_q, user, "q ends", "→ up", "a message")
-            with attached(relay, options("--view")) as side:
+            with watch_relay(relay, options("--view")) as side:
                 print("a message", file=sys.stderr)
                 wait_for(lambda: side.commands.run_pending() or side.quit_requested)
             assert drawn.exception() is None
@@ -173,7 +175,7 @@ def test_a_command_fails_at_once_if_the_relay_has_ended(relay: FakeRelay) -> Non
         while not asked.done():
             commands.close()  # before or after the thread submits its command
     assert str(asked.exception()) == "the emulator has ended"
-    assert commands.look().links[0].name == "up"
+    assert commands.snapshot_here().links[0].name == "up"
 
 
 def test_a_command_to_a_stuck_relay_times_out(relay: FakeRelay, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -237,14 +237,14 @@ def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFi
         assert received == list(range(22, 320, 3))
 
         assert emulator_commands.main(["show", "--json"]) == ExitStatus.OK
-        found = json.loads(capsys.readouterr().out)["links"][0]["forward"]
-        assert (found["received"], found["forwarded"]) == (320, 120)
-        assert (found["fates"]["dropped"], found["fates"]["forced"]) == (200, 100)
-        assert (found["longest_loss_burst"], found["mansd"]) == (2, 2)
-        assert found["loss"]["realised"] == pytest.approx(2 / 3)
-        assert found["loss"]["predicted"] == pytest.approx(2 / 3)
-        assert sum(found["unintended"].values()) == 0
-        assert [flow["packets"] for flow in found["flows"]] == [320]
+        totals = json.loads(capsys.readouterr().out)["links"][0]["forward"]
+        assert (totals["received"], totals["forwarded"]) == (320, 120)
+        assert (totals["fates"]["dropped"], totals["fates"]["forced"]) == (200, 100)
+        assert (totals["longest_loss_burst"], totals["mansd"]) == (2, 2)
+        assert totals["loss"]["realised"] == pytest.approx(2 / 3)
+        assert totals["loss"]["predicted"] == pytest.approx(2 / 3)
+        assert sum(totals["unintended"].values()) == 0
+        assert [flow["packets"] for flow in totals["flows"]] == [320]
 
         assert emulator_commands.main(["set", "lab", "loss 5%"]) == ExitStatus.OK
         assert capsys.readouterr().err == (

@@ -36,12 +36,12 @@ from tests.netem.fate_links import spec_of
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
 
 
-def look(relay: FakeRelay, elapsed_s: float, since: Any = None) -> Snapshot:
-    in_force = {
+def snapshot_of(relay: FakeRelay, elapsed_s: float, since: Any = None) -> Snapshot:
+    applied = {
         key: AppliedSettings(settings, (since or {}).get(key, Counters()))
         for key, settings in relay.settings.items()
     }
-    return Snapshot(relay.report(), in_force, round(elapsed_s * NS_PER_S), UNIX_NS)
+    return Snapshot(relay.report(), applied, round(elapsed_s * NS_PER_S), UNIX_NS)
 
 
 def forward(document: Statistics, link: int = 0) -> DirectionStatistics:
@@ -57,27 +57,27 @@ def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> No
     relay.counters["up", "forward"] = counted
     relay.flows = [FlowReport(3, "[::1]:4000", 60, 2)]
     relay.unintended["lost_in_kernel"] = 7
-    document = statistics(look(relay, 2.5))
+    document = statistics(snapshot_of(relay, 2.5))
     assert document["time"] == "2026-09-21T14:13:20.250000+00:00"
     assert document["elapsed_s"] == 2.5
     up, down = document["links"]
     assert (up["name"], up["listen"], up["to"]) == ("up", "127.0.0.1:5000", "[::1]:6000")
     assert (up["clients"], up["clients_ever"], up["refused"]) == (1, 3, 0)
-    found = forward(document)
-    assert found["words"] == "loss 10% delay 10ms mansd 2"
-    shown = cast(dict[str, Any], found | found["fates"])
+    direction = forward(document)
+    assert direction["words"] == "loss 10% delay 10ms mansd 2"
+    shown = cast(dict[str, Any], direction | direction["fates"])
     for name, number in asdict(counted).items():
         assert shown[name] == number, name
-    assert sum(found["fates"].values()) == 100
-    assert (found["mansd"], found["in_flight"]) == (2, 5)
-    assert found["unintended"] == {"lost_in_kernel": 7, "send_errors": 0}
-    assert found["flows"] == [
+    assert sum(direction["fates"].values()) == 100
+    assert (direction["mansd"], direction["in_flight"]) == (2, 5)
+    assert direction["unintended"] == {"lost_in_kernel": 7, "send_errors": 0}
+    assert direction["flows"] == [
         {"flow": 3, "client": "[::1]:4000", "packets": 60, "longest_loss_burst": 2}
     ]  # fmt: skip
-    assert found["loss"]["realised"] == pytest.approx((100 - 80 - 5 + 9) / 100)
-    assert found["loss"]["drawn"] == pytest.approx((8 + 4) / 100)
-    assert found["loss"]["lost"] == pytest.approx((8 + 4 + 2 + 1) / 100)
-    assert found["recent"] is None
+    assert direction["loss"]["realised"] == pytest.approx((100 - 80 - 5 + 9) / 100)
+    assert direction["loss"]["drawn"] == pytest.approx((8 + 4) / 100)
+    assert direction["loss"]["lost"] == pytest.approx((8 + 4 + 2 + 1) / 100)
+    assert direction["recent"] is None
     assert (down["name"], down["reverse"]["mansd"]) == ("down", None)
     assert json.loads(json.dumps(document, allow_nan=False)) == document
 
@@ -86,21 +86,21 @@ def test_loss_is_counted_since_the_settings_came_into_force(relay: FakeRelay) ->
     """And is at most 1, although late packets become stale."""
     relay.counters["up", "forward"] = Counters(received=300, delivered=150, dropped=150)
     since = {("up", "forward"): Counters(received=100, delivered=100)}
-    before = look(relay, 1, since)
-    found = forward(statistics(before))
-    assert found["loss"]["realised"] == found["loss"]["lost"] == pytest.approx(0.75)
-    assert (found["received_before"], found["received"]) == (100, 300)
+    before = snapshot_of(relay, 1, since)
+    direction = forward(statistics(before))
+    assert direction["loss"]["realised"] == direction["loss"]["lost"] == pytest.approx(0.75)
+    assert (direction["received_before"], direction["received"]) == (100, 300)
     relay.counters["up", "forward"] = Counters(
         received=301, delivered=151, dropped=150, delivered_out_of_order=5
     )
-    recent = forward(statistics(look(relay, 2, since), before))["recent"]
+    recent = forward(statistics(snapshot_of(relay, 2, since), before))["recent"]
     assert recent is not None
     assert recent["loss"] == 1
 
 
 def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
     """In second k, from 0 on, 1000 k datagrams of 100 bytes arrive on each link."""
-    found, before = [], None
+    all_statistics, before = [], None
     for second in range(seconds):
         for (_, side), counters in relay.counters.items():
             if side == "forward":
@@ -114,10 +114,10 @@ def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
                 counters.forwarded_bytes += 100 * (received - received // 5)
                 counters.longest_loss_burst = 2
         relay.delays = relay.delays + times(*[10_000_000] * 98, 20_000_000, 20_000_000)
-        snapshot = look(relay, second + 1)
-        found.append(statistics(snapshot, before))
+        snapshot = snapshot_of(relay, second + 1)
+        all_statistics.append(statistics(snapshot, before))
         before = snapshot
-    return found
+    return all_statistics
 
 
 def text_of(relay: FakeRelay, width: int = 80, height: int | None = 24) -> list[str]:

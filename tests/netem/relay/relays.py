@@ -147,5 +147,5 @@ def relayed(
     """Yield a server, clients, and a relay with a link between them; see :func:`link`."""
     with endpoints(host, *[host] * clients) as (server, *sockets):
         spec = link(name_of(server), *settings, host=host, **others)
-        with running([spec], segment=segment, taps=taps) as one:
-            yield server, *sockets, one
+        with running([spec], segment=segment, taps=taps) as emulator:
+            yield server, *sockets, emulator

@@ -1,6 +1,5 @@
-"""Parts of a relay: its histogram, its links, its memory."""
+"""Parts of a relay: its links, its memory."""
 
-import errno
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -10,48 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.relay.client_table import LinkWarnings
-from netem.relay.relay_links import (
-    BUCKETS,
-    LinkSpec,
-    bucket_start_ns,
-    coarse_histogram,
-    open_links,
-    quantile_ns,
-    socket_name,
-    unpacked_address,
-)
+from netem.relay.relay_links import LinkSpec, open_links, socket_name
 from netem.relay.relay_memory import RelayMemory, name_array
 from netem.tc_words import settings_of
 from noack.core.core_library import core, pointer_to
 from noack.core.errors import CallerError
-from noack.runtime.address import packed_name
+from noack.runtime.address import packed_name, unpacked_address
 from tests.netem.relay.relays import HOSTS, drain, endpoints, link, name_of, running
-
-
-@given(st.integers(0, 2**44 - 1))
-def test_a_bucket_holds_its_times_to_three_percent(t_ns: int) -> None:
-    bucket = core.noack_bucket_of(t_ns)
-    assert bucket_start_ns(bucket) <= t_ns < bucket_start_ns(bucket + 1)
-    assert bucket_start_ns(bucket + 1) - bucket_start_ns(bucket) <= max(1, bucket_start_ns(bucket) / 32)
-    assert core.noack_bucket_of(-1 - t_ns) == 0
-    assert core.noack_bucket_of(2**60) == BUCKETS - 1
-
-
-@given(st.lists(st.integers(0, 2**43), min_size=1, max_size=200))
-def test_quantiles_and_the_coarse_histogram_are_those_of_the_times(times_ns: list[int]) -> None:
-    counts = np.bincount([core.noack_bucket_of(t_ns) for t_ns in times_ns], minlength=BUCKETS)
-    for share in (0.5, 0.99, 1.0):
-        exact = float(np.quantile(times_ns, share, method="inverted_cdf"))
-        assert quantile_ns(counts, share) == pytest.approx(exact, rel=1 / 32, abs=1)
-    steps = coarse_histogram(counts)
-    begins = [begin for begin, _ in steps]
-    assert begins == sorted(begins)
-    assert sum(n for _, n in steps) == len(times_ns)
-    for begin, n in steps:
-        # Four buckets per doubling; below 32 ns, each bucket is 8 ns wide.
-        width = 8 if begin < 32 else 1 << (begin.bit_length() - 3)
-        assert n == sum(begin <= t_ns < begin + width for t_ns in times_ns)
 
 
 def open_and_close(specs: Sequence[LinkSpec]) -> None:
@@ -60,8 +24,8 @@ def open_and_close(specs: Sequence[LinkSpec]) -> None:
 
 
 def free_port(host: str) -> int:
-    with endpoints(host) as (one,):
-        return name_of(one)[1]
+    with endpoints(host) as (endpoint,):
+        return name_of(endpoint)[1]
 
 
 @pytest.mark.parametrize(
@@ -152,15 +116,15 @@ def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
     harsh = settings_of("loss 30% duplicate 30% delay 1ms 1ms mansd 3")
     with (
         endpoints(HOSTS[4]) as (server,),
-        running([link(name_of(server), harsh, idle_s=0.001)]) as one,
+        running([link(name_of(server), harsh, idle_s=0.001)]) as emulator,
     ):
-        relay: Any = one.relay
+        relay: Any = emulator.relay
         for number in range(rounds):
             with endpoints(*[HOSTS[4]] * most_clients) as clients:
                 for client in clients * (size // most_clients):
-                    client.sendto(bytes(600), one.address())
-                one.settle((number + 1) * size)
-                one.until(lambda: one.report().clients == 0)
+                    client.sendto(bytes(600), emulator.address())
+                emulator.settle((number + 1) * size)
+                emulator.until(lambda: emulator.report().clients == 0)
             drain(server)
             memory = relay._memory
             assert memory.core.free_slots == memory.core.slot_count <= 4 * size
@@ -168,11 +132,3 @@ def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
             assert len(relay._clients._free_rows) == len(memory.clients)
             assert relay._clients._paths == {}
             assert relay._directions[0].rows == 16
-
-
-def test_a_link_without_clients_tries_again_after_a_lack_of_descriptors() -> None:
-    """With a client it waits for the end of one; without, nothing would end the wait."""
-    for clients in (0, 1):
-        warnings = LinkWarnings(link(("127.0.0.1", 9)))
-        assert warnings.no_descriptor_left(errno.EMFILE, clients)
-        assert warnings.accepts_client(clients) is (clients == 0)

@@ -52,8 +52,8 @@ class Client:
             with suppress(TimeoutError):
                 answered, numbers = self._questions.recv(1000).decode().split()
                 if answered == flow:
-                    found = int(numbers, 16)
-                    return [k for k in range(found.bit_length()) if found >> k & 1]
+                    received = int(numbers, 16)
+                    return [k for k in range(received.bit_length()) if received >> k & 1]
 
     def exchange(self, flow: str, count: int, interrupt: Callable[[int, str], None]) -> dict[str, object]:
         """Send numbered datagrams; return the client's port, and what came there and back."""
@@ -78,7 +78,7 @@ def change_after(last: int, words: str, name: str) -> Callable[[int, str], None]
         while number == last:
             shown = subprocess.run([*netem, "show", name, "--json"], capture_output=True, check=True)
             flows = json.loads(shown.stdout)["links"][0]["forward"]["flows"]
-            if any(f":{port} " in one["client"] and one["packets"] > number for one in flows):
+            if any(f":{port} " in flow["client"] and flow["packets"] > number for flow in flows):
                 subprocess.run([*netem, "set", name, *words.split()], check=True)
                 break
 
@@ -97,8 +97,8 @@ def main() -> None:
     interrupt = change_after(int(change[0]), *change[1:]) if change else lambda _number, _port: None
     flows = ["ipv4"] if change or "NOACK_OUTSIDE6" not in os.environ else ["ipv4", "ipv6"]
     client = Client(port)
-    found = {flow: client.exchange(flow, int(count), interrupt) for flow in flows}
-    Path(folder, "ends.json").write_text(json.dumps(found))
+    exchanges = {flow: client.exchange(flow, int(count), interrupt) for flow in flows}
+    Path(folder, "ends.json").write_text(json.dumps(exchanges))
 
 
 if __name__ == "__main__":

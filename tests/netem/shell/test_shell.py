@@ -43,7 +43,7 @@ def _permitted(request: pytest.FixtureRequest) -> None:
 
 
 def need(*programs: str) -> None:
-    if missing := [one for one in programs if shutil.which(one) is None]:
+    if missing := [program for program in programs if shutil.which(program) is None]:
         pytest.skip(f"there is no {', '.join(missing)}")
 
 
@@ -78,13 +78,13 @@ class Totals:
     def lost(self, flow: str, direction: str) -> tuple[set[int], int]:
         """Return a flow's packets that the emulator dropped, and its count of the longest burst."""
         text = f":{self.flows[flow]['port']} "
-        (found,) = (one for one in self.link[direction]["flows"] if text in one["client"])
+        (counts,) = (row for row in self.link[direction]["flows"] if text in row["client"])
         rows = [
             row for row in self.rows
-            if row["direction"] == direction and row["flow"] == found["flow"]
+            if row["direction"] == direction and row["flow"] == counts["flow"]
         ]  # fmt: skip
-        assert len(rows) == found["packets"]
-        return {row["packet"] for row in rows if row["fate"] == Fate.DROPPED}, found["longest_loss_burst"]
+        assert len(rows) == counts["packets"]
+        return {row["packet"] for row in rows if row["fate"] == Fate.DROPPED}, counts["longest_loss_burst"]
 
 
 def test_the_ends_miss_exactly_what_the_emulator_drops(tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ def test_the_ends_miss_exactly_what_the_emulator_drops(tmp_path: Path) -> None:
         lost, longest = totals.lost(flow, "reverse")
         assert missing == lost
         assert longest_burst(missing) == longest == 4
-    assert any("udp fragments " in one["client"] for one in totals.link["forward"]["flows"])
+    assert any("udp fragments " in flow["client"] for flow in totals.link["forward"]["flows"])
     packets = read(capture.read_bytes()).packets
     for packet in packets:
         is_v4, header = packet.frame[0] >> 4 == 4, packet.frame[:20]

@@ -27,7 +27,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed
-from tests.cosim.simulation.outage import Deaf, Reborn, simulate_with
+from tests.cosim.simulation.outage import LosingMachine, RestartedMachine, simulate_with
 from tests.helpers.machine_parts import sensor_of
 
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
@@ -78,7 +78,7 @@ def test_a_restarted_sensor_restarts_its_estimate_and_is_replayed(
     observed["observer"] = KALMAN | {"initial_estimate": [0.5, 0.0]}
     scenario, at_ns = resolved(observed), 800_000_000
     successor = sensor_of(scenario, Start(1, at_ns))
-    record = simulate_with(scenario, "sensor", lambda one: Reborn(one, successor, at_ns))
+    record = simulate_with(scenario, "sensor", lambda one: RestartedMachine(one, successor, at_ns))
     notices = [one for one in record.notices if "observer" in one["text"]]
     assert [(one["t_ns"], one["process"]) for one in notices] == [(at_ns, "sensor")]
     rows = record[SENSOR_MEASUREMENT]
@@ -102,7 +102,7 @@ def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str,
     observed["plant"]["measurement"] = {"C": [[1.0, 0.0]], "noise_std": [1e-9]}
     scenario = resolved(observed)
     lost = {30, 31, 32, 33, 70}
-    record = simulate_with(scenario, "sensor", lambda one: Deaf(one, lambda k: k not in lost))
+    record = simulate_with(scenario, "sensor", lambda one: LosingMachine(one, lambda k: k not in lost))
     assert len(record[SENSOR_MEASUREMENT]) == 101 - len(lost)
     assert replay(record).bit_exact
     # The input during the gap is unknown: it changes as the model decays.

@@ -14,7 +14,7 @@ import pytest
 import tomli_w
 
 from cosim.studies.campaign.campaign_file import load as load_campaign
-from netem.tc_words import load_links
+from netem.links_file import load_links
 from noack.core.errors import CallerError
 from noack.scenario import toml_file
 from noack.scenario.resolution import resolve, resolved_loops

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from netem.tc_words import LinksFile
+from netem.links_file import LinksFile
 from noack.scenario.scenario import Scenario
 from noack.settings import section as section_module
 from noack.settings.section import ScenarioSection

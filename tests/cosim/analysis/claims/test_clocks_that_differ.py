@@ -24,7 +24,7 @@ from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER, tables
 from noack.scenario.scenario import Scenario
 from tests.cosim.analysis.claims.conftest import Make
 from tests.cosim.record.changed_records import changed
-from tests.cosim.simulation.shuttle import shuttled
+from tests.cosim.simulation.event_scheduler import record_of_run
 from tests.helpers.machine_parts import Machine
 
 MS = 1_000_000
@@ -59,7 +59,7 @@ class OtherClock:
 def simulated(scenario: Scenario, clocks: dict[str, tuple[int, int]]) -> RunRecord:
     """Simulate with the offset in ns and the drift in ppb of the clock of each role."""
     wraps = {role: partial(OtherClock, offset_ns=at, drift_ppb=by) for role, (at, by) in clocks.items()}
-    return shuttled(scenario, wraps=wraps)
+    return record_of_run(scenario, wraps=wraps)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.01])

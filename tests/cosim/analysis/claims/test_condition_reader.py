@@ -38,7 +38,7 @@ from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions, nominal_conditions
 from tests.cosim.analysis.claims.conftest import Make, event_s, network_of, without
 from tests.cosim.record.changed_records import changed
-from tests.cosim.simulation.outage import Deaf, Reborn, simulate_with, with_outage
+from tests.cosim.simulation.outage import LosingMachine, RestartedMachine, simulate_with, with_outage
 from tests.helpers.machine_parts import controller_of, sensor_of
 
 Batches = Iterator[tuple[str, Rows] | None]
@@ -169,7 +169,7 @@ def losing(*numbers: int, constraint: dict[str, Any]) -> Callable[[Make], RunRec
 def deaf(role: str, first: int, last: int) -> Callable[[Make], RunRecord]:
     """A run in which a process does not receive the messages ``first`` to ``last`` − 1."""
     return lambda make: simulate_with(
-        make(), role, lambda one: Deaf(one, lambda n: not first <= n < last), NO_DELAY
+        make(), role, lambda one: LosingMachine(one, lambda n: not first <= n < last), NO_DELAY
     )
 
 
@@ -193,14 +193,14 @@ def restarted_controller(make: Make) -> RunRecord:
     """A controller that is restarted at once without a known state, in steps of 10 ms."""
     resolved, at_ns = make(network={"initial_sync": "known_state"}), 2_000_000_000
     successor = controller_of(resolved, Start(1, at_ns))
-    return simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))
+    return simulate_with(resolved, "controller", lambda one: RestartedMachine(one, successor, at_ns))
 
 
 def restarted_sensor(make: Make) -> RunRecord:
     """A sensor that is restarted between two measurements, soon after an event."""
     resolved, at_ns = make(), 50_000_000
     successor = sensor_of(resolved, Start(1, at_ns))
-    record = simulate_with(resolved, "sensor", lambda one: Reborn(one, successor, at_ns))
+    record = simulate_with(resolved, "sensor", lambda one: RestartedMachine(one, successor, at_ns))
     period_ns = resolved.timing.measurement_period_ns
     assert (np.diff(record[SENSOR_MEASUREMENT]["t_ns"]) == period_ns).all()
     return record

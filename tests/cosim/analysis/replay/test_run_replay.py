@@ -31,7 +31,7 @@ from noack.protocol.roles import GENERATION, LOOP_ROLES, RESTART, Start
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load, validate
 from tests.cosim.record.changed_records import changed, flipped
-from tests.cosim.simulation.outage import Reborn, simulate_with
+from tests.cosim.simulation.outage import RestartedMachine, simulate_with
 from tests.helpers.machine_parts import controller_of
 
 ROOT = Path(__file__).parents[4]
@@ -251,7 +251,7 @@ def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
     resolved = resolve(validate(content | {"network": {"mansd": 0, "loss": {"model": "lossless"}}}, ""))
     at_ns = 500_000_000 - 300_000  # between ticks, just before an update
     successor = controller_of(resolved, Start(1, at_ns))
-    record = simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))
+    record = simulate_with(resolved, "controller", lambda one: RestartedMachine(one, successor, at_ns))
     rows = {table: record[table] for table in record.tables}
     taken, again = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
     first = taken[taken["input"] == GENERATION]

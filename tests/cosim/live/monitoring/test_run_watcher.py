@@ -25,14 +25,14 @@ PROGRESS: dict[str, Any] = {
 
 
 def test_metrics_follow_the_launchers_reports() -> None:
-    found = RunMetrics(noack.load("lane_following"))
-    assert values_of(exposed(found))["noack_run_loss_burst_limit"] == 4
-    watcher = found.watcher()
+    metrics = RunMetrics(noack.load("lane_following"))
+    assert values_of(exposed(metrics))["noack_run_loss_burst_limit"] == 4
+    watcher = metrics.watcher()
     watcher.waiting(["plant", "sensor"])
     watcher.failed("plant died", 1.0, None)
     watcher.restarted("plant", 1.5)
     watcher.progress(RunProgress(**PROGRESS, warnings=["void"]))
-    values = values_of(exposed(found))
+    values = values_of(exposed(metrics))
     assert values["noack_run_missing_processes"] == 2
     assert values["noack_run_restarts_total,plant"] == values["noack_run_failures_total"] == 1
     assert (values["noack_run_events_total"], values["noack_run_warnings_total"]) == (7, 1)
@@ -57,7 +57,7 @@ def test_a_watcher_whose_output_is_closed_does_not_stop_the_others() -> None:
 def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = free.getsockname()
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     done = threading.Event()
 
     def scrape() -> None:
@@ -67,9 +67,9 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
             except (urllib.error.URLError, ConnectionError):
                 done.wait(0.02)
                 continue
-            if not found:
+            if not metrics:
                 stack.enter_context(slow_reader(address))
-            found.update(values)
+            metrics.update(values)
             done.wait(0.1)
 
     reader = threading.Thread(target=scrape)
@@ -86,9 +86,9 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
         stack.close()
     assert finished.exit_code == 0, finished.stderr
     summary = json.loads(finished.stdout)
-    assert 0 < found["noack_run_simulated_seconds"] <= summary["reached_s"]
-    assert found["noack_run_events_total"] <= summary["loops"][0]["events"]
-    assert found["noack_run_state_norm"] > 0
+    assert 0 < metrics["noack_run_simulated_seconds"] <= summary["reached_s"]
+    assert metrics["noack_run_events_total"] <= summary["loops"][0]["events"]
+    assert metrics["noack_run_state_norm"] > 0
     events = {one["event"]: one for one in objects(finished.stderr) if "event" in one}
     (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
     assert events["run"]["directory"] == events["end"]["directory"] == str(run_dir)

@@ -40,7 +40,7 @@ def live_rows(run: RecordedRun) -> Iterator[tuple[str, Rows]]:
     every = {NETEM_PACKET: network[NETEM_PACKET]}
     for table, dtype in run_tables(network.scenario).items():
         if OWNER[table] != "netem":
-            of_loops = [numbered(one, i, table, dtype) for i, one in enumerate(run.loops)]
+            of_loops = [numbered(record, i, table, dtype) for i, record in enumerate(run.loops)]
             every[table] = np.concatenate(of_loops)
     for begin_ns in range(0, 2 * network.scenario.timing.horizon_ns, BATCH_NS):
         for table, rows in every.items():
@@ -59,11 +59,11 @@ def numbered(record: RunRecord, number: int, table: str, dtype: np.dtype[np.void
 
 
 def found_by(monitor: ClaimMonitor, run: RecordedRun) -> list[Finding]:
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for table, rows in live_rows(run):
         monitor.take(table, rows)
-        found += monitor.advance()
-    return found + monitor.end()
+        findings += monitor.advance()
+    return findings + monitor.end()
 
 
 def test_each_loop_is_checked_as_by_its_own_monitor(content: Content) -> None:
@@ -71,23 +71,25 @@ def test_each_loop_is_checked_as_by_its_own_monitor(content: Content) -> None:
     scenario = run.network.scenario
     stopped = ClaimMonitor(scenario)
     stopped.stop("telemetry is missing")
-    assert {one.notice.level for one in found_by(stopped, run)} == {"diverges"}
-    found = found_by(ClaimMonitor(scenario), run)
+    assert {finding.notice.level for finding in found_by(stopped, run)} == {"diverges"}
+    findings = found_by(ClaimMonitor(scenario), run)
     voids = 0
     for number, (record, phase_ns) in enumerate(zip(run.loops, phases_ns(scenario), strict=True)):
         alone = AssumptionMonitor(record.scenario)
         for table in tables_of(record.scenario):
             alone.take(table, record[table])
-        own = [one for one in found if one.notice[1:4:2] in (("void", number), ("late", number))]
+        own = [
+            finding for finding in findings if finding.notice[1:4:2] in (("void", number), ("late", number))
+        ]
         expected = alone.end()
-        assert {one.notice.text.split(": ", 1)[1].split(",")[0][:24] for one in own} == {
-            one.text.split(",")[0][:24] for one in expected
+        assert {finding.notice.text.split(": ", 1)[1].split(",")[0][:24] for finding in own} == {
+            violation.text.split(",")[0][:24] for violation in expected
         }
-        for one in own:
-            at_s = (one.notice.t_ns + phase_ns) / NS_PER_S
+        for finding in own:
+            at_s = (finding.notice.t_ns + phase_ns) / NS_PER_S
             name = record.scenario.name
             what = {"void": "void (assumption violated)", "late": "later than allowed"}
-            assert one.text.startswith(f"{name}: {what[one.notice.level]} from {at_s:.3f} s on")
+            assert finding.text.startswith(f"{name}: {what[finding.notice.level]} from {at_s:.3f} s on")
         voids += len(own)
     assert voids > 0
 
@@ -101,8 +103,7 @@ def test_a_diverging_loop_is_named_once_also_among_many(content: Content) -> Non
         run = simulate_loops(validate(content, "here"))
         monitor = ClaimMonitor(run.network.scenario)
         assert (monitor.stopped is not None) == many
-        found = [one for one in found_by(monitor, run) if one.notice.level == "diverges"]
-        (only,) = found
+        (only,) = (finding for finding in found_by(monitor, run) if finding.notice.level == "diverges")
         assert only.text.startswith("wild: diverges from ")
         assert only.notice.loop == len(run.loops) - 1
         x = run.loops[-1]["plant_step"]

@@ -119,9 +119,9 @@ class Run:
 
 @pytest.fixture
 def run(content: dict[str, Any], tmp_path: Path) -> Iterator[Run]:
-    found = Run(resolve(validate(content, "")), tmp_path)
-    yield found
-    found.recorder.store.writer.close()
+    opened = Run(resolve(validate(content, "")), tmp_path)
+    yield opened
+    opened.recorder.store.writer.close()
 
 
 def test_invalid_telemetry_is_ignored_and_the_rest_is_stored(
@@ -273,9 +273,9 @@ def test_a_violation_found_at_the_end_is_reported_unless_the_run_was_stopped(
 def test_the_summary_lists_every_violated_assumption(outage: RunRecord) -> None:
     reported = summarise(outage, 0, "horizon").assumption_violations
     assert reported == []  # no process detects that an input is old
-    (found,) = list_violations(reported, RunClaims(outage).violations())
-    assert (found.cause, found.t_s, found.process) == ("hold", pytest.approx(0.506), "recorder")
-    assert found.what == "an input was 0.203 s old, 0.007 s allowed"
+    (violation,) = list_violations(reported, RunClaims(outage).violations())
+    assert (violation.cause, violation.t_s, violation.process) == ("hold", pytest.approx(0.506), "recorder")
+    assert violation.what == "an input was 0.203 s old, 0.007 s allowed"
 
 
 def test_missing_rows_are_reported_as_an_unknown_result(outage: RunRecord, late: Run) -> None:

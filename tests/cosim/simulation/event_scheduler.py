@@ -111,7 +111,7 @@ class Loops:
         return output._replace(loop=loop)
 
 
-class Shuttle:
+class EventScheduler:
     """Carries datagrams between the machines of a run, in the order of virtual time."""
 
     def __init__(
@@ -226,10 +226,10 @@ class Shuttle:
         ]  # fmt: skip
 
 
-def shuttled(
+def record_of_run(
     resolved: Scenario, network: Network | None = None, wraps: Mapping[str, Wrap] | None = None
 ) -> RunRecord:
     """Return the record of a run of one loop."""
-    shuttle = Shuttle(resolved, (resolved,), network=network, wraps=wraps)
-    shuttle.run()
-    return shuttle.record()
+    scheduler = EventScheduler(resolved, (resolved,), network=network, wraps=wraps)
+    scheduler.run()
+    return scheduler.record()

@@ -1,0 +1,253 @@
+"""What the settings of links do, for ``--explain``: in words, as loss rate, and as a command of tc."""
+
+import json
+import textwrap
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import tomli_w
+from pydantic import BaseModel
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from netem.relay.relay_links import LinkSpec
+from netem.tc_words import words_of
+from noack.core.errors import shortened
+from noack.impairments.feature import Impairment
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import expected_loss, with_target_loss
+from noack.impairments.words import percent_text
+from noack.runtime.address import address_text
+
+_MAX_TOML = 4000
+_NARROW_WIDTH, _WIDE_WIDTH = 20, 44
+"""Minimum and maximum columns for words."""
+
+
+def explain(specs: Sequence[LinkSpec], written: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
+    """Print the effect of links' settings on standard output, as tables or as JSON.
+
+    Args:
+        specs: the links.
+        written: the same links, with the names of files instead of their content: what tables show.
+        as_json: JSON, with the content.
+        as_file: tables have the links as a file of links instead of their names.
+    """
+    if as_json:
+        links = [
+            {
+                "name": spec.name,
+                "listen": address_text(spec.listen),
+                "to": address_text(spec.to),
+                "seed": spec.seed,
+                "forward": _document(spec.forward),
+                "reverse": _document(spec.reverse) if spec.return_path else None,
+            }
+            for spec in specs
+        ]
+        print(json.dumps({"links": links}, indent=2))
+        return
+    console = Console(highlight=False)
+    for number, (spec, written_spec) in enumerate(zip(specs, written, strict=True)):
+        if number:
+            console.print()
+        if not as_file:
+            seed = f", seed {spec.seed}" if spec.seed else ""
+            addresses = f"{address_text(spec.listen)} → {address_text(spec.to)}"
+            console.print(Text(f"{spec.name}: {addresses}{seed}", "bold underline"))
+        _print_link(console, spec, written_spec)
+        if as_file:
+            console.print(Text("\nas a file of links (--links)", "bold"))
+            toml = tomli_w.dumps({"link": [_link_table(written_spec)]}).strip()
+            console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)  # for copying
+
+
+def _document(settings: LinkSettings) -> dict[str, object]:
+    prediction, tc = expected_loss(settings), tc_command(settings)
+    return {
+        "words": words_of(settings),
+        "settings": settings.model_dump(mode="json", exclude_none=True),
+        "meaning": [impairment.meaning() for impairment in settings.impairments]
+        + [f"{words}: {meaning}" for words, meaning in settings_meaning(settings)],
+        "predicted_loss": prediction.rate,
+        "predicted_loss_note": prediction.note,
+        "predicted_loss_without_cap": expected_loss(_without_guarantee(settings)).rate,
+        "tc": tc.words,
+        "tc_lacks": list(tc.lacks),
+        "tc_notes": list(tc.notes),
+    }
+
+
+def settings_meaning(settings: LinkSettings) -> Iterator[tuple[str, str]]:
+    """Yield (words, meaning) of the cap and the other settings."""
+    if settings.mansd is not None:
+        meaning = f"at most {settings.mansd} consecutive packets of a flow are not delivered"
+        yield f"mansd {settings.mansd}", f"the cap (M − 1): {meaning}; the next one is always delivered"
+    for constraint in settings.constraints:
+        yield constraint.text(), constraint.meaning()
+    if settings.first_delivered:
+        meaning = "the first packet of each flow is always delivered"
+        yield "first", f"{meaning}; the cap for later packets is mansd"
+    if any(impairment.delays for impairment in settings.impairments):
+        most = settings.limit
+        yield f"limit {most}", f"at most {most} packets are delayed at once; more are dropped"
+
+
+def _print_link(console: Console, spec: LinkSpec, written: LinkSpec) -> None:
+    if spec.return_path and spec.forward == spec.reverse:
+        _print_direction(console, "both directions, each by itself", spec.forward, written.forward)
+        return
+    _print_direction(console, "forward, from clients to the server", spec.forward, written.forward)
+    console.print()
+    if spec.return_path:
+        title = "reverse, from the server to clients"
+        _print_direction(console, title, spec.reverse, written.reverse)
+    else:
+        console.print(Text("reverse: not relayed; the server's answers are discarded", "bold"))
+
+
+def _print_direction(console: Console, title: str, settings: LinkSettings, written: LinkSettings) -> None:
+    if settings == LinkSettings():
+        console.print(Text(f"{title}: no impairment", "bold"))
+        return
+    console.print(Text(f"{title}, in this order", "bold"))
+    console.print(_table(settings, written, console.width))
+    console.print(Text(f"\nexpected loss rate: {_rate_text(settings)}"))
+    _print_tc(console, tc_command(settings, written))
+
+
+def _table(settings: LinkSettings, written: LinkSettings, width: int) -> Table:
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=False)
+    table.add_column(justify="right", style="dim")
+    most = min(max(2 * width // 5, _NARROW_WIDTH), _WIDE_WIDTH)
+    table.add_column(max_width=most, overflow="fold", style="bold")
+    table.add_column(overflow="fold")
+    pairs = zip(settings.impairments, written.impairments, strict=True)
+    for number, (impairment, written_impairment) in enumerate(pairs, 1):
+        # As text: a bracket in a file's name is not markup.
+        words, meaning = shortened(written_impairment.text(), 200), impairment.meaning()
+        table.add_row(str(number), Text(words), Text(meaning))
+    if not settings.impairments:
+        table.add_row("", "", "no impairment")
+    for words, meaning in settings_meaning(settings):
+        table.add_row("", words, meaning)
+    return table
+
+
+def _rate_text(settings: LinkSettings) -> str:
+    prediction = expected_loss(settings)
+    if prediction.rate is None:
+        return f"not known: {prediction.note}"
+    text = f"{100 * prediction.rate:.4g}%"
+    without = expected_loss(_without_guarantee(settings)).rate
+    if without is not None and settings.longest_burst is not None:
+        text += f" (without the guarantee {100 * without:.4g}%)"
+    return f"{text}, {prediction.note}" if prediction.note else text
+
+
+def _without_guarantee(settings: LinkSettings) -> LinkSettings:
+    """Return settings without the guarantee, which lose with the same probabilities."""
+    return with_target_loss(settings).model_copy(update={"mansd": None, "constraints": ()})
+
+
+def _link_table(spec: LinkSpec) -> dict[str, object]:
+    """Return a link's table in a file of links, without default values."""
+    table: dict[str, object] = {
+        "name": spec.name,
+        "listen": address_text(spec.listen),
+        "to": address_text(spec.to),
+    }
+    for key in ("seed", "return_path", "idle_s"):
+        if getattr(spec, key) != getattr(LinkSpec, key):
+            table[key] = getattr(spec, key)
+    sides = {"forward": _set_keys(spec.forward), "reverse": _set_keys(spec.reverse)}
+    return table | {name: side for name, side in sides.items() if side}
+
+
+def _set_keys(section: BaseModel) -> dict[str, object]:
+    """Return the keys of a section that differ from their defaults, and its kind."""
+    return {
+        key: _plain(getattr(section, key))
+        for key, field in type(section).model_fields.items()
+        if key in ("kind", "model") or getattr(section, key) != field.default
+    }
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, BaseModel):
+        return _set_keys(value)
+    return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
+
+
+_FIXED_ORDER = ("duplicate", "loss", "corrupt", "delay", "reorder", "rate")
+"""tc applies its impairments in this order, whatever the order of the words."""
+_LONGEST = 60
+"""Words that are left out are cut to this number of characters."""
+
+
+class TcCommand(NamedTuple):
+    """The nearest settings that ``tc`` supports."""
+
+    words: str | None
+    """After ``tc qdisc add dev DEVICE root netem``; None if tc supports none of the settings."""
+    lacks: tuple[str, ...]
+    """The words that are left out, each with the missing tc feature."""
+    notes: tuple[str, ...]
+    """Differences in behaviour."""
+
+
+def tc_command(settings: LinkSettings, written: LinkSettings | None = None) -> TcCommand:
+    """Return the nearest words of tc's own netem, and the settings that they leave out.
+
+    ``written`` are the same settings, with the names of files instead of their content.
+    """
+    supported: list[Impairment] = []
+    lacks: list[str] = []
+    pairs = zip(settings.impairments, (written or settings).impairments, strict=True)
+    expressible = [(impairment, original.text()) for impairment, original in pairs if impairment.tc_text()]
+    for impairment, words in expressible:
+        if share := getattr(impairment, "loss_correlation", 0.0):
+            lacks.append(f"lossrel {percent_text(share)} (a delay correlated with loss)")
+        lack = impairment.tc_lacks(supported)
+        if any(earlier.kind == impairment.kind for earlier in supported):
+            lack = f"a second {impairment.kind}"
+        if lack:
+            lacks.append(f"{shortened(words, _LONGEST)} ({lack})")
+        else:
+            supported.append(impairment)
+    if settings.mansd is not None:
+        lacks.append(f"mansd {settings.mansd} (a cap on consecutive losses)")
+    lacks += [f"{constraint.text()} (a constraint on losses)" for constraint in settings.constraints]
+    if settings.first_delivered:
+        lacks.append("first (that the first packet of each flow is delivered)")
+    if expressible and not supported:
+        return TcCommand(None, tuple(lacks), ())
+    text = " ".join([f"limit {settings.limit}", *(impairment.tc_text() for impairment in supported)])
+    notes = [note for impairment in supported for note in impairment.tc_notes()]
+    kinds = [impairment.kind for impairment in supported]
+    order = [_FIXED_ORDER.index(kind) for kind in kinds if kind in _FIXED_ORDER]
+    if order != sorted(order):
+        notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
+    return TcCommand(text, tuple(lacks), tuple(dict.fromkeys(notes)))
+
+
+def _print_tc(console: Console, tc: TcCommand) -> None:
+    lacks = ", ".join(tc.lacks)
+    if tc.words is None:
+        console.print(Text(f"not possible with tc, which lacks: {lacks}"))
+        return
+    console.print(Text("nearest command of tc, for a network device:"))
+    command = textwrap.wrap(
+        f"tc qdisc add dev DEVICE root netem {tc.words}",
+        max(console.width - 2, _NARROW_WIDTH),
+        initial_indent="  ",
+        subsequent_indent="      ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    console.print(Text(" \\\n".join(command)), soft_wrap=True)
+    if lacks:
+        console.print(Text(f"tc lacks: {lacks}"))
+    for note in tc.notes:
+        console.print(Text(f"difference: {note}"))

@@ -1,0 +1,123 @@
+"""The file of links: several links of one relay, as TOML; see :class:`LinksFile`."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
+
+from netem.relay.relay_links import LinkSpec
+from netem.tc_words import settings_of
+from noack.core.errors import CallerError
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import read_files
+from noack.runtime.address import parse_address, parse_destination
+from noack.scenario import toml_file
+from noack.settings.section import ScenarioSection, Seed, Table
+
+
+def _settings(value: object) -> LinkSettings:
+    if isinstance(value, LinkSettings):
+        return value
+    if not isinstance(value, str):
+        # Strict validation accepts lists for tuples only in JSON, so that this goes through JSON.
+        return LinkSettings.model_validate_json(json.dumps(value))
+    try:
+        return settings_of(value)
+    except CallerError as error:
+        raise ValueError(str(error)) from None
+
+
+Side = Annotated[LinkSettings, BeforeValidator(_settings, json_schema_input_type=str | LinkSettings)]
+
+
+class LinkTable(ScenarioSection):
+    """One link of a relay: its addresses, and its settings in each direction."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+    """Names the link in reports, and its random streams: letters, digits, _ and -."""
+    listen: str
+    """Where clients send to: HOST:PORT; port 0 takes a free one."""
+    to: str
+    """The server: HOST:PORT."""
+    forward: Side = LinkSettings()
+    """From clients to the server: words, e.g. "delay 10ms loss 5%", or a table."""
+    reverse: Side = LinkSettings()
+    """From the server to the clients: words or a table, as for forward."""
+    words: Side | None = None
+    """Another name for forward."""
+    seed: Seed = 0
+    """Seed of the link's random streams."""
+    return_path: bool = True
+    """false: forward direction only; the server's answers are discarded."""
+    idle_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] = LinkSpec.idle_s
+    """A client without a datagram in either direction for this time, in seconds, is removed."""
+    most_clients: Annotated[int, Field(ge=1, le=1_000_000)] = LinkSpec.most_clients
+    """Maximum number of clients; datagrams of further clients are refused and counted."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.words is not None and "forward" in self.model_fields_set:
+            raise ValueError("words: is short for forward; give one of them")
+        return self
+
+    def spec(self, folder: Path, place: str, *, read: bool = True) -> LinkSpec:
+        """Return the link for a relay; resolves its addresses, and reads its files in a folder.
+
+        Raises:
+            CallerError: the table has a mistake; one line, which begins with ``place``.
+        """
+        listen = parse_address(self.listen, f"{place}.listen")
+        forward, reverse = self.words or self.forward, self.reverse
+        if read:
+            forward = read_files(forward, folder, f"{place}.forward")
+            reverse = read_files(reverse, folder, f"{place}.reverse")
+        return LinkSpec(
+            listen=listen,
+            to=parse_destination(self.to, f"{place}.to", listen),
+            forward=forward,
+            reverse=reverse,
+            **self.model_dump(include={"name", "seed", "return_path", "idle_s", "most_clients"}),
+        )
+
+
+class LinksFile(ScenarioSection):
+    """Links of one relay."""
+
+    link: Annotated[tuple[LinkTable, ...], Field(min_length=1)]
+    """The links, [[link]] each."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        names: set[str] = set()
+        for number, link in enumerate(self.link):
+            if link.name in names:
+                raise ValueError(f"link.{number}.name: another link has this name already")
+            names.add(link.name)
+        return self
+
+
+def load_links(path: Path, *, read: bool = True) -> tuple[LinkSpec, ...]:
+    """Read a links file; ``read`` also the files that it names.
+
+    Raises:
+        CallerError: one line per mistake, each with file, key, value and remedy.
+    """
+    links = toml_file.validated(LinksFile, toml_file.read(path, LinksFile), str(path)).link
+    specs = tuple(
+        link.spec(path.parent, f"{path}: link.{number}", read=read) for number, link in enumerate(links)
+    )
+    listening: dict[object, str] = {}
+    for number, spec in enumerate(specs):
+        if spec.listen[1] and spec.listen in listening:
+            raise CallerError(
+                f'{path}: link.{number}.listen = "{links[number].listen}": '
+                f"link {listening[spec.listen]} listens there already; take another port, or 0"
+            )
+        listening[spec.listen] = spec.name
+    return specs
+
+
+def json_schema() -> Table:
+    """Return the JSON Schema of links files, for editors."""
+    return toml_file.json_schema(LinksFile)
