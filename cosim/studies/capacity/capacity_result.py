@@ -18,7 +18,7 @@ with the simulation if its values lie within the 95 % prediction intervals of a 
 draw, mean ± t s √(1 + 1/k).
 
 How long a study takes is estimated before it starts. The time of a run is proportional to its loops
-and its steps. The time per loop and simulated second is compute_metrics with a short run on this machine,
+and its steps. The time per loop and simulated second is measured with a short run on this machine,
 as processor time, so that other programs that run meanwhile do not count. Loops that overload the
 link take up to twice as long.
 """
@@ -235,9 +235,9 @@ def prediction_interval(metric: Estimate) -> tuple[float, float]:
 
 
 _MEASURED_LOOPS, _MEASURED_STEPS = 20, 4000
-"""Number of loops of the compute_metrics run, if there is such a point, and steps of all its loops."""
+"""Number of loops of the measured run, if there is such a point, and steps of all its loops."""
 _OVERLOADED = 1.2
-"""Mean time of the runs of a study, relative to the compute_metrics one."""
+"""Mean time of the runs of a study, relative to the measured one."""
 _START_S = 3.0
 """Time until the worker processes run."""
 
