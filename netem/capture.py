@@ -30,7 +30,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.relay.relay_links import EVENT, Bytes, Events, LinkSpec
+from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_reports import EVENT, Bytes, Events
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError, why
 from noack.core.file_access import open_growing

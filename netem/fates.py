@@ -35,7 +35,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from netem.relay.relay_links import DIRECTIONS, EVENT, Bytes, Direction, LinkSpec, report_line
+from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_reports import DIRECTIONS, EVENT, Bytes, Direction, report_line
 from noack.core.core_library import Rows, dtype_of
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_growing, open_regular

@@ -20,7 +20,8 @@ from netem.control.emulator_statistics import (
     statistics,
 )
 from netem.relay.relay import Relay
-from netem.relay.relay_links import DIRECTIONS, Direction, LinkSpec
+from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, why
 from noack.impairments.link_settings import LinkSettings

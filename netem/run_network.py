@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from netem.channel import PACKET_ROW, Datagram, announce_change, due_settings, link_name, settings_at_start
-from netem.relay.relay_links import set_receive_timeout, stamp_arrivals
+from netem.relay.link_sockets import set_receive_timeout, stamp_arrivals
 from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.clock import RunClock
 from noack.core.core_library import Rows, core

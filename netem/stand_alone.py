@@ -31,8 +31,10 @@ from netem.emulator_options import command_line_parser, parse_options, specs_of
 from netem.explanation import explain
 from netem.fates import FateRecorder, read_fates
 from netem.relay.device_link import DeviceLink
+from netem.relay.link_sockets import raise_file_limit
 from netem.relay.relay import Relay
-from netem.relay.relay_links import DIRECTIONS, Direction, LinkSpec, Tap, raise_file_limit, report_line
+from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_reports import DIRECTIONS, Direction, Tap, report_line
 from noack.core.errors import CallerError, ExitStatus, NoackError, why
 from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings

@@ -20,7 +20,7 @@ from zenoh import CongestionControl, Priority
 from zenoh.handlers import RingChannel
 
 from netem.control.emulator_statistics import CommandQueue, Statistics, StatisticsThread
-from netem.relay.relay_links import DIRECTIONS, Direction
+from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of, words_of
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings

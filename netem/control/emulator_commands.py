@@ -19,7 +19,7 @@ from zenoh.handlers import RingChannel
 from netem.control.control_server import EMULATORS, find, running
 from netem.control.emulator_statistics import Statistics
 from netem.control.statistics_view import Screen, picture_of
-from netem.relay.relay_links import DIRECTIONS
+from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings

@@ -11,7 +11,7 @@ from prometheus_client import Metric
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily
 
 from netem.control.emulator_statistics import CommandQueue, Statistics, statistics
-from netem.relay.relay_links import DIRECTIONS
+from netem.relay.relay_reports import DIRECTIONS
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
 

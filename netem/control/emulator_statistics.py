@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from netem.control.time_histogram import coarse_histogram, quantile_ns
 from netem.relay.relay import Relay
-from netem.relay.relay_links import DIRECTIONS, Direction, DirectionReport, LinkReport
+from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, LinkReport
 from netem.tc_words import words_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
@@ -217,7 +217,7 @@ class FlowStatistics(TypedDict):
 
 
 class DirectionStatistics(TypedDict):
-    """One direction of a link; see :class:`netem.relay.relay_links.DirectionReport`.
+    """One direction of a link; see :class:`netem.relay.relay_reports.DirectionReport`.
 
     The counts are those of :class:`noack.impairments.link_settings.Counters`.
     """
@@ -257,7 +257,7 @@ class DirectionStatistics(TypedDict):
 
 
 class LinkStatistics(TypedDict):
-    """One link; see :class:`netem.relay.relay_links.LinkReport`."""
+    """One link; see :class:`netem.relay.relay_reports.LinkReport`."""
 
     name: str
     listen: str

@@ -31,7 +31,7 @@ from netem.control.emulator_statistics import (
     RecentRates,
     Statistics,
 )
-from netem.relay.relay_links import DIRECTIONS, Direction
+from netem.relay.relay_reports import DIRECTIONS, Direction
 from noack.core.number_format import with_unit
 
 _BLOCKS = "▁▂▃▄▅▆▇█"

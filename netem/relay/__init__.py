@@ -1,4 +1,5 @@
 """The relay around native/relay, which returns to Python for rare events only.
 
-Read ``relay_links.py``, ``relay_memory.py``, ``client_table.py`` and ``relay.py``, in this order.
+Read ``relay_reports.py``, ``relay_links.py``, ``relay_memory.py``, ``client_table.py`` and
+``relay.py``, in this order. ``link_sockets.py`` has the sockets, ``loss_warnings.py`` the warnings.
 """

@@ -1,109 +1,21 @@
-"""A relay's clients: a row in its memory and a return path for each; and a link's warnings.
+"""A relay's clients, which :class:`ClientTable` accepts, finds and forgets.
 
-:class:`ClientTable` accepts, finds and forgets clients. :class:`LinkWarnings` and
-:class:`UnintendedLosses` report on standard error what goes wrong: refused clients, unreachable
-servers, unintended losses.
+Each has a row in the relay's memory, and may have a return path.
 """
 
 import errno
-import os
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from netem.relay.device_link import DeviceLink
-from netem.relay.relay_links import (
-    Direction,
-    Endpoint,
-    LinkSpec,
-    OpenLink,
-    has_data,
-    report_line,
-    return_path,
-    stamp_arrivals,
-)
+from netem.relay.link_sockets import Endpoint, has_data, return_path, stamp_arrivals
+from netem.relay.loss_warnings import LinkWarnings
+from netem.relay.relay_links import OpenLink
 from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.core_library import core
-from noack.runtime.address import address_text, packed_name
+from noack.runtime.address import packed_name
 from noack.runtime.udp_sockets import drops_of
-
-KERNEL = "lost_in_kernel"
-_CAUSES = {
-    KERNEL: "were lost in the kernel, as its receive buffer was full",
-    os.strerror(errno.ENOBUFS): "were lost, as a queue on the way out was full",
-    os.strerror(errno.ENOMEM): "were lost, as there was no memory to delay them",
-}
-
-
-class LinkWarnings:
-    """Refused clients and the unreachable server of a link; each reason is reported once."""
-
-    def __init__(self, spec: LinkSpec) -> None:
-        self._spec = spec
-        self._reported: set[str] = set()
-
-    def report_full(self) -> None:
-        """Report that the link has its maximum number of clients."""
-        self._report(f"no more than {self._spec.most_clients} clients at once are served")
-
-    def report_no_descriptor(self, clients: int) -> None:
-        """Report that no file descriptor is left for a client in addition to those present."""
-        self._report(
-            f"no file descriptors are left for more than {clients} clients; raise the limit (ulimit -n)"
-        )
-
-    def port_unreachable(self, answers: int) -> None:
-        """Set the total number of ICMP port-unreachable messages from the server's host."""
-        if answers:
-            self._report(
-                f"nothing listens on {address_text(self._spec.to)} (ICMP port unreachable); "
-                "what is sent there is lost"
-            )
-
-    def _report(self, reason: str) -> None:
-        if reason not in self._reported:
-            self._reported.add(reason)
-            report_line(f"link {self._spec.name}: {reason}")
-
-
-class UnintendedLosses:
-    """Losses that no setting caused, in one direction of a link.
-
-    They void the guarantee and are always reported.
-    """
-
-    def __init__(self, link: str, direction: Direction) -> None:
-        self._where = f"link {link}, {direction}"
-        self._counts: Counter[str] = Counter({KERNEL: 0})
-        self._reported: Counter[str] = Counter()
-
-    def lost_in_kernel(self, datagrams: int) -> None:
-        """Set the total number of datagrams that the kernel has dropped."""
-        self._set(KERNEL, datagrams)
-
-    def not_sent(self, error: int, datagrams: int) -> None:
-        """Set the total number of datagrams that could not be sent or stored, for one errno."""
-        self._set(os.strerror(error), datagrams)
-
-    def counts(self) -> Mapping[str, int]:
-        """Return the number of losses by cause."""
-        return dict(self._counts)
-
-    def report(self) -> None:
-        """Report the totals that have changed since the last call on standard error."""
-        for cause, datagrams in self._counts.items():
-            if datagrams > self._reported[cause]:
-                self._reported[cause] = datagrams
-                text = _CAUSES.get(cause, f"could not be sent ({cause})")
-                report_line(f"{self._where}: {datagrams} datagrams {text}; the guarantee is void")
-
-    def _set(self, cause: str, datagrams: int) -> None:
-        if datagrams > 0:
-            self._counts[cause] = datagrams
-            if not self._reported[cause]:
-                self.report()
-
 
 _QUERIED_AT_ONCE = 64
 _STALL_NS = 1_000_000_000

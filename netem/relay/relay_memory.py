@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.link_state import Integers, LinkState
-from netem.relay.relay_links import EVENT, Bytes
+from netem.relay.relay_reports import EVENT, Bytes
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, Rows, core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import Decisions, LinkSettings

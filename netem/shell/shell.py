@@ -14,7 +14,7 @@ from contextlib import contextmanager
 
 from netem.emulator_options import parse_options, shell_parser, shell_spec
 from netem.relay.device_link import DeviceLink
-from netem.relay.relay_links import report_line
+from netem.relay.relay_reports import report_line
 from netem.shell import process
 from netem.shell.devices import inside, open_devices
 from netem.stand_alone import add_recording_options, check_options, relay, report_totals

@@ -9,7 +9,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from netem.capture import PcapngSection
-from netem.relay.relay_links import EVENT, Bytes, Events, LinkSpec
+from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_reports import EVENT, Bytes, Events
 from noack.impairments.link_settings import LinkSettings
 
 T_NS = 1_767_225_600_123_456_789

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from netem.fates import FateRecorder
-from netem.relay.relay_links import EVENT, LinkSpec
+from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_reports import EVENT
 from noack.core.core_library import ffi
 from noack.impairments.link_settings import LinkSettings
 from tests.oracles.link import Datagram, Link

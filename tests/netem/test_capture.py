@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.capture import CaptureWriter, PcapngSection
-from netem.relay.relay_links import DIRECTIONS, EVENT, Bytes, Events
+from netem.relay.relay_reports import DIRECTIONS, EVENT, Bytes, Events
 from noack.core.errors import CallerError
 from tests.helpers.approved import compare_lines
 from tests.helpers.waiting import wait_for

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from netem.fates import METADATA, FateRecorder, read_fates
-from netem.relay.relay_links import EVENT
+from netem.relay.relay_reports import EVENT
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import Decisions, LinkSettings

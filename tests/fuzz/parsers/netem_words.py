@@ -12,7 +12,7 @@ import tomli_w
 from netem.control.control_server import ControlServer, SettingsChange
 from netem.explanation import tc_command
 from netem.links_file import json_schema, load_links
-from netem.relay.relay_links import DIRECTIONS
+from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import EXAMPLES as ANY_WORD
 from netem.tc_words import parse, settings_of, words_of
 from noack.core.errors import CallerError

@@ -25,7 +25,7 @@ from netem.control.emulator_statistics import (
 )
 from netem.control.statistics_view import History, render
 from netem.fates import SCHEMA, FateRecorder
-from netem.relay.relay_links import FlowReport
+from netem.relay.relay_reports import FlowReport
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.relay.relay import Relay
-from netem.relay.relay_links import LinkReport, LinkSpec, Tap
+from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_reports import LinkReport, Tap
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import Address
 from noack.runtime.udp_sockets import enlarge_buffer

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from netem.relay import relay_memory
-from netem.relay.relay_links import DirectionReport
+from netem.relay.relay_reports import DirectionReport
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.runtime import udp_sockets

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.relay.relay_links import LinkSpec, open_links, socket_name
+from netem.relay.link_sockets import socket_name
+from netem.relay.relay_links import LinkSpec, open_links
 from netem.relay.relay_memory import RelayMemory, name_array
 from netem.tc_words import settings_of
 from noack.core.core_library import core, pointer_to
